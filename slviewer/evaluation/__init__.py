@@ -1,0 +1,1 @@
+"""Error maps, histograms, noise floors, incidence, and the Letter's tables."""

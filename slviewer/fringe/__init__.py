@@ -1,0 +1,1 @@
+"""What is projected, and what it says: pattern sequences, phase shift, Gray code, decoding."""

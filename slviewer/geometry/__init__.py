@@ -1,0 +1,1 @@
+"""Lenses, rays, transforms, triangulation, plane and sphere fits."""

@@ -1,0 +1,1 @@
+"""From phase to an organised cloud, normals, and PLY."""

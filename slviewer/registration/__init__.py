@@ -1,0 +1,1 @@
+"""Pairwise ICP and merging of scans taken at different depths."""

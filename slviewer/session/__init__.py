@@ -1,0 +1,1 @@
+"""The folder on disk: layout, atomic saves, importers of other tools' folders."""

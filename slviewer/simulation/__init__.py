@@ -1,0 +1,1 @@
+"""A rig, scenes and a renderer with ground truth; its lens code is its own."""

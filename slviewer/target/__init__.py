@@ -1,0 +1,1 @@
+"""Calibration boards: their notation, detection in an image, and printable sheets."""
