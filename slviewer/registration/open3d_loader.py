@@ -1,0 +1,49 @@
+"""Open3D, imported when it is first needed, also on a machine without libusb.
+
+Open3D's wheels for Linux are linked against ``libusb-1.0.so.0`` (for depth cameras that nobody here uses), which bare
+machines lack. The package ``libusb-package`` carries it; once loaded into the process under its own name, the dynamic
+linker is content with it.
+"""
+
+import ctypes
+import sys
+from functools import cache
+from typing import Any
+
+from slviewer.errors import SlviewerError
+
+
+@cache
+def open3d() -> Any:
+    """The ``open3d`` module, quiet below errors; the first call takes about a second.
+
+    Raises ``SlviewerError`` with the remedy where it cannot be imported.
+    """
+    _supply_libusb()
+    try:
+        import open3d as module
+    except (ImportError, OSError) as error:
+        package = "open3d-cpu" if sys.platform == "linux" else "open3d"
+        raise SlviewerError(
+            f"Open3D, which aligns scans and casts rays, cannot be imported ({error}): "
+            f"run 'pip install {package} libusb-package' in the environment that runs slviewer."
+        ) from error
+    module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
+    return module
+
+
+def _supply_libusb() -> None:
+    """Load a libusb into the process if the system has none; do nothing where none can be found."""
+    if not sys.platform.startswith("linux"):
+        return
+    try:
+        ctypes.CDLL("libusb-1.0.so.0")
+    except OSError:
+        try:
+            import libusb_package
+
+            path = libusb_package.get_library_path()
+            if path is not None:
+                ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+        except (ImportError, OSError):
+            return  # the import of Open3D says what is missing, in its own words
