@@ -11,7 +11,7 @@ import numba
 
 
 def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: ``numba.njit`` that releases the GIL and caches its machine code where a cache folder can be written."""
+    """Decorator: ``numba.njit`` that releases the GIL and caches its machine code where a folder can be written."""
     options: dict[str, Any] = {"parallel": parallel, "fastmath": fastmath, "nogil": True}
 
     def compile_lazily(function: Callable[..., Any]) -> Callable[..., Any]:

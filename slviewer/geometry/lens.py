@@ -1,0 +1,127 @@
+"""A camera or a projector as a pinhole with Brown distortion: from points to pixels and from pixels to rays."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.brown import distort_all, fold_radius_squared, project_all, undistort_all
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """Pinhole and Brown distortion of one device (Letter eq. 1-5).
+
+    ``K``: (3, 3), px, without skew. ``D``: (5,), OpenCV's order (k1, k2, p1, p2, k3); four coefficients, or more of
+    which the rest are zero, are accepted. ``size``: (width, height) px. The arrays are kept as read-only
+    float64 copies.
+
+    Raises InputError for matrices that are no pinhole, and for distortion models other than Brown's.
+    """
+
+    K: np.ndarray
+    D: np.ndarray
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        K = np.array(self.K, dtype=np.float64)
+        D = np.array(self.D, dtype=np.float64).ravel()
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise InputError(
+                f"A camera matrix must be 3x3 finite numbers, this one is {K.shape}: give K as OpenCV does."
+            )
+        form = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+        if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K, form, rtol=0, atol=1e-9 * K[0, 0]):
+            raise InputError(
+                f"A camera matrix must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], this one is {K.tolist()}: "
+                "check the key and calibrate without skew."
+            )
+        if D.size > 5 and not D[5:].any():
+            D = D[:5]
+        if D.size not in (0, 4, 5) or not np.isfinite(D).all():
+            raise InputError(
+                f"{D.size} distortion coefficients were given, {D.tolist()}, and this lens has five "
+                "(k1, k2, p1, p2, k3): calibrate without the rational, thin-prism and tilted models."
+            )
+        D = np.concatenate([D, np.zeros(5 - D.size)])
+        width, height = (int(n) for n in self.size)
+        if width < 1 or height < 1:
+            raise InputError(f"An image of {width}x{height} px was given: its size is width x height, both positive.")
+        K.setflags(write=False)
+        D.setflags(write=False)
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "D", D)
+        object.__setattr__(self, "size", (width, height))
+
+    @cached_property
+    def parameters(self) -> np.ndarray:
+        """(10,) float64: what the compiled kernels take (see ``geometry.brown``)."""
+        K = self.K
+        return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *self.D, fold_radius_squared(self.D)])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) mm in this device's frame to pixels (..., 2) (eq. 1-3).
+
+        NaN for NaN points, behind the device, and past the radius where the distortion polynomial folds over.
+        """
+        flat = _flatten(points, 3, "points")
+        pixels = np.empty((len(flat), 2))
+        project_all(flat, self.parameters, pixels)
+        return pixels.reshape(*np.shape(points)[:-1], 2)
+
+    def distort(self, normalised: np.ndarray) -> np.ndarray:
+        """Undistorted normalised coordinates (..., 2) to pixels (..., 2) (eq. 3); NaN past the fold."""
+        flat = _flatten(normalised, 2, "normalised coordinates")
+        pixels = np.empty((len(flat), 2))
+        distort_all(flat, self.parameters, pixels)
+        return pixels.reshape(np.shape(normalised))
+
+    def undistort(self, pixels: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) to undistorted normalised coordinates (..., 2) (eq. 4, 5), exact to 1e-9.
+
+        NaN for NaN pixels, and where no ray within the fold of the distortion polynomial meets the pixel.
+        """
+        flat = _flatten(pixels, 2, "pixels")
+        normalised = np.empty((len(flat), 2))
+        undistort_all(flat, self.parameters, normalised)
+        return normalised.reshape(np.shape(pixels))
+
+    def rays(self) -> np.ndarray:
+        """(h, w, 2) float64: undistorted normalised coordinates of every pixel; computed once, read-only."""
+        return self._rays
+
+    @cached_property
+    def _rays(self) -> np.ndarray:
+        width, height = self.size
+        v, u = np.mgrid[:height, :width]
+        rays = self.undistort(np.stack([u, v], axis=-1))
+        rays.setflags(write=False)
+        return rays
+
+    def scaled(self, factor: float) -> "Lens":
+        """The same lens at another resolution: pixel centres stay at whole numbers, so c' = (c + 0.5) factor - 0.5."""
+        K = self.K.copy()
+        K[:2, :2] *= factor
+        K[:2, 2] = (K[:2, 2] + 0.5) * factor - 0.5
+        width, height = self.size
+        return Lens(K, self.D, (round(width * factor), round(height * factor)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and lists, for JSON."""
+        return {"K": self.K.tolist(), "D": self.D.tolist(), "size": list(self.size)}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "Lens":
+        """The lens that ``to_dict`` described."""
+        width, height = values["size"]
+        return cls(np.array(values["K"]), np.array(values["D"]), (width, height))
+
+
+def _flatten(values: np.ndarray, last: int, what: str) -> np.ndarray:
+    """(n, last) contiguous float64; InputError where the last dimension differs."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.ndim < 1 or values.shape[-1] != last:
+        raise InputError(f"An array of shape {values.shape} was given as {what}: the last dimension must be {last}.")
+    return np.ascontiguousarray(values.reshape(-1, last))

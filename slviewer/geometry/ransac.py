@@ -1,0 +1,148 @@
+"""A plane or a sphere somewhere in a cloud that also holds other things: a start for the least-squares fits."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.errors import InputError
+from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
+
+SAMPLE = 6000
+"""Points that are looked at: the shape must be found, not measured yet."""
+HYPOTHESES = 800
+POLISHED = 12
+"""How many of the best hypotheses are refined by least squares before the best is chosen."""
+
+
+def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[Plane, np.ndarray]:
+    """The plane that most points (n, 3) agree with to ``tolerance`` mm, and which they are: (n,) bool.
+
+    Looks at a subsample, and ends with least squares over those that agree; the same seed gives the same answer. NaN
+    rows are left out. Raises InputError where nothing flat is found.
+    """
+
+    def hypotheses(triples: np.ndarray) -> tuple[np.ndarray, ...]:
+        a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
+        normals = np.cross(b - a, c - a)
+        lengths = np.linalg.norm(normals, axis=1)
+        normals = normals[lengths > 0] / lengths[lengths > 0, None]
+        return normals, np.einsum("ij,ij->i", normals, a[lengths > 0])
+
+    def distances(sample: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        result: np.ndarray = normal @ sample.T - offset[:, None]
+        return result
+
+    return _search(points, 3, tolerance, seed, hypotheses, distances, fit_plane, "plane")
+
+
+def ransac_sphere(
+    points: np.ndarray, tolerance: float, radius: float | None = None, seed: int = 0
+) -> tuple[Sphere, np.ndarray]:
+    """The sphere that most points (n, 3) agree with to ``tolerance`` mm, and which they are: (n,) bool.
+
+    With ``radius`` (mm) only spheres of about that size are looked for, and the result has it exactly; without, spheres
+    larger than the cloud itself are left out, because any flat patch would pass for one. Otherwise as ``ransac_plane``.
+    """
+    finite = np.asarray(points, dtype=np.float64)[np.isfinite(points).all(axis=-1)]
+    extent = float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 0.0
+    low, high = (10.0 * tolerance, 0.5 * extent) if radius is None else (0.7 * radius, 1.4 * radius)
+
+    def hypotheses(quads: np.ndarray) -> tuple[np.ndarray, ...]:
+        origin = quads[:, :1]
+        edges = quads[:, 1:] - origin
+        regular = np.abs(np.linalg.det(edges)) > 1e-12 * np.linalg.norm(edges, axis=2).prod(axis=1)
+        edges, origin = edges[regular], origin[regular, 0]
+        offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=2)[..., None])[..., 0]
+        radii = np.linalg.norm(offset, axis=1)
+        sized = (radii >= low) & (radii <= high)
+        return (origin + offset)[sized], radii[sized]
+
+    def distances(sample: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        result: np.ndarray = np.linalg.norm(sample[None] - centre[:, None], axis=2) - radii[:, None]
+        return result
+
+    def fit(chosen: np.ndarray) -> Sphere:
+        sphere = fit_sphere(chosen, radius)
+        if not low <= sphere.radius <= high:
+            raise InputError(f"The sphere found has a radius of {sphere.radius:.1f} mm, too large for its cloud.")
+        return sphere
+
+    return _search(points, 4, tolerance, seed, hypotheses, distances, fit, "sphere")
+
+
+def _search(
+    points: np.ndarray,
+    needed: int,
+    tolerance: float,
+    seed: int,
+    hypotheses: Callable[[np.ndarray], tuple[np.ndarray, ...]],
+    distances: Callable[..., np.ndarray],
+    fit: Callable,
+    what: str,
+) -> tuple:
+    """Hypotheses from neighbours at many scales, scored by truncated squares (MSAC); the best few refined."""
+    points = np.asarray(points, dtype=np.float64)
+    finite = np.isfinite(points).all(axis=-1)
+    valid = points[finite]
+    if len(valid) < 3 * needed:
+        raise InputError(
+            f"{len(valid)} points were measured, too few to find a {what} in: check the capture's exposure."
+        )
+    rng = np.random.default_rng(seed)
+    sample = valid[rng.choice(len(valid), min(SAMPLE, len(valid)), replace=False)]
+    parameters = hypotheses(_minimal_sets(sample, needed, rng))
+    # score in slices, so that the table of distances stays small
+    scores = np.concatenate(
+        [
+            _score(distances(sample, *(p[i : i + 50] for p in parameters)), tolerance)
+            for i in range(0, len(parameters[0]), 50)
+        ]
+        or [np.empty(0)]
+    )
+    best, best_score = None, np.inf
+    for index in np.argsort(scores)[:POLISHED]:
+        chosen = np.abs(distances(sample, *(p[index : index + 1] for p in parameters))[0]) <= tolerance
+        try:
+            for _ in range(5):
+                shape = fit(sample[chosen])
+                chosen = np.abs(shape.distance(sample)) <= tolerance
+        except InputError:  # too few, or flat: this hypothesis was chance
+            continue
+        score = float(_score(shape.distance(sample), tolerance))
+        if score < best_score:
+            best, best_score = shape, score
+    if best is None:
+        raise InputError(
+            f"No {what} was found among {len(valid)} points to {tolerance:g} mm: "
+            "check that it fills a good part of the view."
+        )
+    with np.errstate(invalid="ignore"):
+        inliers = np.abs(best.distance(points)) <= tolerance
+    shape = fit(points[inliers])
+    with np.errstate(invalid="ignore"):
+        return shape, np.abs(shape.distance(points)) <= tolerance
+
+
+def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+    """(HYPOTHESES, size, 3): each a random point and some of its neighbours, from near ones to those a quarter away.
+
+    A shape that fills a tenth of the cloud holds four points drawn anywhere once in ten thousand draws; four
+    neighbours, often.
+    """
+    seeds = rng.choice(len(sample), HYPOTHESES)
+    tree = cKDTree(sample)
+    sets = np.empty((HYPOTHESES, size, 3))
+    for share, group in zip((0.01, 0.03, 0.1, 0.25), np.array_split(np.arange(HYPOTHESES), 4), strict=True):
+        count = min(max(3 * size, round(share * len(sample))), len(sample))
+        _, neighbours = tree.query(sample[seeds[group]], k=count)
+        picks = rng.integers(1, count, (len(group), size - 1))
+        sets[group, 0] = sample[seeds[group]]
+        sets[group, 1:] = sample[np.take_along_axis(neighbours, picks, axis=1)]
+    return sets
+
+
+def _score(residuals: np.ndarray, tolerance: float) -> np.ndarray:
+    """Sum of squares truncated at the tolerance, along the last axis: fewer and larger residuals cost more."""
+    total: np.ndarray = np.minimum((residuals / tolerance) ** 2, 1.0).sum(axis=-1)
+    return total

@@ -1,0 +1,67 @@
+"""One camera and one projector, and how they stand to each other."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.lens import Lens
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """Camera, projector, and the transform between them: X_projector = R X_camera + t (the Letter's R(theta_s), t_s).
+
+    ``R``: (3, 3) rotation. ``t``: (3,) mm; OpenCV's (3, 1) is accepted. Kept as read-only float64 copies.
+    """
+
+    camera: Lens
+    projector: Lens
+    R: np.ndarray
+    t: np.ndarray
+
+    def __post_init__(self) -> None:
+        R = np.array(self.R, dtype=np.float64)
+        t = np.array(self.t, dtype=np.float64).ravel()
+        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0:
+            raise InputError(
+                f"The rotation from camera to projector is no 3x3 rotation matrix, {R.tolist()}: check its key."
+            )
+        if t.shape != (3,) or not np.isfinite(t).all():
+            raise InputError(f"The translation from camera to projector must be 3 numbers in mm, not {t.tolist()}.")
+        R.setflags(write=False)
+        t.setflags(write=False)
+        object.__setattr__(self, "R", R)
+        object.__setattr__(self, "t", t)
+
+    @property
+    def T_projector_camera(self) -> np.ndarray:
+        """(4, 4): maps camera-frame points into the projector's frame."""
+        T = np.eye(4)
+        T[:3, :3] = self.R
+        T[:3, 3] = self.t
+        return T
+
+    def to_projector(self, points: np.ndarray) -> np.ndarray:
+        """Camera-frame points (..., 3) mm in the projector's frame, (..., 3) mm."""
+        return np.asarray(points, dtype=np.float64) @ self.R.T + self.t
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Camera-frame points (..., 3) mm to projector pixels (..., 2); NaN behind the projector and past its fold."""
+        return self.projector.project(self.to_projector(points))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and lists, for JSON."""
+        return {
+            "camera": self.camera.to_dict(),
+            "projector": self.projector.to_dict(),
+            "R": self.R.tolist(),
+            "t": self.t.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "StereoRig":
+        """The rig that ``to_dict`` described."""
+        lenses = Lens.from_dict(values["camera"]), Lens.from_dict(values["projector"])
+        return cls(*lenses, np.array(values["R"]), np.array(values["t"]))

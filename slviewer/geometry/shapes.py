@@ -1,0 +1,177 @@
+"""Planes and spheres fitted to points: least squares of the orthogonal distances, with stray points set aside."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.robust import robust_sigma
+
+FLAT = 8.0
+"""A patch is a sphere's only if its height over a plane is at least this many times the RMS left by the sphere fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """n . x = d (Letter eq. 12): unit ``normal`` (3,) that points towards the camera (n_z < 0), ``offset`` d in mm."""
+
+    normal: np.ndarray
+    offset: float
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distances (...) mm of points (..., 3), positive on the camera's side."""
+        distances: np.ndarray = np.asarray(points, dtype=np.float64) @ self.normal - self.offset
+        return distances
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """``centre`` (3,) and ``radius``, mm."""
+
+    centre: np.ndarray
+    radius: float
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed radial distances (...) mm of points (..., 3), positive outside."""
+        return np.linalg.norm(np.asarray(points, dtype=np.float64) - self.centre, axis=-1) - self.radius
+
+
+class Shape(Protocol):
+    def distance(self, points: np.ndarray) -> np.ndarray: ...
+
+
+AnyShape = TypeVar("AnyShape", bound=Shape)
+
+
+def fit_plane(points: np.ndarray, weights: np.ndarray | None = None) -> Plane:
+    """Total least squares plane of points (n, 3) mm (Letter eq. 12), through their moments; NaN rows are left out.
+
+    ``weights``: (n,), one over each point's variance. Raises InputError for fewer than three points, and for points on
+    one line or in a clump, which lie on no one plane.
+    """
+    points, kept = _finite(points, 3, "a plane")
+    w = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)[kept]
+    if not w.sum() > 0:
+        raise InputError("All points of a plane fit have weight 0: give at least three of them a positive weight.")
+    centroid = w @ points / w.sum()
+    centred = points - centroid
+    spread, directions = np.linalg.eigh((centred * w[:, None]).T @ centred)
+    if spread[1] <= 1e-10 * spread[2] or spread[0] > 0.5 * spread[1]:
+        raise InputError(
+            f"The {len(points)} points lie on a line or in a clump, not on a plane: select a wider region."
+        )
+    normal = directions[:, 0]
+    if normal[2] > 0 or (normal[2] == 0 and normal @ centroid > 0):
+        normal = -normal
+    return Plane(normal, float(normal @ centroid))
+
+
+def fit_sphere(points: np.ndarray, radius: float | None = None) -> Sphere:
+    """Sphere of least orthogonal distances to points (n, 3) mm, with the radius held if given; NaN rows are left out.
+
+    Levenberg-Marquardt from the algebraic fit. Raises InputError for fewer than four points, and for a patch that is
+    flat: exactly, or as far as its noise lets one see.
+    """
+    points, _ = _finite(points, 4, "a sphere")
+    origin = points.mean(axis=0)
+    points = points - origin  # better conditioned, and the size of the patch sets the scale
+    spread = np.linalg.eigvalsh(points.T @ points / len(points))
+    flat = InputError(
+        f"The {len(points)} points are too flat to be a part of a sphere: select more of the sphere's cap."
+    )
+    if not spread[0] > 1e-14 * spread[2]:
+        raise flat
+    centre, start = _algebraic_sphere(points)
+    centre, r, rms = _refine_sphere(points, centre, start if radius is None else radius, radius is not None)
+    if not (np.isfinite(r) and 2.0 * np.sqrt(spread[1] * spread[2]) / r > FLAT * rms):  # height of the cap: a^2 / 2r
+        raise flat
+    return Sphere(centre + origin, r)
+
+
+def robust_fit(
+    fit: Callable[[np.ndarray], AnyShape], points: np.ndarray, k: float = 5.0
+) -> tuple[AnyShape, np.ndarray]:
+    """The shape, and which of the points (n, 3) it was fitted to: (n,) bool, False for NaN rows.
+
+    Fits, sets aside the points beyond ``k`` robust sigma (1.4826 MAD of all residuals), and repeats until the set is
+    stable. Stands up to stray points as long as they are few: start with ``ransac_*`` in a cloud of other things.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    finite = np.isfinite(points).all(axis=-1)
+    inliers = finite
+    shape = fit(points[inliers])
+    for _ in range(50):
+        residuals = shape.distance(points)
+        middle = np.median(residuals[finite])
+        # exact points have no spread: rounding must not set any of them aside
+        reach = max(k * robust_sigma(residuals[finite]), 1e-9 * float(np.abs(points[finite]).max()))
+        kept = finite & (np.abs(residuals - middle) <= reach)
+        if np.array_equal(kept, inliers):
+            break
+        inliers = kept
+        shape = fit(points[inliers])
+    return shape, inliers
+
+
+def _finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """The finite rows as float64, and which they are; InputError for another shape or too few of them."""
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"Points of shape {points.shape} were given for {what}: they must be (n, 3).")
+    kept = np.isfinite(points).all(axis=1)
+    if kept.sum() < least:
+        raise InputError(
+            f"{kept.sum()} points were measured, and {what} needs {least} at least: select a wider region."
+        )
+    return (points if kept.all() else points[kept]), kept
+
+
+def _algebraic_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre and radius from |x|^2 = 2 c.x + (r^2 - c^2), linear in the unknowns; points about their centroid."""
+    scale = np.sqrt((points**2).sum(axis=1).mean())
+    unit = points / scale
+    design = np.column_stack([2.0 * unit, np.ones(len(unit))])
+    solution = np.linalg.lstsq(design.T @ design, design.T @ (unit**2).sum(axis=1), rcond=None)[0]
+    centre = solution[:3]
+    return centre * scale, float(np.sqrt(max(solution[3] + centre @ centre, 1e-12)) * scale)
+
+
+def _refine_sphere(
+    points: np.ndarray, centre: np.ndarray, radius: float, fixed: bool
+) -> tuple[np.ndarray, float, float]:
+    """Levenberg-Marquardt on centre (and radius): (centre, radius, RMS of the radial distances)."""
+
+    def misfit(c: np.ndarray, r: float) -> tuple[np.ndarray, np.ndarray, float]:
+        offsets = points - c
+        lengths = np.linalg.norm(offsets, axis=1)
+        residuals = lengths - r
+        return offsets / np.maximum(lengths, 1e-300)[:, None], residuals, float(residuals @ residuals)
+
+    unknowns = 3 if fixed else 4
+    damping = 1e-6
+    directions, residuals, cost = misfit(centre, radius)
+    for _ in range(100):
+        # Jacobian of |x - c| - r is (-direction, -1): the normal equations in 4x4 blocks
+        normal = np.empty((4, 4))
+        normal[:3, :3] = directions.T @ directions
+        normal[3, :3] = normal[:3, 3] = directions.sum(axis=0)
+        normal[3, 3] = len(points)
+        gradient = np.append(residuals @ directions, residuals.sum())
+        damped = normal[:unknowns, :unknowns] + damping * np.diag(np.diag(normal)[:unknowns])
+        step = np.zeros(4)
+        step[:unknowns] = np.linalg.solve(damped, gradient[:unknowns])
+        candidate = misfit(centre + step[:3], radius + step[3])
+        if candidate[2] <= cost:
+            centre, radius = centre + step[:3], float(radius + step[3])
+            gain = cost - candidate[2]
+            directions, residuals, cost = candidate
+            damping = max(damping * 0.1, 1e-12)
+            if gain <= 1e-14 * cost or np.abs(step).max() < 1e-10 * abs(radius):
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    return centre, radius, float(np.sqrt(cost / len(points)))

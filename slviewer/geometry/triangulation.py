@@ -1,0 +1,198 @@
+"""Depth from one projector coordinate per camera pixel, exact under both lenses' distortion."""
+
+from typing import Literal
+
+import numba
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.brown import brown
+from slviewer.geometry.jit import kernel
+from slviewer.geometry.rig import StereoRig
+
+TOLERANCE_PX = 1e-8
+"""How far the distorted projection of the result may be from the measured coordinate."""
+MAX_STEPS = 25
+MARGIN = 0.1
+"""A point may fall outside the projector's image by this share of its width and height: a calibration's own error is
+smaller, and what lies further out was never lit."""
+
+
+def triangulate(
+    rig: StereoRig, coordinate: np.ndarray, axis: Literal["x", "y"], z_range: tuple[float, float] | None = None
+) -> np.ndarray:
+    """Depth (h, w) float64 mm of each camera pixel from its projector column (axis x) or row (axis y).
+
+    ``coordinate``: (h, w) px, NaN where invalid. Starts from Letter eq. 6, whose projector coordinate is normalised
+    without undistorting it (that needs the other coordinate, not known yet), then Newton steps on z until the
+    *distorted* projection meets the measured coordinate. NaN where the coordinate is invalid, the point would lie
+    behind a device, more than a tenth outside the projector's image or past the fold of a lens, the steps do not
+    converge, or z lies outside ``z_range`` (mm). Raises InputError where the map has not the camera's image size.
+    """
+    _check_map(rig, coordinate, "projector coordinates")
+    z = _solve(rig, rig.camera.rays().reshape(-1, 2), np.asarray(coordinate).reshape(-1), axis)
+    if z_range is not None:
+        z[~((z >= z_range[0]) & (z <= z_range[1]))] = np.nan
+    return z.reshape(np.shape(coordinate))
+
+
+def triangulate_pixels(
+    rig: StereoRig, pixels: np.ndarray, coordinate: np.ndarray, axis: Literal["x", "y"]
+) -> np.ndarray:
+    """Points (n, 3) mm in the camera's frame of scattered camera pixels (n, 2) and their projector coordinate (n,) px.
+
+    NaN rows under the same conditions as ``triangulate``.
+    """
+    pixels, coordinate = np.asarray(pixels), np.asarray(coordinate)
+    if pixels.ndim != 2 or pixels.shape[1] != 2 or coordinate.shape != pixels.shape[:1]:
+        raise InputError(
+            f"Pixels of shape {pixels.shape} and coordinates of shape {coordinate.shape} were given: "
+            "they must be (n, 2) and (n,)."
+        )
+    rays = rig.camera.undistort(pixels)
+    z = _solve(rig, rays, coordinate, axis)
+    return np.column_stack([rays * z[:, None], z])
+
+
+def depth_per_px(rig: StereoRig, axis: Literal["x", "y"], z: np.ndarray) -> np.ndarray:
+    """|dz/du_p| (h, w) float64, mm per projector px, along each camera pixel's ray at its depth ``z`` (h, w) mm.
+
+    What a projector coordinate's uncertainty becomes in depth; NaN where z is, or where the point cannot be projected.
+    """
+    _check_map(rig, z, "depths")
+    slopes = np.empty(np.size(z))
+    rays, depths = _read_only(rig.camera.rays().reshape(-1, 2)), _read_only(np.asarray(z).reshape(-1))
+    _slope_all(rays, depths, rig.R.copy(), rig.t.copy(), rig.projector.parameters, _row(axis), slopes)
+    with np.errstate(divide="ignore"):
+        return np.abs(1.0 / slopes).reshape(np.shape(z))
+
+
+def points_from_depth(rays: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Camera-frame points (h, w, 3) float32 mm from rays (h, w, 2) and depths (h, w) mm: eq. 7, 8."""
+    if rays.shape != (*z.shape, 2):
+        raise InputError(f"Rays of shape {rays.shape} and depths of shape {z.shape} do not belong to the same image.")
+    points = np.empty((*z.shape, 3), dtype=np.float32)
+    points[..., 0] = rays[..., 0] * z
+    points[..., 1] = rays[..., 1] * z
+    points[..., 2] = z
+    points[np.isnan(points).any(axis=-1)] = np.nan  # a pixel is valid or it is not
+    return points
+
+
+def _solve(rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Literal["x", "y"]) -> np.ndarray:
+    """Depths (n,) of rays (n, 2) at projector coordinates (n,)."""
+    z = np.empty(len(rays))
+    extent = np.array(rig.projector.size, dtype=np.float64)
+    _triangulate_all(
+        _read_only(rays),
+        _read_only(coordinate),
+        rig.R.copy(),
+        rig.t.copy(),
+        rig.projector.parameters,
+        _row(axis),
+        extent,
+        z,
+    )
+    return z
+
+
+def _row(axis: str) -> int:
+    if axis not in ("x", "y"):
+        raise InputError(f"The axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows).")
+    return 0 if axis == "x" else 1
+
+
+def _check_map(rig: StereoRig, values: np.ndarray, what: str) -> None:
+    width, height = rig.camera.size
+    if np.shape(values) != (height, width):
+        raise InputError(
+            f"A map of {what} of shape {np.shape(values)} was given, and the camera was calibrated at {width}x{height} "
+            "px: use captures of the same camera, at the same resolution and without cropping."
+        )
+
+
+def _read_only(values: np.ndarray) -> np.ndarray:
+    """Contiguous float64 that the kernels may read: one array type, so that they compile once."""
+    view = np.ascontiguousarray(values, dtype=np.float64).view()
+    view.setflags(write=False)
+    return view
+
+
+@kernel()
+def _projection(z, a0, a1, a2, t, parameters, row):
+    """(measured coordinate, the other one, d(measured)/dz, d(undistorted)/dz) of the point at depth z; NaN where none.
+
+    The point is z a + t in the projector's frame, a = R (u_c, v_c, 1).
+    """
+    depth = z * a2 + t[2]
+    if not (z > 0.0 and depth > 0.0):
+        return np.nan, np.nan, np.nan, np.nan
+    x, y = (z * a0 + t[0]) / depth, (z * a1 + t[1]) / depth
+    if not x * x + y * y < parameters[9]:
+        return np.nan, np.nan, np.nan, np.nan
+    dx = (a0 * t[2] - t[0] * a2) / (depth * depth)
+    dy = (a1 * t[2] - t[1] * a2) / (depth * depth)
+    xd, yd, dxx, dxy, dyy = brown(x, y, parameters)
+    u, v = parameters[0] * xd + parameters[2], parameters[1] * yd + parameters[3]
+    if row == 0:
+        return u, v, parameters[0] * (dxx * dx + dxy * dy), parameters[0] * dx
+    return v, u, parameters[1] * (dxy * dx + dyy * dy), parameters[1] * dy
+
+
+@kernel()
+def _depth(uc, vc, measured, R, t, parameters, row, extent):
+    """Depth of one ray; NaN as ``triangulate`` says."""
+    a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
+    a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
+    a2 = R[2, 0] * uc + R[2, 1] * vc + R[2, 2]
+    a = a0 if row == 0 else a1
+    up = (measured - parameters[2 + row]) / parameters[row]
+    denominator = a - a2 * up
+    if denominator == 0.0:
+        return np.nan
+    z = -(t[row] - t[2] * up) / denominator  # Letter eq. 6; rows 2 and 3 of M for axis y
+    u, other, slope, straight = _projection(z, a0, a1, a2, t, parameters, row)
+    error = measured - u
+    for _ in range(MAX_STEPS):
+        if abs(error) <= TOLERANCE_PX:
+            size = extent[1 - row]
+            if not -0.5 - MARGIN * size <= other <= (1.0 + MARGIN) * size - 0.5:
+                return np.nan
+            # where distortion turns the coordinate back along the ray, two depths share it: neither is an answer
+            return z if slope * straight > 0.0 else np.nan
+        if not np.isfinite(error) or slope == 0.0:
+            return np.nan
+        step = error / slope
+        damping = 1.0
+        while True:  # shorten the step until it stays in view and comes nearer
+            nz = z + damping * step
+            nu, other, slope, straight = _projection(nz, a0, a1, a2, t, parameters, row)
+            if abs(measured - nu) < abs(error):
+                break
+            damping *= 0.5
+            if damping < 1e-3:
+                return np.nan
+        z, error = nz, measured - nu
+    return np.nan
+
+
+@kernel(parallel=True)
+def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
+    size = extent[row]
+    low, high = -0.5 - MARGIN * size, (1.0 + MARGIN) * size - 0.5
+    for i in numba.prange(coordinate.shape[0]):
+        measured = coordinate[i]
+        if low <= measured <= high:  # False for NaN
+            z[i] = _depth(rays[i, 0], rays[i, 1], measured, R, t, parameters, row, extent)
+        else:
+            z[i] = np.nan
+
+
+@kernel(parallel=True)
+def _slope_all(rays, depths, R, t, parameters, row, slopes):
+    for i in numba.prange(depths.shape[0]):
+        uc, vc = rays[i, 0], rays[i, 1]
+        a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
+        a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
+        a2 = R[2, 0] * uc + R[2, 1] * vc + R[2, 2]
+        _, _, slopes[i], _ = _projection(depths[i], a0, a1, a2, t, parameters, row)
