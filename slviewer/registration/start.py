@@ -1,0 +1,133 @@
+"""Where to start ICP from: candidate poses from matched FPFH features, and from the centroids.
+
+RANSAC is our own, in NumPy, because Open3D's parallel one gives another answer at every call.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.registration.open3d_loader import open3d
+
+Start = Literal["features", "centroids", "initial"]
+
+_TRIPLETS = 60_000
+_SEED = 0
+_CANDIDATES = 6
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A pose to start from: ``T`` (4, 4) maps the scan into the reference frame, ``start`` says how it was found."""
+
+    T: np.ndarray
+    start: Start
+
+
+def candidates(scan: Any, reference: Any, voxel: float) -> Iterator[Candidate]:
+    """The poses worth trying, features first, for two Open3D clouds with normals, thinned to ``voxel`` mm."""
+    for T in _feature_poses(scan, reference, voxel):
+        yield Candidate(T, "features")
+    T = np.eye(4)
+    T[:3, 3] = np.median(np.asarray(reference.points), axis=0) - np.median(np.asarray(scan.points), axis=0)
+    yield Candidate(T, "centroids")
+
+
+def ranked_starts(scan: Any, reference: Any, voxel: float, initial: np.ndarray | None = None) -> list[Candidate]:
+    """The candidates after a coarse ICP, each pose once, that with the largest part of the scan on the reference first.
+
+    ``scan`` and ``reference`` are Open3D clouds with normals, thinned to ``voxel`` mm. A pose handed in as ``initial``
+    is the only candidate then.
+    """
+    tried = candidates(scan, reference, voxel) if initial is None else iter([Candidate(np.asarray(initial), "initial")])
+    tree = cKDTree(np.asarray(reference.points))
+    found: list[tuple[float, Candidate]] = []
+    for candidate in tried:
+        T = candidate.T
+        for gate in (6.0 * voxel, 3.0 * voxel, 1.5 * voxel):
+            T = _icp(scan, reference, T, gate)
+        if all(_apart(np.asarray(scan.points), T, other.T) > 0.5 * voxel for _, other in found):
+            found.append((_score(scan, reference, tree, T, voxel), Candidate(T, candidate.start)))
+    return [candidate for _, candidate in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
+    """How far, in mm, two poses put some 20 of the points from each other at most."""
+    probe = points[:: max(1, len(points) // 20)]
+    return float(np.abs(probe @ (T - other)[:3, :3].T + (T - other)[:3, 3]).max())
+
+
+def _icp(scan: Any, reference: Any, T: np.ndarray, gate: float) -> np.ndarray:
+    pipeline = open3d().pipelines.registration
+    criteria = pipeline.ICPConvergenceCriteria(1e-5, 1e-5, 20)
+    method = pipeline.TransformationEstimationPointToPlane()
+    return np.array(pipeline.registration_icp(scan, reference, gate, T, method, criteria).transformation)
+
+
+def _score(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
+    """Share of the scan that lies on the reference, times the share of agreement where the two face each other."""
+    points = np.asarray(scan.points) @ T[:3, :3].T + T[:3, 3]
+    normals = np.asarray(scan.normals) @ T[:3, :3].T
+    distance, nearest = tree.query(points, distance_upper_bound=3.0 * voxel)
+    near = np.isfinite(distance)
+    if not near.any():
+        return 0.0
+    other = nearest[near]
+    their_normals = np.asarray(reference.normals)[other]
+    height = np.abs(np.sum(their_normals * (points[near] - np.asarray(reference.points)[other]), axis=1))
+    on = (height < 0.5 * voxel) & (np.sum(their_normals * normals[near], axis=1) > 0.9)
+    return float(on.sum() / len(points) * on.sum() / near.sum())
+
+
+def _feature_poses(scan: Any, reference: Any, voxel: float) -> list[np.ndarray]:
+    """Up to six different poses, those on which most feature matches agree; none where there is nothing to match."""
+    pipeline, search = open3d().pipelines.registration, open3d().geometry.KDTreeSearchParamHybrid(5.0 * voxel, 100)
+    features = [pipeline.compute_fpfh_feature(cloud, search) for cloud in (scan, reference)]
+    matches = np.asarray(pipeline.correspondences_from_features(features[0], features[1], mutual_filter=True))
+    if len(matches) < 10:
+        return []
+    p, q = np.asarray(scan.points)[matches[:, 0]], np.asarray(reference.points)[matches[:, 1]]
+    n, m = np.asarray(scan.normals)[matches[:, 0]], np.asarray(reference.normals)[matches[:, 1]]
+
+    triplets = np.random.default_rng(_SEED).integers(0, len(p), (_TRIPLETS, 3))
+    span = np.linalg.norm(np.ptp(p, axis=0))
+    triplets = triplets[_same_triangle(p[triplets], q[triplets], 0.1 * span, voxel)][:4000]
+    if len(triplets) == 0:
+        return []
+    R, t = rigid(p[triplets], q[triplets])
+    votes = np.empty(len(R), dtype=np.int64)
+    for chunk in np.array_split(np.arange(len(R)), max(1, len(R) * len(p) // 1_000_000)):
+        moved = np.einsum("kij,nj->kni", R[chunk], p) + t[chunk, None]
+        close = np.sum((moved - q) ** 2, axis=2) < (1.5 * voxel) ** 2
+        alike = np.einsum("kij,nj,ni->kn", R[chunk], n, m, optimize=True) > 0.8
+        votes[chunk] = np.count_nonzero(close & alike, axis=1)
+
+    poses: list[np.ndarray] = []
+    for k in np.argsort(-votes, kind="stable"):
+        if len(poses) == _CANDIDATES or votes[k] < 4:
+            break
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R[k], t[k]
+        if all(_apart(p, T, other) > 5.0 * voxel for other in poses):
+            poses.append(T)
+    return poses
+
+
+def _same_triangle(p: np.ndarray, q: np.ndarray, shortest: float, slack: float) -> np.ndarray:
+    """Which pairs of triangles ``(k, 3, 3)`` have sides longer than ``shortest`` that agree within ``slack`` mm."""
+    a, b = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))
+    return np.all((a > shortest) & (np.abs(a - b) < slack), axis=1)
+
+
+def rigid(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations ``(k, 3, 3)`` and translations ``(k, 3)`` that map the points ``p`` ``(k, n, 3)`` best onto ``q``."""
+    p0, q0 = p.mean(axis=1), q.mean(axis=1)
+    H = np.einsum("kni,knj->kij", p - p0[:, None], q - q0[:, None])
+    U, _, Vt = np.linalg.svd(H)
+    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    Vt[:, 2] *= sign[:, None]
+    R = np.einsum("kji,klj->kil", Vt, U)
+    return R, q0 - np.einsum("kij,kj->ki", R, p0)
