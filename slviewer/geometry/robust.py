@@ -1,6 +1,11 @@
-"""The spread of residuals that stray values do not move, and weights that leave those values out."""
+"""The spread of residuals that stray values do not move, and least squares in which those values have no say."""
+
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
+
+Solution = TypeVar("Solution")
 
 
 def robust_sigma(residuals: np.ndarray) -> float:
@@ -10,6 +15,29 @@ def robust_sigma(residuals: np.ndarray) -> float:
 
 def tukey_weights(residuals: np.ndarray, sigma: float) -> np.ndarray:
     """Tukey's biweight at 4.685 sigma (95 % efficient on normal residuals): 0 beyond, so an outlier pulls no more."""
-    scaled = np.minimum(np.abs(residuals) / (4.685 * sigma), 1.0) if sigma > 0 else (residuals != 0).astype(float)
+    scaled = np.minimum(np.abs(residuals) / (4.685 * sigma), 1.0)
     weights: np.ndarray = (1.0 - scaled**2) ** 2
     return weights
+
+
+def reweighted(
+    solve: Callable[[np.ndarray], tuple[Solution, np.ndarray]], values: np.ndarray, weights: np.ndarray
+) -> Solution:
+    """Iteratively reweighted least squares with Tukey's weights.
+
+    ``solve(weights)`` gives a solution and its fitted values (n,); ``values`` (n,) are what they should be, and
+    ``weights`` (n,) one over the variance of each, known up to a factor. Ends when the fit moves by less than a
+    hundredth of the residuals' robust sigma.
+    """
+    solution, fitted = solve(weights)
+    rounding = 1e-12 * float(np.abs(values).max(initial=0.0))
+    for _ in range(10):
+        standardised = (values - fitted) * np.sqrt(weights / weights.max())
+        sigma = robust_sigma(standardised)
+        if sigma <= rounding:
+            break
+        before = fitted
+        solution, fitted = solve(weights * tukey_weights(standardised, sigma))
+        if np.sqrt(np.mean((fitted - before) ** 2)) < 0.01 * sigma:
+            break
+    return solution

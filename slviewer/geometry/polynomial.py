@@ -1,0 +1,123 @@
+"""A polynomial surface over a part of the image, fitted to scattered values (Letter step 2, as it stands there)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from slviewer.errors import InputError
+from slviewer.geometry.jit import kernel
+from slviewer.geometry.robust import reweighted
+
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Polynomial2D:
+    """Sum of c_ij T_i(t) T_j(s), Chebyshev polynomials in v and u scaled to -1 ... 1 over ``box`` (u0, v0, u1, v1) px.
+
+    ``coefficients``: (degree + 1, degree + 1), zero where i + j exceeds the degree. NaN outside the box.
+    """
+
+    coefficients: np.ndarray
+    box: Box
+
+    def evaluate(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Values at scattered pixels ``u``, ``v``, in their shape; NaN outside the box."""
+        u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
+        s, t = _scaled(u, v, self.box)
+        values = chebyshev.chebval2d(t, s, self.coefficients)
+        return np.where((np.abs(s) <= 1.0) & (np.abs(t) <= 1.0), values, np.nan)
+
+    def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+        """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
+        height, width = shape
+        s, t = _scaled(origin[0] + np.arange(width), origin[1] + np.arange(height), self.box)
+        rows = chebyshev.chebvander(t, len(self.coefficients) - 1) @ self.coefficients
+        out = np.empty(shape)
+        _chebyshev_rows(rows, s, t, out)
+        return out
+
+
+def fit_polynomial(
+    u: np.ndarray,
+    v: np.ndarray,
+    values: np.ndarray,
+    weights: np.ndarray | None,
+    extent: Sequence[float],
+    degree: int,
+    robust: bool = False,
+) -> Polynomial2D:
+    """Least-squares polynomial of total ``degree`` through ``values`` (n,) at pixels ``u``, ``v`` (n,).
+
+    ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1) px, or a size
+    (w, h) for a whole image; samples outside it, not finite, or of weight 0 are left out. ``robust``: Tukey's weights,
+    so that stray values do not pull. Raises InputError where fewer samples than coefficients are left.
+    """
+    box = as_box(extent)
+    u, v, values, weights = usable(u, v, values, weights, box)
+    i, j = np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]).T
+    if len(values) < len(i):
+        raise InputError(
+            f"{len(values)} samples are too few for a polynomial of degree {degree} with {len(i)} coefficients: "
+            "lower the degree, or check that the target is lit."
+        )
+    s, t = _scaled(u, v, box)
+    design = chebyshev.chebvander(t, degree)[:, i] * chebyshev.chebvander(s, degree)[:, j]
+
+    def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        weighted = design * w[:, None]
+        solution = np.linalg.lstsq(weighted.T @ design, weighted.T @ values, rcond=1e-14)[0]
+        return solution, design @ solution
+
+    coefficients = np.zeros((degree + 1, degree + 1))
+    coefficients[i, j] = reweighted(solve, values, weights) if robust else solve(weights)[0]
+    return Polynomial2D(coefficients, box)
+
+
+def as_box(extent: Sequence[float]) -> Box:
+    """(u0, v0, u1, v1) px of a box given so, or as an image's (width, height): its pixels with their outer edges."""
+    if len(extent) == 2:
+        return (-0.5, -0.5, extent[0] - 0.5, extent[1] - 0.5)
+    u0, v0, u1, v1 = (float(edge) for edge in extent)
+    if not (u1 > u0 and v1 > v0):
+        raise InputError(f"The region {tuple(extent)} is empty: give (u0, v0, u1, v1) with u0 < u1 and v0 < v1.")
+    return (u0, v0, u1, v1)
+
+
+def usable(
+    u: np.ndarray, v: np.ndarray, values: np.ndarray, weights: np.ndarray | None, box: Box
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The samples inside the box that are finite and have weight, as float64 (n,); InputError for unequal lengths."""
+    arrays = [np.asarray(a, dtype=np.float64).ravel() for a in (u, v, values)]
+    arrays.append(np.ones(len(arrays[2])) if weights is None else np.asarray(weights, dtype=np.float64).ravel())
+    u, v, values, w = arrays
+    if len({len(a) for a in arrays}) != 1:
+        raise InputError(
+            f"A surface fit was given {[len(a) for a in arrays]} of u, v, values, weights: equal numbers needed."
+        )
+    kept = np.isfinite(u) & np.isfinite(v) & np.isfinite(values) & np.isfinite(w) & (w > 0)
+    kept &= (u >= box[0]) & (u <= box[2]) & (v >= box[1]) & (v <= box[3])
+    return u[kept], v[kept], values[kept], w[kept]
+
+
+def _scaled(u: np.ndarray, v: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:
+    u0, v0, u1, v1 = box
+    return 2.0 * (u - u0) / (u1 - u0) - 1.0, 2.0 * (v - v0) / (v1 - v0) - 1.0
+
+
+@kernel(parallel=True)
+def _chebyshev_rows(rows, s, t, out):
+    """out (h, w) from each row's Chebyshev coefficients (h, degree + 1), by Clenshaw's recurrence."""
+    for y in numba.prange(out.shape[0]):
+        inside = abs(t[y]) <= 1.0
+        for x in range(out.shape[1]):
+            if not (inside and abs(s[x]) <= 1.0):
+                out[y, x] = np.nan
+                continue
+            b1, b2 = 0.0, 0.0
+            for k in range(rows.shape[1] - 1, 0, -1):
+                b1, b2 = 2.0 * s[x] * b1 - b2 + rows[y, k], b1
+            out[y, x] = s[x] * b1 - b2 + rows[y, 0]

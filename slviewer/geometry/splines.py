@@ -1,0 +1,184 @@
+"""A cubic B-spline surface over a part of the image: smooths scattered values, and keeps what a lens does locally.
+
+A polynomial of low degree over the whole image removes the local distortion that a pixel-wise calibration should learn
+(its step 2); a spline of some cells across keeps it, and still averages hundreds of pixels.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import solveh_banded
+
+from slviewer.errors import InputError
+from slviewer.geometry.jit import kernel
+from slviewer.geometry.polynomial import Polynomial2D, as_box, fit_polynomial, usable
+from slviewer.geometry.robust import reweighted
+
+TREND_DEGREE = 3
+"""Of a cell's weight: holds coefficients that no sample reaches at the trend, and hardly pulls where samples are."""
+RIDGE = 1e-7
+"""Of a cell's weight: holds coefficients that no sample reaches at the trend, and hardly pulls elsewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A trend plus a tensor-product uniform cubic B-spline over ``trend.box``.
+
+    ``coefficients``: (ny + 3, nx + 3) for ny x nx cells. NaN outside the box; in cells without samples it continues
+    smoothly from its neighbours, which is no measurement: mask those.
+    """
+
+    trend: Polynomial2D
+    coefficients: np.ndarray
+
+    def evaluate(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Values at scattered pixels ``u``, ``v``, in their shape; NaN outside the box."""
+        u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
+        values = self.trend.evaluate(u, v).ravel()
+        inside = np.isfinite(values)
+        ny, nx = (n - 3 for n in self.coefficients.shape)
+        u0, v0, u1, v1 = self.trend.box
+        cells_u, basis_u = _basis(u.ravel()[inside], u0, u1, nx)
+        cells_v, basis_v = _basis(v.ravel()[inside], v0, v1, ny)
+        values[inside] += _spline_at(cells_u, basis_u, cells_v, basis_v, self.coefficients)
+        return values.reshape(u.shape)
+
+    def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+        """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
+        out = self.trend.evaluate_grid(shape, origin)
+        height, width = shape
+        ny, nx = (n - 3 for n in self.coefficients.shape)
+        u0, v0, u1, v1 = self.trend.box
+        cells_u, basis_u = _basis(origin[0] + np.arange(width, dtype=np.float64), u0, u1, nx)
+        cells_v, basis_v = _basis(origin[1] + np.arange(height, dtype=np.float64), v0, v1, ny)
+        _add_spline_rows(cells_u, basis_u, cells_v, basis_v, self.coefficients, out)
+        return out
+
+
+def fit_surface(
+    u: np.ndarray,
+    v: np.ndarray,
+    values: np.ndarray,
+    weights: np.ndarray | None,
+    extent: Sequence[float],
+    cells: tuple[int, int] = (12, 10),
+    smooth: float = 1e-3,
+    robust: bool = False,
+) -> Surface:
+    """Cubic B-spline surface through ``values`` (n,) at pixels ``u``, ``v`` (n,), by penalised least squares.
+
+    ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1) px, or a size
+    (w, h) for a whole image; samples outside it, not finite, or of weight 0 are left out. ``cells``: (across, down).
+    ``smooth``: weight of the squared second differences of the coefficients, relative to a mean cell's data: at 1e-3
+    a wave of four cells loses 1 % of its height, and cells without samples are held by their neighbours. ``robust``:
+    Tukey's weights, so that stray values (contrast edges, 2 pi spikes) do not pull.
+
+    Raises InputError where fewer samples are left than the trend has coefficients, or for no cells.
+    """
+    box = as_box(extent)
+    nx, ny = cells
+    if nx < 1 or ny < 1:
+        raise InputError(f"A surface of {nx}x{ny} cells was asked for: at least one each way is needed.")
+    u, v, values, weights = usable(u, v, values, weights, box)
+    trend = fit_polynomial(u, v, values, weights, box, TREND_DEGREE, robust)
+    rest = values - trend.evaluate(u, v)
+    cells_u, basis_u = _basis(u, box[0], box[2], nx)
+    cells_v, basis_v = _basis(v, box[1], box[3], ny)
+    reached = len(np.unique(cells_v * nx + cells_u))
+    prior = (weights.sum() / reached) * (smooth * _second_differences(nx + 3, ny + 3) + RIDGE * _unit(nx + 3, ny + 3))
+
+    def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        band = prior.copy()
+        right = np.zeros((ny + 3) * (nx + 3))
+        _accumulate(cells_u, basis_u, cells_v, basis_v, w, rest, nx + 3, band, right)
+        solution = solveh_banded(band, right, lower=True, overwrite_ab=True, overwrite_b=True, check_finite=False)
+        coefficients = solution.reshape(ny + 3, nx + 3)
+        return coefficients, _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients)
+
+    return Surface(trend, reweighted(solve, rest, weights) if robust else solve(weights)[0])
+
+
+def _basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Each position's cell (n,), clipped to the box, and its four cubic B-spline weights (n, 4)."""
+    x = (positions - start) * (cells / (end - start))
+    cell = np.clip(np.floor(x).astype(np.int64), 0, cells - 1)
+    f = x - cell
+    g = 1.0 - f
+    weights = np.stack([g**3, 3 * f**3 - 6 * f**2 + 4, 3 * g**3 - 6 * g**2 + 4, f**3], axis=1) / 6.0
+    return cell, weights
+
+
+def _bandwidth(columns: int) -> int:
+    return 3 * columns + 3
+
+
+def _unit(columns: int, rows: int) -> np.ndarray:
+    """The identity in lower banded form."""
+    band = np.zeros((_bandwidth(columns) + 1, columns * rows))
+    band[0] = 1.0
+    return band
+
+
+def _second_differences(columns: int, rows: int) -> np.ndarray:
+    """Thin-plate penalty d_uu^2 + 2 d_uv^2 + d_vv^2 of the coefficients, in lower banded form."""
+    first = [sp.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
+    second = [sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)) for n in (columns, rows)]
+    uu = sp.kron(sp.eye(rows), second[0])
+    vv = sp.kron(second[1], sp.eye(columns))
+    uv = sp.kron(first[1], first[0])
+    penalty = (uu.T @ uu + 2.0 * uv.T @ uv + vv.T @ vv).tocoo()
+    lower = penalty.row >= penalty.col
+    band = np.zeros((_bandwidth(columns) + 1, columns * rows))
+    band[(penalty.row - penalty.col)[lower], penalty.col[lower]] = penalty.data[lower]
+    return band
+
+
+@kernel()
+def _accumulate(cells_u, basis_u, cells_v, basis_v, weights, values, columns, band, right):
+    """Adds the samples' normal equations to ``band`` (lower banded) and ``right``."""
+    for k in range(weights.shape[0]):
+        if weights[k] == 0.0:
+            continue
+        for a in range(4):
+            for b in range(4):
+                row = (cells_v[k] + a) * columns + cells_u[k] + b
+                w = weights[k] * basis_v[k, a] * basis_u[k, b]
+                right[row] += w * values[k]
+                for c in range(a + 1):
+                    first = (cells_v[k] + c) * columns + cells_u[k]
+                    wc = w * basis_v[k, c]
+                    for d in range(4 if c < a else b + 1):
+                        band[row - first - d, first + d] += wc * basis_u[k, d]
+
+
+@kernel()
+def _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients):
+    out = np.empty(cells_u.shape[0])
+    for k in range(cells_u.shape[0]):
+        total = 0.0
+        for a in range(4):
+            for b in range(4):
+                total += basis_v[k, a] * basis_u[k, b] * coefficients[cells_v[k] + a, cells_u[k] + b]
+        out[k] = total
+    return out
+
+
+@kernel(parallel=True)
+def _add_spline_rows(cells_u, basis_u, cells_v, basis_v, coefficients, out):
+    """Adds the spline to out (h, w): each row's coefficients are joined once, then four products a pixel."""
+    for y in numba.prange(out.shape[0]):
+        row = np.zeros(coefficients.shape[1])
+        for a in range(4):
+            for j in range(coefficients.shape[1]):
+                row[j] += basis_v[y, a] * coefficients[cells_v[y] + a, j]
+        for x in range(out.shape[1]):
+            i = cells_u[x]
+            out[y, x] += (
+                basis_u[x, 0] * row[i]
+                + basis_u[x, 1] * row[i + 1]
+                + basis_u[x, 2] * row[i + 2]
+                + basis_u[x, 3] * row[i + 3]
+            )
