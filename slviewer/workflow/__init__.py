@@ -1,1 +1,32 @@
-"""What the operator does, without a face: every function here is a command of the command line."""
+"""What the operator does, without a face: the commands of the command line as Python functions.
+
+``from slviewer.workflow import calibrate`` and so on; each is loaded when it is first asked for.
+"""
+
+import importlib
+from typing import Any
+
+_HOMES = {
+    "import_p18": "importing",
+    "import_procam_calibration": "importing",
+    "import_frames": "importing",
+    "import_opencv_calibration": "importing",
+    "calibrate": "calibrating",
+    "reconstruct": "reconstructing",
+    "verify": "verifying",
+    "merge": "merging",
+    "simulate": "simulating",
+    "reproduce": "reproducing",
+    "patterns": "printing",
+    "target": "printing",
+    "report": "reporting",
+    "inspect": "inspecting",
+}
+
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

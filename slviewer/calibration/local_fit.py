@@ -1,0 +1,93 @@
+"""The projector coordinate at a board feature, read from the phase around it."""
+
+import numpy as np
+
+from slviewer.geometry.jit import kernel
+
+
+def local_values(field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Value of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic fit over the window around each.
+
+    ``radius`` (n,) px is half a window's width; ``weight`` (h, w) is 0 where the field must not be used, so that a dark
+    circle's centre is read from its bright surroundings alone. Returns (n,) float64; NaN where the surroundings are too
+    few (30) or lie on one side only.
+    """
+    out = np.full(len(pixels), np.nan)
+    _local_fits(
+        np.ascontiguousarray(field, np.float64),
+        np.ascontiguousarray(weight, np.float64),
+        np.ascontiguousarray(pixels, np.float64),
+        np.ascontiguousarray(radius, np.float64),
+        out,
+    )
+    return out
+
+
+@kernel(parallel=False)
+def _local_fits(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
+    height, width = field.shape
+    basis = np.empty((1024, 6))
+    value = np.empty(1024)
+    base = np.empty(1024)
+    robust = np.empty(1024)
+    for i in range(len(pixels)):
+        cu, cv, r = pixels[i, 0], pixels[i, 1], radius[i]
+        if not (np.isfinite(cu) and np.isfinite(cv) and r > 1):
+            continue
+        stride = max(1, int(np.ceil(2 * r / 30)))
+        u0, u1 = max(0, int(np.ceil(cu - r))), min(width - 1, int(np.floor(cu + r)))
+        v0, v1 = max(0, int(np.ceil(cv - r))), min(height - 1, int(np.floor(cv + r)))
+        count = 0
+        quadrants = np.zeros(4, np.int64)
+        for v in range(v0, v1 + 1, stride):
+            for u in range(u0, u1 + 1, stride):
+                if weight[v, u] > 0 and count < 1024:
+                    x, y = (u - cu) / r, (v - cv) / r
+                    basis[count, 0] = 1.0
+                    basis[count, 1] = x
+                    basis[count, 2] = y
+                    basis[count, 3] = x * x
+                    basis[count, 4] = x * y
+                    basis[count, 5] = y * y
+                    value[count] = field[v, u]
+                    base[count] = weight[v, u]
+                    quadrants[(1 if x > 0 else 0) + (2 if y > 0 else 0)] += 1
+                    count += 1
+        if count < 30 or np.sum(quadrants >= 4) < 4:
+            continue
+        middle = np.median(value[:count])
+        robust[:count] = 1.0
+        solution = np.zeros(6)
+        for _ in range(5):
+            A = np.zeros((6, 6))
+            b = np.zeros(6)
+            for k in range(count):
+                w = base[k] * robust[k]
+                if w > 0:
+                    for p in range(6):
+                        wp = w * basis[k, p]
+                        b[p] += wp * (value[k] - middle)
+                        for q in range(6):
+                            A[p, q] += wp * basis[k, q]
+            trace = 0.0
+            for p in range(6):
+                trace += A[p, p]
+            for p in range(6):
+                A[p, p] += 1e-12 * trace
+            solution = np.linalg.solve(A, b)
+            residual = np.empty(count)
+            for k in range(count):
+                fitted = 0.0
+                for p in range(6):
+                    fitted += basis[k, p] * solution[p]
+                residual[k] = value[k] - middle - fitted
+            scale = 4.685 * 1.4826 * np.median(np.abs(residual)) + 1e-6
+            for k in range(count):
+                t = residual[k] / scale
+                robust[k] = (1 - t * t) ** 2 if abs(t) < 1 else 0.0
+        kept = 0
+        for k in range(count):
+            if robust[k] > 0.1:
+                kept += 1
+        if kept >= 0.5 * count:
+            out[i] = solution[0] + middle

@@ -1,0 +1,191 @@
+"""What one board pose says: features in both devices, and the smoothed phase over the board (the Letter, step 2).
+
+An observation is small whatever the image size, so any number of poses can be held; frames and phase maps are let go.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from slviewer.calibration.local_fit import local_values
+from slviewer.errors import DetectionError, InputError
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
+from slviewer.geometry.splines import Surface, fit_surface
+from slviewer.target.board import Board
+from slviewer.target.detect import Detection, board_mask
+
+SAMPLES = 30_000
+"""Pixels that one smoothing fit takes; more change the result by less than the noise."""
+CELLS_PER_WIDTH = 14
+"""Spline cells across the image: half the wavelength of the finest lens distortion worth keeping, and no finer."""
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """How step 2 smooths a board's phase.
+
+    ``spline`` (default) keeps the local distortion that the model should learn; ``polynomial`` of degree 5 is
+    close to the Letter's own, and removes part of it.
+    """
+
+    kind: str = "spline"
+    degree: int = 5
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("spline", "polynomial"):
+            raise InputError(f"smoothing '{self.kind}' is unknown: use 'spline' or 'polynomial'")
+        if not 1 <= self.degree <= 20:
+            raise InputError(f"a polynomial of degree {self.degree} cannot be fitted reliably: use 1 to 20")
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One pose of the board, seen by the camera and through it by the projector.
+
+    ``camera`` and ``projector`` are (n, 2) px, row by row with ``points`` (n, 3) mm on the board; a projector
+    coordinate that could not be read is NaN. ``surfaces`` hold the smoothed absolute phase (rad) over the board for
+    each captured axis; ``region`` says where they hold: the board's outline where measured phase lies close by.
+    """
+
+    name: str
+    points: np.ndarray
+    camera: np.ndarray
+    projector: np.ndarray
+    surfaces: Mapping[Axis, Surface | Polynomial2D]
+    periods_px: Mapping[Axis, float]
+    size: tuple[int, int]
+    box: tuple[int, int, int, int]
+    packed_region: np.ndarray = field(repr=False)
+
+    @property
+    def region(self) -> np.ndarray:
+        """(v1 - v0, u1 - u0) bool over ``box`` = (u0, v0, u1, v1)."""
+        u0, v0, u1, v1 = self.box
+        shape = (v1 - v0, u1 - u0)
+        return np.unpackbits(self.packed_region, count=shape[0] * shape[1]).view(bool).reshape(shape)
+
+    def smoothed_phase(self, axis: Axis) -> np.ndarray:
+        """(v1 - v0, u1 - u0) float64 rad over ``box``: the smoothed absolute phase, NaN outside the region."""
+        u0, v0, u1, v1 = self.box
+        return np.where(self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan)
+
+
+def observe(
+    name: str,
+    board: Board,
+    detection: Detection,
+    phases: Mapping[Axis, PhaseMap],
+    smoothing: Smoothing | None = None,
+) -> Observation:
+    """The observation of one pose from its detected board and its decoded phases.
+
+    Raises DetectionError when the projector's light does not reach enough of the board to read it.
+    """
+    smoothing = smoothing or Smoothing()
+    any_phase = next(iter(phases.values()))
+    height, width = any_phase.phase.shape
+    inside = board_mask(board, detection, (height, width))
+    pitch = pitch_px(board, detection)
+    typical_pitch = float(np.median(pitch))
+    box = _bounding_box(inside)
+    projector = np.full((len(detection.ids), 2), np.nan)
+    surfaces: dict[Axis, Surface | Polynomial2D] = {}
+    supported = inside.copy()
+    for axis, phase in phases.items():
+        bright = bright_pixels(phase, inside, typical_pitch)
+        if np.count_nonzero(bright) < 400:
+            raise DetectionError(
+                f"{name}: only {np.count_nonzero(bright)} pixels of the board carry a usable {axis} pattern: "
+                "light the whole board with the projector, and raise the exposure"
+            )
+        weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
+        weight /= weight.max()
+        projector[:, 0 if axis == "x" else 1] = local_values(
+            np.where(bright, phase.coordinate, 0.0), weight, detection.pixels, 0.8 * pitch
+        )
+        surfaces[axis] = _smooth(phase, weight, box, typical_pitch, smoothing)
+        supported &= _near(bright, reach=typical_pitch)
+    u0, v0, u1, v1 = box
+    return Observation(
+        name=name,
+        points=board.points[detection.ids],
+        camera=np.asarray(detection.pixels, float),
+        projector=projector,
+        surfaces=surfaces,
+        periods_px={axis: phase.period_px for axis, phase in phases.items()},
+        size=(width, height),
+        box=box,
+        packed_region=np.packbits(supported[v0:v1, u0:u1]),
+    )
+
+
+def pitch_px(board: Board, detection: Detection) -> np.ndarray:
+    """(n,) px: the board's pitch as the camera sees it at each feature."""
+    points = board.points[detection.ids][:, :2]
+    H, _ = cv2.findHomography(points, np.asarray(detection.pixels, float))
+    half = board.pitch_mm / 2
+    lengths = []
+    for step in (np.array([half, 0.0]), np.array([0.0, half])):
+        ahead, behind = (cv2.perspectiveTransform((points + s)[None], H)[0] for s in (step, -step))
+        lengths.append(np.linalg.norm(ahead - behind, axis=1))
+    return np.minimum(*lengths)
+
+
+def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarray:
+    """(h, w) bool: valid pixels of the board's bright parts, clear of the contrast edges.
+
+    Across an edge the camera's PSF mixes a dark and a bright phase; dark parts carry little light. Bright means more
+    than half of the modulation found within a pitch.
+    """
+    modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
+    shrink = max(1, int(pitch // 12))
+    small = cv2.blur(modulation, (shrink, shrink))[::shrink, ::shrink] if shrink > 1 else modulation
+    reach = 2 * int(np.ceil(0.7 * pitch / shrink)) + 1
+    crest = cv2.dilate(small, np.ones((reach, reach), np.uint8))
+    crest = cv2.resize(crest, modulation.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    bright = (modulation > 0.5 * crest) & (modulation > 0)
+    margin = 2 * int(np.clip(pitch / 12, 1, 3)) + 1
+    dark = cv2.morphologyEx(  # a lone pixel lost to noise is no edge
+        (~bright).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+    )
+    return bright & (cv2.dilate(dark, np.ones((margin, margin), np.uint8)) == 0)
+
+
+def _smooth(
+    phase: PhaseMap, weight: np.ndarray, box: tuple[int, int, int, int], pitch: float, smoothing: Smoothing
+) -> Surface | Polynomial2D:
+    u0, v0, u1, v1 = box
+    v, u = np.nonzero(weight[v0:v1, u0:u1])
+    if len(v) > SAMPLES:
+        chosen = np.random.default_rng(0).choice(len(v), SAMPLES, replace=False)
+        v, u = v[chosen], u[chosen]
+    v, u = v + v0, u + u0
+    values, weights = phase.phase[v, u].astype(float), weight[v, u]
+    extent = (u0 - 0.5, v0 - 0.5, u1 - 0.5, v1 - 0.5)
+    if smoothing.kind == "polynomial":
+        return fit_polynomial(u, v, values, weights, extent, smoothing.degree, robust=True)
+    cell = max(phase.phase.shape[1] / CELLS_PER_WIDTH, 1.2 * pitch)
+    cells = (max(1, round((u1 - u0) / cell)), max(1, round((v1 - v0) / cell)))
+    return fit_surface(u, v, values, weights, extent, cells, robust=True)
+
+
+def _near(bright: np.ndarray, reach: float) -> np.ndarray:
+    """(h, w) bool: pixels that have bright ones within ``reach`` px on every side of a closing."""
+    step = max(1, int(reach // 8))
+    height, width = bright.shape
+    small = cv2.resize(bright.astype(np.uint8), (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA)
+    size = 2 * int(np.ceil(reach / step)) + 1
+    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    grown = cv2.dilate(closed, np.ones((3, 3), np.uint8))
+    return cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _bounding_box(mask: np.ndarray) -> tuple[int, int, int, int]:
+    rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
+    if not len(rows):
+        raise DetectionError("the board's outline lies outside the image: move the board into view")
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

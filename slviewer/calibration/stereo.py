@@ -1,0 +1,304 @@
+"""The traditional stereo calibration of camera and projector (the Letter, eq. 1-8 and step 1)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slviewer.calibration.observe import Observation
+from slviewer.errors import CalibrationRejected
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
+
+MIN_POSES = 3
+MIN_FEATURES = 12
+MIN_TILT_SPREAD_DEG = 4.0
+MAX_FOCAL_SIGMA = 0.05
+"""Above this relative uncertainty the poses did not determine a focal length."""
+MAX_REPROJECTION_PX = 2.0
+"""Above this the features and the model do not belong together, whatever the cause."""
+ROBUST_SIGMAS = 6.0
+ITERATIONS = 200
+
+
+@dataclass(frozen=True)
+class StereoModel:
+    """A calibrated camera and projector, and how well the poses agree with them.
+
+    ``poses`` map board to camera (4, 4); ``pose_rms_px`` holds (camera, projector) reprojection RMS of each pose used;
+    ``residuals_px`` (n, 4) holds camera and projector residuals of each pose's features (NaN: set aside or not read).
+    """
+
+    rig: StereoRig
+    board: str
+    axes: tuple[Axis, ...]
+    reprojection_rms_px: Mapping[str, float]
+    poses: Mapping[str, np.ndarray]
+    pose_rms_px: Mapping[str, tuple[float, float]]
+    left_out: Mapping[str, str]
+    depth_range_mm: tuple[float, float]
+    focal_sigma_px: Mapping[str, float]
+    features_set_aside: int = 0
+    residuals_px: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+    name = "stereo"
+
+    @property
+    def baseline_mm(self) -> float:
+        """Distance between the two devices' centres."""
+        return float(np.linalg.norm(self.rig.t))
+
+    def points(self, phase: PhaseMap) -> np.ndarray:
+        """(h, w, 3) float32 mm from one axis (eq. 6-8, the distorted projection met exactly); NaN where invalid."""
+        z = triangulate(self.rig, phase.coordinate, phase.axis)
+        return points_from_depth(self.rig.camera.rays(), z)
+
+    def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
+        """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``."""
+        z = points[..., 2].astype(float)
+        per_rad = depth_per_px(self.rig, phase.axis, z) * phase.period_px / (2 * np.pi)
+        return (per_rad * phase.sigma_phase).astype(np.float32)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; residual arrows included as lists."""
+        return {
+            "rig": self.rig.to_dict(),
+            "board": self.board,
+            "axes": list(self.axes),
+            "reprojection_rms_px": dict(self.reprojection_rms_px),
+            "poses": {name: T.tolist() for name, T in self.poses.items()},
+            "pose_rms_px": {name: list(rms) for name, rms in self.pose_rms_px.items()},
+            "left_out": dict(self.left_out),
+            "depth_range_mm": list(self.depth_range_mm),
+            "focal_sigma_px": dict(self.focal_sigma_px),
+            "features_set_aside": self.features_set_aside,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "StereoModel":
+        """The inverse of ``to_dict``."""
+        return cls(
+            rig=StereoRig.from_dict(data["rig"]),
+            board=data["board"],
+            axes=tuple(data["axes"]),
+            reprojection_rms_px=data["reprojection_rms_px"],
+            poses={name: np.array(T) for name, T in data["poses"].items()},
+            pose_rms_px={name: (rms[0], rms[1]) for name, rms in data["pose_rms_px"].items()},
+            left_out=data["left_out"],
+            depth_range_mm=(data["depth_range_mm"][0], data["depth_range_mm"][1]),
+            focal_sigma_px=data["focal_sigma_px"],
+            features_set_aside=data["features_set_aside"],
+        )
+
+
+def calibrate_stereo(
+    observations: Sequence[Observation],
+    projector_size: tuple[int, int],
+    board: str = "",
+    left_out: Mapping[str, str] | None = None,
+) -> StereoModel:
+    """Pinhole and Brown (k1 k2 p1 p2 k3) for both devices, and their relative pose, from board features.
+
+    Features beyond 6 robust sigma, and poses most of whose features are, are set aside and named. Raises
+    CalibrationRejected where the poses cannot determine the devices: too few, all parallel, or features that contradict the model.
+    """
+    left_out = dict(left_out or {})
+    kept: dict[str, np.ndarray] = {}
+    for observation in observations:
+        usable = np.isfinite(observation.projector).all(1) & np.isfinite(observation.camera).all(1)
+        if len(observation.surfaces) < 2:
+            only = ", ".join(observation.surfaces)
+            left_out[observation.name] = f"holds the {only} axis alone: a calibration pose needs both x and y"
+        elif usable.sum() < MIN_FEATURES:
+            left_out[observation.name] = (
+                f"{usable.sum()} of {len(usable)} features carry both projector coordinates: light the whole board"
+            )
+        else:
+            kept[observation.name] = usable
+    used = [o for o in observations if o.name in kept]
+    _check_enough(used, left_out)
+    _check_tilts(used)
+
+    for _ in range(4):
+        solution = _Solution.fit(used, [kept[o.name] for o in used], projector_size)
+        outliers = _outliers(solution, used, kept)
+        if not outliers:
+            break
+        for name, bad in outliers.items():
+            kept[name] = kept[name] & ~bad
+            if kept[name].sum() < max(MIN_FEATURES, 0.5 * len(bad)):
+                left_out[name] = (
+                    f"{bad.sum()} of {len(bad)} features disagree with the other poses: "
+                    "was the board moved during the capture, or its grid shifted?"
+                )
+                used = [o for o in used if o.name != name]
+        _check_enough(used, left_out)
+    return solution.model(used, kept, board, left_out)
+
+
+def _check_enough(used: Sequence[Observation], left_out: Mapping[str, str]) -> None:
+    if len(used) < MIN_POSES:
+        why = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
+        raise CalibrationRejected(
+            f"{len(used)} usable pose{'s' * (len(used) != 1)}, and at least {MIN_POSES} are needed: "
+            f"capture the board in more positions and tilts{why}"
+        )
+
+
+def _check_tilts(used: Sequence[Observation]) -> None:
+    """Parallel boards share their vanishing line and say nothing of the focal length."""
+    normals = []
+    for o in used:
+        width, height = o.size
+        H, _ = cv2.findHomography(o.points[:, :2], o.camera)
+        line = np.linalg.inv(H).T @ np.array([0.0, 0.0, 1.0])
+        f = 1.5 * width
+        nominal = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
+        normal = nominal.T @ line
+        normals.append(normal / np.linalg.norm(normal) * np.sign(normal[2] or 1))
+    cosines = np.clip(np.array(normals) @ np.array(normals).T, -1, 1)
+    spread = float(np.degrees(np.arccos(cosines.min())))
+    if spread < MIN_TILT_SPREAD_DEG:
+        raise CalibrationRejected(
+            f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees): "
+            "tilt the board by 15 to 30 degrees, in different directions"
+        )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    camera: Lens
+    projector: Lens
+    R: np.ndarray
+    t: np.ndarray
+    poses: list[tuple[np.ndarray, np.ndarray]]
+    focal_sigma_px: dict[str, float]
+
+    @classmethod
+    def fit(
+        cls, used: Sequence[Observation], kept: Sequence[np.ndarray], projector_size: tuple[int, int]
+    ) -> "_Solution":
+        objects = [o.points[k].astype(np.float32) for o, k in zip(used, kept, strict=True)]
+        cameras = [o.camera[k].astype(np.float32) for o, k in zip(used, kept, strict=True)]
+        projectors = [o.projector[k].astype(np.float32) for o, k in zip(used, kept, strict=True)]
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
+        sigma: dict[str, float] = {}
+        intrinsics = []
+        for device, images, size in (("camera", cameras, used[0].size), ("projector", projectors, projector_size)):
+            try:
+                _, K, D, _, _, deviations, _, _ = cv2.calibrateCameraExtended(
+                    objects, images, size, None, None, criteria=criteria
+                )
+            except cv2.error as error:
+                raise CalibrationRejected(
+                    f"the {device}'s lens could not be solved from {len(used)} poses: "
+                    f"capture the board in more positions and tilts ({error.err})"
+                ) from error
+            sigma[device] = float(np.max(deviations.ravel()[:2]))
+            relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
+            if not np.isfinite(relative) or relative > MAX_FOCAL_SIGMA:
+                raise CalibrationRejected(
+                    f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f} %: "
+                    "tilt the board by 15 to 30 degrees in different directions, and vary its distance"
+                )
+            intrinsics.append((K, D.ravel()[:5]))
+        (K_c, D_c), (K_p, D_p) = intrinsics
+        _, K_c, D_c, K_p, D_p, R, T, _, _, rvecs, tvecs, _ = cv2.stereoCalibrateExtended(
+            objects,
+            cameras,
+            projectors,
+            K_c,
+            D_c,
+            K_p,
+            D_p,
+            used[0].size,
+            np.eye(3),
+            np.zeros((3, 1)),
+            flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+            criteria=criteria,
+        )
+        return cls(
+            Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size),
+            Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size),
+            np.array(R),
+            np.array(T).ravel(),
+            [(cv2.Rodrigues(np.array(r))[0], np.array(t).ravel()) for r, t in zip(rvecs, tvecs, strict=True)],
+            sigma,
+        )
+
+    @property
+    def rig(self) -> StereoRig:
+        return StereoRig(self.camera, self.projector, self.R, self.t)
+
+    def residuals(self, index: int, observation: Observation) -> np.ndarray:
+        """(n, 4) px: camera and projector residuals of every feature of one pose."""
+        R, t = self.poses[index]
+        X = observation.points @ R.T + t
+        return np.hstack([observation.camera - self.camera.project(X), observation.projector - self.rig.project(X)])
+
+    def model(
+        self,
+        used: Sequence[Observation],
+        kept: Mapping[str, np.ndarray],
+        board: str,
+        left_out: Mapping[str, str],
+    ) -> StereoModel:
+        residuals, poses, pose_rms, depths = {}, {}, {}, []
+        for i, o in enumerate(used):
+            r = np.where(kept[o.name][:, None], self.residuals(i, o), np.nan)
+            residuals[o.name] = r
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = self.poses[i]
+            poses[o.name] = T
+            pose_rms[o.name] = (_rms_px(r[:, :2]), _rms_px(r[:, 2:]))
+            depths.append((o.points @ T[:3, :3].T + T[:3, 3])[:, 2])
+        every = np.concatenate(list(residuals.values()))
+        rms = {"camera": _rms_px(every[:, :2]), "projector": _rms_px(every[:, 2:])}
+        rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
+        if rms["stereo"] > MAX_REPROJECTION_PX:
+            raise CalibrationRejected(
+                f"the reprojection error is {rms['stereo']:.1f} px (camera {rms['camera']:.1f}, projector "
+                f"{rms['projector']:.1f}), above {MAX_REPROJECTION_PX:g}: check the target's notation, the projector's "
+                "size, the fringe period, and that x and y are not exchanged"
+            )
+        z = np.concatenate(depths)
+        if z.min() <= 0:
+            raise CalibrationRejected("the solution puts the board behind the camera: check the target's notation")
+        return StereoModel(
+            rig=self.rig,
+            board=board,
+            axes=("x", "y"),
+            reprojection_rms_px=rms,
+            poses=poses,
+            pose_rms_px=pose_rms,
+            left_out=left_out,
+            depth_range_mm=(float(z.min()), float(z.max())),
+            focal_sigma_px=self.focal_sigma_px,
+            features_set_aside=int(sum((~k).sum() for name, k in kept.items() if name in poses)),
+            residuals_px=residuals,
+        )
+
+
+def _rms_px(residuals: np.ndarray) -> float:
+    """Root mean square length of 2-D residuals, as OpenCV reports it."""
+    return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
+
+
+def _outliers(
+    solution: _Solution, used: Sequence[Observation], kept: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Per pose, the features still in use that lie beyond ROBUST_SIGMAS of all features, in either device."""
+    lengths = {}
+    for i, o in enumerate(used):
+        r = solution.residuals(i, o)
+        lengths[o.name] = np.stack([np.hypot(r[:, 0], r[:, 1]), np.hypot(r[:, 2], r[:, 3])], axis=1)
+    every = np.concatenate([lengths[o.name][kept[o.name]] for o in used])
+    sigma = np.median(every, axis=0) / 1.1774  # of a Rayleigh distribution
+    limit = np.maximum(ROBUST_SIGMAS * sigma, 0.05)
+    outliers = {o.name: kept[o.name] & (lengths[o.name] > limit).any(1) for o in used}
+    return {name: bad for name, bad in outliers.items() if bad.any()}

@@ -1,0 +1,171 @@
+"""From a session's target poses to calibrations."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.observe import Observation, Smoothing, observe
+from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
+from slviewer.calibration.stereo import StereoModel, calibrate_stereo
+from slviewer.errors import CalibrationRejected, DetectionError, InputError
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.target.detect import detect
+from slviewer.workflow.decoding import capture_texture, check_projector, decoded
+from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.workflow.models import save_pixelwise, save_stereo
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """What ``calibrate`` found."""
+
+    stereo: StereoModel
+    pixelwise: PixelwiseModel | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``calibrate --json``."""
+        rig = self.stereo.rig
+        models: dict[str, Any] = {
+            "stereo": {
+                "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
+                "K_camera": rig.camera.K.tolist(),
+                "D_camera": rig.camera.D.tolist(),
+                "K_projector": rig.projector.K.tolist(),
+                "D_projector": rig.projector.D.tolist(),
+                "R": rig.R.tolist(),
+                "T": rig.t.tolist(),
+            }
+        }
+        if self.pixelwise is not None:
+            models["pixelwise"] = {
+                "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.axes[0]),
+                "axes": {axis: self.pixelwise.median_rms_mm(axis) for axis in self.pixelwise.axes},
+            }
+        return {
+            "models": models,
+            "poses_used": list(self.stereo.poses),
+            "poses_left_out": dict(self.stereo.left_out),
+        }
+
+    def text(self) -> str:
+        """For people."""
+        s = self.stereo
+        rms, total = s.reprojection_rms_px, len(s.poses) + len(s.left_out)
+        fc, fp = s.rig.camera.K, s.rig.projector.K
+        sigma = s.focal_sigma_px
+        lines = [
+            f"poses: {len(s.poses)} of {total} used, boards at {s.depth_range_mm[0]:.0f}-{s.depth_range_mm[1]:.0f} mm",
+            *(f"  left out: {name}: {why}" for name, why in s.left_out.items()),
+            f"stereo: reprojection RMS camera {rms['camera']:.3f} px, projector {rms['projector']:.3f} px, "
+            f"stereo {rms['stereo']:.3f} px",
+            f"  camera focal length {fc[0, 0]:.1f}, {fc[1, 1]:.1f} px (+- {sigma['camera']:.1f}); "
+            f"projector {fp[0, 0]:.1f}, {fp[1, 1]:.1f} px (+- {sigma['projector']:.1f}); "
+            f"baseline {s.baseline_mm:.2f} mm",
+        ]
+        if s.features_set_aside:
+            lines.append(f"  {s.features_set_aside} features set aside beyond 6 robust sigma")
+        if self.pixelwise is not None:
+            for axis in self.pixelwise.axes:
+                fit = self.pixelwise.fits[axis]
+                fitted = np.isfinite(fit.coefficients[0])
+                fit_rms = self.pixelwise.median_rms_mm(axis)
+                lines.append(
+                    f"pixelwise {axis}: {100 * fitted.mean():.1f} % of the pixels fitted, "
+                    f"in {np.median(fit.poses[fitted]):.0f} poses (median); "
+                    f"fit RMS z {fit_rms['z']:.3f}, x {fit_rms['x']:.3f}, y {fit_rms['y']:.3f} mm (median)"
+                )
+        return "\n".join(lines)
+
+
+def calibrate(
+    session: Path | str,
+    target: str,
+    *,
+    models: Sequence[str] = ("stereo", "pixelwise"),
+    smoothing: str = "spline",
+    degree: int = 5,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> CalibrationResult:
+    """Calibrate from the session's captures of role calibration, and save the models in the session.
+
+    ``pixelwise`` is fitted on top of ``stereo``, which is always made. A pose that cannot be used is left out with the
+    reason; CalibrationRejected when what is left cannot determine the rig, and then the session stays as it was.
+    """
+    board = Board.parse(target)
+    step_2 = Smoothing(smoothing, degree)
+    with Session.open(session, write=True) as store:
+        excluded = store.excluded()
+        names = store.capture_names("calibration")
+        if not names:
+            raise InputError(
+                f"{session} holds no target poses: import some with --role calibration, or capture them first"
+            )
+        left_out = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
+        names = [name for name in names if name not in left_out]
+        observations, size, projector = _observe_all(
+            store, names, board, step_2, left_out, part(progress, 0, 0.6), warn
+        )
+        progress(0.6, "stereo calibration")
+        stereo = calibrate_stereo(observations, projector, str(board), left_out)
+        for name, why in stereo.left_out.items():
+            if name not in excluded:
+                warn(f"{name} is left out: {why}")
+        pixelwise = None
+        if "pixelwise" in models:
+            fitting = part(progress, 0.7, 0.97)
+            try:
+                pixelwise = calibrate_pixelwise(observations, stereo, lambda done: fitting(done, "pixel-wise fit"))
+            except CalibrationRejected as error:
+                if len(models) == 1:
+                    raise
+                warn(f"no pixel-wise model: {error}")
+        progress(0.97, "saving")
+        inputs = store.input_hashes(*stereo.poses)
+        settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
+        save_stereo(store, stereo, inputs, settings)
+        if pixelwise is not None:
+            save_pixelwise(store, pixelwise, inputs, settings)
+        progress(1.0, "calibrated")
+    return CalibrationResult(stereo, pixelwise)
+
+
+def _observe_all(
+    store: Session,
+    names: Sequence[str],
+    board: Board,
+    smoothing: Smoothing,
+    left_out: dict[str, str],
+    progress: Progress,
+) -> tuple[list[Observation], tuple[int, int]]:
+    observations: list[Observation] = []
+    size: tuple[int, int] | None = None
+    projector: tuple[int, int] | None = None
+    for i, (capture, frames, phases) in enumerate(decoded(store, names)):
+        progress(i / len(names), f"reading {capture.name}")
+        here = (frames.shape[2], frames.shape[1])
+        if size is None:
+            size, projector = here, capture.sequence.projector
+        elif here != size or capture.sequence.projector != projector:
+            raise InputError(
+                f"{capture.name} has a {here[0]}x{here[1]} camera and a {_wxh(capture.sequence.projector)} projector, "
+                f"the poses before it {size[0]}x{size[1]} and {_wxh(projector or (0, 0))}: "
+                "calibrate poses of one rig at one resolution"
+            )
+        check_projector(capture.name, capture.sequence, phases)
+        try:
+            found = detect(board, capture_texture(capture, frames))
+            observations.append(observe(capture.name, board, found, phases, smoothing))
+        except DetectionError as error:
+            left_out[capture.name] = str(error)
+    if size is None or projector is None:
+        raise InputError("every target pose is excluded: include some again")
+    return observations, projector
+
+
+def _wxh(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

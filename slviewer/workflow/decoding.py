@@ -1,0 +1,76 @@
+"""From a stored capture to phase maps and a texture."""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.decode import decode, texture
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+
+MAX_OUTSIDE = 0.05
+"""Share of lit pixels whose code may lie outside the projector before the projector's size is doubted."""
+
+
+def decode_capture(capture: Capture, frames: np.ndarray | None = None) -> dict[Axis, PhaseMap]:
+    """The absolute phase of every axis that a capture holds."""
+    frames = capture.frames if frames is None else frames
+    return decode_frames(capture.name, capture.sequence, frames)
+
+
+def decode_frames(name: str, sequence: PatternSequence, frames: np.ndarray) -> dict[Axis, PhaseMap]:
+    """The absolute phase of every axis; errors name the capture."""
+    phases = {}
+    for axis in sequence.axes:
+        try:
+            phases[axis] = decode(sequence, frames, axis)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+    return phases
+
+
+def check_projector(name: str, sequence: PatternSequence, phases: dict[Axis, PhaseMap]) -> None:
+    """Raise InputError where the codes that were seen contradict the projector's size."""
+    for axis, phase in phases.items():
+        outside = np.count_nonzero(phase.reason == Reason.OUTSIDE)
+        inside = np.count_nonzero(phase.mask)
+        if inside + outside == 0:
+            raise InputError(
+                f"{name}: no pixel carries a readable {axis} pattern: are the frames in order, "
+                "and was the projector bright enough?"
+            )
+        if outside > MAX_OUTSIDE * (inside + outside):
+            width, height = sequence.projector
+            extent = width if axis == "x" else height
+            what = "columns" if axis == "x" else "rows"
+            raise InputError(
+                f"{name}: {100 * outside / (inside + outside):.0f} % of the {axis} codes lie outside the projector's "
+                f"{extent} {what}: give the size of the projector that was used, instead of {width}x{height}"
+            )
+
+
+def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
+    """(h, w) or (h, w, 3) uint8: what the scene looks like under white light."""
+    colour = capture.texture
+    image = texture(capture.sequence, frames) if colour is None else colour
+    if image.dtype == np.uint16:
+        top = max(int(image.max()), 1)
+        image = cv2.convertScaleAbs(image, alpha=255.0 / top)
+    return np.ascontiguousarray(image, np.uint8)
+
+
+def decoded(session: Session, names: Sequence[str]) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
+    """Captures with their frames and phases, in order; the next one's frames are read while one is worked on."""
+    with ThreadPoolExecutor(1) as reader:
+        captures = [session.load_capture(name) for name in names]
+        waiting = [reader.submit(lambda c=captures[0]: c.stack())] if captures else []
+        for i, capture in enumerate(captures):
+            frames = waiting.pop().result()
+            if i + 1 < len(captures):
+                waiting.append(reader.submit(lambda c=captures[i + 1]: c.stack()))
+            yield capture, frames, decode_capture(capture, frames)

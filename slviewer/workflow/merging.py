@@ -1,0 +1,79 @@
+"""Registering scans taken at different depths, and merging them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from slviewer.errors import InputError
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.ply import write_ply
+from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_phases
+from slviewer.registration.merge import Merged
+from slviewer.registration.merge import merge as merge_clouds
+from slviewer.session.store import Session
+from slviewer.workflow.decoding import capture_texture, decoded
+from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.workflow.models import best, load_model, warn_if_stale
+
+
+@dataclass(frozen=True)
+class Merge:
+    """A merged cloud, how its scans were registered, and the file it went to."""
+
+    merged: Merged
+    clouds: Mapping[str, Cloud]
+    reference: str
+    out: Path
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``merge --json``."""
+        return {
+            "reference": self.reference,
+            "pairs": {
+                name: {
+                    "rms_mm": pair.rms_mm,
+                    "overlap": pair.overlap,
+                    "T_reference_scan": pair.T_reference_scan.tolist(),
+                }
+                for name, pair in self.merged.pairs.items()
+            },
+        }
+
+    def text(self) -> str:
+        """For people."""
+        lines = [
+            f"{name} -> {self.reference}: RMS {pair.rms_mm:.3f} mm, overlap {100 * pair.overlap:.0f} %"
+            for name, pair in self.merged.pairs.items()
+        ]
+        return "\n".join([*lines, f"{len(self.merged.points)} points -> {self.out}"])
+
+
+def merge(
+    session: Path | str,
+    captures: Sequence[str],
+    reference: str,
+    out: Path | str,
+    *,
+    model: str | None = None,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Merge:
+    """Reconstruct scans, register each to ``reference`` by point-to-plane ICP, and write them as one PLY."""
+    names = list(dict.fromkeys([*captures, reference]))
+    if len(names) < 2:
+        raise InputError(f"only {reference} was named: name the scans to merge with it")
+    with Session.open(session) as store:
+        fitted = load_model(store, model or best(store))
+        warn_if_stale(store, warn)
+        clouds = {}
+        for i, (shot, frames, phases) in enumerate(decoded(store, names)):
+            progress(0.5 * i / len(names), f"reconstructing {shot.name}")
+            clouds[shot.name] = reconstruct_phases(fitted, phases, texture=capture_texture(shot, frames))
+    registering = part(progress, 0.5, 0.9)
+    merged = merge_clouds(clouds, reference, lambda done: registering(done, "registering"))
+    progress(0.9, "writing")
+    Path(out).parent.mkdir(parents=True, exist_ok=True)
+    write_ply(Path(out), merged.points, colours=merged.colours, normals=merged.normals)
+    progress(1.0, "merged")
+    return Merge(merged, clouds, reference, Path(out))

@@ -1,0 +1,84 @@
+"""Calibrations in a session: saving, loading, choosing, and noticing when one is stale."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.session.store import Session
+from slviewer.workflow.feedback import Warn
+
+Model = StereoModel | PixelwiseModel
+
+MODELS = ("stereo", "pixelwise")
+POSES_FOR_PIXELWISE = 8
+"""With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
+
+
+def save_stereo(store: Session, model: StereoModel, inputs: Mapping[str, str], settings: Mapping[str, Any]) -> None:
+    """Replace the session's stereo calibration."""
+    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
+    store.save_result("calibration/stereo", meta, {f"residuals_{n}": r for n, r in model.residuals_px.items()})
+
+
+def save_pixelwise(
+    store: Session, model: PixelwiseModel, inputs: Mapping[str, str], settings: Mapping[str, Any]
+) -> None:
+    """Replace the session's pixelwise calibration."""
+    meta = {"axes": list(model.axes), "inputs": dict(inputs), "settings": dict(settings)}
+    store.save_result("calibration/pixelwise", meta, model.to_arrays())
+
+
+def available(store: Session) -> tuple[str, ...]:
+    """Names of the calibrations that the session holds."""
+    return tuple(name for name in MODELS if store.state_of(f"calibration/{name}") != "absent")
+
+
+def load_stereo(store: Session) -> StereoModel:
+    """The session's stereo calibration, without its residual arrows."""
+    if "stereo" not in available(store):
+        raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
+    return StereoModel.from_dict(store.load_result("calibration/stereo", only=())[0]["model"])
+
+
+def load_model(store: Session, name: str) -> Model:
+    """One calibration by name."""
+    if name not in available(store):
+        there = ", ".join(available(store))
+        raise InputError(
+            f"{store.folder} holds no {name} calibration ({f'there is {there}' if there else 'there is none'}): "
+            "run `slviewer calibrate` first"
+        )
+    if name == "stereo":
+        return load_stereo(store)
+    return PixelwiseModel.from_arrays(store.load_result("calibration/pixelwise")[1])
+
+
+def best(store: Session) -> str:
+    """The calibration to use where none is named: pixelwise if it had 8 poses or more, else stereo."""
+    there = available(store)
+    if not there:
+        raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
+    if (
+        "pixelwise" in there
+        and len(store.load_result("calibration/pixelwise", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE
+    ):
+        return "pixelwise"
+    return there[0]
+
+
+def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:
+    """Calibrations by name; all there are where none is named."""
+    load_stereo(store)
+    return {name: load_model(store, name) for name in names or available(store)}
+
+
+def warn_if_stale(store: Session, warn: Warn) -> None:
+    """Say so when target poses have changed since the calibration was made."""
+    for name in available(store):
+        if store.state_of(f"calibration/{name}") == "stale":
+            warn(
+                f"the {name} calibration was made from target poses that have since been replaced or removed: "
+                "run `slviewer calibrate` again"
+            )

@@ -1,0 +1,130 @@
+"""From a capture to a cloud."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.errors import DetectionError, InputError
+from slviewer.evaluation.compare import Comparison, compare
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.ply import write_ply
+from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_phases
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.target.detect import board_mask, detect
+from slviewer.workflow.decoding import capture_texture, decode_capture
+from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
+from slviewer.workflow.models import Model, best, load_models, load_stereo, warn_if_stale
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A reconstructed capture, the file it went to, and for a board pose how flat each model measures the board."""
+
+    cloud: Cloud
+    ply: Path
+    points: int
+    board: Comparison | None = None
+
+    def text(self) -> str:
+        """For people."""
+        cloud = self.cloud
+        z, sigma = cloud.points[..., 2][cloud.mask], cloud.sigma_z[cloud.mask]
+        lines = [
+            f"{self.points} points by {cloud.model} from axis {cloud.axis}, z {np.percentile(z, 1):.0f}-"
+            f"{np.percentile(z, 99):.0f} mm, predicted depth noise {np.median(sigma):.3f} mm -> {self.ply}"
+        ]
+        if self.board is not None:
+            lines += ["inside the board's outline:", self.board.text()]
+        return "\n".join(lines)
+
+
+def reconstruct(
+    session: Path | str,
+    capture: str,
+    *,
+    model: str | None = None,
+    axis: Axis | None = None,
+    out: Path | str | None = None,
+    grid: Path | str | None = None,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Reconstruction:
+    """Reconstruct a capture, write it as PLY, and ``grid`` as an organised (h, w, 3) float32 .npy.
+
+    The PLY of a board pose holds the points inside the board's outline; a scan's holds every point.
+    """
+    with Session.open(session) as store:
+        name = model or best(store)
+        warn_if_stale(store, warn)
+        shot = store.load_capture(capture)
+        progress(0.1, "reading frames")
+        frames = shot.stack()
+        progress(0.3, "decoding")
+        phases = decode_capture(shot, frames)
+        texture = capture_texture(shot, frames)
+        is_pose = shot.role == "calibration"
+        chosen = load_models(store, () if is_pose and model is None else (name,))
+        progress(0.6, "reconstructing")
+        clouds = {n: reconstruct_phases(m, phases, axis=axis, texture=texture) for n, m in chosen.items()}
+        cloud = clouds[name]
+        region = board_region(store, shot, texture, warn) if is_pose else None
+        board = None
+        if region is not None:
+            depth_range = load_stereo(store).depth_range_mm
+            board = compare("plane", clouds, lit(phases, clouds), region=region, depth_range=depth_range)
+        keep = cloud.mask if region is None else cloud.mask & region
+        if not keep.any():
+            raise InputError(
+                f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong to this camera "
+                "and projector, and is the scene within its depths?"
+            )
+        ply = Path(out) if out is not None else store.exports / f"{capture}_{name}.ply"
+        progress(0.8, "writing")
+        ply.parent.mkdir(parents=True, exist_ok=True)
+        write_ply(ply, cloud.points[keep], colours=texture[keep], scalars={"sigma_z": cloud.sigma_z[keep]})
+        if grid is not None:
+            write_grid(Path(grid), cloud.points)
+        progress(1.0, "reconstructed")
+    return Reconstruction(cloud, ply, int(np.count_nonzero(keep)), board)
+
+
+def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
+    """(h, w) bool: the board's outline in a target pose; None, with a warning, where no board is found."""
+    board = load_stereo(store).board
+    if not board:
+        return None
+    try:
+        found = detect(Board.parse(board), texture)
+    except DetectionError as error:
+        warn(f"{shot.name}: {error}")
+        return None
+    return board_mask(Board.parse(board), found, texture.shape[:2])
+
+
+def lit(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:
+    """(h, w) bool: what a perfect decoder could have measured on the axis that the clouds came from."""
+    return phases[next(iter(clouds.values())).axis].lit
+
+
+def reconstruct_models(
+    chosen: Mapping[str, Model], phases: Mapping[Axis, PhaseMap], axis: Axis | None
+) -> dict[str, Cloud]:
+    """One cloud a model, all from the same axis so that they can be compared pixel by pixel."""
+    clouds: dict[str, Cloud] = {}
+    for name, model in chosen.items():
+        clouds[name] = reconstruct_phases(model, phases, axis=axis)
+        axis = axis or clouds[name].axis
+    return clouds
+
+
+def write_grid(path: Path, points: np.ndarray) -> None:
+    """Write an organised cloud as .npy."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "wb") as file:  # a file object, so that NumPy adds no suffix of its own
+        np.save(file, points)

@@ -1,0 +1,78 @@
+"""Measuring known shapes with each model, and comparing."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.evaluation.compare import Comparison, compare
+from slviewer.fringe.sequence import Axis
+from slviewer.session.store import Session
+from slviewer.workflow.decoding import capture_texture, decoded
+from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
+from slviewer.workflow.models import load_models, load_stereo, warn_if_stale
+from slviewer.workflow.reconstructing import board_region, lit, reconstruct_models
+
+Shape = Literal["plane", "sphere"]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The comparison of the models on each capture."""
+
+    captures: Mapping[str, Comparison]
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``verify --json``."""
+        return {"captures": {name: comparison.to_dict() for name, comparison in self.captures.items()}}
+
+    def text(self) -> str:
+        """For people."""
+        return "\n".join(f"{name}:\n{comparison.text()}" for name, comparison in self.captures.items())
+
+
+def verify(
+    session: Path | str,
+    captures: Sequence[str],
+    shape: Shape,
+    *,
+    models: Sequence[str] = (),
+    depth_range: tuple[float, float] | None = None,
+    radius: float | None = None,
+    axis: Axis | None = None,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Verification:
+    """Fit a plane or a sphere to each capture, by each model, over the pixels that all of them measure.
+
+    ``depth_range`` bounds R2 in mm; by default the depths of the board poses. ``radius`` mm fixes a sphere's.
+    """
+    if not captures:
+        raise InputError("no capture named: give the captures to measure, for instance plane_01 plane_02")
+    if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
+        raise InputError(f"the range {depth_range[0]:g} {depth_range[1]:g} is empty: give near and far in mm")
+    if radius is not None and not radius > 0:
+        raise InputError(f"a radius of {radius:g} mm is not possible: give a positive one")
+    results: dict[str, Comparison] = {}
+    with Session.open(session) as store:
+        chosen = load_models(store, models)
+        warn_if_stale(store, warn)
+        reach = depth_range or load_stereo(store).depth_range_mm
+        for i, (shot, frames, phases) in enumerate(decoded(store, captures)):
+            progress(i / len(captures), f"measuring {shot.name}")
+            clouds = reconstruct_models(chosen, phases, axis)
+            region: np.ndarray | None = None
+            if shape == "plane" and shot.role == "calibration":
+                region = board_region(store, shot, capture_texture(shot, frames), warn)
+            try:
+                result = compare(shape, clouds, lit(phases, clouds), region=region, depth_range=reach, radius=radius)
+            except InputError as error:
+                raise InputError(f"{shot.name}: {error}") from error
+            for message in result.warnings:
+                warn(f"{shot.name}: {message}")
+            results[shot.name] = result
+        progress(1.0, "measured")
+    return Verification(results)

@@ -1,0 +1,107 @@
+"""The house's rules: imports run one way, files stay readable, ruff and mypy agree, CI runs what the README says."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ROOMS = [
+    "errors",
+    "geometry",
+    "fringe",
+    "target",
+    "calibration",
+    "reconstruction",
+    "registration",
+    "evaluation",
+    "simulation",
+    "devices",
+    "session",
+    "report",
+    "workflow",
+    "server",
+    "gui",
+    "cli",
+]
+STRANGERS = [
+    # the renderer's lenses must not hide an error of the calibration's, nor the other way round
+    ("simulation", "slviewer.calibration"),
+    ("simulation", "slviewer.geometry.lens"),
+    ("simulation", "slviewer.geometry.brown"),
+    ("simulation", "slviewer.geometry.rig"),
+    ("simulation", "slviewer.geometry.triangulation"),
+    # replay takes frames, and the workflow opens the session
+    ("session", "slviewer.devices"),
+]
+NUMERIC = ROOMS[1 : ROOMS.index("simulation")]
+SOURCES = sorted((ROOT / "slviewer").rglob("*.py"))
+
+
+def imports_of(path: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path} imports relatively"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def room_of(module: str) -> str | None:
+    parts = module.split(".")
+    return parts[1] if parts[0] == "slviewer" and len(parts) > 1 and parts[1] in ROOMS else None
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_run_one_way(path: Path) -> None:
+    place = path.relative_to(ROOT / "slviewer").with_suffix("").parts[0]
+    if place == "__init__":
+        assert imports_of(path) == set()
+        return
+    for name in imports_of(path):
+        room = room_of(name)
+        if room is not None:
+            assert ROOMS.index(room) <= ROOMS.index(place), f"{path} imports {name}: against the flow"
+        for here, stranger in STRANGERS:
+            assert not (place == here and name.startswith(stranger)), f"{path} must not import {name}"
+
+
+@pytest.mark.parametrize("path", [p for p in SOURCES if p.relative_to(ROOT / "slviewer").parts[0] in NUMERIC], ids=str)
+def test_numeric_rooms_know_no_device_and_no_browser(path: Path) -> None:
+    banned = {"viser", "zarr", "tyro", "websockets", "jinja2", "matplotlib"}
+    assert not banned & {name.split(".")[0] for name in imports_of(path)}
+
+
+def test_files_can_be_read_in_one_sitting() -> None:
+    long = {str(p.relative_to(ROOT)): n for p in SOURCES if (n := len(p.read_text().splitlines())) > 500}
+    assert not long
+
+
+def test_ruff() -> None:
+    run = subprocess.run([sys.executable, "-m", "ruff", "check", "."], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout
+    run = subprocess.run(
+        [sys.executable, "-m", "ruff", "format", "--check", "."], cwd=ROOT, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stdout
+
+
+def test_mypy() -> None:
+    run = subprocess.run([sys.executable, "-m", "mypy"], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout
+
+
+def test_ci_runs_the_readmes_test_command() -> None:
+    ci = (ROOT / ".ci" / "run").read_text()
+    commands = [line for line in (ROOT / "README.md").read_text().splitlines() if "pytest" in line and ".venv" in line]
+    assert commands and commands[0] in ci
+
+
+def test_the_first_import_is_light() -> None:
+    heavy = "{'numpy', 'cv2', 'numba', 'scipy', 'open3d', 'zarr', 'matplotlib'}"
+    code = f"import sys, slviewer.cli; sys.exit(bool({heavy} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
