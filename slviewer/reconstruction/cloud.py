@@ -1,0 +1,67 @@
+"""A cloud that keeps the camera's grid: neighbours in the image are neighbours on the surface."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from slviewer.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """What one capture measured.
+
+    ``points``: (h, w, 3) float32 mm in the camera's frame, NaN where invalid. ``axis``: the one that depth came from.
+    ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm, predicted from the capture's noise. ``texture``:
+    (h, w) grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's range (10, 12, 14
+    or 16 bits, whichever holds its brightest pixel).
+    """
+
+    points: np.ndarray
+    axis: Literal["x", "y"]
+    model: str
+    sigma_z: np.ndarray
+    texture: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points, dtype=np.float32)
+        sigma_z = np.asarray(self.sigma_z, dtype=np.float32)
+        if points.ndim != 3 or points.shape[2] != 3 or sigma_z.shape != points.shape[:2]:
+            raise InputError(
+                f"Points of shape {points.shape} and sigma_z of shape {sigma_z.shape} make no cloud: "
+                "(h, w, 3) and (h, w) are needed."
+            )
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "sigma_z", sigma_z)
+        if self.texture is not None:
+            object.__setattr__(self, "texture", _eight_bits(self.texture, points.shape[:2]))
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(h, w) bool: the measured pixels."""
+        return np.isfinite(self.points).all(axis=-1)
+
+    @property
+    def measured(self) -> np.ndarray:
+        """(n, 3) float32 mm: the measured points, in the order of ``mask``."""
+        return self.points[self.mask]
+
+    def colours(self) -> np.ndarray | None:
+        """(n,) grey or (n, 3) RGB uint8 of the measured points, in the order of ``mask``; None without a texture."""
+        return None if self.texture is None else self.texture[self.mask]
+
+
+def _eight_bits(texture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    if texture.shape not in (shape, (*shape, 3)):
+        raise InputError(
+            f"A texture of shape {texture.shape} does not belong to a cloud of {shape[1]}x{shape[0]} pixels: "
+            "use the one of the same capture."
+        )
+    if texture.dtype == np.uint8:
+        return texture
+    if texture.dtype != np.uint16:
+        raise InputError(f"A texture of {texture.dtype} was given: it must be uint8 or uint16.")
+    brightest = int(texture.max(initial=0))
+    bits = next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits)
+    return (texture >> (bits - 8)).astype(np.uint8)

@@ -1,0 +1,167 @@
+"""Clouds and meshes as binary PLY: little endian, float32, in mm; complete or absent."""
+
+import os
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.errors import InputError, SlviewerError
+
+COLOURS = ("red", "green", "blue")
+TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
+FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
+
+
+@dataclass(frozen=True, eq=False)
+class Ply:
+    """A PLY's content: ``points`` (n, 3) float32 mm, ``colours`` (n, 3) uint8, ``normals`` (n, 3) float32, ``faces``
+    (m, 3) int32, each None where absent, and every other property of the vertices in ``scalars`` by name, (n,)."""
+
+    points: np.ndarray
+    colours: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    scalars: dict[str, np.ndarray] = field(default_factory=dict)
+    faces: np.ndarray | None = None
+
+
+def write_ply(
+    path: str | Path,
+    points: np.ndarray,
+    colours: np.ndarray | None = None,
+    normals: np.ndarray | None = None,
+    scalars: Mapping[str, np.ndarray] | None = None,
+    faces: np.ndarray | None = None,
+) -> None:
+    """Writes points (n, 3) mm, and what else is given, as one binary PLY that appears whole or not at all.
+
+    ``colours``: (n,) grey or (n, 3) RGB, uint8. ``normals``: (n, 3). ``scalars``: named (n,), as float32 properties of
+    the vertices. ``faces``: (m, 3) indices into the points. Raises InputError for shapes that do not fit together
+    and for NaN points; SlviewerError where the file cannot be written (an older file of that name is left as it was).
+    """
+    vertices = _vertices(np.asarray(points), colours, normals, dict(scalars or {}))
+    header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm, camera frame"]
+    header.append(f"element vertex {len(vertices)}")
+    names = {np.dtype(code): name for name, code in TYPES.items()}
+    header += [f"property {names[vertices.dtype[name]]} {name}" for name in vertices.dtype.names or ()]
+    blocks = [vertices]
+    if faces is not None:
+        blocks.append(_faces(np.asarray(faces), len(vertices)))
+        header += [f"element face {len(blocks[1])}", "property list uchar int vertex_indices"]
+    header.append("end_header\n")
+    _write_whole(Path(path), "\n".join(header).encode("ascii"), blocks)
+
+
+def read_ply(path: str | Path) -> Ply:
+    """What a PLY that ``write_ply`` wrote holds.
+
+    Raises InputError for an absent or truncated file and for other kinds of PLY (text, big endian, polygons).
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): check its name.") from None
+    end = data.find(b"end_header\n")
+    lines = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
+    if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
+        raise InputError(f"{path} is no binary little-endian PLY: only files that slviewer wrote can be read back.")
+    counts: dict[str, int] = {}
+    properties: list[tuple[str, str]] = []
+    for words in lines[2:]:
+        if words[0] == "element":
+            counts[words[1]] = int(words[2])
+        elif words[0] == "property" and list(counts) == ["vertex"] and words[1] in TYPES:
+            properties.append((words[2], TYPES[words[1]]))
+        elif words[0] == "property" and words[1:] != ["list", "uchar", "int", "vertex_indices"]:
+            raise InputError(f"{path} holds '{' '.join(words)}', which slviewer does not write: convert it first.")
+    vertex = np.dtype(properties)
+    start = end + len(b"end_header\n")
+    middle = start + counts.get("vertex", 0) * vertex.itemsize
+    if len(data) != middle + counts.get("face", 0) * FACE.itemsize or not {"x", "y", "z"} <= set(vertex.names or ()):
+        raise InputError(f"{path} is {len(data)} bytes, not what its header says: it is truncated, or has polygons.")
+    vertices = np.frombuffer(data[start:middle], dtype=vertex)
+    faces = np.frombuffer(data[middle:], dtype=FACE)
+    if (faces["count"] != 3).any():
+        raise InputError(f"{path} has faces that are no triangles: triangulate it first.")
+    return _content(vertices, faces["vertices"].copy() if "face" in counts else None)
+
+
+def _content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
+    names = vertices.dtype.names or ()
+
+    def joined(*fields: str) -> np.ndarray | None:
+        return np.stack([vertices[name] for name in fields], axis=1) if set(fields) <= set(names) else None
+
+    known = {"x", "y", "z", "nx", "ny", "nz", *COLOURS}
+    scalars = {name: vertices[name].copy() for name in names if name not in known}
+    points = joined("x", "y", "z")
+    assert points is not None
+    return Ply(points, joined(*COLOURS), joined("nx", "ny", "nz"), scalars, faces)
+
+
+def _vertices(
+    points: np.ndarray, colours: np.ndarray | None, normals: np.ndarray | None, scalars: dict[str, np.ndarray]
+) -> np.ndarray:
+    """One record a vertex, as PLY lays them out."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"Points of shape {points.shape} were given: a PLY holds (n, 3); select the valid ones first.")
+    if not np.isfinite(points).all():
+        raise InputError("Some points are NaN: select the valid ones first.")
+    fields: list[tuple[str, str, np.ndarray]] = [(name, "<f4", points[:, i]) for i, name in enumerate("xyz")]
+    if normals is not None:
+        _check(normals.shape == points.shape, "normals", normals, len(points))
+        fields += [(name, "<f4", normals[:, i]) for i, name in enumerate(("nx", "ny", "nz"))]
+    if colours is not None:
+        _check(colours.shape in (points.shape, points.shape[:1]), "colours", colours, len(points))
+        if colours.dtype != np.uint8:
+            raise InputError(f"Colours of {colours.dtype} were given: they must be uint8.")
+        fields += [(name, "u1", colours if colours.ndim == 1 else colours[:, i]) for i, name in enumerate(COLOURS)]
+    for name, values in scalars.items():
+        _check(np.shape(values) == points.shape[:1], name, np.asarray(values), len(points))
+        if not (name.isascii() and name.isidentifier()) or name in {field[0] for field in fields}:
+            raise InputError(
+                f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a new name."
+            )
+        fields.append((name, "<f4", values))
+    vertices = np.empty(len(points), dtype=[(name, code) for name, code, _ in fields])
+    for name, _, values in fields:
+        vertices[name] = values
+    return vertices
+
+
+def _faces(faces: np.ndarray, count: int) -> np.ndarray:
+    if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and not 0 <= faces.min() <= faces.max() < count):
+        raise InputError(
+            f"Faces of shape {faces.shape} were given: (m, 3) indices below {count}, the number of points."
+        )
+    records = np.empty(len(faces), dtype=FACE)
+    records["count"] = 3
+    records["vertices"] = faces
+    return records
+
+
+def _check(fits: bool, what: str, values: np.ndarray, count: int) -> None:
+    if not fits:
+        raise InputError(f"{what} of shape {values.shape} do not belong to {count} points: give one for each point.")
+
+
+def _write_whole(path: Path, header: bytes, blocks: list[np.ndarray]) -> None:
+    """Into a file beside it, which then takes the name."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        with temporary.open("xb") as file:
+            file.write(header)
+            for block in blocks:
+                file.write(block.data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise SlviewerError(
+            f"{path} could not be written ({error.strerror}): check the folder and its free space."
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)

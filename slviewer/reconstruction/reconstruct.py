@@ -1,0 +1,164 @@
+"""From absolute phase and a calibration to an organised cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numba
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.jit import kernel
+from slviewer.reconstruction.cloud import Cloud
+
+if TYPE_CHECKING:
+    from slviewer.fringe.phase import PhaseMap
+
+Axis = Literal["x", "y"]
+
+JUMP = 0.01
+"""A neighbour this much nearer or deeper (share of the depth) belongs to another surface."""
+
+
+class Model(Protocol):
+    """What reconstruction asks of a calibration, whichever it is."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The axes it was calibrated for."""
+
+    def points(self, phase: PhaseMap) -> np.ndarray:
+        """(h, w, 3) float32 mm in the camera's frame, NaN where invalid."""
+
+    def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
+        """(h, w) mm: predicted standard deviation of depth."""
+
+
+def reconstruct(
+    model: Model,
+    phases: Mapping[Axis, PhaseMap],
+    axis: Axis | None = None,
+    texture: np.ndarray | None = None,
+) -> Cloud:
+    """The organised cloud of a capture: points, predicted sigma_z and texture on the camera's grid.
+
+    ``phases``: the capture's absolute phase maps by axis. ``axis``: the one that depth is taken from; None chooses as
+    ``choose_axis`` does. ``texture``: (h, w) or (h, w, 3), uint8 or uint16.
+
+    Raises InputError where the capture or the model lacks the axis.
+    """
+    if axis is not None:
+        if axis not in phases:
+            raise InputError(f"The capture holds no axis {axis}, only {_listed(phases)}: choose one of these.")
+        if axis not in model.axes:
+            raise InputError(
+                f"The {model.name} calibration has no axis {axis}, only {_listed(model.axes)}: "
+                f"choose one of these, or calibrate with captures of axis {axis}."
+            )
+        points, sigma_z = _measure(model, phases[axis])
+    else:
+        measured = _measure_all(model, phases)
+        axis = _best_axis(measured)
+        points, sigma_z = measured[axis]
+    return Cloud(points, axis, model.name, sigma_z, texture)
+
+
+def choose_axis(model: Model, phases: Mapping[Axis, PhaseMap]) -> Axis:
+    """The axis with the smaller median predicted sigma_z over the pixels that both axes measure.
+
+    Where no pixel is measured through both, the one that measures more of them. Raises InputError where the capture and
+    the model share no axis.
+    """
+    return _best_axis(_measure_all(model, phases))
+
+
+def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
+    """Unit normals (h, w, 3) float32 of an organised cloud, towards the camera; NaN where neighbours are missing.
+
+    The cross product of the surface's differences along rows and columns: central differences, averaged by least
+    squares over the valid pixels of a window of 2 ``reach`` + 1, because two neighbours alone would show little but
+    their noise. Neighbours across a depth jump are left out.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float32)
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise InputError(f"Points of shape {points.shape} were given: normals need an organised cloud, (h, w, 3).")
+    out = np.empty_like(points)
+    _normals(points, reach, out)
+    return out
+
+
+def _measure(model: Model, phase: PhaseMap) -> tuple[np.ndarray, np.ndarray]:
+    points = model.points(phase)
+    return points, model.sigma_z(phase, points)
+
+
+def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, tuple[np.ndarray, np.ndarray]]:
+    shared = [axis for axis in model.axes if axis in phases]
+    if not shared:
+        raise InputError(
+            f"The capture holds axis {_listed(phases)} and the {model.name} calibration {_listed(model.axes)}: "
+            "capture along an axis that is calibrated, or calibrate with the captured one."
+        )
+    return {axis: _measure(model, phases[axis]) for axis in shared}
+
+
+def _best_axis(measured: Mapping[Axis, tuple[np.ndarray, np.ndarray]]) -> Axis:
+    axes = list(measured)
+    if len(axes) == 1:
+        return axes[0]
+    valid = {axis: np.isfinite(points[..., 2]) & np.isfinite(sigma) for axis, (points, sigma) in measured.items()}
+    both = np.logical_and.reduce(list(valid.values()))
+    if both.any():
+        return min(axes, key=lambda axis: float(np.median(measured[axis][1][both])))
+    return max(axes, key=lambda axis: int(valid[axis].sum()))
+
+
+def _listed(axes: Mapping[Axis, PhaseMap] | tuple[Axis, ...]) -> str:
+    return " and ".join(sorted(axes)) or "none"
+
+
+@kernel(parallel=True)
+def _normals(points, reach, out):
+    """Per pixel, fits p = p0 + a du + b dv to the window's valid points; the normal is along a x b."""
+    height, width = points.shape[0], points.shape[1]
+    for y in numba.prange(height):
+        for x in range(width):
+            out[y, x, 0] = out[y, x, 1] = out[y, x, 2] = np.nan
+            z = points[y, x, 2]
+            if not np.isfinite(z):
+                continue
+            n = su = sv = suu = suv = svv = 0.0
+            p0 = p1 = p2 = u0 = u1 = u2 = v0 = v1 = v2 = 0.0
+            for j in range(max(y - reach, 0), min(y + reach + 1, height)):
+                for i in range(max(x - reach, 0), min(x + reach + 1, width)):
+                    if not abs(points[j, i, 2] - z) <= JUMP * z:  # False for NaN too
+                        continue
+                    du, dv = float(i - x), float(j - y)
+                    d0 = float(points[j, i, 0]) - points[y, x, 0]
+                    d1 = float(points[j, i, 1]) - points[y, x, 1]
+                    d2 = float(points[j, i, 2]) - z
+                    n += 1.0
+                    su, sv = su + du, sv + dv
+                    suu, suv, svv = suu + du * du, suv + du * dv, svv + dv * dv
+                    p0, p1, p2 = p0 + d0, p1 + d1, p2 + d2
+                    u0, u1, u2 = u0 + du * d0, u1 + du * d1, u2 + du * d2
+                    v0, v1, v2 = v0 + dv * d0, v1 + dv * d1, v2 + dv * d2
+            # about the mean of the window's valid pixels
+            suu, suv, svv = suu - su * su / n, suv - su * sv / n, svv - sv * sv / n
+            determinant = suu * svv - suv * suv
+            if not determinant > 1e-6:  # all neighbours on one line of pixels
+                continue
+            u0, u1, u2 = u0 - su * p0 / n, u1 - su * p1 / n, u2 - su * p2 / n
+            v0, v1, v2 = v0 - sv * p0 / n, v1 - sv * p1 / n, v2 - sv * p2 / n
+            a0, a1, a2 = svv * u0 - suv * v0, svv * u1 - suv * v1, svv * u2 - suv * v2
+            b0, b1, b2 = suu * v0 - suv * u0, suu * v1 - suv * u1, suu * v2 - suv * u2
+            n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+            length = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+            if not length > 0.0:
+                continue
+            if n0 * points[y, x, 0] + n1 * points[y, x, 1] + n2 * z > 0.0:
+                length = -length
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = n0 / length, n1 / length, n2 / length
