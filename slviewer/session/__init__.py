@@ -1,1 +1,16 @@
-"""The folder on disk: layout, atomic saves, importers of other tools' folders."""
+"""The folder on disk: layout, atomic saves, importers of other tools' folders, exporters.
+
+`store.Session` is the door. A session folder holds
+
+=========================  ==================================================================================
+`session.json`             schema number, when and by which version it was made
+`captures/<name>/`         `capture.json` (role, pattern sequence, content hash, source, settings), `frames.zarr`
+                           (Zarr v3, one uncompressed chunk a frame), `texture.png` where the texture has colour
+`results/<name>/`          `meta.json` and one `.npy` an array; the name may hold slashes
+`decisions.json`           what the operator decided, such as captures left out and why
+`trash/`                   what was replaced or deleted
+`exports/`                 files for other programs
+=========================  ==================================================================================
+
+A capture or result is written beside its place, synced, and renamed in: it is complete or absent, whatever happens.
+"""

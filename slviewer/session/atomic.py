@@ -1,0 +1,204 @@
+"""Folders and files that are complete or absent, also after `kill -9` or with a full disk.
+
+A folder is written as `.<name>.tmp-<pid>-<random>` beside its place, every file synced, then renamed in. Where it
+replaces another it is first renamed to `.<name>.new-<pid>-<random>`: from then on the replacement is decided, and
+`recover` finishes it if the program dies between moving the old folder away and moving the new one in.
+"""
+
+import errno
+import json
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import SessionError
+
+_LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|new)-\d+-[0-9a-f]+")
+_SPARE_BYTES = 1 << 20  # metadata, folders, the file system's own rounding
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in `folder` durable."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_bytes(path: Path, *parts: Any) -> None:
+    """Write buffers one after another to a new file and sync it; its name is durable once its folder is synced."""
+    with open(path, "xb") as file:
+        for part in parts:
+            file.write(part)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write a new JSON file and sync it. NumPy numbers and arrays become numbers and lists."""
+    write_bytes(path, to_json(data))
+
+
+def to_json(data: Any) -> bytes:
+    """UTF-8 JSON for people and programs; NaN stays NaN, as Python's own reader understands it."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.generic | np.ndarray):
+            return value.tolist()
+        if isinstance(value, os.PathLike):
+            return os.fspath(value)
+        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+
+    return (json.dumps(data, indent=2, ensure_ascii=False, default=plain) + "\n").encode()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; SessionError where the file is damaged or holds no object."""
+    try:
+        data = json.loads(path.read_bytes())
+    except (ValueError, OSError) as error:
+        raise SessionError(
+            f"{path} cannot be read ({error}): restore it from a copy, or move its folder away"
+        ) from error
+    if not isinstance(data, dict):
+        raise SessionError(f"{path} holds no JSON object: restore it from a copy, or move its folder away")
+    return data
+
+
+def replace_json(path: Path, data: Any) -> None:
+    """Replace a JSON file by a new one in one step."""
+    temporary = _beside(path, "tmp")
+    with _disk_errors(path.parent):
+        try:
+            write_json(temporary, data)
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        sync_folder(path.parent)
+
+
+@contextmanager
+def staged_folder(target: Path, needs_bytes: int) -> Iterator[Path]:
+    """A new empty folder beside `target` to write into; synced when the block ends, gone if it fails.
+
+    The caller then hands it to `commit`. Raises SessionError if the disk has not `needs_bytes` to spare, or fills up
+    or fails while the block writes.
+    """
+    with _disk_errors(target.parent, needs_bytes):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _check_space(target.parent, needs_bytes)
+        folder = _beside(target, "tmp")
+        folder.mkdir()
+        try:
+            yield folder
+            for inner, _, _ in os.walk(folder):
+                sync_folder(Path(inner))
+        except BaseException:
+            discard(folder)
+            raise
+
+
+def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
+    """Rename a staged folder to `target`. What stood there goes to `old_to`, or is deleted where that is None."""
+    with _disk_errors(target.parent):
+        if target.exists():
+            decided = _beside(target, "new")
+            os.rename(folder, decided)
+            sync_folder(target.parent)
+            _make_way(target, old_to)
+            folder = decided
+        os.rename(folder, target)
+        sync_folder(target.parent)
+
+
+def move(folder: Path, target: Path) -> None:
+    """Rename a folder within the session and make that durable."""
+    with _disk_errors(target.parent):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.rename(folder, target)
+        sync_folder(target.parent)
+        sync_folder(folder.parent)
+
+
+def discard(folder: Path) -> None:
+    """Remove a staged folder or file that will not be used."""
+    if folder.is_dir():
+        shutil.rmtree(folder, ignore_errors=True)
+    else:
+        folder.unlink(missing_ok=True)
+
+
+def leftovers(root: Path) -> list[Path]:
+    """What writers that died left under `root`, or writers at work there are writing."""
+    found = []
+    for parent, folders, files in os.walk(root):
+        found += [Path(parent, name) for name in (*folders, *files) if _LEFTOVER.fullmatch(name)]
+        # neither into leftovers nor into stacks, which hold a folder a frame
+        folders[:] = [name for name in folders if not _LEFTOVER.fullmatch(name) and not name.endswith(".zarr")]
+    return found
+
+
+def recover(root: Path, trash: Path) -> None:
+    """Finish decided replacements and remove unfinished ones. Call with the session's lock held, nothing writing."""
+    for path in leftovers(root):
+        match = _LEFTOVER.fullmatch(path.name)
+        if match and match["state"] == "new":
+            target = path.with_name(match["name"])
+            if target.exists():
+                _make_way(target, trash / f"{target.name}-{secrets.token_hex(4)}")
+            os.rename(path, target)
+            sync_folder(target.parent)
+        else:
+            discard(path)
+
+
+def _make_way(target: Path, old_to: Path | None) -> None:
+    if old_to is not None:
+        move(target, old_to)
+        return
+    doomed = _beside(target, "tmp")
+    os.rename(target, doomed)
+    discard(doomed)
+
+
+def _beside(target: Path, state: str) -> Path:
+    return target.with_name(f".{target.name}.{state}-{os.getpid()}-{secrets.token_hex(4)}")
+
+
+def _check_space(folder: Path, needs_bytes: int) -> None:
+    if shutil.disk_usage(folder).free < needs_bytes + _SPARE_BYTES:
+        raise _full(folder, needs_bytes)
+
+
+def _full(folder: Path, needs_bytes: int) -> SessionError:
+    free = shutil.disk_usage(folder).free
+    needs = f"needs {megabytes(needs_bytes)}, " if needs_bytes else ""
+    return SessionError(
+        f"the disk is full: the save {needs}{megabytes(free)} are free on {folder}: "
+        "free some space or choose another folder"
+    )
+
+
+def megabytes(size: int) -> str:
+    """A size for people: `96 MB`."""
+    return f"{size / 1e6:.0f} MB" if size >= 1e7 else f"{size / 1e6:.1f} MB"
+
+
+@contextmanager
+def _disk_errors(folder: Path, needs_bytes: int = 0) -> Iterator[None]:
+    """Turn what the system says about the disk into a SessionError."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise _full(folder, needs_bytes) from error
+        raise SessionError(f"{folder} cannot be written ({error}): check its permissions and the disk") from error

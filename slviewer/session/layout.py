@@ -1,0 +1,68 @@
+"""What makes a folder a session: `session.json` with a schema that this program reads."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+from slviewer import __version__
+from slviewer.errors import SessionError
+from slviewer.session.atomic import read_json, replace_json
+
+SCHEMA = 1
+
+
+def is_session(path: str | Path) -> bool:
+    """Whether a session, readable or not, is in this folder."""
+    return (_absolute(path) / "session.json").is_file()
+
+
+def session_folder(path: str | Path) -> Path:
+    """The absolute folder of an existing session; SessionError where there is none, or a damaged or newer one."""
+    folder = _absolute(path)
+    if not is_session(folder):
+        raise SessionError(
+            f"{folder} is not a session folder (it holds no session.json): "
+            "give the folder of a session, or make one with `slviewer import` or `slviewer simulate`"
+        )
+    schema = read_json(folder / "session.json").get("schema")
+    if not isinstance(schema, int) or schema < 1:
+        raise SessionError(f"{folder / 'session.json'} names no schema: restore the file from a copy")
+    if schema > SCHEMA:
+        raise SessionError(
+            f"{folder} was made by a newer slviewer (schema {schema}; this one reads {SCHEMA}): update slviewer"
+        )
+    return folder
+
+
+def new_folder(path: str | Path) -> Path:
+    """A folder that a session may be made in: new, or empty but for hidden files; SessionError otherwise."""
+    folder = _absolute(path)
+    if is_session(folder):
+        raise SessionError(f"{folder} is a session already: open it, or choose another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        strangers = [entry.name for entry in folder.iterdir() if not entry.name.startswith(".")]
+    except OSError as error:
+        raise SessionError(f"{folder} cannot be made ({error}): choose a folder that you may write to") from error
+    # the rooms of a session whose making was cut short are no strangers
+    if any(name not in ("captures", "results") or inner_folders(folder / name) for name in strangers):
+        raise SessionError(f"{folder} holds other things: choose a new or an empty folder for the session")
+    return folder
+
+
+def furnish(folder: Path) -> None:
+    """Make a session of a folder from `new_folder`; it becomes one with its last file."""
+    for inner in ("captures", "results"):
+        (folder / inner).mkdir(exist_ok=True)
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    replace_json(folder / "session.json", {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"})
+
+
+def inner_folders(folder: Path) -> list[str]:
+    """Names of the folders in a folder, without hidden ones, in no order; none where it is missing."""
+    if not folder.is_dir():
+        return []
+    return [entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
+
+
+def _absolute(path: str | Path) -> Path:
+    return Path(path).expanduser().absolute()

@@ -1,0 +1,50 @@
+"""One writer at a time: an exclusive lock on the session folder, and whose it is."""
+
+import json
+import os
+import socket
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from slviewer.errors import SessionError
+
+_PATIENCE_S = 0.3  # outlasts a reader that holds the lock for the moment it needs to clear leftovers
+
+
+class WriterLock:
+    """The session's lock, released by the system if its holder dies."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._lock = FileLock(folder / ".lock", thread_local=False)  # closed by another thread than opened it
+        self._holder = folder / ".lock-holder"
+
+    def acquire(self) -> None:
+        """Take the lock or raise a SessionError that says which process holds it."""
+        try:
+            self._lock.acquire(timeout=_PATIENCE_S, poll_interval=0.02)
+        except Timeout as error:
+            raise SessionError(
+                f"{self._folder} is open for writing in {self._who()}: close it there, or wait until it has finished"
+            ) from error
+        except OSError as error:
+            raise SessionError(f"{self._folder} cannot be written ({error}): check its permissions") from error
+        self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
+
+    def release(self) -> None:
+        """Let the next writer in."""
+        if self._lock.is_locked:
+            self._holder.unlink(missing_ok=True)
+            self._lock.release()
+
+    @property
+    def held(self) -> bool:
+        return self._lock.is_locked
+
+    def _who(self) -> str:
+        try:
+            holder = json.loads(self._holder.read_text())
+            return f"process {holder['pid']} on {holder['host']}"
+        except (OSError, ValueError, KeyError):
+            return "another process"

@@ -1,0 +1,32 @@
+"""Names of captures and results: safe as folder names on every system, sorted as a person counts."""
+
+import re
+
+from slviewer.errors import InputError
+
+_SAFE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}")
+
+
+def safe_name(name: str) -> str:
+    """`name` itself if it can stand as a folder name: letters, digits, `_`, `-`, `.`, no dot or dash first.
+
+    Raises InputError otherwise.
+    """
+    if not isinstance(name, str) or not _SAFE.fullmatch(name) or name.endswith("."):
+        raise InputError(f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', with no path in it")
+    return name
+
+
+def safe_path(name: str) -> str:
+    """`name` itself if every part between its slashes is a safe name, as in `calibration/stereo`; else InputError."""
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', parts joined by '/'")
+    for part in name.split("/"):
+        safe_name(part)
+    return name
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that puts `pose_2` before `pose_10`."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts]

@@ -1,0 +1,322 @@
+"""A session: the folder that holds captures, results and decisions, and the only door to it."""
+
+import contextlib
+import threading
+from collections.abc import Collection, Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.errors import InputError, SessionError
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.session import atomic
+from slviewer.session.capture import Capture, NewCapture, Role, check_capture, read_capture, write_capture
+from slviewer.session.layout import furnish, inner_folders, is_session, new_folder, session_folder
+from slviewer.session.lock import WriterLock
+from slviewer.session.names import natural_key, safe_name, safe_path
+from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
+
+State = Literal["absent", "fresh", "stale"]
+
+
+class Session:
+    """An open session folder. Use `Session.create`, `Session.open` or `Session.open_or_create`, in a `with` block.
+
+    Readers need no lock and may be many; one writer at a time holds the folder. Saving from several threads of the
+    writer is safe.
+    """
+
+    def __init__(self, folder: Path, lock: WriterLock | None):
+        self.folder = folder
+        self._lock = lock
+        self._decisions_lock = threading.Lock()
+
+    # opening and closing
+
+    @classmethod
+    def create(cls, path: str | Path) -> "Session":
+        """A new session, open for writing, in a new or empty folder; SessionError where something is there already."""
+        folder = new_folder(path)
+        lock = WriterLock(folder)
+        lock.acquire()
+        try:
+            furnish(folder)
+        except BaseException:
+            lock.release()
+            raise
+        return cls(folder, lock)
+
+    @classmethod
+    def open(cls, path: str | Path, write: bool = False) -> "Session":
+        """An existing session, for reading, or for writing by this process alone.
+
+        Raises SessionError where there is no session, where it is damaged or of a newer schema, or where another
+        process is writing to it.
+        """
+        folder = session_folder(path)
+        lock = WriterLock(folder)
+        if write:
+            lock.acquire()
+        session = cls(folder, lock if write else None)
+        try:
+            session._recover()
+        except BaseException:
+            session.close()
+            raise
+        return session
+
+    @classmethod
+    def open_or_create(cls, path: str | Path) -> "Session":
+        """The session in a folder, open for writing; made where the folder is missing or empty."""
+        return cls.open(path, write=True) if is_session(path) else cls.create(path)
+
+    def close(self) -> None:
+        """Let the next writer in. Does nothing for a reader or when called again."""
+        if self._lock is not None:
+            self._lock.release()
+
+    def __enter__(self) -> "Session":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # captures
+
+    def capture_names(self, role: Role | None = None) -> list[str]:
+        """Names of the captures (of one role), `pose_2` before `pose_10`."""
+        names = sorted(inner_folders(self.folder / "captures"), key=natural_key)
+        return names if role is None else [name for name in names if self.load_capture(name).role == role]
+
+    def captures(self, role: Role | None = None) -> list[Capture]:
+        """The captures (of one role) in the order of `capture_names`; their frames stay on disk."""
+        loaded = [self.load_capture(name) for name in self.capture_names()]
+        return [capture for capture in loaded if role in (None, capture.role)]
+
+    def load_capture(self, name: str) -> Capture:
+        """A capture; its frames stay on disk until asked for. InputError where there is none of that name."""
+        folder = self._capture_folder(name)
+        if not folder.is_dir():
+            there = ", ".join(self.capture_names()) or "none"
+            raise InputError(f"there is no capture {name!r} in {self.folder}: the captures are {there}")
+        return read_capture(folder)
+
+    def save_capture(
+        self,
+        name: str,
+        role: Role,
+        sequence: PatternSequence,
+        frames: np.ndarray,
+        *,
+        source: str,
+        texture: np.ndarray | None = None,
+        settings: Mapping[str, Any] | None = None,
+        board: object | None = None,
+        force: bool = False,
+    ) -> Capture:
+        """Save frames (n, h, w), uint8 or uint16, in the order of the sequence, with an optional colour texture.
+
+        Complete on disk when this returns; absent if it raises: InputError for a name that is taken (unless `force`,
+        which moves the old capture to the trash) or frames that do not fit, SessionError where the disk refuses.
+        """
+        staged = self._stage(name, role, sequence, frames, texture, source, settings or {}, board, force)
+        self._commit_capture(staged, name)
+        return self.load_capture(name)
+
+    def save_captures(
+        self, captures: Iterable[NewCapture], role: Role, *, board: object | None = None, force: bool = False
+    ) -> list[Capture]:
+        """Save all of `captures` or, where any of them fails (or the iterable raises), none.
+
+        Takes them one at a time, so that a generator needs memory for one; returns them in that order.
+        """
+        staged: dict[str, Path] = {}
+        try:
+            for new in captures:
+                if new.name in staged:
+                    raise InputError(f"two captures are named {new.name!r}: rename one of their folders")
+                staged[new.name] = self._stage(
+                    new.name, role, new.sequence, new.frames, new.texture, new.source, new.settings, board, force
+                )
+        except BaseException:
+            for folder in staged.values():
+                atomic.discard(folder)
+            raise
+        for name, folder in staged.items():
+            self._commit_capture(folder, name)
+        return [self.load_capture(name) for name in staged]
+
+    def trash_capture(self, name: str) -> Path:
+        """Move a capture to the trash folder; returns where it lies now."""
+        self._require_writer()
+        folder = self.load_capture(name).folder
+        target = self._trash_place(name)
+        atomic.move(folder, target)
+        return target
+
+    # results
+
+    def result_names(self) -> list[str]:
+        """Names of the results, such as `calibration/stereo`, sorted."""
+        return sorted(list_results(self.folder / "results"), key=natural_key)
+
+    def save_result(self, name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        """Save what was computed; replaces a result of that name in one step, which stays if this fails.
+
+        `meta["inputs"]` = {capture or result: its hash} is what `state_of` goes by; `input_hashes` gives it.
+        """
+        self._require_writer()
+        target = self.folder / "results" / safe_path(name)
+        check_place(self.folder / "results", name)
+        checked = check_result(meta, arrays)
+        size = sum(array.nbytes for array in checked.values())
+        with atomic.staged_folder(target, size) as staged:
+            write_result(staged, meta, checked)
+        atomic.commit(staged, target)
+
+    def load_result(
+        self, name: str, only: Collection[str] | None = None
+    ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """`meta` as saved with its content `hash`, and the arrays (those named in `only`).
+
+        Raises InputError where there is no such result, SessionError where it is damaged.
+        """
+        folder = self.folder / "results" / safe_path(name)
+        if not (folder / "meta.json").is_file():
+            there = ", ".join(self.result_names()) or "none"
+            raise InputError(f"there is no result {name!r} in {self.folder}: the results are {there}")
+        return read_meta(folder), read_arrays(folder, only)
+
+    def trash_result(self, name: str) -> Path:
+        """Move a result to the trash folder; returns where it lies now."""
+        self._require_writer()
+        self.load_result(name, only=())
+        target = self._trash_place(name.replace("/", "-"))
+        atomic.move(self.folder / "results" / name, target)
+        return target
+
+    def input_hashes(self, *names: str) -> dict[str, str]:
+        """{name: content hash} of captures and results as they are now, for `meta["inputs"]`; InputError if absent."""
+        hashes = {}
+        for name in names:
+            found = self._hashes(name)
+            if not found:
+                raise InputError(f"there is no capture or result {name!r} in {self.folder}")
+            hashes[name] = found[0]
+        return hashes
+
+    def state_of(self, name: str) -> State:
+        """`fresh` if every input that a result names is there with the hash it had, and is fresh itself."""
+        folder = self.folder / "results" / safe_path(name)
+        if not (folder / "meta.json").is_file():
+            return "absent"
+        for input_name, used in read_meta(folder).get("inputs", {}).items():
+            if used not in self._hashes(input_name):
+                return "stale"
+            if input_name != name and self.state_of(input_name) == "stale":
+                return "stale"
+        return "fresh"
+
+    # decisions and exports
+
+    def exclude(self, name: str, why: str) -> None:
+        """Leave a capture out of calibrations from now on, and remember why."""
+        self.load_capture(name)
+        self._decide(lambda excluded: {**excluded, name: why})
+
+    def include(self, name: str) -> None:
+        """Take a capture back in. Does nothing where it was not left out."""
+        self._decide(lambda excluded: {other: why for other, why in excluded.items() if other != name})
+
+    def excluded(self) -> dict[str, str]:
+        """{capture: why} of the captures that the operator left out."""
+        path = self.folder / "decisions.json"
+        return dict(atomic.read_json(path).get("excluded", {})) if path.exists() else {}
+
+    @property
+    def exports(self) -> Path:
+        """The folder for files made for other programs; made where it is missing."""
+        folder = self.folder / "exports"
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise SessionError(f"{folder} cannot be made ({error}): check its permissions") from error
+        return folder
+
+    # inside
+
+    def _recover(self) -> None:
+        """Clear what dead writers left; a reader does so only where nobody writes and the folder lets it."""
+        if not atomic.leftovers(self.folder):
+            return
+        if self._lock is not None:
+            atomic.recover(self.folder, self.folder / "trash")
+            return
+        lock = WriterLock(self.folder)
+        with contextlib.suppress(SessionError, OSError):
+            lock.acquire()
+            try:
+                atomic.recover(self.folder, self.folder / "trash")
+            finally:
+                lock.release()
+
+    def _require_writer(self) -> None:
+        if self._lock is None or not self._lock.held:
+            raise SessionError(f"{self.folder} is open for reading only: open it with write=True")
+
+    def _stage(
+        self,
+        name: str,
+        role: Role,
+        sequence: PatternSequence,
+        frames: np.ndarray,
+        texture: np.ndarray | None,
+        source: str,
+        settings: Mapping[str, Any],
+        board: object | None,
+        force: bool,
+    ) -> Path:
+        self._require_writer()
+        target = self._capture_folder(name)
+        if target.exists() and not force:
+            raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")
+        check_capture(role, sequence, frames, texture)
+        size = frames.nbytes + (0 if texture is None else texture.nbytes)
+        with atomic.staged_folder(target, size) as staged:
+            write_capture(
+                staged,
+                role,
+                sequence,
+                frames,
+                texture=texture,
+                source=source,
+                settings=settings,
+                board=None if board is None else str(board),
+            )
+        return staged
+
+    def _commit_capture(self, staged: Path, name: str) -> None:
+        atomic.commit(staged, self._capture_folder(name), self._trash_place(name))
+
+    def _capture_folder(self, name: str) -> Path:
+        return self.folder / "captures" / safe_name(name)
+
+    def _trash_place(self, name: str) -> Path:
+        return self.folder / "trash" / f"{name}-{datetime.now(UTC).strftime('%Y%m%dT%H%M%S%f')}"
+
+    def _hashes(self, name: str) -> list[str]:
+        """Content hashes of the capture and of the result of that name, where there are any."""
+        found = []
+        if "/" not in name and self._capture_folder(name).is_dir():
+            found.append(self.load_capture(name).hash)
+        folder = self.folder / "results" / safe_path(name)
+        if (folder / "meta.json").is_file():
+            found.append(str(read_meta(folder).get("hash")))
+        return found
+
+    def _decide(self, change: Any) -> None:
+        self._require_writer()
+        with self._decisions_lock:
+            atomic.replace_json(self.folder / "decisions.json", {"excluded": change(self.excluded())})
