@@ -1,0 +1,165 @@
+"""Boards and their notation: what features a board has, and where they lie on it.
+
+=============================  ================================================================================
+``circles:21x16:9``            columns x rows of circles : pitch mm
+``acircles:4x11:20``           OpenCV's asymmetric grid: circle j of row i lies at ((2 j + i % 2) pitch, i pitch)
+``chessboard:9x7:75``          columns x rows of *inner corners* : side of a square in mm
+``charuco:8x6:30``             columns x rows of *squares* : side of a square in mm; then, if they differ from the
+                               defaults, ``:marker mm`` (0.75 of the square) and ``:dictionary`` (DICT_5X5_1000).
+                               The layout is OpenCV's since 4.6: the top-left square is dark
+=============================  ================================================================================
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, cast, get_args
+
+import numpy as np
+
+from slviewer.errors import InputError
+
+Kind = Literal["circles", "acircles", "chessboard", "charuco"]
+
+EXAMPLES = {
+    "circles": "circles:21x16:9",
+    "acircles": "acircles:4x11:20",
+    "chessboard": "chessboard:9x7:75",
+    "charuco": "charuco:8x6:30",
+}
+DEFAULT_DICTIONARY = "DICT_5X5_1000"
+DEFAULT_MARKER = 0.75
+"""Side of a ChArUco marker in squares."""
+_DICTIONARY = re.compile(r"DICT_([4-7])X\1_(50|100|250|1000)")
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat calibration target.
+
+    Features lie at ``points``, row by row: x along a row, y along a column, so that the normal (x cross y) points
+    away from a camera that sees the printed side; the first feature is the origin. ``marker_mm`` and
+    ``dictionary`` belong to ChArUco boards only.
+    """
+
+    kind: Kind
+    columns: int
+    rows: int
+    pitch_mm: float
+    marker_mm: float = 0.0
+    dictionary: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in EXAMPLES:
+            raise InputError(f"there is no board of kind '{self.kind}': use one of {', '.join(EXAMPLES)}")
+        least = 2 if self.kind == "acircles" else 3
+        if not (least <= self.columns <= 200 and 3 <= self.rows <= 200):
+            raise InputError(
+                f"a {self.kind} board of {self.columns}x{self.rows} cannot be used: give {least} to 200 columns and "
+                f"3 to 200 rows, as in '{EXAMPLES[self.kind]}'"
+            )
+        if not (math.isfinite(self.pitch_mm) and 0.01 <= self.pitch_mm <= 10_000):
+            raise InputError(
+                f"a pitch of {self.pitch_mm:g} mm cannot be used: give 0.01 to 10000 mm, as in '{EXAMPLES[self.kind]}'"
+            )
+        if self.kind == "charuco":
+            self._check_markers()
+        elif self.marker_mm or self.dictionary:
+            raise InputError(f"a {self.kind} board has no markers: leave out marker and dictionary")
+
+    def _check_markers(self) -> None:
+        if not self.marker_mm:
+            object.__setattr__(self, "marker_mm", DEFAULT_MARKER * self.pitch_mm)
+        if not self.dictionary:
+            object.__setattr__(self, "dictionary", DEFAULT_DICTIONARY)
+        if not 0.2 * self.pitch_mm <= self.marker_mm <= 0.95 * self.pitch_mm:
+            raise InputError(
+                f"markers of {self.marker_mm:g} mm do not fit squares of {self.pitch_mm:g} mm: "
+                "give 0.2 to 0.95 of the square, as in 'charuco:8x6:30:22.5'"
+            )
+        known = _DICTIONARY.fullmatch(self.dictionary)
+        if not known:
+            raise InputError(
+                f"'{self.dictionary}' is no marker dictionary of OpenCV's 4x4 to 7x7 families: "
+                "write for example 'charuco:8x6:30:22.5:DICT_5X5_1000'"
+            )
+        needed = self.columns * self.rows // 2
+        if needed > int(known[2]):
+            raise InputError(
+                f"a ChArUco board of {self.columns}x{self.rows} squares needs {needed} markers, and "
+                f"{self.dictionary} has {known[2]}: choose a larger dictionary"
+            )
+
+    @classmethod
+    def parse(cls, notation: str) -> "Board":
+        """The board that a notation such as ``circles:21x16:9`` describes; InputError says what is wrong with it."""
+        kind, *fields = notation.strip().split(":")
+        kind = kind.strip().lower()
+        if kind not in get_args(Kind):
+            raise InputError(
+                f"board '{notation}' is not understood: it starts with none of {', '.join(EXAMPLES)}; "
+                f"write for example '{EXAMPLES['circles']}'"
+            )
+        example = EXAMPLES[kind]
+        most = 4 if kind == "charuco" else 2
+        if not 2 <= len(fields) <= most:
+            raise InputError(
+                f"board '{notation}' has {len(fields)} fields after the kind: give columns x rows and the "
+                f"{'side of a square' if kind in ('chessboard', 'charuco') else 'pitch'} in mm, as in '{example}'"
+            )
+        size = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", fields[0])
+        if not size:
+            raise InputError(f"board '{notation}': '{fields[0]}' is not columns x rows, as in '{example}'")
+        lengths = [_millimetres(notation, text, example) for text in fields[1:3]]
+        dictionary = fields[3].strip().upper() if len(fields) > 3 else ""
+        return cls(cast(Kind, kind), int(size[1]), int(size[2]), *lengths, dictionary=dictionary)
+
+    def __str__(self) -> str:
+        fields = [self.kind, f"{self.columns}x{self.rows}", _number(self.pitch_mm)]
+        if self.kind == "charuco":
+            plain = self.dictionary == DEFAULT_DICTIONARY
+            if not plain or self.marker_mm != DEFAULT_MARKER * self.pitch_mm:
+                fields.append(_number(self.marker_mm))
+            if not plain:
+                fields.append(self.dictionary)
+        return ":".join(fields)
+
+    @property
+    def features(self) -> tuple[int, int]:
+        """(columns, rows) of features: a ChArUco board of c x r squares has (c - 1) x (r - 1) inner corners."""
+        return (self.columns - 1, self.rows - 1) if self.kind == "charuco" else (self.columns, self.rows)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(n, 3) float64 mm, z = 0, row by row; read-only."""
+        columns, rows = self.features
+        i, j = np.divmod(np.arange(columns * rows), columns)
+        x = 2 * j + i % 2 if self.kind == "acircles" else j
+        points = np.stack([x, i, np.zeros(len(i))], axis=1) * self.pitch_mm
+        points.flags.writeable = False
+        return points
+
+    def outline(self, margin_mm: float | None = None) -> np.ndarray:
+        """(4, 3) float64 mm: a rectangle around the features, in the order top left, top right, bottom right, bottom left.
+
+        ``margin_mm`` beyond the outermost features; by default as much as surely belongs to the board: half a pitch
+        for circles, 0.95 of a square for a chessboard's inner corners, the whole sheet of squares for ChArUco.
+        """
+        if margin_mm is None:
+            squares = {"circles": 0.5, "acircles": 0.5, "chessboard": 0.95, "charuco": 1.0}[self.kind]
+            margin_mm = squares * self.pitch_mm
+        x0, y0 = self.points[:, :2].min(0) - margin_mm
+        x1, y1 = self.points[:, :2].max(0) + margin_mm
+        return np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
+
+
+def _number(value: float) -> str:
+    return repr(float(value)).removesuffix(".0")
+
+
+def _millimetres(notation: str, text: str, example: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"board '{notation}': '{text}' is not a length in mm, as in '{example}'") from None
