@@ -1,0 +1,83 @@
+"""What one capture says along one axis, and why a pixel says nothing."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+
+GRAY_SIGMA_PX = 0.29
+"""Standard deviation of a coordinate known only to its projector column: 1 / sqrt(12)."""
+
+
+class Reason(IntEnum):
+    """Why a pixel has no absolute phase."""
+
+    VALID = 0
+    DARK = 1
+    """Too little modulation for its noise: shadow, black surface, or out of the projector's light."""
+    SATURATED = 2
+    """The camera clipped the fringes."""
+    INCONSISTENT = 3
+    """A bit that could not be decided, or an order that contradicts the phase or the neighbourhood."""
+    OUTSIDE = 4
+    """The coordinate lies outside the projector."""
+
+
+@dataclass(frozen=True)
+class PhaseMap:
+    """Decoded frames of one axis; every map is (h, w).
+
+    ``phase`` float32 rad, absolute (2 pi u / period_px), NaN where ``reason`` (uint8, a `Reason`) is not VALID.
+    ``wrapped`` float32 rad of the finest period, in -pi ... pi, also where masked; all NaN for Gray code alone.
+    ``modulation`` and ``background`` float32 grey levels. ``noise`` = (a, b): the variance of one frame's grey level is
+    a + b * level, measured from this capture. ``steps``: phase steps of the finest period, 0 for Gray code alone.
+    """
+
+    axis: Axis
+    period_px: float
+    phase: np.ndarray
+    wrapped: np.ndarray
+    modulation: np.ndarray
+    background: np.ndarray
+    reason: np.ndarray
+    noise: tuple[float, float]
+    steps: int
+
+    def __post_init__(self) -> None:
+        maps = (self.phase, self.wrapped, self.modulation, self.background, self.reason)
+        if any(m.ndim != 2 or m.shape != self.phase.shape for m in maps):
+            raise InputError(
+                f"the maps of a phase map have shapes {[m.shape for m in maps]}: they must all be one (h, w)"
+            )
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(h, w) bool, True where the absolute phase is valid."""
+        return self.reason == Reason.VALID
+
+    @property
+    def lit(self) -> np.ndarray:
+        """(h, w) bool, lit and modulated: what a perfect decoder could measure; the denominator of coverage."""
+        return self.reason != Reason.DARK
+
+    @property
+    def coordinate(self) -> np.ndarray:
+        """(h, w) float32 px: the projector column (axis x) or row (axis y), NaN where invalid."""
+        return self.phase * np.float32(self.period_px / (2 * np.pi))
+
+    @property
+    def sigma_phase(self) -> np.ndarray:
+        """(h, w) float32 rad: standard deviation of the phase, sqrt(2 / n) sigma_I / B; 2 pi 0.29 for Gray code alone.
+
+        NaN where the phase is.
+        """
+        if self.steps == 0:
+            sigma = np.full_like(self.phase, 2 * np.pi * GRAY_SIGMA_PX / self.period_px)
+        else:
+            a, b = self.noise
+            variance = np.float32(a) + np.float32(b) * self.background
+            sigma = np.sqrt(variance * np.float32(2 / self.steps)) / np.maximum(self.modulation, np.float32(1e-6))
+        return np.where(self.mask, sigma, np.float32(np.nan))

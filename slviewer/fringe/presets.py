@@ -1,0 +1,85 @@
+"""Ready-made pattern sequences."""
+
+from collections.abc import Callable, Sequence
+from math import ceil, log2
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence
+
+AXES: tuple[Axis, ...] = ("x", "y")
+
+
+def p18(projector: tuple[int, int]) -> PatternSequence:
+    """18 steps at a period of 18 px, seven Gray bits (more where the projector needs them), then white; x, then y."""
+    frames: list[Frame] = []
+    for axis, extent in zip(AXES, projector, strict=True):
+        frames += phase_steps(axis, 18, 18.0) + gray_bits(axis, max(7, bits_for(extent / 18)))
+        frames.append(Frame("texture"))
+    return PatternSequence(projector, tuple(frames))
+
+
+def gray(projector: tuple[int, int]) -> PatternSequence:
+    """Gray code alone, each bit followed by its inverse; x, then y, white, black (the procam-calibration layout)."""
+    frames: list[Frame] = []
+    for axis, extent in zip(AXES, projector, strict=True):
+        bits = bits_for(extent)
+        for bit in range(bits):
+            frames += [Frame("gray", axis, bit=bit, bits=bits), Frame("inverse", axis, bit=bit, bits=bits)]
+    return PatternSequence(projector, (*frames, Frame("white"), Frame("black")))
+
+
+def complementary(projector: tuple[int, int], steps: int = 8, period_px: float = 16.0) -> PatternSequence:
+    """Phase steps, Gray bits of the fringe order and the complementary bit; x, then y, then white."""
+    frames: list[Frame] = []
+    for axis, extent in zip(AXES, projector, strict=True):
+        frames += phase_steps(axis, steps, period_px) + gray_bits(axis, bits_for(extent / period_px))
+        frames.append(Frame("complementary", axis))
+    return PatternSequence(projector, (*frames, Frame("texture")))
+
+
+def multifrequency(
+    projector: tuple[int, int], steps: int = 6, periods_px: Sequence[float] | None = None
+) -> PatternSequence:
+    """Phase steps at several periods, longest first; x, then y, then white.
+
+    ``periods_px`` defaults to 16 px, and as many periods eight times as long each as it takes to cover the axis.
+    """
+    frames: list[Frame] = []
+    for axis, extent in zip(AXES, projector, strict=True):
+        periods = list(periods_px) if periods_px is not None else covering_periods(extent)
+        if len(set(periods)) != len(periods) or not periods:
+            raise InputError(f"periods of {periods} px: give one or more, each once")
+        for period in sorted(periods, reverse=True):
+            frames += phase_steps(axis, steps, period)
+    return PatternSequence(projector, (*frames, Frame("texture")))
+
+
+PRESETS: dict[str, Callable[[tuple[int, int]], PatternSequence]] = {
+    "p18": p18,
+    "gray": gray,
+    "complementary": complementary,
+    "multifrequency": multifrequency,
+}
+
+
+def phase_steps(axis: Axis, steps: int, period_px: float) -> list[Frame]:
+    """All steps of one period, in order."""
+    return [Frame("phase", axis, step=k, steps=steps, period_px=float(period_px)) for k in range(steps)]
+
+
+def gray_bits(axis: Axis, bits: int) -> list[Frame]:
+    """Gray bits, most significant first."""
+    return [Frame("gray", axis, bit=b, bits=bits) for b in range(bits)]
+
+
+def bits_for(cells: float) -> int:
+    """Bits that number so many cells."""
+    return max(1, ceil(log2(max(1, ceil(cells)))))
+
+
+def covering_periods(extent: int, finest: float = 16.0, ratio: float = 8.0) -> list[float]:
+    """Periods from the finest up, the last a tenth longer than the axis so that its ends cannot be confused."""
+    periods = [finest]
+    while periods[-1] * ratio < extent:
+        periods.append(periods[-1] * ratio)
+    return [*periods, 1.1 * extent] if extent > periods[-1] else periods

@@ -1,0 +1,221 @@
+"""What is projected, frame by frame."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from slviewer.errors import InputError
+
+Axis = Literal["x", "y"]
+Kind = Literal["phase", "gray", "inverse", "complementary", "white", "black", "texture"]
+
+_FIELDS = {
+    "phase": ("axis", "step", "steps", "period_px"),
+    "gray": ("axis", "bit", "bits"),
+    "inverse": ("axis", "bit", "bits"),
+    "complementary": ("axis",),
+    "white": (),
+    "black": (),
+    "texture": (),
+}
+"""What a frame of each kind must say about itself."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One projected image.
+
+    ``phase``: step ``step`` of ``steps`` of a cosine of ``period_px``. ``gray``: bit ``bit`` (0 = most significant) of
+    ``bits`` of the Gray code of the fringe order; ``inverse``: its negative. ``complementary``: the one extra, least
+    significant bit, so that Gray and complementary bits together number the half periods. ``white``, ``black``,
+    ``texture`` (the scene under white light): no axis.
+    """
+
+    kind: Kind
+    axis: Axis | None = None
+    step: int = 0
+    steps: int = 0
+    period_px: float = 0.0
+    bit: int = 0
+    bits: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise InputError(f"frame kind '{self.kind}' is unknown: use one of {', '.join(get_args(Kind))}")
+        if self.axis not in (None, "x", "y"):
+            raise InputError(f"frame axis '{self.axis}' is unknown: use x (varies along columns) or y (along rows)")
+        if "axis" in _FIELDS[self.kind] and self.axis is None:
+            raise InputError(f"a {self.kind} frame has no axis: say x (varies along columns) or y (along rows)")
+        if self.kind == "phase":
+            if self.steps < 3:
+                raise InputError(f"{self.steps} phase steps cannot be decoded: use 3 or more")
+            if not 0 <= self.step < self.steps:
+                raise InputError(f"phase step {self.step} of {self.steps} does not exist: count from 0")
+            if not self.period_px >= 2:
+                raise InputError(f"a fringe period of {self.period_px:g} px cannot be shown: use 2 px or more")
+        if self.kind in ("gray", "inverse") and not 0 <= self.bit < 31:
+            raise InputError(f"Gray bit {self.bit} does not exist: count from 0, the most significant")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that matter for its kind, in the words of the `frames` TOML."""
+        return (
+            {"kind": self.kind}
+            | ({"axis": self.axis} if self.axis else {})
+            | {name: getattr(self, name) for name in _FIELDS[self.kind] if name != "axis"}
+        )
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Frame":
+        """The frame that `to_dict` or a `[[frame]]` table describes; entries that its kind does not need are ignored."""
+        known = {"kind", "axis", "step", "steps", "period_px", "bit", "bits"}
+        unknown = sorted(set(data) - known - {"file"})
+        if unknown:
+            raise InputError(f"a frame has the unknown entry '{unknown[0]}': use {', '.join(sorted(known))}")
+        if "kind" not in data:
+            raise InputError('a frame does not say its kind: add kind = "phase", "gray", ...')
+        try:
+            numbers = {name: int(data[name]) for name in ("step", "steps", "bit", "bits") if name in data}
+            period = float(data.get("period_px", 0.0))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"a {data['kind']} frame has an entry that is no number ({error}): mend it") from error
+        kind = data["kind"]
+        values = {
+            name: value for name, value in (numbers | {"period_px": period}).items() if name in _FIELDS.get(kind, ())
+        }
+        return cls(kind=kind, axis=data.get("axis"), **values)
+
+
+@dataclass(frozen=True)
+class PatternSequence:
+    """The frames of one capture, in the order in which they are shown, and the conventions they follow.
+
+    ``projector`` is (width, height) in px. ``phase_sign`` -1: the frames were made with cos(phi - 2 pi k / n).
+    ``gray_origin_px`` is the projector coordinate at which Gray code 0 begins; a displayed column u reaches from
+    u - 0.5 to u + 0.5, hence -0.5. Raises InputError when steps or bits are missing, double, or contradict each other.
+    """
+
+    projector: tuple[int, int]
+    frames: tuple[Frame, ...]
+    phase_sign: int = 1
+    gray_origin_px: float = -0.5
+
+    def __post_init__(self) -> None:
+        if len(self.projector) != 2 or min(self.projector) < 1:
+            raise InputError(f"a projector of {self.projector} px does not exist: give width and height, like 912x1140")
+        if self.phase_sign not in (1, -1):
+            raise InputError(f"phase_sign is {self.phase_sign}: use 1 or -1")
+        for axis in self.axes:
+            self._check_phase(axis)
+            self._check_bits(axis)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The axes that carry a pattern, x before y."""
+        coded = {f.axis for f in self.frames if "axis" in _FIELDS[f.kind]}
+        return tuple(axis for axis in get_args(Axis) if axis in coded)
+
+    def extent(self, axis: Axis) -> int:
+        """Projector px along the axis: columns for x, rows for y."""
+        return self.projector[0] if axis == "x" else self.projector[1]
+
+    def periods_px(self, axis: Axis) -> tuple[float, ...]:
+        """The phase-shifted periods of the axis, longest first; empty for Gray code alone."""
+        return tuple(sorted({f.period_px for f in self.frames if f.kind == "phase" and f.axis == axis}, reverse=True))
+
+    def period_px(self, axis: Axis) -> float:
+        """The finest period; 1.0 for Gray code alone."""
+        periods = self.periods_px(axis)
+        return periods[-1] if periods else 1.0
+
+    def select(self, axis: Axis) -> list[int]:
+        """Indices of the frames that decoding this axis needs: its own, and white and black."""
+        return [
+            i
+            for i, f in enumerate(self.frames)
+            if (f.axis == axis and "axis" in _FIELDS[f.kind])
+            or (f.kind in ("white", "black") and f.axis in (None, axis))
+        ]
+
+    def find(self, kind: Kind, axis: Axis) -> list[int]:
+        """Indices of the axis' frames of one kind, in order."""
+        return [i for i in self.select(axis) if self.frames[i].kind == kind]
+
+    def _check_phase(self, axis: Axis) -> None:
+        for period in self.periods_px(axis):
+            frames = [f for f in self.frames if f.kind == "phase" and f.axis == axis and f.period_px == period]
+            counts = {f.steps for f in frames}
+            where = f"axis {axis}, period {period:g} px"
+            if len(counts) > 1:
+                raise InputError(
+                    f"{where}: the frames speak of {_listed(counts)} phase steps: they must all say the same"
+                )
+            _check_complete([f.step for f in frames], range(counts.pop()), f"{where}: phase step")
+
+    def _check_bits(self, axis: Axis) -> None:
+        gray = [f.bit for f in self.frames if f.kind == "gray" and f.axis == axis]
+        inverse = [f.bit for f in self.frames if f.kind == "inverse" and f.axis == axis]
+        complementary = len(self.find("complementary", axis))
+        # `bits` of a foreign description may or may not count the complementary bit; the frames themselves decide,
+        # yet a least significant bit that was announced and is absent must not pass for a shorter code.
+        said = {f.bits for f in self.frames if f.kind == "gray" and f.axis == axis and f.bits}
+        if len(said) > 1:
+            raise InputError(f"axis {axis}: the frames speak of {_listed(said)} Gray bits: they must all say the same")
+        needed = max([b + 1 for b in gray + inverse], default=0)
+        if said:
+            needed = max(needed, said.pop() - min(complementary, 1))
+        _check_complete(gray, range(needed), f"axis {axis}: Gray bit")
+        if inverse:
+            _check_complete(inverse, range(needed), f"axis {axis}: inverse of Gray bit")
+        if complementary > 1:
+            raise InputError(f"axis {axis}: {complementary} complementary frames: there is only one such bit, keep one")
+        if complementary and not self.periods_px(axis):
+            raise InputError(f"axis {axis}: a complementary bit without phase steps says nothing: call it a Gray bit")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON or TOML, in the words of the `frames` TOML."""
+        return {
+            "projector": f"{self.projector[0]}x{self.projector[1]}",
+            "phase_sign": self.phase_sign,
+            "gray_origin": self.gray_origin_px,
+            "frame": [frame.to_dict() for frame in self.frames],
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "PatternSequence":
+        """The sequence that `to_dict` or a `frames` TOML describes. Raises InputError."""
+        frames = data.get("frame")
+        if not isinstance(frames, list) or not frames:
+            raise InputError("the sequence names no frames: add a [[frame]] table for each image")
+        try:
+            sign, origin = int(data.get("phase_sign", 1)), float(data.get("gray_origin", -0.5))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"phase_sign and gray_origin must be numbers ({error}): mend them") from error
+        return cls(parse_size(data.get("projector")), tuple(Frame.from_dict(f) for f in frames), sign, origin)
+
+
+def parse_size(text: Any) -> tuple[int, int]:
+    """(width, height) from "912x1140" or [912, 1140]. Raises InputError."""
+    parts = text.lower().split("x") if isinstance(text, str) else text
+    try:
+        width, height = (int(part) for part in parts)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"'{text}' is no projector size: write width and height like 912x1140") from error
+    if width < 1 or height < 1:
+        raise InputError(f"'{text}' is no projector size: write width and height like 912x1140")
+    return width, height
+
+
+def _check_complete(found: list[int], wanted: range, what: str) -> None:
+    missing = sorted(set(wanted) - set(found))
+    if missing:
+        raise InputError(
+            f"{what} {_listed(missing)} of {len(wanted)} is missing: add the frame, or mend its description"
+        )
+    double = [value for value, count in Counter(found).items() if count > 1]
+    if double:
+        raise InputError(f"{what} {_listed(double)} occurs more than once: keep one frame of each")
+
+
+def _listed(values: Any) -> str:
+    return ", ".join(f"{v:g}" for v in sorted(values))
