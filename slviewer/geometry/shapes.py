@@ -9,7 +9,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.robust import robust_sigma
 
-FLAT = 8.0
+FLAT = 4.0
 """A patch is a sphere's only if its height over a plane is at least this many times the RMS left by the sphere fit."""
 
 

@@ -74,8 +74,7 @@ def points_from_depth(rays: np.ndarray, z: np.ndarray) -> np.ndarray:
     points = np.empty((*z.shape, 3), dtype=np.float32)
     points[..., 0] = rays[..., 0] * z
     points[..., 1] = rays[..., 1] * z
-    points[..., 2] = z
-    points[np.isnan(points).any(axis=-1)] = np.nan  # a pixel is valid or it is not
+    points[..., 2] = np.where(np.isnan(points[..., 0]), np.nan, z)  # a pixel without a ray is invalid as a whole
     return points
 
 
