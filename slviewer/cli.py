@@ -397,7 +397,7 @@ def main(arguments: list[str] | None = None) -> int:
         run = tyro.cli(
             _union(COMMANDS),
             prog="slviewer",
-            description="Structured-light 3D scanning: calibrate camera and projector pixel by pixel, prove it, scan, merge.",
+            description="Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge.",
             args=arguments,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
         )

@@ -105,7 +105,8 @@ def calibrate_stereo(
     """Pinhole and Brown (k1 k2 p1 p2 k3) for both devices, and their relative pose, from board features.
 
     Features beyond 6 robust sigma, and poses most of whose features are, are set aside and named. Raises
-    CalibrationRejected where the poses cannot determine the devices: too few, all parallel, or features that contradict the model.
+    CalibrationRejected where the poses cannot determine the devices: too few, all parallel, or features that
+    contradict the model.
     """
     left_out = dict(left_out or {})
     kept: dict[str, np.ndarray] = {}

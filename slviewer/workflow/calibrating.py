@@ -107,9 +107,8 @@ def calibrate(
             )
         left_out = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
         names = [name for name in names if name not in left_out]
-        observations, size, projector = _observe_all(
-            store, names, board, step_2, left_out, part(progress, 0, 0.6), warn
-        )
+        reading = part(progress, 0, 0.6)
+        observations, projector = _observe_all(store, names, board, step_2, left_out, reading)
         progress(0.6, "stereo calibration")
         stereo = calibrate_stereo(observations, projector, str(board), left_out)
         for name, why in stereo.left_out.items():

@@ -1,0 +1,38 @@
+"""What a session holds, in words."""
+
+from pathlib import Path
+
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+from slviewer.workflow.models import available, best, load_stereo
+
+
+def inspect(session: Path | str) -> str:
+    """Captures with their role, size and sequence, calibrations with their quality, and what is stale."""
+    with Session.open(session) as store:
+        excluded = store.excluded()
+        captures = store.captures()
+        lines = [f"{store.folder}: {len(captures)} capture{'s' * (len(captures) != 1)}"]
+        for capture in captures:
+            note = f"  [excluded: {excluded[capture.name]}]" if capture.name in excluded else ""
+            lines.append(f"  {capture.name:<16} {capture.role:<12} {_described(capture)}{note}")
+        for name in available(store):
+            state = store.state_of(f"calibration/{name}")
+            poses = store.load_result(f"calibration/{name}", only=())[0]["inputs"]
+            mark = ", the default" if name == best(store) else ""
+            made = f"from {len(poses)} poses" if poses else "made elsewhere"
+            lines.append(f"calibration {name}: {made}, {state}{mark}")
+            if name == "stereo":
+                rms = load_stereo(store).reprojection_rms_px
+                if rms:
+                    lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms.items()))
+        if not available(store):
+            lines.append("no calibration yet: run `slviewer calibrate`")
+    return "\n".join(lines)
+
+
+def _described(capture: Capture) -> str:
+    sequence, (width, height) = capture.sequence, capture.size
+    periods = ", ".join(f"{axis} {sequence.period_px(axis):g} px" for axis in sequence.axes)
+    projector = f"{sequence.projector[0]}x{sequence.projector[1]}"
+    return f"camera {width}x{height}, projector {projector}, {len(sequence.frames)} frames, period {periods}"

@@ -1,0 +1,107 @@
+"""The pixel-wise rational model against an exactly known rig."""
+
+import numpy as np
+import pytest
+from analytic_rig import BOARD, PERIOD, PROJECTOR, board_poses, cv_project, observation, rig
+from slviewer.fringe.phase import PhaseMap
+
+from slviewer.calibration.moments import RationalMoments
+from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
+from slviewer.calibration.stereo import calibrate_stereo
+from slviewer.errors import CalibrationRejected
+
+TRUE = rig()
+OBSERVATIONS = [observation(TRUE, T, f"pose_{k:02d}", 0.01) for k, T in enumerate(board_poses(16))]
+
+
+@pytest.fixture(scope="module")
+def model() -> PixelwiseModel:
+    return calibrate_pixelwise(OBSERVATIONS, calibrate_stereo(OBSERVATIONS, PROJECTOR, str(BOARD)))
+
+
+def phase_of_plane(z: float) -> tuple[PhaseMap, np.ndarray]:
+    """Exact phase of the plane at depth z, and its points."""
+    rays = TRUE.camera.rays()
+    points = np.dstack([rays * z, np.full(rays.shape[:2], z)])
+    coordinate = cv_project(TRUE.projector, points.reshape(-1, 3) @ TRUE.R.T + TRUE.t)[:, 0].reshape(rays.shape[:2])
+    shape = coordinate.shape
+    phase = PhaseMap(
+        axis="x",
+        period_px=PERIOD,
+        phase=(2 * np.pi * coordinate / PERIOD).astype(np.float32),
+        wrapped=np.zeros(shape, np.float32),
+        modulation=np.full(shape, 80, np.float32),
+        background=np.full(shape, 120, np.float32),
+        reason=np.zeros(shape, np.uint8),
+        noise=(1.0, 0.01),
+        steps=18,
+    )
+    return phase, points
+
+
+@pytest.mark.parametrize(("z", "limit"), [(560.0, 0.06), (640.0, 0.06), (460.0, 0.25), (760.0, 0.25)])
+def test_depth_inside_and_outside_the_calibrated_range(model: PixelwiseModel, z: float, limit: float) -> None:
+    phase, truth = phase_of_plane(z)
+    measured = model.points(phase)
+    seen = model.fits["x"].poses >= 10
+    error = (measured - truth)[seen]
+    rms = np.sqrt(np.nanmean(error[:, 2] ** 2))
+    assert 1e-4 < rms < limit
+    assert np.sqrt(np.nanmean(error[:, :2] ** 2)) < 0.15  # the gauge: a principal point some tenths of a pixel off
+
+
+def test_fit_rms_is_kept_in_z_x_and_y(model: PixelwiseModel) -> None:
+    rms = model.median_rms_mm("x")
+    assert 1e-5 < rms["z"] < 0.08 and 0 < rms["x"] < 0.02 and 0 < rms["y"] < 0.02
+
+
+def test_a_pixel_of_fewer_than_four_poses_is_nan(model: PixelwiseModel) -> None:
+    fit = model.fits["x"]
+    few = fit.poses < 4
+    assert few.any() and np.isnan(fit.coefficients[:, few]).all() and np.isnan(fit.rms_mm[:, few]).all()
+    assert np.isfinite(fit.coefficients[:, fit.poses >= 8]).all()
+    assert fit.poses.max() == 16
+
+
+def test_a_phase_far_from_the_fitted_ones_is_masked(model: PixelwiseModel) -> None:
+    phase, _ = phase_of_plane(200.0)
+    assert np.isnan(model.points(phase)).all()
+
+
+def test_predicted_noise_is_the_measured_one(model: PixelwiseModel) -> None:
+    phase, _ = phase_of_plane(600.0)
+    clean = model.points(phase)
+    rng = np.random.default_rng(1)
+    noisy = phase.phase + rng.normal(size=clean.shape[:2]).astype(np.float32) * phase.sigma_phase
+    shaken = model.points(PhaseMap(**{**vars(phase), "phase": noisy.astype(np.float32)}))
+    ratio = (shaken - clean)[..., 2] / model.sigma_z(phase, clean)
+    assert np.nanstd(ratio) == pytest.approx(1.0, abs=0.02)
+
+
+def test_it_survives_saving(model: PixelwiseModel) -> None:
+    again = PixelwiseModel.from_arrays(model.to_arrays())
+    phase, _ = phase_of_plane(600.0)
+    assert np.array_equal(again.points(phase), model.points(phase), equal_nan=True)
+
+
+def test_too_few_poses_are_rejected() -> None:
+    stereo = calibrate_stereo(OBSERVATIONS[::5], PROJECTOR)
+    with pytest.raises(CalibrationRejected, match="at least 4"):
+        calibrate_pixelwise(OBSERVATIONS[:3], stereo)
+
+
+def test_moments_find_an_exact_rational_function() -> None:
+    """Noise-free data of the form itself come back to rounding, whatever the reference point."""
+    phi = np.linspace(100, 130, 9)
+    c0, c1, c2 = 900.0, -1.5, 3e-3
+    z = (c0 + c1 * phi) / (1 + c2 * phi)
+    moments = RationalMoments(np.full((1, 1), 118.0), 600.0)
+    for p, depth in zip(phi, z, strict=True):
+        moments.add(np.array([[p]]), np.array([[depth]]), (0, 0))
+    moments.solve(4)
+    for p, depth in zip(phi, z, strict=True):
+        moments.add_refinement(np.array([[p]]), np.array([[depth]]), (0, 0))
+    assert moments.refine(4)[0, 0] < 1e-6
+    a0, a1, a2 = moments.coefficients[:, 0, 0]
+    s = phi - 118.0
+    assert np.allclose(600 + (a0 + a1 * s) / (1 + a2 * s), z, atol=1e-7)
