@@ -1,0 +1,239 @@
+"""What a report is drawn from: plain values and arrays, so that whoever computed them needs to know no drawing.
+
+Lengths in mm, image errors in px; NaN is "unknown" everywhere. A mapping that is keyed by model holds the models in
+the order in which they are to be shown, the one to beat ("stereo") first.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+ByModel = Mapping[str, float]
+"""One value a model, such as ``{"stereo": 0.198, "pixelwise": 0.076}``."""
+
+Region = Literal["R1", "R2", "R3"]
+
+
+@dataclass(frozen=True)
+class PlaneRow:
+    """A flat board at one pose. ``incidence`` is its share in R1, R2 and R3 in percent; ``letter_*`` the Letter's own."""
+
+    name: str
+    incidence: Mapping[str, float]
+    rms_mm: ByModel
+    noise_floor_mm: ByModel
+    letter_incidence: Mapping[str, float] = field(default_factory=dict)
+    letter_rms_mm: ByModel = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SphereRow:
+    """A sphere of known ``true_radius_mm`` at one place, in depth range ``region``."""
+
+    name: str
+    region: str
+    true_radius_mm: float
+    rms_mm: ByModel
+    noise_floor_mm: ByModel
+    radius_mm: ByModel
+    letter_rms_mm: ByModel = field(default_factory=dict)
+    letter_radius_mm: ByModel = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SpacingRow:
+    """The distance between the centres of two spheres, known and as each model measures it."""
+
+    name: str
+    known_mm: float
+    measured_mm: ByModel
+
+
+@dataclass(frozen=True)
+class MergePair:
+    """How one scan lies on the reference after ICP; ``overlap`` is a share, 0 to 1."""
+
+    name: str
+    reference: str
+    rms_mm: float
+    overlap: float
+    letter_rms_mm: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class PixelCurve:
+    """One camera pixel's data, (n,) each, and what was fitted to it (the Letter, eq. 9-11).
+
+    ``coefficients`` (5,) c0 ... c4 for phase in rad and lengths in mm; ``rms_mm`` (3,) in z, x, y.
+    """
+
+    pixel: tuple[int, int]
+    axis: str
+    phase: np.ndarray
+    z: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    coefficients: np.ndarray
+    rms_mm: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMaps:
+    """Signed errors (h, w) mm, NaN where nothing counts, of each model on one capture, with RMS and noise floor."""
+
+    title: str
+    maps: Mapping[str, np.ndarray]
+    rms_mm: ByModel
+    noise_floor_mm: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class CloudView:
+    """A scan to look at: ``points`` (h, w, 3) organised, or (n, 3), mm, NaN where invalid.
+
+    ``normals`` like ``points``, or None (found from the grid); ``source`` (n,) numbers the scan that each point of a
+    merged cloud comes from, ``names`` names these; ``note`` is said beside the number of points.
+    """
+
+    name: str
+    points: np.ndarray
+    normals: np.ndarray | None = None
+    source: np.ndarray | None = None
+    names: tuple[str, ...] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ReproductionData:
+    """The Letter's experiments on a simulated rig.
+
+    ``depth_range_mm`` bounds R2. ``rms_maps_mm`` (3, h, w) are the pixel-wise fits' RMS in z, x, y. ``plane_outlines``
+    holds, by plane, four or more points (n, 3) of it. ``reprojection_rms_px`` and the Letter's have the keys camera,
+    projector (and stereo, ours). ``notes`` are warnings of the run, one sentence each.
+    """
+
+    camera: tuple[int, int]
+    projector: tuple[int, int]
+    quick: bool
+    seed: int
+    poses: int
+    depth_range_mm: tuple[float, float]
+    reprojection_rms_px: Mapping[str, float]
+    letter_reprojection_rms_px: Mapping[str, float]
+    fit_rms_mm: Mapping[str, float]
+    planes: Sequence[PlaneRow]
+    spheres: Sequence[SphereRow]
+    spacings: Sequence[SpacingRow]
+    pairs: Sequence[MergePair]
+    pixel_curve: PixelCurve | None
+    rms_maps_mm: np.ndarray
+    plane_maps: Sequence[ErrorMaps]
+    sphere_maps: Sequence[ErrorMaps]
+    plane_outlines: Mapping[str, np.ndarray]
+    clouds: Sequence[CloudView]
+    merged: CloudView | None
+    poses_left_out: Mapping[str, str] = field(default_factory=dict)
+    letter_points: Mapping[str, int] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class CaptureRow:
+    """One capture of a session. ``state``: used, left out, excluded or scan; ``why`` says why it is not used."""
+
+    name: str
+    role: str
+    state: Literal["used", "left out", "excluded", "scan", "waiting"]
+    camera: tuple[int, int]
+    projector: tuple[int, int]
+    frames: int
+    periods_px: Mapping[str, float]
+    why: str = ""
+    made: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceParameters:
+    """A lens as calibrated: K (3, 3) px, D (5,) k1 k2 p1 p2 k3, size (width, height), and sigma of the focal length."""
+
+    K: np.ndarray
+    D: np.ndarray
+    size: tuple[int, int]
+    focal_sigma_px: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class PoseResiduals:
+    """Features of one board pose: camera ``pixels`` (n, 2) and ``camera``, ``projector`` residuals (n, 2) px.
+
+    ``projector_pixels`` (n, 2) is where the projector's residuals belong. NaN: set aside or not read.
+    """
+
+    pixels: np.ndarray
+    camera: np.ndarray
+    projector_pixels: np.ndarray
+    projector: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationView:
+    """A stereo calibration: lenses, ``R`` (3, 3) and ``t`` (3,) mm camera to projector, and how well the poses agree.
+
+    ``pose_rms_px`` holds (camera, projector) by pose; ``residuals`` may be empty where none were kept.
+    """
+
+    camera: DeviceParameters
+    projector: DeviceParameters
+    R: np.ndarray
+    t: np.ndarray
+    target: str
+    depth_range_mm: tuple[float, float]
+    reprojection_rms_px: Mapping[str, float]
+    pose_rms_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    residuals: Mapping[str, PoseResiduals] = field(default_factory=dict)
+    features_set_aside: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class PixelFitView:
+    """The pixel-wise fits of one axis: ``rms_mm`` (3, h, w) in z, x, y; ``poses`` (h, w) that each pixel saw."""
+
+    axis: str
+    rms_mm: np.ndarray
+    poses: np.ndarray
+    curve: PixelCurve | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationView:
+    """A plane or sphere measured by each model; ``coverage`` is a share 0 to 1, ``true_radius_mm`` NaN if unknown."""
+
+    name: str
+    shape: Literal["plane", "sphere"]
+    incidence: Mapping[str, float]
+    points: int
+    set_aside: Mapping[str, int]
+    coverage: ByModel
+    rms_mm: ByModel
+    noise_floor_mm: ByModel
+    radius_mm: ByModel = field(default_factory=dict)
+    true_radius_mm: float = float("nan")
+    maps: ErrorMaps | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SessionData:
+    """A session's captures, its calibrations, and what was measured with them."""
+
+    name: str
+    captures: Sequence[CaptureRow]
+    calibration: CalibrationView | None = None
+    pixel_fits: Sequence[PixelFitView] = ()
+    verifications: Sequence[VerificationView] = ()
+    spacings: Sequence[SpacingRow] = ()
+    clouds: Sequence[CloudView] = ()
+    merged: CloudView | None = None
+    pairs: Sequence[MergePair] = ()
+    warnings: Sequence[str] = ()

@@ -1,0 +1,168 @@
+"""One HTML file that holds everything it shows: text, tables, and figures as embedded PNG. No script, no network."""
+
+import base64
+import contextlib
+import os
+import re
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from slviewer import __version__
+from slviewer.errors import InputError
+
+Mark = Literal["", "better", "worse", "strong", "muted"]
+"""How a value stands to its rivals; colour and weight follow it, and the text beside it says so in words."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture: PNG bytes, a caption for readers, ``alt`` in place of the picture; ``width`` in CSS px as drawn."""
+
+    png: bytes
+    caption: str
+    alt: str
+    width: int
+
+    @property
+    def data(self) -> str:
+        """The picture as the base64 of a data address."""
+        return base64.b64encode(self.png).decode()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A table cell whose value is marked."""
+
+    text: str
+    mark: Mark = ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's heading, its unit, and the group of neighbours that it shares a heading with."""
+
+    title: str
+    unit: str = ""
+    group: str = ""
+    align: Literal["left", "right", "centre"] = "right"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of texts or cells under columns; ``footer`` rows (means) stand apart below, then ``notes``."""
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[str | Cell]]
+    caption: str
+    notes: Sequence[str] = ()
+    footer: Sequence[Sequence[str | Cell]] = ()
+
+    def __post_init__(self) -> None:
+        for row in (*self.rows, *self.footer):
+            if len(row) != len(self.columns):
+                raise InputError(
+                    f"a row of the table '{self.caption}' has {len(row)} cells and the table {len(self.columns)} "
+                    "columns: give one cell a column"
+                )
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """The headings above the columns' own, with how many columns each spans; empty where no column has one."""
+        spans: list[tuple[str, int]] = []
+        for column in self.columns:
+            if spans and spans[-1][0] == column.group:
+                spans[-1] = (column.group, spans[-1][1] + 1)
+            else:
+                spans.append((column.group, 1))
+        return spans if any(name for name, _ in spans) else []
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A sentence that must not be overlooked."""
+
+    text: str
+    kind: Literal["warning", "good", "plain"] = "warning"
+
+
+Item = Figure | Table | Notice
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled part of a page: paragraphs, then its figures, tables and notices in order."""
+
+    title: str
+    text: str | Sequence[str]
+    items: Sequence[Item] = ()
+
+    @property
+    def paragraphs(self) -> tuple[str, ...]:
+        return ((self.text,) if self.text else ()) if isinstance(self.text, str) else tuple(self.text)
+
+    @property
+    def anchor(self) -> str:
+        """The title as an address within the page."""
+        return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
+
+
+class Headline(NamedTuple):
+    """A key number with its unit, what it is, and what to compare it with."""
+
+    value: str
+    label: str
+    note: str = ""
+    mark: Mark = ""
+
+
+def write_page(
+    path: Path | str,
+    title: str,
+    subtitle: str,
+    headlines: Sequence[Headline | tuple[str, str, str]],
+    sections: Sequence[Section],
+) -> None:
+    """Write the page to ``path``, complete or not at all; every text is shown as typed, never run.
+
+    Raises InputError where the file cannot be written.
+    """
+    page = _render(title, subtitle, [Headline(*headline) for headline in headlines], sections)
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}-{secrets.token_hex(4)}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "xb") as file:
+            file.write(page.encode())
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}): choose another place or free it") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: Sequence[Section]) -> str:
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    here = Path(__file__).parent
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.tests["figure"] = lambda item: isinstance(item, Figure)
+    environment.tests["table"] = lambda item: isinstance(item, Table)
+    environment.tests["cell"] = lambda item: isinstance(item, Cell)
+    template = environment.from_string((here / "page.html.j2").read_text(encoding="utf-8"))
+    return template.render(
+        title=title,
+        subtitle=subtitle,
+        headlines=headlines,
+        sections=sections,
+        style=Markup((here / "page.css").read_text(encoding="utf-8")),  # ours, not a user's
+        version=__version__,
+        written=datetime.now().strftime("%Y-%m-%d %H:%M"),
+    )
