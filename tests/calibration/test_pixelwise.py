@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from analytic_rig import BOARD, PERIOD, PROJECTOR, board_poses, cv_project, observation, rig
-from slviewer.fringe.phase import PhaseMap
 
 from slviewer.calibration.moments import RationalMoments
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import CalibrationRejected
+from slviewer.fringe.phase import PhaseMap
 
 TRUE = rig()
 OBSERVATIONS = [observation(TRUE, T, f"pose_{k:02d}", 0.01) for k, T in enumerate(board_poses(16))]
