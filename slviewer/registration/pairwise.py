@@ -16,7 +16,7 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.start import Start, ranked_starts
 
-Progress = Callable[[float, str], None]
+Progress = Callable[[float], None]
 
 LEVELS_MM = ((2.0, 8.0), (1.0, 2.0), (0.5, 1.0))  # voxel and gate for objects of 75 to 300 mm, coarse to fine
 LEAST_POINTS = 500
@@ -37,8 +37,8 @@ class Registration:
     also holds the spacing of the points. Overlapping are the scan points that have a reference point within
     ``gate_mm``; ``overlap`` is their share. ``agreement`` is the share, among the scan points that face the reference
     within four gates, of those within one. ``slack_mm`` says how well the shape holds the pose: how far the scan would
-    have to slide or turn (at the overlap's rim) in its loosest direction until the surfaces come apart by ``rms_mm``; it
-    is large for planes and spheres, and far larger than the pose's error.
+    have to slide or turn (at the overlap's rim) in its loosest direction until the surfaces come apart by ``rms_mm``.
+    It is large for planes and spheres, and always far larger than the pose's error.
     """
 
     T_reference_scan: np.ndarray
@@ -65,8 +65,8 @@ def register(
 
     Points are ``(n, 3)`` mm without NaN, each in the frame of the camera that took it; normals ``(n, 3)`` point to that
     camera, and are estimated where missing. ``sigma_mm`` is the expected error of one point, when it is known: gates
-    are never narrower than noise. ``initial`` (4, 4) replaces the search for a start. ``progress`` receives a share of
-    the work done and a word about it, and may raise to cancel.
+    are never narrower than noise. ``initial`` (4, 4) replaces the search for a start. ``progress`` receives the
+    share of the work done, 0 to 1, and may raise to cancel.
 
     Raises ``SlviewerError`` where nothing aligns, where too little overlaps, or where the shape does not hold the pose.
     """
@@ -77,9 +77,9 @@ def register(
         _check(name, points, normals)
     if initial is not None and np.shape(initial) != (4, 4):
         raise InputError(f"The initial pose has shape {np.shape(initial)}: give a (4, 4) matrix.")
-    say = progress or (lambda share, word: None)
+    say = progress or (lambda share: None)
 
-    say(0.0, "thinning")
+    say(0.0)
     size = min(_size(scan_points), _size(reference_points))
     scale = 1.0 if 75.0 <= size <= 300.0 else size / (75.0 if size < 75.0 else 300.0)
     tree = cKDTree(reference_points, balanced_tree=False, compact_nodes=False)
@@ -90,12 +90,12 @@ def register(
     scan = _cloud(scan_points, scan_normals, finest)
     reference = _cloud(reference_points, reference_normals, finest)
 
-    say(0.3, "looking for a start")
+    say(0.3)
     coarse = max(size / 40.0, 2.0 * spacing)
     starts = ranked_starts(scan.voxel_down_sample(coarse), reference.voxel_down_sample(coarse), coarse, initial)
     refusal: SlviewerError | None = None
     for attempt, start in enumerate(starts[:MOST_ATTEMPTS]):
-        say(0.5 + 0.15 * attempt, "aligning")
+        say(0.5 + 0.15 * attempt)
         T = start.T
         for voxel, gate in levels:
             thin = [scan, reference] if voxel <= finest else [c.voxel_down_sample(voxel) for c in (scan, reference)]
@@ -106,7 +106,7 @@ def register(
         except SlviewerError as error:
             refusal = refusal or error  # the best start's refusal says most
             continue
-        say(1.0, "aligned")
+        say(1.0)
         return result
     assert refusal is not None
     raise refusal

@@ -93,7 +93,7 @@ def _feature_poses(scan: Any, reference: Any, voxel: float) -> list[np.ndarray]:
     n, m = np.asarray(scan.normals)[matches[:, 0]], np.asarray(reference.normals)[matches[:, 1]]
 
     triplets = np.random.default_rng(_SEED).integers(0, len(p), (_TRIPLETS, 3))
-    span = np.linalg.norm(np.ptp(p, axis=0))
+    span = float(np.linalg.norm(np.ptp(p, axis=0)))
     triplets = triplets[_same_triangle(p[triplets], q[triplets], 0.1 * span, voxel)][:4000]
     if len(triplets) == 0:
         return []

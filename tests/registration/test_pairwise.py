@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slviewer.errors import InputError, SlviewerError
+from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.registration.pairwise import Registration, register
 
 CENTRE = np.array([0.0, 0.0, 600.0])
@@ -140,10 +140,10 @@ def test_a_pose_handed_in_replaces_the_search() -> None:
 
 
 def test_progress_can_cancel() -> None:
-    def stop(share: float, word: str) -> None:
-        raise KeyboardInterrupt(word)
+    def stop(share: float) -> None:
+        raise Cancelled("Stopped.")
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Cancelled):
         register(view(bumpy(2), (-45, 75), 1), view(bumpy(2), (-75, 45), 2), progress=stop)
 
 

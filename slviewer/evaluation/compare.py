@@ -1,0 +1,140 @@
+"""Calibrations side by side: the same capture, the same pixels, each model's own fit."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.evaluation.incidence import incidence
+from slviewer.evaluation.plane import PlaneResult, evaluate_plane
+from slviewer.evaluation.region import find_plane, find_sphere, measured_pixels
+from slviewer.evaluation.render import Row, render
+from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
+from slviewer.reconstruction.cloud import Cloud
+
+Shape = Literal["plane", "sphere"]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """One capture of a plane or a sphere, seen through several models.
+
+    ``results`` by model name, each over the pixels of ``common`` ``(h, w)`` bool: those of ``region`` ``(h, w)`` bool
+    that every model measures. ``coverage`` by model: measured over lit pixels of the region, NaN if it is not known
+    what is lit. ``incidence``: percent of the measured region in R1, R2, R3, or None without a depth range.
+    """
+
+    shape: Shape
+    results: dict[str, PlaneResult | SphereResult]
+    region: np.ndarray
+    common: np.ndarray
+    coverage: dict[str, float]
+    incidence: dict[str, float] | None
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences that name the model: where more than 2 % was set aside."""
+        return [f"{model}: {result.warning}" for model, result in self.results.items() if result.warning]
+
+    def text(self) -> str:
+        """For people: a line a model, with the shares in R1, R2, R3 above."""
+        table: list[Row] = []
+        for model, result in self.results.items():
+            row: Row = {"model": model, "RMS mm": result.rms_mm, "noise floor mm": result.noise_floor_mm}
+            if isinstance(result, SphereResult):
+                row["radius"] = result.radius_mm
+            coverage = 100.0 * self.coverage[model]
+            table.append(
+                row | {"points": result.points, "set aside %": 100.0 * result.set_aside_share, "coverage %": coverage}
+            )
+        shares = (
+            "" if self.incidence is None else ", ".join(f"{r} {share:.1f} %" for r, share in self.incidence.items())
+        )
+        return "\n".join([*([shares] if shares else []), render(table)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the figures without the maps; what is not known is None."""
+        models = {
+            model: {
+                "rms_mm": result.rms_mm,
+                "noise_floor_mm": _known(result.noise_floor_mm),
+                "radius_mm": result.radius_mm if isinstance(result, SphereResult) else None,
+                "points": result.points,
+                "set_aside": result.set_aside,
+                "coverage": _known(self.coverage[model]),
+            }
+            for model, result in self.results.items()
+        }
+        return {"shape": self.shape, "incidence": self.incidence, "models": models}
+
+
+def compare(
+    shape: Shape,
+    clouds: Mapping[str, Cloud],
+    lit: np.ndarray | None = None,
+    *,
+    region: np.ndarray | None = None,
+    depth_range: tuple[float, float] | None = None,
+    radius: float | None = None,
+) -> Comparison:
+    """Fit the shape to every model's cloud of one capture, over the pixels that all of them measure.
+
+    ``lit`` ``(h, w)`` bool: what a perfect decoder could measure (``PhaseMap.lit``). ``region`` ``(h, w)`` bool: the
+    pixels that show the shape, such as a board's outline; None: it is found in the first model's cloud, completed by
+    the others'. ``depth_range`` in mm bounds R2. ``radius`` in mm, roughly, helps to find a sphere; the fitted one is
+    free all the same.
+
+    Raises ``InputError`` where clouds differ in size, the shape is not found, or the models share too few pixels.
+    """
+    if not clouds:
+        raise InputError("No cloud was given to evaluate: name at least one model.")
+    sizes = {cloud.points.shape[:2] for cloud in clouds.values()}
+    if len(sizes) > 1:
+        raise InputError(f"The models' clouds have different sizes, {sizes}: reconstruct them from the same capture.")
+
+    every = _union(clouds)
+    if region is None:
+        region = find_plane(every)[1] if shape == "plane" else find_sphere(every, radius=radius)[1]
+    measured_pixels(every, region)  # says so if there is too little
+    common = region & np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
+    results: dict[str, PlaneResult | SphereResult] = {}
+    for model, cloud in clouds.items():
+        try:
+            results[model] = (
+                evaluate_plane(cloud.points, common, cloud.sigma_z)
+                if shape == "plane"
+                else evaluate_sphere(cloud.points, common, cloud.sigma_z, radius)
+            )
+        except InputError as error:
+            raise InputError(f"No {shape} could be fitted to the {model} cloud. {error}") from error
+    return Comparison(
+        shape=shape,
+        results=results,
+        region=region,
+        common=common,
+        coverage={model: _coverage(cloud, region, lit) for model, cloud in clouds.items()},
+        incidence=None if depth_range is None else incidence(every, region, depth_range),
+    )
+
+
+def _union(clouds: Mapping[str, Cloud]) -> np.ndarray:
+    """The first cloud's points, and where it has none, the next one's."""
+    first, *others = clouds.values()
+    points = first.points.copy()
+    for cloud in others:
+        missing = ~np.isfinite(points).all(axis=2)
+        points[missing] = cloud.points[missing]
+    return points
+
+
+def _coverage(cloud: Cloud, region: np.ndarray, lit: np.ndarray | None) -> float:
+    measurable = 0 if lit is None else np.count_nonzero(region & lit)
+    if lit is None or measurable == 0:
+        return float("nan")
+    return np.count_nonzero(region & lit & cloud.mask) / measurable
+
+
+def _known(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,111 @@
+"""One least-squares shape in one cloud: what it leaves over, and what noise alone would leave over."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.shapes import Plane, Sphere
+
+Fitted = TypeVar("Fitted", Plane, Sphere)
+
+SET_ASIDE_SIGMA = 5.0
+SET_ASIDE_WARNING = 0.02
+LEAST_POINTS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeResult:
+    """What a cloud's distance from its own best plane or sphere says.
+
+    ``points`` pixels were looked at; of these ``set_aside`` lie beyond 5 robust sigma and count neither in the fit nor
+    in ``rms_mm``, the root mean square of the perpendicular (radial) distances. ``noise_floor_mm`` is what that would
+    be from the cloud's expected noise alone, over the same pixels; NaN where none is known. ``error_map`` ``(h, w)``
+    float32, mm, NaN where nothing was looked at, holds every distance, those set aside too: positive towards the
+    camera for a plane, outwards for a sphere. ``inliers`` ``(h, w)`` bool says which pixels counted.
+    """
+
+    rms_mm: float
+    noise_floor_mm: float
+    points: int
+    set_aside: int
+    error_map: np.ndarray
+    inliers: np.ndarray
+
+    @property
+    def set_aside_share(self) -> float:
+        return self.set_aside / self.points
+
+    @property
+    def warning(self) -> str | None:
+        """A sentence if so much was set aside that the RMS does not speak for the shape."""
+        if self.set_aside_share <= SET_ASIDE_WARNING:
+            return None
+        return (
+            f"{100 * self.set_aside_share:.1f} % of the points lie beyond {SET_ASIDE_SIGMA:g} robust sigma and were "
+            "set aside: look at the error map before you trust the RMS."
+        )
+
+
+def settle(fit: Callable[[np.ndarray], Fitted], points: np.ndarray, start: Fitted) -> tuple[Fitted, np.ndarray]:
+    """Least squares over ``points`` (n, 3), those beyond 5 robust sigma set aside, repeated until the set is stable.
+
+    Sigma is 1.4826 times the median absolute deviation of *all* points, so that it does not shrink from round to round
+    until only the best are left. Returns the shape and which points counted, (n,) bool.
+    """
+    shape, kept = start, np.zeros(len(points), dtype=bool)
+    for _ in range(30):
+        residuals = shape.distance(points)
+        reach = max(SET_ASIDE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
+        before, kept = kept, np.abs(residuals - np.median(residuals)) <= reach
+        if np.count_nonzero(kept ^ before) <= 1e-5 * len(points):
+            break
+        shape = fit(points[kept])
+    return shape, kept
+
+
+def measure(
+    points: np.ndarray,
+    mask: np.ndarray,
+    sigma_z: np.ndarray | None,
+    start: Fitted,
+    fit: Callable[[np.ndarray], Fitted],
+) -> tuple[Fitted, ShapeResult]:
+    """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and judge what is left over."""
+    for name, shape_of in (("mask", mask.shape), ("noise map", mask.shape if sigma_z is None else sigma_z.shape)):
+        if shape_of != points.shape[:2]:
+            raise InputError(f"The {name} has shape {shape_of} and the cloud {points.shape[:2]}: they must agree.")
+    looked_at = mask & np.isfinite(points).all(axis=2)
+    chosen = points[looked_at].astype(np.float64)
+    if len(chosen) < LEAST_POINTS:
+        raise InputError(f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed.")
+    shape, kept = settle(fit, chosen, start)
+    residuals = shape.distance(chosen)
+
+    error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)
+    error_map[looked_at] = residuals
+    inliers = np.zeros(points.shape[:2], dtype=bool)
+    inliers[looked_at] = kept
+    floor = float("nan") if sigma_z is None else noise_floor(shape, chosen[kept], sigma_z[inliers])
+    rms = float(np.sqrt(np.mean(residuals[kept] ** 2)))
+    return shape, ShapeResult(rms, floor, len(chosen), int(np.count_nonzero(~kept)), error_map, inliers)
+
+
+def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) -> float:
+    """Root mean square of ``sigma_z |n . r|`` over points (n, 3), r = (x/z, y/z, 1), n the shape's normal there; mm.
+
+    ``sigma_z`` (n,) is the expected noise of each depth; an error of z moves the point along its ray r.
+    """
+    known = np.isfinite(sigma_z)
+    if not known.any():
+        return float("nan")
+    points, sigma_z = points[known], sigma_z[known].astype(np.float64)
+    rays = points / points[:, 2:]
+    if isinstance(shape, Plane):
+        along = rays @ shape.normal
+    else:
+        along = np.sum((points - shape.centre) / np.linalg.norm(points - shape.centre, axis=1)[:, None] * rays, axis=1)
+    return float(np.sqrt(np.mean((sigma_z * along) ** 2)))

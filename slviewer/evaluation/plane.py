@@ -1,0 +1,31 @@
+"""How flat a cloud measures a flat board."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.evaluation.fit import ShapeResult, measure
+from slviewer.evaluation.region import RANSAC_TOLERANCE_MM, find_plane, measured_pixels, sample
+from slviewer.geometry.ransac import ransac_plane
+from slviewer.geometry.shapes import Plane, fit_plane
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneResult(ShapeResult):
+    """``ShapeResult`` of a plane (Letter eq. 12); errors are positive towards the camera."""
+
+    plane: Plane
+
+
+def evaluate_plane(points: np.ndarray, mask: np.ndarray | None, sigma_z: np.ndarray | None = None) -> PlaneResult:
+    """The plane in a cloud ``(h, w, 3)`` mm, NaN where invalid, and the distances from it.
+
+    ``mask`` ``(h, w)``: the pixels that show the plane; None: the largest flat patch is found. ``sigma_z`` ``(h, w)``
+    mm: the expected noise of z, for the noise floor.
+    """
+    if mask is None:
+        start, mask = find_plane(points)
+    else:
+        start, _ = ransac_plane(sample(points, measured_pixels(points, mask)), RANSAC_TOLERANCE_MM)
+    plane, result = measure(points, mask, sigma_z, start, fit_plane)
+    return PlaneResult(**vars(result), plane=plane)

@@ -1,0 +1,131 @@
+"""Which pixels of an organised cloud show the plane or the sphere, found in the cloud itself.
+
+RANSAC says where the shape is; the largest patch of connected pixels within a tolerance says how far it reaches. The
+tolerance is many times wider than any form error worth measuring, so that finding the shape never flatters it: what
+is wrong by less stays in, and what is wrong by more, inside the patch, stays in too, to be counted as set aside.
+"""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.evaluation.fit import Fitted
+from slviewer.geometry.ransac import ransac_plane, ransac_sphere
+from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
+
+RANSAC_TOLERANCE_MM = 1.0
+PLANE_TOLERANCE_MM = 3.0
+SPHERE_TOLERANCE = 0.04  # of its radius, at most PLANE_TOLERANCE_MM
+RIM_PX = 2  # mixed pixels at an object's outline show neither the object nor what is behind it
+LEAST_PIXELS = 200
+_SAMPLE = 40_000
+
+
+def find_plane(points: np.ndarray, mask: np.ndarray | None = None) -> tuple[Plane, np.ndarray]:
+    """The plane that holds most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
+
+    ``mask`` leaves only some pixels to search in. The region is one patch without its outermost two pixels; isolated
+    pixels and small holes inside it belong to it, whether something was measured there or not. The plane is a start
+    for fits, not a result. Raises ``InputError`` where no plane fills a patch.
+    """
+    measured = measured_pixels(points, mask)
+    plane, _ = ransac_plane(sample(points, measured), RANSAC_TOLERANCE_MM)
+    return _grow(points, measured, plane, fit_plane, lambda shape: PLANE_TOLERANCE_MM, "flat")
+
+
+def find_sphere(
+    points: np.ndarray, mask: np.ndarray | None = None, radius: float | None = None
+) -> tuple[Sphere, np.ndarray]:
+    """The sphere that holds most pixels, and its region, as ``find_plane``; ``radius`` in mm narrows the search."""
+    measured = measured_pixels(points, mask)
+    sphere, _ = ransac_sphere(sample(points, measured), RANSAC_TOLERANCE_MM, radius)
+
+    def tolerance(shape: Sphere) -> float:
+        return min(PLANE_TOLERANCE_MM, SPHERE_TOLERANCE * shape.radius)
+
+    return _grow(points, measured, sphere, fit_sphere, tolerance, "round")
+
+
+def find_spheres(points: np.ndarray, count: int, radius: float | None = None) -> list[np.ndarray]:
+    """The regions of ``count`` spheres in one cloud, from left to right in the image."""
+    free = measured_pixels(points, None)
+    regions = []
+    for _ in range(count):
+        _, region = find_sphere(points, free, radius)
+        regions.append(region)
+        free &= ~cv2.dilate(region.astype(np.uint8), np.ones((4 * RIM_PX + 1,) * 2, np.uint8)).astype(bool)
+    return sorted(regions, key=lambda region: float(np.nonzero(region)[1].mean()))
+
+
+def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """Which pixels ``(h, w)`` of a cloud hold a point, under a mask if there is one; ``InputError`` if too few do."""
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise InputError(f"The cloud has shape {points.shape}: an organised cloud (h, w, 3) is needed.")
+    if mask is not None and mask.shape != points.shape[:2]:
+        raise InputError(f"The mask has shape {mask.shape} and the cloud {points.shape[:2]}: they must agree.")
+    measured: np.ndarray = np.isfinite(points).all(axis=2)
+    measured = measured if mask is None else measured & mask
+    if np.count_nonzero(measured) < LEAST_PIXELS:
+        raise InputError(
+            f"{np.count_nonzero(measured)} points were measured where the shape is looked for: at least "
+            f"{LEAST_PIXELS} are needed; check that it is in view and lit."
+        )
+    return measured
+
+
+def sample(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Some 40,000 of the measured points, (n, 3) float64."""
+    chosen = points[measured]
+    return chosen[:: -(-len(chosen) // _SAMPLE)].astype(np.float64)
+
+
+def _grow(
+    points: np.ndarray,
+    measured: np.ndarray,
+    shape: Fitted,
+    fit: Callable[[np.ndarray], Fitted],
+    tolerance: Callable[[Fitted], float],
+    kind: str,
+) -> tuple[Fitted, np.ndarray]:
+    """Patch and least squares over it in turn, until the patch is stable."""
+    patch = np.zeros_like(measured)
+    for _ in range(20):
+        before = patch
+        agreeing = measured & (np.abs(shape.distance(np.where(measured[..., None], points, 0.0))) < tolerance(shape))
+        patch = _largest_patch(agreeing)
+        region = _without_rim(patch)
+        shown = np.count_nonzero(region & agreeing)
+        if shown < LEAST_PIXELS or shown < 0.5 * np.count_nonzero(region & measured):
+            raise InputError(
+                f"The largest {kind} patch has {shown} of {np.count_nonzero(measured)} measured pixels: "
+                "check that the shape fills a good part of the view, and that the cloud is not mere noise."
+            )
+        if np.count_nonzero(patch ^ before) <= 1e-4 * np.count_nonzero(patch):
+            break
+        shape = fit(sample(points, patch & agreeing))
+    return shape, region
+
+
+def _largest_patch(agreeing: np.ndarray) -> np.ndarray:
+    """The largest 4-connected patch; gaps of up to four unmeasured pixels do not cut it, and small holes are filled."""
+    closed = cv2.morphologyEx(agreeing.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
+    if count < 2:
+        return np.zeros_like(agreeing)
+    patch = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~patch).astype(np.uint8), connectivity=8)
+    small = stats[:, cv2.CC_STAT_AREA] < 0.005 * np.count_nonzero(patch)
+    h, w = patch.shape
+    inside = (stats[:, 0] > 0) & (stats[:, 1] > 0) & (stats[:, 0] + stats[:, 2] < w) & (stats[:, 1] + stats[:, 3] < h)
+    holes = small & inside
+    holes[0] = False  # label 0 is the patch itself
+    filled: np.ndarray = patch | holes[labels]
+    return filled
+
+
+def _without_rim(patch: np.ndarray) -> np.ndarray:
+    """The patch less its outermost pixels, where it ends inside the image."""
+    kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+    return cv2.erode(patch.astype(np.uint8), kernel, borderValue=1).astype(bool)

@@ -1,0 +1,77 @@
+"""How round, how large and how far apart a cloud measures spheres."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.evaluation.fit import ShapeResult, measure
+from slviewer.evaluation.region import RANSAC_TOLERANCE_MM, find_sphere, find_spheres, measured_pixels, sample
+from slviewer.geometry.ransac import ransac_sphere
+from slviewer.geometry.shapes import Sphere, fit_sphere
+
+
+@dataclass(frozen=True, eq=False)
+class SphereResult(ShapeResult):
+    """``ShapeResult`` of a sphere with free radius; errors are positive outwards."""
+
+    sphere: Sphere
+
+    @property
+    def radius_mm(self) -> float:
+        return self.sphere.radius
+
+
+def evaluate_sphere(
+    points: np.ndarray, mask: np.ndarray | None, sigma_z: np.ndarray | None = None, radius: float | None = None
+) -> SphereResult:
+    """The sphere in a cloud ``(h, w, 3)`` mm, NaN where invalid, and the radial distances from it.
+
+    ``mask`` ``(h, w)``: the pixels that show the sphere; None: the largest round patch is found. ``sigma_z`` ``(h, w)``
+    mm: the expected noise of z. ``radius`` in mm, roughly, helps to find the sphere; the fitted radius stays free, as
+    in the Letter's Table 2.
+    """
+    if mask is None:
+        start, mask = find_sphere(points, radius=radius)
+    else:
+        start, _ = ransac_sphere(sample(points, measured_pixels(points, mask)), RANSAC_TOLERANCE_MM, radius)
+    sphere, result = measure(points, mask, sigma_z, start, fit_sphere)
+    return SphereResult(**vars(result), sphere=sphere)
+
+
+def evaluate_spheres(
+    points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
+) -> list[SphereResult]:
+    """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise as above."""
+    return [evaluate_sphere(points, region, sigma_z, radius) for region in find_spheres(points, count, radius)]
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """Distance between two spheres' centres, measured and known, and the error in mm and in parts of the known."""
+
+    pair: tuple[str, str]
+    distance_mm: float
+    known_mm: float
+
+    @property
+    def error_mm(self) -> float:
+        return self.distance_mm - self.known_mm
+
+    @property
+    def error_ppm(self) -> float:
+        return 1e6 * self.error_mm / self.known_mm
+
+
+def spacings(centres: Mapping[str, np.ndarray], known_mm: Mapping[tuple[str, str], float]) -> list[Spacing]:
+    """The spacing of every pair of spheres whose distance is known; ``centres`` are (3,) mm by name."""
+    found = []
+    for (a, b), known in known_mm.items():
+        missing = [name for name in (a, b) if name not in centres]
+        if missing:
+            raise InputError(f"No sphere called {missing[0]!r} was measured: there are {', '.join(centres) or 'none'}.")
+        if not known > 0:
+            raise InputError(f"The known distance between {a} and {b} is {known:g} mm: give a positive one.")
+        found.append(Spacing((a, b), float(np.linalg.norm(np.subtract(centres[a], centres[b]))), known))
+    return found

@@ -1,0 +1,173 @@
+"""Several models on one capture: the same pixels, each its own fit; histograms and tables."""
+
+import json
+
+import numpy as np
+import pytest
+from planted import board_before_a_wall, cloud, plane_depth, sphere_depth
+
+from slviewer.errors import InputError
+from slviewer.evaluation import letter
+from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.histogram import histogram
+from slviewer.evaluation.incidence import incidence
+from slviewer.evaluation.render import render
+from slviewer.evaluation.tables import rows
+from slviewer.reconstruction.cloud import Cloud
+
+
+def seen(points: np.ndarray, model: str, sigma: float = 0.05) -> Cloud:
+    return Cloud(points, "x", model, np.full(points.shape[:2], sigma, np.float32))
+
+
+@pytest.fixture(scope="module")
+def two() -> tuple[dict[str, Cloud], np.ndarray, Comparison]:
+    first, board = board_before_a_wall(0.10, 1)
+    second, _ = board_before_a_wall(0.05, 2)
+    second[..., 2] += 1.0  # a plane of its own, which its own fit forgives
+    second[:, :150] = np.nan
+    lit = board.copy()
+    lit[:, 300:] = False
+    clouds = {"stereo": seen(first, "stereo", 0.10), "pixelwise": seen(second, "pixelwise")}
+    return clouds, board, compare("plane", clouds, lit, depth_range=(590.0, 610.0))
+
+
+def test_every_model_is_measured_over_the_common_pixels(two: tuple[dict[str, Cloud], np.ndarray, Comparison]) -> None:
+    result = two[2]
+    stereo, pixelwise = result.results["stereo"], result.results["pixelwise"]
+    assert stereo.points == pixelwise.points == result.common.sum()
+    assert not result.common[:, :150].any()
+    assert 0.09 < stereo.rms_mm < 0.105
+    assert 0.045 < pixelwise.rms_mm < 0.052
+    assert stereo.noise_floor_mm == pytest.approx(stereo.rms_mm, rel=0.02)
+    assert pixelwise.noise_floor_mm == pytest.approx(pixelwise.rms_mm, rel=0.02)
+    assert result.coverage["stereo"] == 1.0
+    lit_columns = 300 - 52
+    assert result.coverage["pixelwise"] == pytest.approx(150 / lit_columns, abs=0.02)
+    assert result.warnings == []
+
+
+def test_a_given_region_is_taken_as_it_is() -> None:
+    points, board = board_before_a_wall()
+    points[40:60, 60:90] = np.nan
+    result = compare("plane", {"stereo": seen(points, "stereo")}, board, region=board)
+    assert result.results["stereo"].points == board.sum() - 600
+    assert result.coverage["stereo"] == pytest.approx(1 - 600 / board.sum())
+
+
+def test_what_is_not_known_is_none_in_json() -> None:
+    points, _ = board_before_a_wall()
+    figures = json.loads(json.dumps(compare("plane", {"stereo": seen(points, "stereo")}).to_dict()))
+    assert figures["incidence"] is None
+    assert figures["models"]["stereo"]["coverage"] is None
+    assert figures["models"]["stereo"]["radius_mm"] is None
+    assert 0.04 < figures["models"]["stereo"]["rms_mm"] < 0.06
+
+
+def test_models_without_common_pixels_are_refused() -> None:
+    left, board = board_before_a_wall()
+    right = left.copy()
+    left[:, 180:] = np.nan
+    right[:, :180] = np.nan
+    with pytest.raises(InputError, match="left"):
+        compare("plane", {"left": seen(left, "left"), "right": seen(right, "right")}, region=board)
+    with pytest.raises(InputError, match="different sizes"):
+        compare("plane", {"left": seen(left, "left"), "right": seen(right[:100], "right")})
+    with pytest.raises(InputError, match="at least one"):
+        compare("plane", {})
+
+
+def test_a_sphere_reports_its_radius() -> None:
+    points = cloud(sphere_depth((0.0, 0.0, 650.0), 98.0), 0.04)
+    result = compare("sphere", {"stereo": seen(points, "stereo", 0.04)}, radius=98.0)
+    assert result.to_dict()["models"]["stereo"]["radius_mm"] == pytest.approx(98.0, abs=0.01)
+    assert "98.0" in result.text()
+
+
+def test_incidence_counts_points_by_depth() -> None:
+    z = np.repeat(np.arange(400.0, 800.0)[None], 300, axis=0)  # columns at 400 ... 799 mm
+    points = cloud(z)
+    everywhere = np.ones(z.shape, bool)
+    assert incidence(points, everywhere, (500.0, 700.0)) == {"R1": 25.0, "R2": 50.25, "R3": 24.75}
+    points[:, :100] = np.nan
+    assert incidence(points, everywhere, (500.0, 700.0))["R1"] == 0.0
+    assert incidence(points, z < 600, (500.0, 700.0)) == {"R1": 0.0, "R2": 100.0, "R3": 0.0}
+    with pytest.raises(InputError, match="smaller depth"):
+        incidence(points, everywhere, (700.0, 500.0))
+    with pytest.raises(InputError, match="No point"):
+        incidence(points, z < 450, (500.0, 700.0))
+
+
+def test_histograms_share_one_robust_range() -> None:
+    rng = np.random.default_rng(0)
+    wide, narrow = rng.normal(0, 0.2, (100, 100)), rng.normal(0, 0.05, (100, 100))
+    wide[0, 0], narrow[5] = 50.0, np.nan
+    result = histogram({"wide": wide, "narrow": narrow})
+    assert result.edges[0] == -result.edges[-1]
+    assert 0.5 < result.edges[-1] < 0.6  # 2.8 sigma of the wide one; the stray point does not stretch it
+    assert result.counts["wide"].sum() + result.beyond["wide"] == 10_000
+    assert result.counts["narrow"].sum() == 9_900
+    with pytest.raises(InputError):
+        histogram({"empty": np.full((3, 3), np.nan)})
+
+
+def test_the_letters_means_follow_from_its_rows() -> None:
+    stereo, pixelwise = (
+        np.mean([getattr(row, name) for row in letter.TABLE_1]) for name in ("stereo_mm", "pixelwise_mm")
+    )
+    assert stereo == pytest.approx(letter.TABLE_1_MEAN_MM[0], abs=6e-4)
+    assert pixelwise == pytest.approx(letter.TABLE_1_MEAN_MM[1], abs=6e-4)
+    assert stereo / pixelwise == pytest.approx(letter.TABLE_1_RATIO_OF_MEANS, abs=0.005)
+    assert max(row.stereo_mm / row.pixelwise_mm for row in letter.TABLE_1) == pytest.approx(3.59, abs=0.005)
+    assert all(sum(row.incidence) == pytest.approx(100.0, abs=0.11) for row in letter.TABLE_1)
+    assert tuple(row.pose for row in letter.TABLE_1 if row.incidence[1] >= 87.0) == letter.IN_RANGE_POSES
+
+    for k, name in enumerate(("stereo", "pixelwise")):
+        rms = np.mean([getattr(row, f"{name}_mm") for row in letter.TABLE_2])
+        radii = [getattr(row, f"{name}_radius_mm") for row in letter.TABLE_2]
+        assert rms == pytest.approx(letter.TABLE_2_MEAN_MM[k], abs=6e-4)
+        assert np.mean(radii) == pytest.approx(letter.TABLE_2_RADIUS_MM[k][0], abs=1e-3)
+        assert np.std(radii, ddof=1) == pytest.approx(letter.TABLE_2_RADIUS_MM[k][1], abs=2e-3)  # rows have 2 decimals
+
+
+def test_tables_show_the_letters_figures_beside_ours(two: tuple[dict[str, Cloud], np.ndarray, Comparison]) -> None:
+    comparison = two[2]
+    table = rows({"plane_01": comparison, "plane_03": comparison}, letter=True)
+    assert [row["capture"] for row in table] == ["plane_01", "plane_03", "mean"]
+    assert table[1]["Letter stereo"] == 0.144
+    assert table[2]["Letter ratio"] == 2.13
+    assert table[2]["ratio"] == pytest.approx(
+        comparison.results["stereo"].rms_mm / comparison.results["pixelwise"].rms_mm
+    )
+    json.dumps(table)
+    lines = render(table).splitlines()
+    assert [line.split()[0] for line in lines[-5:-3]] == ["-" * len(lines[-5]), "plane_01"]
+    assert lines[-2] == lines[-5] and lines[-1].startswith("mean")
+    assert len({line.index("0.188") if "0.188" in line else 0 for line in lines}) == 2
+    assert all(len(line) <= len(lines[-2]) <= 140 for line in lines)
+
+
+def test_sphere_tables_hold_radii() -> None:
+    points = cloud(sphere_depth((0.0, 0.0, 650.0), 98.0), 0.04)
+    clouds = {"stereo": seen(points, "stereo"), "pixelwise": seen(points, "pixelwise")}
+    comparison = compare("sphere", clouds, radius=98.0)
+    table = rows({"sphere_2": comparison, "sphere_7": comparison}, letter=True)
+    assert table[0]["Letter pixelwise radius"] == 98.00
+    assert "Letter stereo" not in table[1]
+    assert table[2]["Letter stereo radius"] == 98.256
+    assert table[2]["pixelwise radius"] == pytest.approx(98.0, abs=0.01)
+    assert " -" in render(table).splitlines()[-3]
+
+
+def test_nothing_to_show_renders_as_nothing() -> None:
+    assert render([]) == ""
+    assert rows({}) == []
+    assert (
+        render([{"model": "stereo", "RMS mm": 0.1234, "noise floor mm": float("nan")}]).splitlines()[-1].endswith("-")
+    )
+
+
+def test_a_plane_far_off_the_depths_is_all_in_one_range() -> None:
+    points = cloud(plane_depth(440.0), 0.02)
+    result = compare("plane", {"stereo": seen(points, "stereo")}, depth_range=letter.DEPTH_RANGE_MM)
+    assert result.incidence == {"R1": 100.0, "R2": 0.0, "R3": 0.0}
