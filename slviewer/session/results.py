@@ -56,7 +56,7 @@ def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.
         np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))
         path = folder / _ARRAYS / f"{name}.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
-        body = memoryview(array.reshape(-1).view(np.uint8)) if array.size else b""
+        body = array.reshape(-1).view(np.uint8).data if array.size else b""
         write_bytes(path, header.getvalue(), body)
         whole = hashlib.blake2b(header.getvalue(), digest_size=20)
         whole.update(body)

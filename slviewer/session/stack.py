@@ -119,7 +119,7 @@ def _chunk(path: Path, index: int) -> Path:
 
 
 def _read_into(file: RawIOBase, frame: np.ndarray) -> bool:
-    view = memoryview(frame).cast("B")
+    view = frame.data.cast("B")
     done = 0
     while done < len(view):
         count = file.readinto(view[done:])

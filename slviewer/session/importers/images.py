@@ -1,0 +1,140 @@
+"""Image files into one stack, and none of them believed without a look: OpenCV decodes half a file without a word."""
+
+import struct
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
+
+_THREADS = 4  # decoding releases the interpreter
+_GREEN = 1
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+
+
+def read_frames(paths: Sequence[Path], colour_frame: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    """A stack (n, h, w), uint8 or uint16, and the colours (h, w, 3) RGB of frame `colour_frame` if it has any.
+
+    Colour frames become their green channel: a colour camera samples it most densely, and unlike a mixture it stays
+    linear up to the level at which it saturates, which decoding can see. Raises InputError, naming the file, for an
+    image that is missing, cut short, damaged, of another size or bit depth than the first, or transparent.
+    """
+    first = read_image(paths[0])
+    stack = np.empty((len(paths), *first.shape[:2]), first.dtype)
+    colours: list[np.ndarray] = []
+
+    def read(index: int) -> None:
+        image = first if index == 0 else read_image(paths[index])
+        _check_alike(image, first, paths[index], paths[0])
+        stack[index] = image if image.ndim == 2 else image[..., _GREEN]
+        if index == colour_frame and image.ndim == 3 and not _is_grey(image):
+            colours.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(read, range(len(paths))))
+    return stack, colours[0] if colours else None
+
+
+def read_image(path: Path) -> np.ndarray:
+    """(h, w) or (h, w, 3) BGR, uint8 or uint16. Raises InputError for anything that is not wholly an image."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{_short(path)} cannot be read ({error.strerror}): check the file") from error
+    if fault := _fault(data):
+        raise InputError(f"{_short(path)} is {fault}: copy or record it again")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"{_short(path)} is not a readable image: copy or record it again")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{_short(path)} has pixels of type {image.dtype}: save frames with 8 or 16 bits")
+    if image.ndim == 3 and image.shape[2] != 3:
+        raise InputError(f"{_short(path)} has {image.shape[2]} channels: save frames in grey or RGB, without alpha")
+    return image
+
+
+def _check_alike(image: np.ndarray, first: np.ndarray, path: Path, first_path: Path) -> None:
+    if image.shape[:2] != first.shape[:2]:
+        raise InputError(
+            f"{_short(path)} is {_size(image)} px, {_short(first_path)} is {_size(first)}: "
+            "all frames of a capture must have one size"
+        )
+    if image.dtype != first.dtype:
+        raise InputError(
+            f"{_short(path)} has {8 * image.itemsize} bits, {_short(first_path)} has {8 * first.itemsize}: "
+            "all frames of a capture must have one bit depth"
+        )
+
+
+def _fault(data: bytes) -> str | None:
+    """What is wrong with the file as a whole, where the decoder would not say."""
+    if not data:
+        return "empty"
+    if data.startswith(_PNG):
+        return _png_fault(data)
+    if data.startswith(_JPEG):
+        return None if _jpeg_ends(data) else "cut short (its end-of-image marker is missing)"
+    if data.startswith(b"BM") and len(data) >= 54:
+        begin, width, height, bits, packed = (
+            *struct.unpack_from("<I", data, 10),
+            *struct.unpack_from("<ii", data, 18),
+            *struct.unpack_from("<HI", data, 28),
+        )
+        row = (abs(width) * bits + 31) // 32 * 4
+        return "cut short" if packed in (0, 3) and len(data) < begin + row * abs(height) else None
+    return None
+
+
+def _png_fault(data: bytes) -> str | None:
+    """Walk the chunks of a PNG: each says its length and carries a checksum, and the last is IEND."""
+    at, view = len(_PNG), memoryview(data)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(view[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            return "damaged (a PNG checksum is wrong)"
+        if data[at + 4 : at + 8] == b"IEND":
+            return None
+        at = end
+    return "cut short (its PNG end is missing)"
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """Whether an end-of-image marker follows the scan; one inside a thumbnail, which comes before, does not count."""
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return False
+        marker, (length,) = data[at + 1], struct.unpack_from(">H", data, at + 2)
+        if marker == 0xFF:  # padding
+            at += 1
+        elif marker == 0xDA:  # start of scan: from here on only a true marker follows 0xFF
+            return data.rfind(b"\xff\xd9", at) > 0
+        else:
+            at += 2 + length
+    return False
+
+
+def _is_grey(image: np.ndarray) -> bool:
+    return bool(np.array_equal(image[..., 0], image[..., 1]) and np.array_equal(image[..., 1], image[..., 2]))
+
+
+def _size(image: np.ndarray) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def _short(path: Path) -> str:
+    """The file with the two folders above it: enough to find it in a source of many captures."""
+    return "/".join(path.parts[-3:])

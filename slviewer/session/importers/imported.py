@@ -1,0 +1,118 @@
+"""What an importer hands back, and how it finds the capture folders in a source."""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.session.importers.images import IMAGE_SUFFIXES, read_frames
+from slviewer.session.names import natural_key, safe_name
+
+
+@dataclass(frozen=True)
+class ImportedCapture:
+    """One capture as another tool recorded it, in memory."""
+
+    name: str
+    sequence: PatternSequence
+    frames: np.ndarray  # (n, h, w) uint8 or uint16, in the sequence's order
+    texture: np.ndarray | None  # (h, w, 3) RGB where the source is in colour
+    source: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One capture that was found and is complete by its file names, not yet read."""
+
+    name: str
+    sequence: PatternSequence
+    files: tuple[Path, ...]  # one a frame, in the sequence's order
+    source: Path
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def read(self) -> ImportedCapture:
+        """The capture with its frames; InputError where an image cannot be used."""
+        frames, texture = read_frames(self.files, _colour_frame(self.sequence))
+        return ImportedCapture(self.name, self.sequence, frames, texture, str(self.source), self.settings)
+
+
+@dataclass(frozen=True)
+class Imports:
+    """All captures of a source. Iterating reads them one at a time, so that memory is needed for one."""
+
+    recordings: Sequence[Recording]
+    warnings: Sequence[str]  # what was seen and left aside, one sentence each
+
+    def __len__(self) -> int:
+        return len(self.recordings)
+
+    def __iter__(self) -> Iterator[ImportedCapture]:
+        return (recording.read() for recording in self.recordings)
+
+
+def find_captures(source: Path, is_capture: Callable[[Path], bool], looks_like: str) -> tuple[list[Path], list[str]]:
+    """Capture folders in counting order, and warnings: `source` itself if it is one, else those right inside it.
+
+    Raises InputError where there are none (it should look like `looks_like`), or where a folder that is named like the
+    captures beside it has nothing of one inside.
+    """
+    source = Path(source).expanduser().resolve()
+    if not source.is_dir():
+        raise InputError(f"{source} is no folder: give the folder of a capture, or a folder of such folders")
+    if is_capture(source):
+        return [source], []
+    inner = sorted((entry for entry in visible(source) if entry.is_dir()), key=lambda entry: natural_key(entry.name))
+    captures = [folder for folder in inner if is_capture(folder)]
+    if not captures:
+        raise InputError(f"{source} holds no captures: {looks_like} was looked for in it and in the folders inside")
+    stems = {_stem(folder) for folder in captures}
+    warnings = []
+    for folder in inner:
+        if folder not in captures and _stem(folder) in stems:
+            raise InputError(f"{folder} holds no frames ({looks_like}): add them, or move the folder away")
+        if folder not in captures:
+            warnings.append(f"folder {folder.name} was left aside: it holds no capture ({looks_like})")
+    return captures, warnings
+
+
+def capture_name(folder: Path, prefix: str | None) -> str:
+    """The folder's name, behind `prefix_` if there is one; InputError where that cannot be a capture's name."""
+    return safe_name(f"{prefix}_{folder.name}" if prefix else folder.name)
+
+
+def visible(folder: Path) -> list[Path]:
+    """What is in a folder, without hidden files; InputError where it cannot be listed."""
+    try:
+        return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+    except OSError as error:
+        raise InputError(f"{folder} cannot be listed ({error}): check its permissions") from error
+
+
+def strangers_warning(folder: Path, files: Sequence[Path]) -> list[str]:
+    """A warning that names files which the layout does not know, as a list of one, or of none."""
+    if not files:
+        return []
+    images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
+    shown = listed([file.name for file in (*images, *(file for file in files if file not in images))])
+    return [f"{folder.parent.name}/{folder.name}: {shown} left aside: not part of the layout"]
+
+
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Names in a sentence, the first few of many."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _stem(folder: Path) -> str:
+    return re.sub(r"\d+", "#", folder.name.lower())
+
+
+def _colour_frame(sequence: PatternSequence) -> int | None:
+    """Index of the frame that shows the scene as it looks: the texture, else white."""
+    kinds = [frame.kind for frame in sequence.frames]
+    return next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), None)

@@ -1,0 +1,123 @@
+"""A stereo calibration made elsewhere, in an OpenCV FileStorage file (YAML, XML or JSON)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+
+ENTRIES = ("K_camera", "D_camera", "K_projector", "D_projector", "R", "T")
+
+_ROTATION_TOLERANCE = 1e-4  # a matrix written with five digits still passes
+_SHORTEST_BASELINE_MM = 1.0
+
+
+def read(path: Path, keys: Sequence[str] = ENTRIES) -> dict[str, np.ndarray]:
+    """The matrices under the file's own `keys`, given in the order of `ENTRIES`, and named by these.
+
+    K (3, 3) px; D (5,) = (k1, k2, p1, p2, k3); R (3, 3), the nearest rotation to what the file says; T (3,) mm; all
+    float64. R and T map camera to projector. Raises InputError where an entry is missing, has another shape, or says
+    what pinhole and Brown distortion with square axes cannot.
+    """
+    if len(keys) != len(ENTRIES):
+        raise InputError(f"{len(keys)} keys were given: name those of {' '.join(ENTRIES)}, in this order")
+    found = _matrices(Path(path), keys)
+    where = {entry: f"{Path(path).name}: {key}" for entry, key in zip(ENTRIES, keys, strict=True)}
+    values = dict(zip(ENTRIES, found, strict=True))
+    return {
+        "K_camera": _intrinsics(values["K_camera"], where["K_camera"]),
+        "D_camera": _distortion(values["D_camera"], where["D_camera"]),
+        "K_projector": _intrinsics(values["K_projector"], where["K_projector"]),
+        "D_projector": _distortion(values["D_projector"], where["D_projector"]),
+        "R": _rotation(values["R"], where["R"]),
+        "T": _translation(values["T"], where["T"]),
+    }
+
+
+def _matrices(path: Path, keys: Sequence[str]) -> list[np.ndarray]:
+    if not path.is_file():
+        raise InputError(f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)")
+    unreadable = f"{path.name} is no OpenCV FileStorage file (.yml, .xml or .json): export the calibration again"
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError) as error:
+        raise InputError(unreadable) from error
+    try:
+        if not storage.isOpened():
+            raise InputError(unreadable)
+        there = list(storage.root().keys())
+        if missing := [key for key in keys if key not in there]:
+            raise InputError(f"{path.name} has no {', '.join(missing)}: its keys are {', '.join(there) or 'none'}")
+        return [_matrix(storage.getNode(key), f"{path.name}: {key}") for key in keys]
+    finally:
+        storage.release()
+
+
+def _matrix(node: Any, where: str) -> np.ndarray:
+    """A FileStorage matrix, or numbers in (nested) lists, as float64."""
+
+    def numbers(node: Any) -> Any:
+        if node.isSeq():
+            return [numbers(node.at(i)) for i in range(node.size())]
+        if node.isInt() or node.isReal():
+            return node.real()
+        raise ValueError
+
+    try:
+        matrix = node.mat() if node.isMap() else np.array(numbers(node), np.float64)
+        if matrix is None:
+            raise ValueError
+        matrix = np.asarray(matrix, np.float64)
+    except (ValueError, cv2.error) as error:
+        raise InputError(f"{where} is no matrix of numbers: name the key of one") from error
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where} holds numbers that are not finite: calibrate again")
+    return matrix
+
+
+def _intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
+    if matrix.shape != (3, 3):
+        raise InputError(f"{where} has shape {matrix.shape}: a camera matrix is 3x3")
+    fx, fy = matrix[0, 0], matrix[1, 1]
+    if fx <= 0 or fy <= 0 or not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-9):
+        raise InputError(f"{where} is no camera matrix (fx 0 cx, 0 fy cy, 0 0 1): check the key")
+    if abs(matrix[0, 1]) > 1e-9 * fx:
+        raise InputError(f"{where} has a skew of {matrix[0, 1]:g}, which is not modelled here: calibrate without skew")
+    return matrix
+
+
+def _distortion(matrix: np.ndarray, where: str) -> np.ndarray:
+    coefficients = matrix.ravel()
+    if max(matrix.shape, default=0) != coefficients.size or coefficients.size not in (4, 5, 8, 12, 14):
+        raise InputError(f"{where} has shape {matrix.shape}: OpenCV's distortion has 4, 5, 8, 12 or 14 coefficients")
+    if np.any(coefficients[5:]):
+        raise InputError(
+            f"{where} has {coefficients.size} coefficients with rational, prism or tilt terms, which k1 k2 p1 p2 k3 "
+            "cannot represent: calibrate with five coefficients"
+        )
+    return np.concatenate([coefficients[:5], np.zeros(max(0, 5 - coefficients.size))])
+
+
+def _rotation(matrix: np.ndarray, where: str) -> np.ndarray:
+    if matrix.shape != (3, 3):
+        raise InputError(f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3")
+    left, _, right = np.linalg.svd(matrix)
+    nearest = left @ right
+    error = np.abs(matrix - nearest).max()
+    if error > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
+        raise InputError(
+            f"{where} is no rotation (off by {error:.2g}, determinant {np.linalg.det(matrix):.3g}): check it"
+        )
+    return nearest
+
+
+def _translation(matrix: np.ndarray, where: str) -> np.ndarray:
+    if matrix.shape not in ((3, 1), (1, 3), (3,)):
+        raise InputError(f"{where} has shape {matrix.shape}: the translation from camera to projector has 3 numbers")
+    translation = matrix.ravel()
+    if np.linalg.norm(translation) < _SHORTEST_BASELINE_MM:
+        raise InputError(f"{where} is {np.linalg.norm(translation):.3g} long: give the translation in mm")
+    return translation

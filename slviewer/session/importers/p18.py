@@ -1,0 +1,110 @@
+"""The p18 layout: `pose_XX/{V,H}/P18_FNN.PNG`.
+
+F00-F17 are 18 phase steps at a period of 18 px, F18-F24 seven Gray bits, most significant first, F25 or F26 the
+texture. V varies along projector columns (axis x), H along rows (axis y). Capitals and suffixes vary.
+"""
+
+import re
+from pathlib import Path
+
+from slviewer.errors import InputError
+from slviewer.fringe.presets import gray_bits, phase_steps
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence
+from slviewer.session.importers.images import IMAGE_SUFFIXES, read_image
+from slviewer.session.importers.imported import (
+    Imports,
+    Recording,
+    capture_name,
+    find_captures,
+    listed,
+    strangers_warning,
+    visible,
+)
+
+_STEPS, _PERIOD_PX, _BITS = 18, 18.0, 7
+_CODED = _STEPS + _BITS
+_TEXTURES = (_CODED, _CODED + 1)
+_AXES: dict[str, Axis] = {"v": "x", "h": "y"}
+_FILE = re.compile(r"p18_f(\d+)", re.IGNORECASE)
+
+
+def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] = (912, 1140)) -> Imports:
+    """Captures named after their folders; each holds the axes whose folder is there, V before H.
+
+    Raises InputError where frames are missing, double or too many, or where the Gray code cannot number the
+    projector's columns or rows.
+    """
+    folders, warnings = find_captures(Path(source), _is_pose, "a folder V or H with P18_FNN images")
+    recordings = []
+    for folder in folders:
+        recording, more = _recording(folder, capture_name(folder, prefix), projector)
+        recordings.append(recording)
+        warnings += more
+    return Imports(recordings, warnings)
+
+
+def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Recording, list[str]]:
+    files: list[Path] = []
+    frames: list[Frame] = []
+    texture: Path | None = None
+    warnings: list[str] = []
+    for folder, axis in _axis_folders(pose):
+        extent = projector[0] if axis == "x" else projector[1]
+        if 2**_BITS * _PERIOD_PX < extent:
+            raise InputError(
+                f"{_BITS} Gray bits of {_PERIOD_PX:g} px number {2**_BITS * _PERIOD_PX:g} px of the projector's {extent} "
+                f"along {axis}: give the size of the projector that was used, or describe the frames in a TOML"
+            )
+        numbered, more = _numbered(folder)
+        warnings += more
+        files += [numbered[number] for number in range(_CODED)]
+        frames += phase_steps(axis, _STEPS, _PERIOD_PX) + gray_bits(axis, _BITS)
+        if texture is None and (textures := [numbered[number] for number in _TEXTURES if number in numbered]):
+            texture = textures[0]
+            if len(textures) == 2:
+                texture = max(textures, key=lambda path: read_image(path).mean())
+                warnings.append(f"{pose.name}/{folder.name}: both F25 and F26 are there: the brighter is the texture")
+            files.append(texture)
+            frames.append(Frame("texture"))
+    if texture is None:
+        warnings.append(f"{pose.name} has no texture (P18_F25 or F26): its clouds take their grey from the fringes")
+    return Recording(name, PatternSequence(projector, tuple(frames)), tuple(files), pose), warnings
+
+
+def _numbered(folder: Path) -> tuple[dict[int, Path], list[str]]:
+    """{frame number: file}, complete, and warnings."""
+    numbered: dict[int, Path] = {}
+    strangers: list[Path] = []
+    where = f"{folder.parent.name}/{folder.name}"
+    for file in sorted(visible(folder)):
+        match = _FILE.fullmatch(file.stem)
+        if not match or file.suffix.lower() not in IMAGE_SUFFIXES:
+            strangers.append(file)
+            continue
+        number = int(match[1])
+        if number in numbered:
+            raise InputError(f"{where} holds {numbered[number].name} and {file.name}: keep one of them")
+        numbered[number] = file
+    if missing := [number for number in range(_CODED) if number not in numbered]:
+        raise InputError(f"{where} lacks P18_F{listed([f'{n:02d}' for n in missing])}: record or copy them again")
+    if extra := [file.name for number, file in numbered.items() if number > max(_TEXTURES)]:
+        raise InputError(
+            f"{where} holds {listed(extra)}, beyond the p18 layout's F00 to F26: "
+            "move them away, or describe the frames in a TOML"
+        )
+    return numbered, strangers_warning(folder, strangers)
+
+
+def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
+    """V, then H, whichever are there."""
+    there = [entry for entry in visible(pose) if entry.is_dir() and entry.name.lower() in _AXES]
+    if len({entry.name.lower() for entry in there}) < len(there):
+        raise InputError(f"{pose} holds {listed(sorted(entry.name for entry in there))}: keep one folder an axis")
+    return sorted(((entry, _AXES[entry.name.lower()]) for entry in there), key=lambda found: found[1])
+
+
+def _is_pose(folder: Path) -> bool:
+    return any(
+        entry.is_dir() and entry.name.lower() in _AXES and any(_FILE.match(file.stem) for file in visible(entry))
+        for entry in visible(folder)
+    )
