@@ -1,0 +1,147 @@
+"""Boards that are not quite flat, with features that are not quite where they should be."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.simulation.board_kernels import coverage, intersect
+from slviewer.simulation.scenes import Surface
+from slviewer.target.board import Board
+
+
+@dataclass(frozen=True)
+class Pose:
+    """T_camera_board: X_camera = R X_board + t, mm."""
+
+    R: np.ndarray
+    t: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.R.shape != (3, 3) or self.t.shape != (3,):
+            raise InputError(f"a pose needs R (3, 3) and t (3,), got the shapes {self.R.shape} and {self.t.shape}")
+
+    def to_camera(self, points: np.ndarray) -> np.ndarray:
+        """Board-frame points (..., 3) in the camera frame."""
+        return points @ self.R.T + self.t
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How far a board departs from a plane, mm: z = bow_x (1 - X^2) + bow_y (1 - Y^2) + twist X Y.
+
+    X and Y run from -1 to 1 over the board; z points away from the camera. `misplaced_mm` is the standard deviation of
+    each circle's offset in x and y.
+    """
+
+    bow_x_mm: float = 0.0
+    bow_y_mm: float = 0.0
+    twist_mm: float = 0.0
+    misplaced_mm: float = 0.0
+
+
+FLAT = Shape()
+
+
+@dataclass(frozen=True)
+class BoardScene:
+    """A white plate at `pose`, printed with `board`'s features, or blank if `board` is None.
+
+    The plate reaches from `corner` to `corner + size` (x, y) in the board's frame, where the first feature is the
+    origin; `misplacement` (n, 2) mm is what has been added to the printed circles. Circles are `diameter_mm` wide.
+    """
+
+    pose: Pose
+    board: Board | None
+    corner: tuple[float, float]
+    plate: tuple[float, float]
+    shape: Shape
+    misplacement: np.ndarray
+    diameter_mm: float = 0.0
+    white: float = 0.85
+    dark: float = 0.09
+
+    @cached_property
+    def features(self) -> np.ndarray:
+        """(n, 3) mm in the board's frame: where the features really are, bow and misplacement included."""
+        if self.board is None:
+            return np.zeros((0, 3))
+        xy = self.board.points[:, :2] + self.misplacement
+        return np.concatenate([xy, self.height(xy)[:, None]], 1)
+
+    def height(self, xy: np.ndarray) -> np.ndarray:
+        """z (...) mm of the plate's surface at (..., 2) of the board's frame."""
+        X, Y = np.moveaxis(2 * (xy - np.array(self.corner)) / np.array(self.plate) - 1, -1, 0)
+        shape = self.shape
+        return shape.bow_x_mm * (1 - X * X) + shape.bow_y_mm * (1 - Y * Y) + shape.twist_mm * X * Y
+
+    def trace(self, rays: np.ndarray) -> Surface:
+        """Where the rays meet the plate; albedo averaged over each pixel."""
+        bounds = np.array([*self.corner, *self.plate])
+        shape = np.array([self.shape.bow_x_mm, self.shape.bow_y_mm, self.shape.twist_mm])
+        origin, axes = -self.pose.R.T @ self.pose.t, np.ascontiguousarray(self.pose.R.T)
+        xy, points, normals = intersect(np.ascontiguousarray(rays), origin, axes, self.pose.R, bounds, shape)
+        if self.board is None:
+            kind, pitch, cells = 0, 1.0, np.zeros((1, 1), np.int32)
+        elif self.board.kind == "chessboard":
+            kind, pitch, cells = 2, self.board.pitch_mm, np.array([[self.board.columns, self.board.rows]], np.int32)
+        else:
+            kind, pitch, cells = 1, self.board.pitch_mm, self._cells
+        albedo = coverage(
+            xy, bounds, kind, pitch, cells, self.features[:, :2].copy(), self.diameter_mm / 2, self.white, self.dark
+        )
+        outside = albedo == 0
+        points[outside], normals[outside] = np.nan, np.nan
+        return Surface(points, normals, albedo)
+
+    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """A nearly flat plate shades no part of itself."""
+        return np.zeros(len(points), bool)
+
+    @cached_property
+    def _cells(self) -> np.ndarray:
+        """(rows, columns) int32: in cells of a quarter pitch, the nearest circle: the only one that can be there."""
+        assert self.board is not None
+        step = self.board.pitch_mm / 4
+        shape = [int(np.ceil(length / step)) for length in reversed(self.plate)]
+        j, i = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
+        middle = np.stack([self.corner[0] + (j + 0.5) * step, self.corner[1] + (i + 0.5) * step], -1)
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.features[:, :2]).query(middle)[1].astype(np.int32)
+
+
+def printed_board(
+    board: Board,
+    pose: Pose,
+    shape: Shape = FLAT,
+    seed: int = 0,
+    margin_mm: float | None = None,
+    diameter_mm: float | None = None,
+) -> BoardScene:
+    """`board` printed on a plate with `margin_mm` around its outermost features (default 1.5 pitches).
+
+    `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a pitch wide unless
+    `diameter_mm` says otherwise. Raises `InputError` for ChArUco boards, which the simulation does not print.
+    """
+    if board.kind == "charuco":
+        raise InputError("the simulation does not print ChArUco boards: use circles, acircles or a chessboard")
+    diameter = (board.pitch_mm / 2 if diameter_mm is None else diameter_mm) if board.kind != "chessboard" else 0.0
+    if diameter > 0.6 * board.pitch_mm:
+        raise InputError(f"circles of {diameter:g} mm at a pitch of {board.pitch_mm:g} mm: give 0.6 pitches at most")
+    margin = 1.5 * board.pitch_mm if margin_mm is None else margin_mm
+    low = board.points[:, :2].min(0) - margin
+    high = board.points[:, :2].max(0) + margin
+    size = high - low
+    misplacement = np.random.default_rng([seed, 0xB0A]).normal(0, 1, (len(board.points), 2)) * shape.misplaced_mm
+    if board.kind == "chessboard":
+        misplacement *= 0  # its corners share edges, so that they cannot move one by one
+    return BoardScene(
+        pose, board, (float(low[0]), float(low[1])), (float(size[0]), float(size[1])), shape, misplacement, diameter
+    )
+
+
+def blank_board(pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: Shape = FLAT) -> BoardScene:
+    """A white plate of `size` mm whose middle is the origin of its frame."""
+    return BoardScene(pose, None, (-size[0] / 2, -size[1] / 2), size, shape, np.zeros((0, 2)))

@@ -1,0 +1,84 @@
+"""One camera frame: light on the surface, through the camera's lens, with noise, to 8 bits."""
+
+import numba
+import numpy as np
+from scipy.special import ive, ndtri
+
+from slviewer.geometry.jit import kernel
+
+_ROWS = 24  # rows per task: small enough for the cache, large enough that the PSF's overlap costs little
+
+NORMAL_QUANTILES = ndtri((np.arange(65536) + 0.5) / 65536).astype(np.float32)
+"""A standard normal deviate for each 16 random bits."""
+
+
+def psf_taps(sigma_px: float) -> np.ndarray:
+    """(2 r + 1,) float32: the discrete Gaussian, whose variance is sigma^2 at any sampling, also for small sigma."""
+    radius = 0 if sigma_px == 0 else max(1, int(np.ceil(3 * sigma_px)))
+    taps = ive(np.abs(np.arange(-radius, radius + 1)), sigma_px**2)
+    return (taps / taps.sum()).astype(np.float32)
+
+
+@kernel()
+def _mix(x):
+    """A 32-bit hash (Wellons' lowbias32)."""
+    x ^= x >> np.uint32(16)
+    x = np.uint32(x * np.uint32(0x7FEB352D))
+    x ^= x >> np.uint32(15)
+    x = np.uint32(x * np.uint32(0x846CA68B))
+    x ^= x >> np.uint32(16)
+    return x
+
+
+@kernel(parallel=True, fastmath=True)
+def expose(coordinate, level, gain, table, offset, per_px, taps, stray, noise, quantiles, keys, out):
+    """Write one frame into `out` (h, w) uint8.
+
+    Light gain * table(level, coordinate) is blurred by `taps` in both directions; `stray` (h, w), blurred before, is
+    added. noise: dark level, read variance, shot variance. The noise depends on the pixel and on `keys` (two uint32)
+    alone, not on how the rows are shared among threads.
+    """
+    h, w = out.shape
+    radius = taps.size // 2
+    last = np.float32(table.shape[1] - 1.001)
+    dark, read, shot = np.float32(noise[0]), np.float32(noise[1]), np.float32(noise[2])
+    start, scale = np.float32(offset), np.float32(per_px)
+    key0, key1 = keys[0], keys[1]
+    for task in numba.prange((h + _ROWS - 1) // _ROWS):
+        first, end = task * _ROWS, min((task + 1) * _ROWS, h)
+        blurred = np.zeros((_ROWS + 2 * radius, w), np.float32)
+        line = np.zeros(w + 2 * radius, np.float32)
+        for k in range(end - first + 2 * radius):
+            i = min(max(first - radius + k, 0), h - 1)
+            for j in range(w):
+                place = min(max(coordinate[i, j] * scale + start, np.float32(0)), last)
+                left = int(place)
+                share = place - np.float32(left)
+                sharp = int(level[i, j])
+                wide = min(sharp + 1, table.shape[0] - 1)
+                mix = level[i, j] - np.float32(sharp)
+                a = table[sharp, left] + share * (table[sharp, left + 1] - table[sharp, left])
+                b = table[wide, left] + share * (table[wide, left + 1] - table[wide, left])
+                line[radius + j] = gain[i, j] * (a + mix * (b - a))
+            for j in range(radius):
+                line[j], line[w + radius + j] = line[radius], line[w + radius - 1]
+            for tap in range(taps.size):
+                weight = taps[tap]
+                for j in range(w):
+                    blurred[k, j] += weight * line[tap + j]
+        light = np.empty(w, np.float32)
+        bits = np.empty(w, np.uint32)
+        for i in range(first, end):
+            light[:] = stray[i]
+            for tap in range(taps.size):
+                weight = taps[tap]
+                source = blurred[i - first + tap]
+                for j in range(w):
+                    light[j] += weight * source[j]
+            for j in range(w):
+                x = _mix(np.uint32(np.uint32(i * w + j) ^ key0))
+                bits[j] = _mix(np.uint32(x + key1)) >> np.uint32(16)
+            for j in range(w):
+                spread = np.sqrt(read + shot * max(light[j], np.float32(0)))
+                value = dark + light[j] + spread * quantiles[bits[j]] + np.float32(0.5)
+                out[i, j] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))

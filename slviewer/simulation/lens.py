@@ -1,0 +1,136 @@
+"""The simulated lens: pinhole, Brown distortion, and a local distortion that Brown cannot express.
+
+Written apart from the calibration's lens on purpose: an error in one must show against the other.
+"""
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numba
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.jit import kernel
+from slviewer.simulation.waves import Waves
+
+
+@dataclass(frozen=True)
+class SimulatedLens:
+    """A lens described at full resolution and used at `scale`.
+
+    Pixel p = Brown(pinhole) in px of the full resolution, then p + W(p) with the waves W, then (p + 0.5) scale - 0.5:
+    pixel centres at whole numbers, and the image's outer edges stay where they are.
+
+    focal_px, centre_px: (x, y) at full resolution; brown: k1, k2, p1, p2, k3 (OpenCV's order); full_size: (width, height).
+    """
+
+    full_size: tuple[int, int]
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    brown: tuple[float, float, float, float, float]
+    waves: Waves = field(default_factory=lambda: np.zeros((0, 6)), repr=False)
+    scale: float = 1.0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) px at `scale`."""
+        return round(self.full_size[0] * self.scale), round(self.full_size[1] * self.scale)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) of `points` (..., 3) mm in this device's frame; NaN where z <= 0 or a coordinate is NaN."""
+        points = _checked(points, 3)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+            return self._apply(_project_kernel, points[..., :2] / z)
+
+    def undistort(self, pixels: np.ndarray) -> np.ndarray:
+        """Normalised coordinates (..., 2) = (x/z, y/z) whose projection is `pixels` (..., 2), by Newton; NaN if it fails."""
+        return self._apply(_undistort_kernel, _checked(pixels, 2))
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """(h, w, 2) float64: normalised coordinates (x/z, y/z) of every pixel."""
+        width, height = self.size
+        u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+        return self.undistort(np.stack([u, v], -1))
+
+    def _apply(self, function: Any, values: np.ndarray) -> np.ndarray:
+        numbers = np.array([*self.focal_px, *self.centre_px, *self.brown, self.scale])
+        flat = np.ascontiguousarray(values.reshape(-1, 2))
+        return function(flat, numbers, self.waves).reshape(values.shape)
+
+
+def _checked(values: np.ndarray, last: int) -> np.ndarray:
+    values = np.asarray(values, float)
+    if values.ndim < 1 or values.shape[-1] != last:
+        raise InputError(f"expected an array (..., {last}), got the shape {values.shape}")
+    return values
+
+
+@kernel()
+def _forward(x, y, numbers, waves):
+    """Pixel (u, v) at the lens's scale, and its derivatives by x and y (4 numbers), for one normalised point."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, scale = numbers
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / d r2, twice: times x or y it is d radial / dx or dy
+    u = cx + fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x))
+    v = cy + fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+    ux = fx * (radial + x * x * slope + 2 * p1 * y + 6 * p2 * x)
+    uy = fx * (x * y * slope + 2 * p1 * x + 2 * p2 * y)
+    vx = fy * (x * y * slope + 2 * p1 * x + 2 * p2 * y)
+    vy = fy * (radial + y * y * slope + 6 * p1 * y + 2 * p2 * x)
+    wu, wv, wuu, wuv, wvu, wvv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(waves.shape[0]):
+        angle = waves[i, 0] * u + waves[i, 1] * v
+        a, b = angle + waves[i, 3], angle + waves[i, 5]
+        wu += waves[i, 2] * math.sin(a)
+        wv += waves[i, 4] * math.sin(b)
+        ca, cb = waves[i, 2] * math.cos(a), waves[i, 4] * math.cos(b)
+        wuu += ca * waves[i, 0]
+        wuv += ca * waves[i, 1]
+        wvu += cb * waves[i, 0]
+        wvv += cb * waves[i, 1]
+    return (
+        (u + wu + 0.5) * scale - 0.5,
+        (v + wv + 0.5) * scale - 0.5,
+        scale * (ux * (1 + wuu) + vx * wuv),
+        scale * (uy * (1 + wuu) + vy * wuv),
+        scale * (ux * wvu + vx * (1 + wvv)),
+        scale * (uy * wvu + vy * (1 + wvv)),
+    )
+
+
+@kernel(parallel=True)
+def _project_kernel(normalised, numbers, waves):
+    out = np.empty_like(normalised)
+    for i in numba.prange(normalised.shape[0]):
+        u, v, _, _, _, _ = _forward(normalised[i, 0], normalised[i, 1], numbers, waves)
+        out[i, 0], out[i, 1] = u, v
+    return out
+
+
+@kernel(parallel=True)
+def _undistort_kernel(pixels, numbers, waves):
+    out = np.empty_like(pixels)
+    fx, fy, cx, cy, scale = numbers[0], numbers[1], numbers[2], numbers[3], numbers[9]
+    for i in numba.prange(pixels.shape[0]):
+        x = ((pixels[i, 0] + 0.5) / scale - 0.5 - cx) / fx
+        y = ((pixels[i, 1] + 0.5) / scale - 0.5 - cy) / fy
+        error = np.inf
+        for _ in range(20):
+            u, v, ux, uy, vx, vy = _forward(x, y, numbers, waves)
+            du, dv = pixels[i, 0] - u, pixels[i, 1] - v
+            determinant = ux * vy - uy * vx
+            x += (vy * du - uy * dv) / determinant
+            y += (ux * dv - vx * du) / determinant
+            error = abs(du) + abs(dv)
+            if not error > 1e-6:  # the step just taken squares this: 1e-12 px and better; also leaves on NaN
+                break
+        if error <= 1e-6:
+            out[i, 0], out[i, 1] = x, y
+        else:
+            out[i, 0], out[i, 1] = np.nan, np.nan
+    return out

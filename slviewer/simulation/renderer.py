@@ -1,0 +1,151 @@
+"""From a rig and a scene to the frames that its camera would take, and the truth behind them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import correlate1d
+
+from slviewer.errors import InputError
+from slviewer.fringe.patterns import profile
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.simulation.film import NORMAL_QUANTILES, expose, psf_taps
+from slviewer.simulation.light import OVERSAMPLING, blur_levels, blurred_profile, window
+from slviewer.simulation.rig import SimulatedRig
+from slviewer.simulation.scenes import Scene
+
+_EXPOSURE_QUANTILE = 0.995  # of the lit pixels; a few brighter ones do not decide an exposure
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a perfect instrument would measure.
+
+    points: (h, w, 3) float64 mm, camera frame, NaN where the camera's ray meets nothing. projector: (h, w, 2) float64
+    px (column, row) of those points, also beyond the projector's image. mask: (h, w) bool, where the projector's light
+    arrives: inside its image, on a surface that faces it, in no shadow.
+    """
+
+    points: np.ndarray
+    projector: np.ndarray
+    mask: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """(h, w) float32 of a scene at unit exposure: full white light, light of any kind but the pattern, blur levels."""
+
+    gain: np.ndarray
+    stray: np.ndarray
+    level: np.ndarray
+    sigmas: np.ndarray
+    coordinates: dict[Axis, np.ndarray]
+    truth: Truth
+
+
+class Renderer:
+    """Renders one scene with one rig: geometry once, then frame after frame of any pattern sequence.
+
+    The exposure is set as an operator would: the brightest half percent of the lit surface reaches the sensor's
+    `peak_level` in full white light. Defocus and pixel response blur the projected profile by the surface's depth;
+    the camera's PSF blurs each frame. Silhouettes are not anti-aliased, printed edges are.
+    """
+
+    def __init__(self, rig: SimulatedRig, scene: Scene) -> None:
+        self.rig = rig
+        self.scene = scene
+
+    def truth(self) -> Truth:
+        """What a perfect instrument would measure."""
+        return self._maps.truth
+
+    def capture(
+        self, sequence: PatternSequence, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    ) -> np.ndarray:
+        """(n, h, w) uint8: every frame of `sequence`; the same seed (and rig) gives the same frames.
+
+        `progress(done, n)` is called after each frame, and may raise to stop.
+        """
+        rig, maps = self.rig, self._maps
+        if tuple(sequence.projector) != rig.projector.size:
+            raise InputError(
+                f"the patterns are {sequence.projector[0]}x{sequence.projector[1]} px and the simulated projector has "
+                f"{rig.projector.size[0]}x{rig.projector.size[1]}: make them for this projector"
+            )
+        rng = np.random.default_rng([rig.seed, seed, 0xF0])
+        keys = rng.integers(0, 2**32, (len(sequence.frames), 2), dtype=np.uint32)
+        lamp = 1 + rig.light.flicker * rng.standard_normal(len(sequence.frames))
+        taps = psf_taps(rig.sensor.psf_px * rig.camera.scale)
+        exposure = self.exposure
+        gain = (exposure * (1 - rig.light.black) * maps.gain).astype(np.float32)
+        stray = exposure * (rig.light.black * maps.gain + maps.stray)
+        for direction in (0, 1):
+            stray = correlate1d(stray, taps, axis=direction, mode="nearest")
+        stray = np.ascontiguousarray(stray, np.float32)
+        sensor = rig.sensor
+        noise = np.array([sensor.dark_level, sensor.read_variance, sensor.shot_variance])
+        width, height = rig.camera.size
+        stack = np.empty((len(sequence.frames), height, width), np.uint8)
+        for k in range(len(stack)):
+            varies, grey_levels = profile(sequence, k)
+            # Rows and columns are blurred alike in space, hence by different numbers of pixels.
+            sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
+            pattern = blurred_profile((grey_levels / 255.0) ** rig.light.gamma, sigmas)
+            expose(
+                maps.coordinates[varies or "x"], maps.level, gain, np.float32(lamp[k]) * pattern.table, pattern.offset,
+                OVERSAMPLING, taps, stray, noise, NORMAL_QUANTILES, keys[k], stack[k],
+            )  # fmt: skip
+            if progress is not None:
+                progress(k + 1, len(stack))
+        return stack
+
+    @cached_property
+    def exposure(self) -> float:
+        """Grey levels of full white light on an albedo of 1 that faces the projector at its focus."""
+        maps, sensor = self._maps, self.rig.sensor
+        lit = maps.gain[maps.truth.mask] + maps.stray[maps.truth.mask]
+        if not lit.size:
+            raise InputError("nothing in the scene is lit by the projector: move it to where both fields meet")
+        return (sensor.peak_level - sensor.dark_level) / float(np.quantile(lit, _EXPOSURE_QUANTILE))
+
+    @property
+    def _rows_per_column(self) -> float:
+        return self.rig.projector.focal_px[1] / self.rig.projector.focal_px[0]
+
+    @cached_property
+    def _maps(self) -> _Maps:
+        rig, light = self.rig, self.rig.light
+        rays = rig.camera.rays
+        surface = self.scene.trace(rays)
+        hit = np.isfinite(surface.points[..., 2])
+        projector = rig.project(surface.points)
+        to_source = rig.projector_centre - surface.points
+        distance = np.linalg.norm(to_source, axis=-1)
+        with np.errstate(invalid="ignore"):
+            facing = np.nan_to_num((surface.normals * to_source).sum(-1) / distance).clip(min=0)
+            depth = surface.points @ rig.R[2] + rig.t[2]
+            blur = np.hypot(light.blur_px, light.defocus_px_mm * np.abs(1 / depth - 1 / light.focus_mm))
+            shade = np.nan_to_num(facing * (light.focus_mm / distance) ** 2)
+        reached = facing > 0
+        reached[reached] = ~self.scene.occluded(surface.points[reached], rig.projector_centre)
+        columns, rows = rig.projector.size
+        u, v = projector[..., 0], projector[..., 1]
+        lens_falloff = (1 + (rays**2).sum(-1)) ** -2  # cos^4 of the angle to the camera's axis
+        seen = surface.albedo * lens_falloff
+        lit = window(u, columns, blur) * window(v, rows, blur * self._rows_per_column)
+        with np.errstate(invalid="ignore"):
+            inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
+        sigmas, level = blur_levels(blur)
+        return _Maps(
+            gain=(seen * shade * reached * lit).astype(np.float32),
+            stray=(seen * light.ambient * hit).astype(np.float32),
+            level=level,
+            sigmas=sigmas,
+            coordinates={"x": _finite(u), "y": _finite(v)},
+            truth=Truth(surface.points, projector, hit & reached & inside),
+        )
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0), np.float32)

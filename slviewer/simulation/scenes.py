@@ -1,0 +1,94 @@
+"""What stands before the simulated rig, and what its camera rays meet.
+
+Every scene answers two questions: `trace` (where do the rays meet the surface, with which normal and albedo) and
+`occluded` (does the scene itself stand between a surface point and the projector). All lengths in mm, camera frame.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from slviewer.errors import InputError
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What the rays of (h, w) pixels meet: points and unit normals (h, w, 3) float64, NaN where nothing is met;
+    normals look towards the camera; albedo (h, w) float32, averaged over the pixel's area, 0 where nothing is met.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    albedo: np.ndarray
+
+
+class Scene(Protocol):
+    """Anything that can be rendered."""
+
+    def trace(self, rays: np.ndarray) -> Surface:
+        """What the camera rays (h, w, 2) = (x/z, y/z) meet."""
+        ...
+
+    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """(n,) bool: the way from `points` (n, 3) on the surface to `source` (3,) is blocked."""
+        ...
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """One or several diffuse spheres: centres (n, 3), one radius, nothing behind them."""
+
+    centres: np.ndarray
+    radius_mm: float
+    albedo: float = 0.85
+
+    def __post_init__(self) -> None:
+        if self.centres.ndim != 2 or self.centres.shape[1] != 3 or self.radius_mm <= 0:
+            raise InputError(f"spheres need centres (n, 3) and a radius above 0, got the shape {self.centres.shape}")
+
+    def trace(self, rays: np.ndarray) -> Surface:
+        """The nearer intersection with the nearest sphere."""
+        directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
+        squared = (directions**2).sum(-1)
+        depth = np.full(rays.shape[:2], np.inf)
+        normals = np.full(directions.shape, np.nan)
+        for centre in self.centres:
+            along = directions @ centre / squared
+            root = along**2 - (centre @ centre - self.radius_mm**2) / squared
+            with np.errstate(invalid="ignore"):
+                z = along - np.sqrt(root)
+            nearer = (z > 0) & (z < depth)
+            depth[nearer] = z[nearer]
+            normals[nearer] = (directions[nearer] * z[nearer, None] - centre) / self.radius_mm
+        points = directions * np.where(np.isfinite(depth), depth, np.nan)[..., None]
+        return Surface(points, normals, np.where(np.isfinite(depth), self.albedo, 0).astype(np.float32))
+
+    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """Whether another part of the spheres lies on the way to `source`."""
+        way = source - points
+        blocked = np.zeros(len(points), bool)
+        for centre in self.centres:
+            to_centre = centre - points
+            share = (to_centre * way).sum(-1) / (way**2).sum(-1)
+            gap = np.linalg.norm(to_centre - share[:, None] * way, axis=-1)
+            # A point of this very sphere lies at its radius: blocked only if the way enters, which `share > 0` says.
+            blocked |= (share > 0) & (gap < self.radius_mm * (1 - 1e-9))
+        return blocked
+
+
+def sphere(centre: tuple[float, float, float], diameter_mm: float = 196.0) -> Spheres:
+    """The Letter's sphere, of 196 mm diameter."""
+    return Spheres(np.array([centre], float), diameter_mm / 2)
+
+
+def sphere_pair(
+    middle: tuple[float, float, float],
+    direction: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    diameter_mm: float = 50.0,
+    spacing_mm: float = 150.0,
+) -> Spheres:
+    """Two spheres whose centres lie `spacing_mm` apart along `direction`, as on a ball bar."""
+    half = np.array(direction, float)
+    half *= spacing_mm / 2 / np.linalg.norm(half)
+    return Spheres(np.array([middle - half, middle + half]), diameter_mm / 2)
