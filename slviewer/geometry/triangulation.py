@@ -10,9 +10,10 @@ from slviewer.geometry.brown import brown
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rig import StereoRig
 
-TOLERANCE_PX = 1e-8
+TOLERANCE_PX = 1e-7
 """How far the distorted projection of the result may be from the measured coordinate."""
 MAX_STEPS = 25
+CHUNK = 1024
 MARGIN = 0.1
 """A point may fall outside the projector's image by this share of its width and height: a calibration's own error is
 smaller, and what lies further out was never lit."""
@@ -119,72 +120,81 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 
 @kernel()
 def _projection(z, a0, a1, a2, t, parameters, row):
-    """(measured coordinate, the other one, d(measured)/dz, d(undistorted)/dz) of the point at depth z; NaN where none.
+    """Of the point at depth z: (measured coordinate, the other one, d(measured)/dz, d(undistorted)/dz, undistorted).
 
-    The point is z a + t in the projector's frame, a = R (u_c, v_c, 1).
+    The point is z a + t in the projector's frame, a = R (u_c, v_c, 1); NaN where it cannot be projected.
     """
     depth = z * a2 + t[2]
     if not (z > 0.0 and depth > 0.0):
-        return np.nan, np.nan, np.nan, np.nan
-    x, y = (z * a0 + t[0]) / depth, (z * a1 + t[1]) / depth
+        return np.nan, np.nan, np.nan, np.nan, np.nan
+    inverse = 1.0 / depth
+    x, y = (z * a0 + t[0]) * inverse, (z * a1 + t[1]) * inverse
     if not x * x + y * y < parameters[9]:
-        return np.nan, np.nan, np.nan, np.nan
-    dx = (a0 * t[2] - t[0] * a2) / (depth * depth)
-    dy = (a1 * t[2] - t[1] * a2) / (depth * depth)
+        return np.nan, np.nan, np.nan, np.nan, np.nan
+    dx = (a0 * t[2] - t[0] * a2) * inverse * inverse
+    dy = (a1 * t[2] - t[1] * a2) * inverse * inverse
     xd, yd, dxx, dxy, dyy = brown(x, y, parameters)
     u, v = parameters[0] * xd + parameters[2], parameters[1] * yd + parameters[3]
     if row == 0:
-        return u, v, parameters[0] * (dxx * dx + dxy * dy), parameters[0] * dx
-    return v, u, parameters[1] * (dxy * dx + dyy * dy), parameters[1] * dy
+        return u, v, parameters[0] * (dxx * dx + dxy * dy), parameters[0] * dx, x
+    return v, u, parameters[1] * (dxy * dx + dyy * dy), parameters[1] * dy, y
 
 
 @kernel()
-def _depth(uc, vc, measured, R, t, parameters, row, extent):
-    """Depth of one ray; NaN as ``triangulate`` says."""
+def _depth(uc, vc, measured, shift, R, t, parameters, row, extent):
+    """(depth of one ray, undistorted minus distorted normalised coordinate there); NaN as ``triangulate`` says.
+
+    ``shift``: a guess of the latter.
+    """
     a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
     a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
     a2 = R[2, 0] * uc + R[2, 1] * vc + R[2, 2]
     a = a0 if row == 0 else a1
-    up = (measured - parameters[2 + row]) / parameters[row]
+    reading = (measured - parameters[2 + row]) / parameters[row]
+    up = reading + shift
     denominator = a - a2 * up
     if denominator == 0.0:
-        return np.nan
+        return np.nan, 0.0
     z = -(t[row] - t[2] * up) / denominator  # Letter eq. 6; rows 2 and 3 of M for axis y
-    u, other, slope, straight = _projection(z, a0, a1, a2, t, parameters, row)
+    u, other, slope, straight, undistorted = _projection(z, a0, a1, a2, t, parameters, row)
     error = measured - u
     for _ in range(MAX_STEPS):
         if abs(error) <= TOLERANCE_PX:
             size = extent[1 - row]
             if not -0.5 - MARGIN * size <= other <= (1.0 + MARGIN) * size - 0.5:
-                return np.nan
+                return np.nan, 0.0
             # where distortion turns the coordinate back along the ray, two depths share it: neither is an answer
-            return z if slope * straight > 0.0 else np.nan
+            return (z if slope * straight > 0.0 else np.nan), undistorted - reading
         if not np.isfinite(error) or slope == 0.0:
-            return np.nan
+            return np.nan, 0.0
         step = error / slope
         damping = 1.0
         while True:  # shorten the step until it stays in view and comes nearer
             nz = z + damping * step
-            nu, other, slope, straight = _projection(nz, a0, a1, a2, t, parameters, row)
+            nu, other, slope, straight, undistorted = _projection(nz, a0, a1, a2, t, parameters, row)
             if abs(measured - nu) < abs(error):
                 break
             damping *= 0.5
             if damping < 1e-3:
-                return np.nan
+                return np.nan, 0.0
         z, error = nz, measured - nu
-    return np.nan
+    return np.nan, 0.0
 
 
 @kernel(parallel=True)
 def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
     size = extent[row]
     low, high = -0.5 - MARGIN * size, (1.0 + MARGIN) * size - 0.5
-    for i in numba.prange(coordinate.shape[0]):
-        measured = coordinate[i]
-        if low <= measured <= high:  # False for NaN
-            z[i] = _depth(rays[i, 0], rays[i, 1], measured, R, t, parameters, row, extent)
-        else:
+    for chunk in numba.prange((coordinate.shape[0] + CHUNK - 1) // CHUNK):
+        shift = 0.0  # the neighbour's distortion is a guess that saves a step or two; a chunk's first ray has none
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, coordinate.shape[0])):
+            uc, vc, measured = rays[i, 0], rays[i, 1], coordinate[i]
             z[i] = np.nan
+            if low <= measured <= high:  # False for NaN
+                z[i], new = _depth(uc, vc, measured, shift, R, t, parameters, row, extent)
+                if np.isnan(z[i]) and shift != 0.0:
+                    z[i], new = _depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
+                shift = new
 
 
 @kernel(parallel=True)
@@ -194,4 +204,4 @@ def _slope_all(rays, depths, R, t, parameters, row, slopes):
         a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
         a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
         a2 = R[2, 0] * uc + R[2, 1] * vc + R[2, 2]
-        _, _, slopes[i], _ = _projection(depths[i], a0, a1, a2, t, parameters, row)
+        _, _, slopes[i], _, _ = _projection(depths[i], a0, a1, a2, t, parameters, row)
