@@ -94,9 +94,13 @@ def compare(
     if len(sizes) > 1:
         raise InputError(f"The models' clouds have different sizes, {sizes}: reconstruct them from the same capture.")
 
-    every = _union(clouds)
+    every, sigma_z = _union(clouds)
     if region is None:
-        region = find_plane(every)[1] if shape == "plane" else find_sphere(every, radius=radius)[1]
+        _, region = (
+            find_plane(every, sigma_z=sigma_z)
+            if shape == "plane"
+            else find_sphere(every, sigma_z=sigma_z, radius=radius)
+        )
     measured_pixels(every, region)  # says so if there is too little
     common = region & np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
     results: dict[str, PlaneResult | SphereResult] = {}
@@ -119,14 +123,14 @@ def compare(
     )
 
 
-def _union(clouds: Mapping[str, Cloud]) -> np.ndarray:
-    """The first cloud's points, and where it has none, the next one's."""
+def _union(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
+    """The first cloud's points and their noise, and where it has none, the next one's."""
     first, *others = clouds.values()
-    points = first.points.copy()
+    points, sigma_z = first.points.copy(), first.sigma_z.copy()
     for cloud in others:
         missing = ~np.isfinite(points).all(axis=2)
-        points[missing] = cloud.points[missing]
-    return points
+        points[missing], sigma_z[missing] = cloud.points[missing], cloud.sigma_z[missing]
+    return points, sigma_z
 
 
 def _coverage(cloud: Cloud, region: np.ndarray, lit: np.ndarray | None) -> float:

@@ -75,9 +75,6 @@ def measure(
     fit: Callable[[np.ndarray], Fitted],
 ) -> tuple[Fitted, ShapeResult]:
     """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and judge what is left over."""
-    for name, shape_of in (("mask", mask.shape), ("noise map", mask.shape if sigma_z is None else sigma_z.shape)):
-        if shape_of != points.shape[:2]:
-            raise InputError(f"The {name} has shape {shape_of} and the cloud {points.shape[:2]}: they must agree.")
     looked_at = mask & np.isfinite(points).all(axis=2)
     chosen = points[looked_at].astype(np.float64)
     if len(chosen) < LEAST_POINTS:

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.evaluation.fit import ShapeResult, measure
-from slviewer.evaluation.region import RANSAC_TOLERANCE_MM, find_plane, measured_pixels, sample
-from slviewer.geometry.ransac import ransac_plane
+from slviewer.evaluation.region import find_plane, start_plane
 from slviewer.geometry.shapes import Plane, fit_plane
 
 
@@ -24,8 +23,8 @@ def evaluate_plane(points: np.ndarray, mask: np.ndarray | None, sigma_z: np.ndar
     mm: the expected noise of z, for the noise floor.
     """
     if mask is None:
-        start, mask = find_plane(points)
+        start, mask = find_plane(points, sigma_z=sigma_z)
     else:
-        start, _ = ransac_plane(sample(points, measured_pixels(points, mask)), RANSAC_TOLERANCE_MM)
+        start = start_plane(points, mask, sigma_z)
     plane, result = measure(points, mask, sigma_z, start, fit_plane)
     return PlaneResult(**vars(result), plane=plane)

@@ -2,7 +2,8 @@
 
 RANSAC says where the shape is; the largest patch of connected pixels within a tolerance says how far it reaches. The
 tolerance is many times wider than any form error worth measuring, so that finding the shape never flatters it: what
-is wrong by less stays in, and what is wrong by more, inside the patch, stays in too, to be counted as set aside.
+is wrong by less stays in, and what is wrong by more, inside the patch, stays in too, to be counted as set aside. Where
+a cloud is noisier than that (Gray code alone), the tolerances follow its expected noise.
 """
 
 from collections.abc import Callable
@@ -15,48 +16,82 @@ from slviewer.evaluation.fit import Fitted
 from slviewer.geometry.ransac import ransac_plane, ransac_sphere
 from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
 
-RANSAC_TOLERANCE_MM = 1.0
-PLANE_TOLERANCE_MM = 3.0
-SPHERE_TOLERANCE = 0.04  # of its radius, at most PLANE_TOLERANCE_MM
+RANSAC_TOLERANCE_MM = 1.0  # or twice the noise
+PATCH_TOLERANCE_MM = 3.0  # or six times the noise
+SPHERE_TOLERANCE = 0.04  # of its radius, if that is less
 RIM_PX = 2  # mixed pixels at an object's outline show neither the object nor what is behind it
 LEAST_PIXELS = 200
 _SAMPLE = 40_000
 
 
-def find_plane(points: np.ndarray, mask: np.ndarray | None = None) -> tuple[Plane, np.ndarray]:
+def find_plane(
+    points: np.ndarray, mask: np.ndarray | None = None, sigma_z: np.ndarray | None = None
+) -> tuple[Plane, np.ndarray]:
     """The plane that holds most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
 
-    ``mask`` leaves only some pixels to search in. The region is one patch without its outermost two pixels; isolated
-    pixels and small holes inside it belong to it, whether something was measured there or not. The plane is a start
-    for fits, not a result. Raises ``InputError`` where no plane fills a patch.
+    ``mask`` leaves only some pixels to search in; ``sigma_z`` ``(h, w)`` mm is the expected noise. The region is one
+    patch without its outermost two pixels; isolated pixels and small holes inside it belong to it, whether something
+    was measured there or not. The plane is a start for fits, not a result. Raises ``InputError`` where no plane fills a
+    patch.
     """
     measured = measured_pixels(points, mask)
-    plane, _ = ransac_plane(sample(points, measured), RANSAC_TOLERANCE_MM)
-    return _grow(points, measured, plane, fit_plane, lambda shape: PLANE_TOLERANCE_MM, "flat")
+    noise = _typical(sigma_z, measured)
+    reach = max(PATCH_TOLERANCE_MM, 6.0 * noise)
+    return _grow(points, measured, start_plane(points, measured, sigma_z), fit_plane, lambda shape: reach, "flat")
 
 
 def find_sphere(
-    points: np.ndarray, mask: np.ndarray | None = None, radius: float | None = None
+    points: np.ndarray,
+    mask: np.ndarray | None = None,
+    sigma_z: np.ndarray | None = None,
+    radius: float | None = None,
 ) -> tuple[Sphere, np.ndarray]:
     """The sphere that holds most pixels, and its region, as ``find_plane``; ``radius`` in mm narrows the search."""
     measured = measured_pixels(points, mask)
-    sphere, _ = ransac_sphere(sample(points, measured), RANSAC_TOLERANCE_MM, radius)
+    noise = _typical(sigma_z, measured)
 
-    def tolerance(shape: Sphere) -> float:
-        return min(PLANE_TOLERANCE_MM, SPHERE_TOLERANCE * shape.radius)
+    def reach(shape: Sphere) -> float:
+        return max(min(PATCH_TOLERANCE_MM, SPHERE_TOLERANCE * shape.radius), 6.0 * noise)
 
-    return _grow(points, measured, sphere, fit_sphere, tolerance, "round")
+    return _grow(points, measured, start_sphere(points, measured, sigma_z, radius), fit_sphere, reach, "round")
 
 
-def find_spheres(points: np.ndarray, count: int, radius: float | None = None) -> list[np.ndarray]:
+def find_spheres(
+    points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
+) -> list[np.ndarray]:
     """The regions of ``count`` spheres in one cloud, from left to right in the image."""
     free = measured_pixels(points, None)
     regions = []
     for _ in range(count):
-        _, region = find_sphere(points, free, radius)
+        _, region = find_sphere(points, free, sigma_z, radius)
         regions.append(region)
         free &= ~cv2.dilate(region.astype(np.uint8), np.ones((4 * RIM_PX + 1,) * 2, np.uint8)).astype(bool)
     return sorted(regions, key=lambda region: float(np.nonzero(region)[1].mean()))
+
+
+def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None) -> Plane:
+    """The plane that most points under ``mask`` agree with."""
+    measured = measured_pixels(points, mask)
+    return ransac_plane(sample(points, measured), max(RANSAC_TOLERANCE_MM, 2.0 * _typical(sigma_z, measured)))[0]
+
+
+def start_sphere(
+    points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None, radius: float | None = None
+) -> Sphere:
+    """The sphere that most points under ``mask`` agree with."""
+    measured = measured_pixels(points, mask)
+    tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical(sigma_z, measured))
+    return ransac_sphere(sample(points, measured), tolerance, radius)[0]
+
+
+def _typical(sigma_z: np.ndarray | None, measured: np.ndarray) -> float:
+    """Median noise of the measured pixels in mm; 0 where none is known."""
+    if sigma_z is None:
+        return 0.0
+    if sigma_z.shape != measured.shape:
+        raise InputError(f"The noise map has shape {sigma_z.shape} and the cloud {measured.shape}: they must agree.")
+    known = sigma_z[measured & np.isfinite(sigma_z)]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:

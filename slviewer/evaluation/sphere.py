@@ -7,8 +7,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.fit import ShapeResult, measure
-from slviewer.evaluation.region import RANSAC_TOLERANCE_MM, find_sphere, find_spheres, measured_pixels, sample
-from slviewer.geometry.ransac import ransac_sphere
+from slviewer.evaluation.region import find_sphere, find_spheres, start_sphere
 from slviewer.geometry.shapes import Sphere, fit_sphere
 
 
@@ -33,9 +32,9 @@ def evaluate_sphere(
     in the Letter's Table 2.
     """
     if mask is None:
-        start, mask = find_sphere(points, radius=radius)
+        start, mask = find_sphere(points, sigma_z=sigma_z, radius=radius)
     else:
-        start, _ = ransac_sphere(sample(points, measured_pixels(points, mask)), RANSAC_TOLERANCE_MM, radius)
+        start = start_sphere(points, mask, sigma_z, radius)
     sphere, result = measure(points, mask, sigma_z, start, fit_sphere)
     return SphereResult(**vars(result), sphere=sphere)
 
@@ -44,7 +43,8 @@ def evaluate_spheres(
     points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
 ) -> list[SphereResult]:
     """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise as above."""
-    return [evaluate_sphere(points, region, sigma_z, radius) for region in find_spheres(points, count, radius)]
+    regions = find_spheres(points, count, sigma_z, radius)
+    return [evaluate_sphere(points, region, sigma_z, radius) for region in regions]
 
 
 @dataclass(frozen=True)

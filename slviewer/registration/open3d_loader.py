@@ -7,6 +7,7 @@ linker is content with it.
 
 import ctypes
 import sys
+import warnings
 from functools import cache
 from typing import Any
 
@@ -28,6 +29,8 @@ def open3d() -> Any:
             f"Open3D, which aligns scans and casts rays, cannot be imported ({error}): "
             f"run 'pip install {package} libusb-package' in the environment that runs slviewer."
         ) from error
+    # Open3D brings a TBB older than numba wants; numba then takes another threading layer, and need not say so
+    warnings.filterwarnings("ignore", message="The TBB threading layer requires")
     module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
     return module
 

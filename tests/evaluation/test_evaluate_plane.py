@@ -92,6 +92,14 @@ def test_a_bent_corner_stays_in_the_region() -> None:
     assert result.warning is not None
 
 
+def test_tolerances_follow_the_noise_of_a_coarse_cloud() -> None:
+    sigma = 6.0  # Gray code alone, on a rig with little depth per projector pixel
+    points, board = board_before_a_wall(sigma)
+    result = evaluate_plane(points, None, np.full(points.shape[:2], sigma))
+    assert result.points > 0.95 * board.sum()
+    assert result.noise_floor_mm == pytest.approx(result.rms_mm, rel=0.02)
+
+
 def test_a_given_mask_is_all_that_is_looked_at() -> None:
     points, board = board_before_a_wall(SIGMA)
     wall = rectangle((330, 400), (0, 300))
@@ -120,3 +128,5 @@ def test_clouds_without_a_plane_are_refused() -> None:
         evaluate_plane(empty.reshape(-1, 3), None)
     with pytest.raises(InputError, match="mask"):
         evaluate_plane(cloud(plane_depth()), np.ones((3, 4), bool))
+    with pytest.raises(InputError, match="noise map"):
+        evaluate_plane(cloud(plane_depth()), None, np.ones((3, 4)))

@@ -1,61 +1,11 @@
 """Registration finds a known motion to hundredths of a millimetre, and refuses what it cannot know."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from bumpy_scans import NOISE, bumpy, error, motion, view
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
-from slviewer.registration.pairwise import Registration, register
-
-CENTRE = np.array([0.0, 0.0, 600.0])
-NOISE = 0.03
-POINTS = 20_000
-
-
-def bumpy(seed: int, relief: float = 12.0) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """A height field of nine Gaussians over a square of 150 mm, with no symmetry."""
-    rng = np.random.default_rng(seed)
-    centres, widths, heights = rng.uniform(-65, 65, (9, 2)), rng.uniform(9, 22, 9), rng.uniform(-1, 1, 9) * relief
-
-    def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        squares = (x[:, None] - centres[:, 0]) ** 2 + (y[:, None] - centres[:, 1]) ** 2
-        return np.exp(-squares / 2 / widths**2) @ heights
-
-    return height
-
-
-def motion(deg: float, mm: float, seed: int = 0) -> np.ndarray:
-    """A rotation about an oblique axis through the object, and a shift."""
-    rng = np.random.default_rng(seed)
-    axis, shift = rng.normal(size=(2, 3))
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(np.radians(deg) * axis / np.linalg.norm(axis)).as_matrix()
-    T[:3, 3] = CENTRE + mm * shift / np.linalg.norm(shift) - T[:3, :3] @ CENTRE
-    return T
-
-
-def view(
-    height: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    x_range: tuple[float, float],
-    seed: int,
-    T_reference_scan: np.ndarray | None = None,
-    points: int = POINTS,
-    scale: float = 1.0,
-) -> np.ndarray:
-    """Noisy points of the part of the surface with x in the range, in the frame of the scan."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(*x_range, points), rng.uniform(-75, 75, points)
-    P = CENTRE + scale * np.stack([x, y, height(x, y) + rng.normal(0.0, NOISE, points)], axis=1)
-    return P if T_reference_scan is None else (P - T_reference_scan[:3, 3]) @ T_reference_scan[:3, :3]
-
-
-def error(result: Registration, T: np.ndarray) -> tuple[float, float]:
-    """Shift of the object's centre in mm, and rotation in degrees, between the pose found and the truth."""
-    D = result.T_reference_scan @ np.linalg.inv(T)
-    shift = float(np.linalg.norm(D[:3, :3] @ CENTRE + D[:3, 3] - CENTRE))
-    return shift, float(np.degrees(np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec())))
+from slviewer.registration.pairwise import register
 
 
 @pytest.mark.parametrize(("deg", "mm"), [(1.0, 2.0), (10.0, 30.0), (60.0, 150.0)])
