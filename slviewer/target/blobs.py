@@ -1,0 +1,95 @@
+"""Round blobs in an image: candidates for a board's circles."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+SMALLEST_PX = 12
+"""Pixels in the smallest blob whose shape says anything."""
+LONGEST = 4.0
+"""Length over width of a blob beyond which it is no circle seen at a usable slant."""
+ROUNDEST = 0.88
+"""Least area over that of the ellipse with the same second moments: 1 for ellipses, 0.955 for rectangles."""
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """``centres`` (n, 2) px, ``areas`` (n,) px² and ``covariances`` (n, 2, 2) px² of elliptical blobs, all darker than
+    their surroundings, or all brighter if ``inverted``."""
+
+    centres: np.ndarray
+    areas: np.ndarray
+    covariances: np.ndarray
+    inverted: bool
+
+    def scaled(self, scale: np.ndarray) -> "Blobs":
+        """The same blobs in an image that is (2,) ``scale`` times as wide and as high, by pixel centres."""
+        centres = (self.centres + 0.5) * scale - 0.5
+        return Blobs(centres, self.areas * scale.prod(), self.covariances * np.outer(scale, scale), self.inverted)
+
+
+def find_blobs(grey: np.ndarray, pitch: float) -> Iterator[Blobs]:
+    """Blobs of an image (h, w) uint8, attempt by attempt: dark ones first, then bright ones.
+
+    ``pitch`` px is the largest distance that neighbouring circles can have. Each attempt compares pixels with the
+    middle between the darkest and the brightest of a neighbourhood (or with its mean, where reflections spoil the
+    brightest), for neighbourhoods of different sizes: a small one follows uneven light, a large one holds large circles.
+    """
+    smooth = cv2.GaussianBlur(grey, (3, 3), 0)
+    for inverted in (False, True):
+        image = 255 - smooth if inverted else smooth
+        for by_mean in (False, True):
+            for share in (0.5, 1.0, 0.25, 0.125):
+                window = share * pitch
+                if window >= 8:
+                    yield _elliptical(_by_mean(image, window) if by_mean else _by_extremes(image, window), inverted)
+
+
+def _by_extremes(image: np.ndarray, window: float) -> np.ndarray:
+    """(h, w) uint8: 1 where darker than the middle of the neighbourhood's darkest and brightest."""
+    size = image.shape[::-1]
+    factor = min(1.0, 16.0 / window)
+    small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
+    reach = 2 * round(window * factor / 2) + 1
+    kernel = np.ones((reach, reach), np.uint8)
+    bright = cv2.blur(cv2.dilate(small, kernel), (reach, reach))
+    dark = cv2.blur(cv2.erode(small, kernel), (reach, reach))
+    contrast = cv2.subtract(bright, dark)
+    middle = np.where(contrast > np.maximum(8, bright // 10), cv2.addWeighted(bright, 0.5, dark, 0.5, 0), 0)
+    middle = middle.astype(np.uint8)
+    return np.asarray(image < (cv2.resize(middle, size) if factor < 1 else middle), np.uint8)
+
+
+def _by_mean(image: np.ndarray, window: float) -> np.ndarray:
+    """(h, w) uint8: 1 where darker than the neighbourhood's mean by a twelfth of it and by 4 grey levels."""
+    reach = 2 * round(window * 0.75) + 1
+    mean = cv2.blur(image, (reach, reach))
+    return np.asarray(image < cv2.subtract(mean, cv2.max(mean // 12, 4)), np.uint8)
+
+
+def _elliptical(mask: np.ndarray, inverted: bool) -> Blobs:
+    """The blobs of a mask that are as full as an ellipse, and lie clear of the image's border."""
+    height, width = mask.shape
+    _, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=cv2.CV_32S)
+    left, top, across, down, area = stats.T
+    plausible = (area >= SMALLEST_PX) & (area <= height * width / 8) & (area >= 0.25 * across * down)
+    plausible &= (across <= LONGEST * down) & (down <= LONGEST * across)
+    plausible &= (left > 0) & (top > 0) & (left + across < width) & (top + down < height)
+    plausible[0] = False
+    number = np.cumsum(plausible, dtype=np.int32) - 1
+    count = int(np.count_nonzero(plausible))
+    v, u = np.nonzero(mask)
+    label = labels[v, u]
+    mine = plausible[label]
+    v, u, label = v[mine], u[mine], label[mine]
+    du, dv = u - centres[label, 0], v - centres[label, 1]
+    label, n = number[label], area[plausible].astype(float)
+    covariances = np.empty((count, 2, 2))
+    covariances[:, 0, 0] = np.bincount(label, du * du, count) / n + 1 / 12  # a pixel is a square, not a point
+    covariances[:, 1, 1] = np.bincount(label, dv * dv, count) / n + 1 / 12
+    covariances[:, 0, 1] = covariances[:, 1, 0] = np.bincount(label, du * dv, count) / n
+    determinant = np.linalg.det(covariances) if count else np.zeros(0)
+    round_enough = n > ROUNDEST * 4 * np.pi * np.sqrt(np.maximum(determinant, 1e-9))
+    return Blobs(centres[plausible][round_enough], n[round_enough], covariances[round_enough], inverted)

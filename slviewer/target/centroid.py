@@ -1,0 +1,78 @@
+"""Sub-pixel centres of circles: centroids of how much darker (or brighter) than the paper around it a circle is."""
+
+import numpy as np
+
+SOFT_PX = 2.5
+"""How far, in px, the camera's PSF carries a circle's edge outwards."""
+RING_PX = 5.0
+"""Width of the ring beyond the soft edge from which the paper's brightness is read."""
+CORE = 0.6
+"""Share of a bright circle's radius that is surely free of its edge."""
+SMALLEST_RING = 12
+"""Pixels that a plane through the ring needs."""
+
+
+def refine_centres(image: np.ndarray, centres: np.ndarray, covariances: np.ndarray, inverted: bool) -> np.ndarray:
+    """(n, 2) float64 px: the centroid of each circle's ink, by the image's own brightness around it.
+
+    ``image`` (h, w) float32; ``centres`` (n, 2) px and ``covariances`` (n, 2, 2) px² describe the circles' ellipses to
+    some tenths of a pixel; ``inverted`` for bright circles on dark ground. Ink is ``1 - I / W`` with W the plane through
+    the paper's brightness next to the circle, so that uneven light does not move the centroid. NaN where there is no
+    paper to compare with, or where the result lies outside the circle's core.
+    """
+    ring_px = _ring_widths(centres, covariances)
+    refined = np.full(centres.shape, np.nan)
+    for k, (centre, covariance) in enumerate(zip(centres, covariances, strict=True)):
+        refined[k] = _centroid(image, centre, covariance, float(ring_px[k]), inverted)
+    off = np.linalg.norm(refined - centres, axis=1)
+    refined[~(off < np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))] = np.nan
+    return refined
+
+
+def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+    """(n,) px of paper between each circle and its nearest neighbour's soft edge."""
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    nearest = apart.argmin(1)
+    towards = (centres[nearest] - centres) / apart.min(1)[:, None]
+    # half the width of an ellipse along a direction e: 2 sqrt(e C e), C being a quarter of the squared half axes
+    own, other = (
+        2 * np.sqrt(np.einsum("ni,nij,nj->n", towards, c, towards)) for c in (covariances, covariances[nearest])
+    )
+    return np.asarray(apart.min(1) - own - other)
+
+
+def _centroid(
+    image: np.ndarray, centre: np.ndarray, covariance: np.ndarray, gap: float, inverted: bool
+) -> tuple[float, float]:
+    soft = min(SOFT_PX, 0.35 * gap)
+    reach = 2 * np.sqrt(np.diag(covariance)) + min(SOFT_PX + RING_PX, gap - soft) + 1
+    u0, v0 = np.maximum(np.floor(centre - reach), 0).astype(int)
+    u1, v1 = np.minimum(np.ceil(centre + reach) + 1, image.shape[::-1]).astype(int)
+    patch = image[v0:v1, u0:u1].astype(np.float64)
+    du, dv = np.meshgrid(np.arange(u0, u1) - centre[0], np.arange(v0, v1) - centre[1])
+    (a, b), (_, c) = np.linalg.inv(covariance) / 4
+    radius = np.sqrt(a * du * du + 2 * b * du * dv + c * dv * dv)  # 1 on the edge
+    beyond = np.hypot(du, dv) * (1 - 1 / np.maximum(radius, 1e-6))  # px from the edge, outwards
+    ring = (beyond > soft) & (beyond < min(SOFT_PX + RING_PX, gap - soft))
+    if np.count_nonzero(ring) < SMALLEST_RING:
+        return np.nan, np.nan
+    within = beyond < soft
+    ground = _plane(du, dv, patch, ring)
+    if inverted:
+        light = _plane(du, dv, patch, radius < CORE)
+        ink = (patch - ground) / np.maximum(light, 1.0)
+    else:
+        ink = 1 - patch / np.maximum(ground, 1.0)
+    ink = ink[within]
+    total = ink.sum()
+    if total <= 0:
+        return np.nan, np.nan
+    return float(centre[0] + ink @ du[within] / total), float(centre[1] + ink @ dv[within] / total)
+
+
+def _plane(du: np.ndarray, dv: np.ndarray, values: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """(h, w): the plane through the chosen values, by least squares."""
+    A = np.stack([np.ones(int(np.count_nonzero(where))), du[where], dv[where]], axis=1)
+    c = np.linalg.lstsq(A, values[where], rcond=None)[0]
+    return np.asarray(c[0] + c[1] * du + c[2] * dv)

@@ -1,0 +1,46 @@
+"""Find the inner corners of a ChArUco board: its markers tell which corners they are, so that some are enough."""
+
+import cv2
+import numpy as np
+
+from slviewer.errors import DetectionError
+from slviewer.target.board import Board
+from slviewer.target.corners import SEARCH_PX, refine_corners
+from slviewer.target.images import BoardImage, advice
+from slviewer.target.numbering import check_grid
+
+FEWEST = 8
+"""Corners that a pose needs."""
+
+
+def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
+    """OpenCV's own description of the board."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    return cv2.aruco.CharucoBoard((board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary)
+
+
+def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndarray]:
+    """((n, 2) float64 px, (n,) int ids) of the corners seen; raises DetectionError with how many were seen."""
+    detector = cv2.aruco.CharucoDetector(opencv_board(board))
+    first = min(1.0, SEARCH_PX / max(image.grey.shape))
+    best: tuple[np.ndarray, np.ndarray] | None = None
+    markers = 0
+    for factor in dict.fromkeys((first, 1.0, first / 2)):
+        small = cv2.resize(image.grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        corners, ids, _, marker_ids = detector.detectBoard(small)
+        markers = max(markers, 0 if marker_ids is None else len(marker_ids))
+        if ids is not None and len(ids) and (best is None or len(ids) > len(best[1])):
+            pixels = (np.reshape(corners, (-1, 2)).astype(float) + 0.5) / factor - 0.5
+            best = pixels, np.ravel(ids).astype(int)
+        if best is not None and 2 * len(best[1]) >= len(board.points):
+            break
+    seen = 0 if best is None else len(best[1])
+    if best is None or seen < FEWEST:
+        raise DetectionError(
+            f"{seen} of {len(board.points)} corners and {markers} of {board.columns * board.rows // 2} markers of {board} "
+            f"found, and a pose needs {FEWEST} corners: {advice(image.grey)}"
+        )
+    pixels, ids = best
+    pixels = refine_corners(image.deep, pixels, board.points[ids][:, :2], board.pitch_mm)
+    check_grid(board, pixels, ids, "corners")
+    return pixels, ids

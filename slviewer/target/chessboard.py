@@ -1,0 +1,97 @@
+"""Find the inner corners of a chessboard."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from slviewer.errors import DetectionError
+from slviewer.target.board import Board
+from slviewer.target.corners import SEARCH_PX, crossing, refine_corners
+from slviewer.target.images import BoardImage, advice, evenly_lit
+from slviewer.target.numbering import check_grid, upright
+
+
+def detect_chessboard(board: Board, image: BoardImage) -> np.ndarray:
+    """(n, 2) float64 px of every inner corner; raises DetectionError with how many were seen.
+
+    A board whose columns + rows are odd is numbered so that its top-left square is dark.
+    """
+    most = 0
+    for pixels in _attempts(board, image.grey):
+        most = max(most, len(pixels))
+        if len(pixels) == len(board.points):
+            break
+    else:
+        raise DetectionError(f"{most} of {len(board.points)} corners of {board} found: {advice(image.grey)}")
+    # the finders' own order may be mirrored; all that is kept of it is what lies beside what
+    grid = pixels.reshape(board.rows, board.columns, 2)
+    if np.cross(*(np.mean(np.diff(grid, axis=axis), axis=(0, 1)) for axis in (1, 0))) < 0:
+        grid = grid[:, ::-1]
+    pixels = refine_corners(image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm)
+    check_grid(board, pixels, np.arange(len(pixels)), "corners")
+    grid = pixels.reshape(grid.shape)
+    first_is_dark = _first_is_dark(image.deep, grid)
+    _refuse_larger(board, image.deep, grid, first_is_dark)
+    return upright(board, [g.reshape(-1, 2) for g in _numberings(grid, first_is_dark)])
+
+
+def _attempts(board: Board, grey: np.ndarray) -> Iterator[np.ndarray]:
+    """Corners, row by row or as many as were seen: the quickest search first."""
+    first = min(1.0, SEARCH_PX / max(grey.shape))
+    accurate, thorough = cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
+    searches = [(first / 2, False, 0), (first, False, 0), (first / 2, True, thorough), (first, True, thorough)]
+    if first < 1:
+        searches.append((1.0, False, accurate))
+    for factor, even, flags in searches:
+        image = _resized(evenly_lit(grey) if even else grey, factor)
+        found, corners = cv2.findChessboardCornersSB(image, board.features, flags=flags)
+        if found:
+            yield (corners.reshape(-1, 2).astype(float) + 0.5) / factor - 0.5
+    for even in (False, True):
+        image = _resized(evenly_lit(grey) if even else grey, first / 2)
+        _, corners = cv2.findChessboardCorners(image, board.features)
+        yield np.zeros((0, 2)) if corners is None else (corners.reshape(-1, 2).astype(float) + 0.5) * 2 / first - 0.5
+
+
+def _resized(grey: np.ndarray, factor: float) -> np.ndarray:
+    return cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else grey
+
+
+def _first_is_dark(image: np.ndarray, grid: np.ndarray) -> bool:
+    """Whether the square beyond the first corner is dark; raises DetectionError where squares do not alternate."""
+    colours = crossing(image, grid, np.gradient(grid, axis=1), np.gradient(grid, axis=0))
+    rows, columns = colours.shape
+    colours = colours * np.where(np.indices(colours.shape).sum(0) % 2, -1, 1)
+    good = max(np.count_nonzero(colours > 0), np.count_nonzero(colours < 0))
+    if good < rows * columns:
+        raise DetectionError(
+            f"at {rows * columns - good} of {rows * columns} corners no dark and bright squares alternate: "
+            "move the board so that all of it is in view, uncovered and without reflections"
+        )
+    return bool(colours[0, 0] > 0)
+
+
+def _refuse_larger(board: Board, image: np.ndarray, grid: np.ndarray, first_is_dark: bool) -> None:
+    """Raises DetectionError where the squares go on beyond the grid: it may be shifted by a row."""
+    for side in range(4):
+        turned = np.rot90(grid, side)
+        beyond = 3 * turned[0] - 3 * turned[1] + turned[2]
+        seen = crossing(image, beyond, np.gradient(beyond, axis=0), turned[0] - beyond)
+        if np.count_nonzero(seen) > 0.5 * len(seen) and (np.diff(seen[seen != 0]) != 0).mean() > 0.5:
+            raise DetectionError(
+                f"the chessboard goes on beyond the {board.columns}x{board.rows} inner corners of {board}: "
+                "check the board's columns and rows"
+            )
+
+
+def _numberings(grid: np.ndarray, first_is_dark: bool) -> list[np.ndarray]:
+    """The grids (rows, columns, 2), turned, that the colours of the squares allow."""
+    rows, columns = grid.shape[:2]
+    allowed = []
+    for turns in range(0, 4, 1 if rows == columns else 2):
+        # the square beyond the first corner, after turning, was the one beyond another corner of the grid
+        i, j = ((0, 0), (0, columns), (rows, columns), (rows, 0))[turns]
+        allowed.append((np.rot90(grid, turns), first_is_dark == ((i + j) % 2 == 0)))
+    dark = [turned for turned, is_dark in allowed if is_dark]
+    return dark if 0 < len(dark) < len(allowed) else [turned for turned, _ in allowed]

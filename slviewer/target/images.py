@@ -1,0 +1,53 @@
+"""Images as the detectors take them."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+
+
+@dataclass(frozen=True)
+class BoardImage:
+    """``grey`` (h, w) uint8 to search in, stretched if the image is dim; ``deep`` (h, w) float32 to measure in, in the
+    image's own grey levels."""
+
+    grey: np.ndarray
+    deep: np.ndarray
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> "BoardImage":
+        """From (h, w), or (h, w, 3) RGB, uint8 or uint16; raises InputError."""
+        image = np.asarray(image)
+        flat = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+        if image.dtype not in (np.uint8, np.uint16) or not flat or min(image.shape[:2]) < 32:
+            raise InputError(
+                f"an image of shape {image.shape} and type {image.dtype} was given: boards are found in (h, w) or "
+                "(h, w, 3) images of uint8 or uint16, 32 pixels and more on each side"
+            )
+        if image.ndim == 3:
+            image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        bright = max(1.0, float(np.percentile(image[::4, ::4], 99.5)))
+        grey = image
+        if image.dtype != np.uint8 or bright < 100:
+            grey = cv2.convertScaleAbs(image.astype(np.float32), alpha=220 / bright)
+        return cls(np.ascontiguousarray(grey), image.astype(np.float32))
+
+
+def advice(grey: np.ndarray) -> str:
+    """What the operator should try, by how bright the image is."""
+    sample = grey[::4, ::4]
+    saturated = float(np.mean(sample >= 255))
+    if saturated > 0.02:
+        return f"lower the exposure ({saturated:.0%} of the image is saturated), or move the board so that all of it is in view"
+    return "move the board so that all of it is in view, evenly lit and in focus"
+
+
+def evenly_lit(grey: np.ndarray) -> np.ndarray:
+    """(h, w) uint8: the image over the brightest of each neighbourhood, an eighth of it wide, so that paper is white."""
+    factor = 64 / max(grey.shape)
+    small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    white = cv2.GaussianBlur(cv2.dilate(small, np.ones((9, 9), np.uint8)), (9, 9), 0)
+    white = cv2.resize(white, grey.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return cv2.divide(grey, cv2.max(white, 8), scale=230)

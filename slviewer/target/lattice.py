@@ -1,0 +1,162 @@
+"""Order scattered blobs into a grid: grow a lattice from neighbour to neighbour, then lay the board's pattern on it.
+
+A board is accepted only if every one of its circles is there, in exactly one place of the lattice: a grid that could as
+well be shifted by a row is refused, not guessed.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.target.blobs import Blobs
+from slviewer.target.board import Board
+
+REACH = 0.27
+"""How far, in steps, a neighbour may lie from where its predecessors point."""
+ALIKE = 2.2
+"""Ratio of areas up to which neighbouring blobs count as alike."""
+SEEDS = 60
+"""Lattices that are grown before an attempt gives up."""
+SHEARS = np.array([[[1, 0], [0, 1]], [[1, 0], [1, 1]], [[1, 1], [0, 1]], [[1, 0], [-1, 1]], [[1, -1], [0, 1]]])
+"""Changes of basis, for a strong slant where a diagonal of the grid looks shorter than its sides."""
+TURNS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
+DIAGONAL = np.array([[1, 1], [-1, 1]])
+"""From nearest neighbours of an asymmetric grid, which lie on its diagonals, to its columns and rows."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """``nodes`` (m, 2) integer coordinates along two directions that are right-handed in the image (u right, v
+    down), and ``blobs`` (m,): which blob lies at each."""
+
+    nodes: np.ndarray
+    blobs: np.ndarray
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Nodes along the longer and the shorter direction."""
+        spans = self.nodes.max(0) - self.nodes.min(0) + 1
+        return int(spans.max()), int(spans.min())
+
+
+def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
+    """Lattices of like blobs, begun in the most regular neighbourhoods; each blob belongs to one at most."""
+    if len(blobs.centres) < 6:
+        return
+    tree = cKDTree(blobs.centres)
+    free = np.ones(len(blobs.centres), bool)
+    grown = 0
+    for seed, first, second in _seeds(tree, blobs):
+        if not free[seed]:
+            continue
+        lattice = _grow(tree, blobs, free, seed, first, second)
+        free[lattice.blobs] = False
+        yield lattice
+        grown += 1
+        if grown == SEEDS:
+            return
+
+
+def lay_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
+    """Every numbering of the board's features by the lattice's blobs, (n,) indices each; empty where some are missing.
+
+    Numberings of the same blobs are the board's rotational symmetries; different sets of blobs mean that the lattice
+    is larger than the board.
+    """
+    pattern = np.rint(board.points[:, :2] / board.pitch_mm).astype(int)
+    spans = pattern.max(0) + 1
+    to_board = DIAGONAL if board.kind == "acircles" else np.eye(2, dtype=int)
+    for shear in SHEARS:
+        numberings = []
+        for turn in TURNS:
+            nodes = lattice.nodes @ (turn @ to_board @ shear).T
+            nodes = nodes - nodes.min(0)
+            room = nodes.max(0) + 1 - spans
+            if (room < 0).any():
+                continue
+            occupied = np.full(nodes.max(0) + 1, -1)
+            occupied[nodes[:, 0], nodes[:, 1]] = lattice.blobs
+            for dx, dy in np.ndindex(*(np.minimum(room, 12) + 1)):
+                chosen = occupied[pattern[:, 0] + dx, pattern[:, 1] + dy]
+                if (chosen >= 0).all():
+                    numberings.append(chosen)
+        if numberings:
+            return numberings
+    return []
+
+
+def _seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """(blob, step, step) where like neighbours lie opposite each other in two directions, the most regular first."""
+    centres, areas = blobs.centres, blobs.areas
+    _, near = tree.query(centres, k=min(9, len(centres)))
+    near = near[:, 1:]
+    step = centres[near] - centres[:, None]
+    length = np.linalg.norm(step, axis=2)
+    alike = np.abs(np.log(areas[near] / areas[:, None])) < np.log(ALIKE)
+    gap = np.linalg.norm(step[:, :, None] + step[:, None], axis=3)
+    shorter = np.minimum(length[:, :, None], length[:, None])
+    regular = np.where(alike[:, :, None] & alike[:, None], gap / np.maximum(shorter, 1e-9), np.inf)
+    seeds = []
+    for blob in np.nonzero((regular < 0.3).sum((1, 2)) >= 4)[0]:
+        a, b = np.nonzero(np.triu(regular[blob] < 0.3))
+        order = np.argsort(length[blob, a] + length[blob, b])
+        a, b = a[order], b[order]
+        axes = (step[blob, a] - step[blob, b]) / 2
+        lengths = np.linalg.norm(axes, axis=1)
+        cross = axes[0, 0] * axes[:, 1] - axes[0, 1] * axes[:, 0]
+        across = np.nonzero(np.abs(cross) > 0.35 * lengths[0] * lengths)[0]
+        if len(across):
+            k = across[0]
+            score = regular[blob, a[0], b[0]] + regular[blob, a[k], b[k]]
+            seeds.append((score, int(blob), axes[0], axes[k] * np.sign(cross[k])))
+    return [(blob, first, second) for _, blob, first, second in sorted(seeds, key=lambda seed: seed[0])]
+
+
+def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.ndarray, second: np.ndarray) -> Lattice:
+    """The lattice around a seed: each node looks for its four neighbours where its known ones point."""
+    centres, areas = blobs.centres, blobs.areas
+    at = {(0, 0): seed}
+    steps = {(0, 0): (first, second)}
+    taken = {seed}
+    queue = [(0, 0)]
+    for node in queue:
+        i, j = node
+        here = centres[at[node]]
+        for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            di, dj = (sign, 0) if axis == 0 else (0, sign)
+            ahead = (i + di, j + dj)
+            if ahead in at:
+                continue
+            step = sign * steps[node][axis]
+            behind = at.get((i - di, j - dj))
+            if behind is not None:
+                step = here - centres[behind]
+            else:
+                for side in (1, -1):
+                    beside = at.get((i + side * dj, j + side * di))
+                    diagonal = at.get((i + di + side * dj, j + dj + side * di))
+                    if beside is not None and diagonal is not None:
+                        step = centres[diagonal] - centres[beside]
+            found = _nearest_alike(
+                tree, here + step, REACH * float(np.hypot(*step)), areas, areas[at[node]], free, taken
+            )
+            if found is None:
+                continue
+            at[ahead] = found
+            taken.add(found)
+            moved = sign * (centres[found] - here)
+            steps[ahead] = (moved, steps[node][1]) if axis == 0 else (steps[node][0], moved)
+            queue.append(ahead)
+    return Lattice(np.array(list(at)), np.array(list(at.values())))
+
+
+def _nearest_alike(
+    tree: cKDTree, place: np.ndarray, reach: float, areas: np.ndarray, area: float, free: np.ndarray, taken: set[int]
+) -> int | None:
+    distances, indices = tree.query(place, k=3, distance_upper_bound=reach)
+    for distance, index in zip(distances, indices, strict=True):
+        if np.isfinite(distance) and free[index] and index not in taken and 1 / ALIKE < areas[index] / area < ALIKE:
+            return int(index)
+    return None

@@ -1,0 +1,71 @@
+"""Which way round a board is numbered, and whether the numbered grid is one that a flat board can show.
+
+A board that looks the same turned by 180 degrees (symmetric circles, asymmetric circles with an even number of rows,
+chessboards whose columns + rows are even) is numbered with its x axis to the right in the image: of the two numberings,
+the one whose x axis points more along (2, 1) px, right and a little down. So an upright board counts from its top-left
+feature, a board whose rows run vertically counts from the top right, and neither changes when the board rolls by
+60 degrees clockwise or 25 degrees the other way. A board that looks the same turned by 90 degrees takes, of its four
+numberings, the one whose x axis points most to the right.
+"""
+
+import cv2
+import numpy as np
+
+from slviewer.errors import DetectionError
+from slviewer.target.board import Board
+
+MOST_OFF = 0.08
+"""How far, in pitches, a feature may lie from the grid that all features together describe."""
+MOST_BENT = 0.6
+"""How far, in pitches, a lens may bend the grid."""
+
+
+def upright(board: Board, numberings: list[np.ndarray]) -> np.ndarray:
+    """Of equally valid numberings (n, 2) px, the one that the rule above chooses."""
+    preferred = np.array([1.0, 0.0] if len(numberings) == 4 else [2.0, 1.0])
+    return max(numberings, key=lambda pixels: float(x_direction(board, pixels) @ preferred))
+
+
+def x_direction(board: Board, pixels: np.ndarray) -> np.ndarray:
+    """(2,) unit vector in the image along the board's x axis, in the mean over the board."""
+    x = board.points[:, 0] - board.points[:, 0].mean()
+    direction = x @ (pixels - pixels.mean(0))
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> None:
+    """Raises DetectionError unless the features lie, one by one, where a flat board behind a real lens shows them.
+
+    A homography must explain them up to a lens's distortion, which is smooth: of what the homography leaves over, a
+    cubic of the board's coordinates is taken away, and the rest must be small. The numbering must be right-handed.
+    """
+    advice = "keep the board flat and in focus, without reflections, and take the pose again"
+    points = board.points[ids][:, :2] / board.pitch_mm
+    H, _ = cv2.findHomography(points, pixels)
+    if H is None:
+        raise DetectionError(f"the {len(ids)} {what} found lie on one line: turn the board towards the camera")
+    if np.linalg.det(H) <= 0:  # with w > 0 on the board, its sign is the handedness
+        raise DetectionError(f"the {what} appear mirrored: show the board to the camera directly, not in a mirror")
+    left_over = pixels - cv2.perspectiveTransform(points[None], H)[0]
+    pitch = np.sqrt(np.abs(np.linalg.det(np.array([_jacobian(H, point) for point in points]))))
+    if (np.linalg.norm(left_over, axis=1) > MOST_BENT * pitch).any():
+        raise DetectionError(f"the {what} found do not lie on a flat grid: {advice}")
+    x, y = (2 * (points - points.min(0)) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1).T
+    degree = 3 if len(points) >= 25 else 1
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    smooth = terms @ np.linalg.lstsq(terms, left_over, rcond=None)[0]
+    off = np.linalg.norm(left_over - smooth, axis=1)
+    wrong = off > np.maximum(MOST_OFF * pitch, 0.5)
+    if wrong.any():
+        worst = int(np.argmax(off / pitch))
+        u, v = pixels[worst]
+        raise DetectionError(
+            f"{np.count_nonzero(wrong)} of {len(ids)} {what} do not fit the grid (the worst, at pixel {u:.0f}, {v:.0f}, "
+            f"is {off[worst]:.1f} px off): {advice}"
+        )
+
+
+def _jacobian(H: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """(2, 2) px per pitch at a point of the board."""
+    p = H @ np.array([*point, 1.0])
+    return np.asarray((H[:2, :2] - np.outer(p[:2] / p[2], H[2, :2])) / p[2])
