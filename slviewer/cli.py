@@ -133,7 +133,8 @@ def _import_opencv_calibration(
     from slviewer.workflow import import_opencv_calibration
 
     model = import_opencv_calibration(file, session, keys, projector=projector, camera=camera, force=force)
-    print(f"stereo calibration imported: baseline {model.baseline_mm:.1f} mm")
+    baseline = f": baseline {model.baseline_mm:.1f} mm" if model else "; import the scans that it belongs to"
+    print(f"stereo calibration imported{baseline}")
 
 
 @_deferred

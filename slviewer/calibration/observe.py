@@ -73,6 +73,52 @@ class Observation:
         u0, v0, u1, v1 = self.box
         return np.where(self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan)
 
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Named arrays, for saving."""
+        arrays = {
+            "points": self.points,
+            "camera": self.camera,
+            "projector": self.projector,
+            "size": np.array(self.size),
+            "box": np.array(self.box),
+            "region": self.packed_region,
+        }
+        for axis, surface in self.surfaces.items():
+            trend = surface.trend if isinstance(surface, Surface) else surface
+            arrays |= {
+                f"{axis}_period_px": np.array(self.periods_px[axis]),
+                f"{axis}_trend": trend.coefficients,
+                f"{axis}_extent": np.array(trend.box),
+            }
+            if isinstance(surface, Surface):
+                arrays[f"{axis}_spline"] = surface.coefficients
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, name: str, arrays: Mapping[str, np.ndarray]) -> "Observation":
+        """The inverse of ``to_arrays``."""
+        surfaces: dict[Axis, Surface | Polynomial2D] = {}
+        axes: tuple[Axis, ...] = ("x", "y")
+        captured: list[Axis] = [axis for axis in axes if f"{axis}_trend" in arrays]
+        for axis in captured:
+            u0, v0, u1, v1 = (float(edge) for edge in arrays[f"{axis}_extent"])
+            trend = Polynomial2D(arrays[f"{axis}_trend"], (u0, v0, u1, v1))
+            spline = arrays.get(f"{axis}_spline")
+            surfaces[axis] = trend if spline is None else Surface(trend, spline)
+        width, height = (int(n) for n in arrays["size"])
+        left, top, right, bottom = (int(edge) for edge in arrays["box"])
+        return cls(
+            name,
+            arrays["points"],
+            arrays["camera"],
+            arrays["projector"],
+            surfaces,
+            {axis: float(arrays[f"{axis}_period_px"]) for axis in captured},
+            (width, height),
+            (left, top, right, bottom),
+            arrays["region"],
+        )
+
 
 def observe(
     name: str,

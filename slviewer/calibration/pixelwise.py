@@ -18,7 +18,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.shapes import Plane, fit_plane
-from slviewer.geometry.triangulation import depth_per_px, triangulate
+from slviewer.geometry.triangulation import depth_per_px, triangulate, triangulate_pixels
 
 MIN_POSES = 4
 """Three coefficients and one pose more, so that the fit's RMS says something."""
@@ -44,9 +44,15 @@ class PixelFit:
 
 @dataclass(frozen=True)
 class PixelwiseModel:
-    """The Letter's calibration: a rational function of the phase for each camera pixel and captured axis."""
+    """The Letter's calibration: a rational function of the phase for each camera pixel and captured axis.
+
+    ``planes`` are the ideal planes of the target poses (eq. 12), and ``depth_axis`` the axis that they were reconstructed
+    from.
+    """
 
     fits: Mapping[Axis, PixelFit]
+    planes: Mapping[str, Plane]
+    depth_axis: Axis
 
     name = "pixelwise"
 
@@ -107,7 +113,7 @@ def calibrate_pixelwise(
         )
     depth_axis = best_axis(used, stereo)
     planes = {o.name: ideal_plane(o, stereo, depth_axis) for o in used}
-    z_ref = float(np.mean(stereo.depth_range_mm))
+    z_ref = mid_depth(stereo)
     width, height = used[0].size
     axes = [axis for axis in stereo.axes if all(axis in o.surfaces for o in used)]
     moments = {
@@ -136,12 +142,39 @@ def calibrate_pixelwise(
             f"no pixel saw the board in {MIN_POSES} poses or more: let the poses overlap in the image"
         )
     c3, c4, rms_x, rms_y = rays.solve(MIN_POSES)
-    return PixelwiseModel({axis: _pixel_fit(m, c3, c4, rms_x, rms_y) for axis, m in moments.items()})
+    fits = {axis: _pixel_fit(m, c3, c4, rms_x, rms_y) for axis, m in moments.items()}
+    return PixelwiseModel(fits, planes, depth_axis)
+
+
+def pixel_samples(
+    observations: Sequence[Observation], stereo: StereoModel, model: PixelwiseModel, axis: Axis, pixel: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What one pixel (u, v) was fitted to: phase (n,) rad and ideal points (n, 3) mm, one of each pose that it saw."""
+    u, v = pixel
+    phases, points = [], []
+    for o in observations:
+        u0, v0, u1, v1 = o.box
+        if o.name not in model.planes or not (u0 <= u < u1 and v0 <= v < v1 and o.region[v - v0, u - u0]):
+            continue
+        coordinate = o.surfaces[model.depth_axis].evaluate(np.array([u]), np.array([v]))
+        coordinate *= o.periods_px[model.depth_axis] / (2 * np.pi)
+        X = triangulate_pixels(stereo.rig, np.array([[u, v]], float), coordinate, model.depth_axis)[0]
+        plane = model.planes[o.name]
+        points.append(X - (X @ plane.normal - plane.offset) * plane.normal)
+        phases.append(float(o.surfaces[axis].evaluate(np.array([u]), np.array([v]))[0]))
+    return np.array(phases), np.array(points).reshape(-1, 3)
+
+
+def mid_depth(stereo: StereoModel) -> float:
+    """Middle of the calibrated depths, mm."""
+    if stereo.depth_range_mm is None:
+        raise CalibrationRejected("the stereo calibration was made elsewhere, without poses to fit pixels to")
+    return float(np.mean(stereo.depth_range_mm))
 
 
 def best_axis(observations: Sequence[Observation], stereo: StereoModel) -> Axis:
     """The axis whose coordinate moves most with depth, at mid depth."""
-    z = np.full(observations[0].size[::-1], float(np.mean(stereo.depth_range_mm)))
+    z = np.full(observations[0].size[::-1], mid_depth(stereo))
     sensitivity = {axis: float(np.nanmedian(depth_per_px(stereo.rig, axis, z))) for axis in stereo.axes}
     return min(stereo.axes, key=lambda axis: sensitivity[axis])
 

@@ -41,7 +41,7 @@ class StereoModel:
     poses: Mapping[str, np.ndarray]
     pose_rms_px: Mapping[str, tuple[float, float]]
     left_out: Mapping[str, str]
-    depth_range_mm: tuple[float, float]
+    depth_range_mm: tuple[float, float] | None
     focal_sigma_px: Mapping[str, float]
     features_set_aside: int = 0
     residuals_px: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
@@ -74,10 +74,15 @@ class StereoModel:
             "poses": {name: T.tolist() for name, T in self.poses.items()},
             "pose_rms_px": {name: list(rms) for name, rms in self.pose_rms_px.items()},
             "left_out": dict(self.left_out),
-            "depth_range_mm": list(self.depth_range_mm),
+            "depth_range_mm": self.depth_range_mm,
             "focal_sigma_px": dict(self.focal_sigma_px),
             "features_set_aside": self.features_set_aside,
         }
+
+    @classmethod
+    def made_elsewhere(cls, rig: StereoRig) -> "StereoModel":
+        """A calibration of which only the rig is known: no poses, no residuals, no calibrated depths."""
+        return cls(rig, "", ("x", "y"), {}, {}, {}, {}, None, {})
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "StereoModel":

@@ -16,7 +16,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import detect
 from slviewer.workflow.decoding import capture_texture, check_projector, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import save_pixelwise, save_stereo
+from slviewer.workflow.models import save_observations, save_pixelwise, save_stereo
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,9 @@ class CalibrationResult:
         rms, total = s.reprojection_rms_px, len(s.poses) + len(s.left_out)
         fc, fp = s.rig.camera.K, s.rig.projector.K
         sigma = s.focal_sigma_px
+        near, far = s.depth_range_mm or (np.nan, np.nan)
         lines = [
-            f"poses: {len(s.poses)} of {total} used, boards at {s.depth_range_mm[0]:.0f}-{s.depth_range_mm[1]:.0f} mm",
+            f"poses: {len(s.poses)} of {total} used, boards at {near:.0f}-{far:.0f} mm",
             *(f"  left out: {name}: {why}" for name, why in s.left_out.items()),
             f"stereo: reprojection RMS camera {rms['camera']:.3f} px, projector {rms['projector']:.3f} px, "
             f"stereo {rms['stereo']:.3f} px",
@@ -126,6 +127,7 @@ def calibrate(
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
+        save_observations(store, observations, store.input_hashes(*(o.name for o in observations)))
         save_stereo(store, stereo, inputs, settings)
         if pixelwise is not None:
             save_pixelwise(store, pixelwise, inputs, settings)

@@ -1,23 +1,164 @@
 """Bringing captures and calibrations that other tools made into a session: all of them, or none."""
 
+import dataclasses
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
-from slviewer.geometry.lens import Lens
-from slviewer.geometry.rig import StereoRig
+from slviewer.fringe.origin import estimate_gray_origin
+from slviewer.fringe.sequence import parse_size
 from slviewer.session.importers import frames as frames_layout
 from slviewer.session.importers import opencv_calibration, p18, procam_calibration
-from slviewer.session.store import Session
+from slviewer.session.importers.imported import ImportedCapture, Imports
+from slviewer.session.store import Session, is_session
 from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
-from slviewer.workflow.models import available, save_stereo
-from slviewer.workflow.sizes import parse_size
-
-if TYPE_CHECKING:
-    from slviewer.session.importers.imported import ImportedCapture
+from slviewer.workflow.models import available, load_stereo, save_imported_stereo
 
 Role = Literal["calibration", "scan"]
+Size = str | tuple[int, int]
+
+
+def import_p18(
+    source: Path | str,
+    session: Path | str,
+    *,
+    role: Role = "calibration",
+    prefix: str | None = None,
+    projector: Size = "912x1140",
+    force: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> list[str]:
+    """Import ``pose_XX/{V,H}/P18_FNN.PNG`` folders; returns the captures' names.
+
+    ``source`` is one pose folder or a folder of them; captures are named after their folders, behind ``prefix_``.
+    Either all are saved or, with an InputError that says why, none.
+    """
+    found = p18.read(Path(source), prefix=prefix, projector=parse_size(projector))
+    return _save(found, session, role, force, progress, warn)
+
+
+def import_procam_calibration(
+    source: Path | str,
+    session: Path | str,
+    *,
+    role: Role = "calibration",
+    prefix: str | None = None,
+    projector: Size = "1024x768",
+    force: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> list[str]:
+    """Import ``capture_N/graycode_NN.*`` folders (Gray code with inverses, white, black); as ``import_p18``."""
+    found = procam_calibration.read(Path(source), prefix=prefix, projector=parse_size(projector))
+    return _save(found, session, role, force, progress, warn)
+
+
+def import_frames(
+    source: Path | str,
+    session: Path | str,
+    sequence: Path | str,
+    *,
+    role: Role = "calibration",
+    prefix: str | None = None,
+    projector: Size | None = None,
+    force: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> list[str]:
+    """Import any folder of images that a TOML describes frame by frame; as ``import_p18``.
+
+    Where the TOML does not say at which projector coordinate Gray code 0 begins, that is found from the images.
+    """
+    size = None if projector is None else parse_size(projector)
+    found = frames_layout.read(Path(source), Path(sequence), prefix=prefix, projector=size)
+    return _save(found, session, role, force, progress, warn)
+
+
+def import_opencv_calibration(
+    file: Path | str,
+    session: Path | str,
+    keys: Sequence[str],
+    *,
+    projector: Size | None = None,
+    camera: Size | None = None,
+    force: bool = False,
+) -> StereoModel | None:
+    """Make a stereo calibration from an OpenCV FileStorage file the session's own.
+
+    ``keys`` are the file's names for K_camera, D_camera, K_projector, D_projector, R and T (camera to projector, mm).
+    Image sizes that are not given are those of the session's captures. Returns the model, or None while the session
+    holds no capture to tell a missing size. The session's pixelwise calibration, if any, goes to the trash with the
+    stereo one that it was made from.
+    """
+    matrices = opencv_calibration.read(Path(file), list(keys))
+    with _open(session) as store:
+        there = available(store)
+        if there and not force:
+            raise InputError(
+                f"{store.folder} holds a {' and a '.join(there)} calibration already: "
+                "replace it with --force (it goes to the session's trash)"
+            )
+        for name in there:
+            store.trash_result(f"calibration/{name}")
+        save_imported_stereo(
+            store,
+            matrices,
+            source=str(file),
+            camera=None if camera is None else parse_size(camera),
+            projector=None if projector is None else parse_size(projector),
+        )
+        known = bool(store.capture_names()) or (camera is not None and projector is not None)
+        return load_stereo(store) if known else None
+
+
+def _save(found: Imports, session: Path | str, role: Role, force: bool, progress: Progress, warn: Warn) -> list[str]:
+    for message in found.warnings:
+        warn(message)
+
+    def checked() -> Iterator[ImportedCapture]:
+        for i, recording in enumerate(found.recordings):
+            progress(i / len(found), f"reading {recording.name}")
+            yield _checked(recording.read(), warn)
+
+    with _open(session) as store:
+        saved = store.save_captures(checked(), role, force=force)
+    progress(1.0, "imported")
+    return [capture.name for capture in saved]
+
+
+def _checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
+    """The capture, with its Gray origin found if it was not given; InputError where codes contradict the projector."""
+    sequence = capture.sequence
+    if not capture.settings.get("gray_origin_given", True) and any(f.kind == "gray" for f in sequence.frames):
+        origins = [
+            estimate_gray_origin(sequence, capture.frames, axis) for axis in sequence.axes if sequence.periods_px(axis)
+        ]
+        if origins:
+            sequence = dataclasses.replace(sequence, gray_origin_px=origins[0])
+            warn(f"{capture.name}: Gray code 0 was found to begin at projector px {origins[0]:.2f}")
+    check_projector(capture.name, sequence, decode_frames(capture.name, sequence, capture.frames))
+    return dataclasses.replace(capture, sequence=sequence)
+
+
+@contextmanager
+def _open(session: Path | str) -> Iterator[Session]:
+    """The session, open for writing; one that had to be made goes again if nothing could be saved in it."""
+    folder = Path(session).expanduser().absolute()
+    fresh, parent_fresh = not is_session(folder), not folder.exists()
+    store = Session.open_or_create(folder)
+    try:
+        with store:
+            yield store
+    except BaseException:
+        if fresh:
+            for entry in folder.iterdir():
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            if parent_fresh:
+                folder.rmdir()
+        raise

@@ -3,9 +3,14 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
 from slviewer.session.store import Session
 from slviewer.workflow.feedback import Warn
 
@@ -26,8 +31,24 @@ def save_pixelwise(
     store: Session, model: PixelwiseModel, inputs: Mapping[str, str], settings: Mapping[str, Any]
 ) -> None:
     """Replace the session's pixelwise calibration."""
-    meta = {"axes": list(model.axes), "inputs": dict(inputs), "settings": dict(settings)}
+    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
     store.save_result("calibration/pixelwise", meta, model.to_arrays())
+
+
+def save_observations(store: Session, observations: Sequence[Observation], inputs: Mapping[str, str]) -> None:
+    """Keep what each pose said, so that curves and residuals can be shown without decoding again."""
+    arrays = {f"{o.name}/{key}": value for o in observations for key, value in o.to_arrays().items()}
+    store.save_result("calibration/poses", {"poses": [o.name for o in observations], "inputs": dict(inputs)}, arrays)
+
+
+def load_observations(store: Session) -> list[Observation]:
+    """The observations of the poses that the last calibration read."""
+    meta, arrays = store.load_result("calibration/poses")
+    keys = {name: [key for key in arrays if key.startswith(f"{name}/")] for name in meta["poses"]}
+    return [
+        Observation.from_arrays(name, {key.removeprefix(f"{name}/"): arrays[key] for key in found})
+        for name, found in keys.items()
+    ]
 
 
 def available(store: Session) -> tuple[str, ...]:
@@ -35,11 +56,37 @@ def available(store: Session) -> tuple[str, ...]:
     return tuple(name for name in MODELS if store.state_of(f"calibration/{name}") != "absent")
 
 
+def save_imported_stereo(
+    store: Session,
+    matrices: Mapping[str, np.ndarray],
+    *,
+    source: str,
+    camera: tuple[int, int] | None,
+    projector: tuple[int, int] | None,
+) -> None:
+    """Make matrices from elsewhere the session's stereo calibration; sizes may be left to the session's captures."""
+    imported = {name: value.tolist() for name, value in matrices.items()}
+    meta = {"imported": imported, "source": source, "camera": camera, "projector": projector, "inputs": {}}
+    store.save_result("calibration/stereo", meta, {})
+
+
 def load_stereo(store: Session) -> StereoModel:
     """The session's stereo calibration, without its residual arrows."""
     if "stereo" not in available(store):
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    return StereoModel.from_dict(store.load_result("calibration/stereo", only=())[0]["model"])
+    meta = store.load_result("calibration/stereo", only=())[0]
+    if "model" in meta:
+        return StereoModel.from_dict(meta["model"])
+    captures = store.captures()
+    if not captures and not (meta["camera"] and meta["projector"]):
+        raise InputError(f"{store.folder} holds no capture that tells the camera's size: import the scans first")
+    camera = tuple(meta["camera"] or captures[0].size)
+    projector = tuple(meta["projector"] or captures[0].sequence.projector)
+    m = {name: np.array(value) for name, value in meta["imported"].items()}
+    rig = StereoRig(
+        Lens(m["K_camera"], m["D_camera"], camera), Lens(m["K_projector"], m["D_projector"], projector), m["R"], m["T"]
+    )
+    return StereoModel.made_elsewhere(rig)
 
 
 def load_model(store: Session, name: str) -> Model:
@@ -52,7 +99,8 @@ def load_model(store: Session, name: str) -> Model:
         )
     if name == "stereo":
         return load_stereo(store)
-    return PixelwiseModel.from_arrays(store.load_result("calibration/pixelwise")[1])
+    meta, arrays = store.load_result("calibration/pixelwise")
+    return PixelwiseModel.restored(meta["model"], arrays)
 
 
 def best(store: Session) -> str:

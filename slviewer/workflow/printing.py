@@ -4,17 +4,17 @@ from pathlib import Path
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
+from slviewer.fringe.sequence import parse_size
 from slviewer.session.exporters import write_pattern_folder
 from slviewer.target.board import Board
 from slviewer.target.sheet import write_sheet
-from slviewer.workflow.sizes import parse_size
 
 
 def patterns(preset: str, projector: str | tuple[int, int], out: Path | str) -> int:
     """Write every image of a preset sequence as PNG, with the TOML that ``import_frames`` reads; returns how many."""
     if preset not in PRESETS:
         raise InputError(f"no pattern sequence is called {preset!r}: use {', '.join(PRESETS)}")
-    sequence = PRESETS[preset](parse_size(projector, "projector"))
+    sequence = PRESETS[preset](parse_size(projector))
     write_pattern_folder(Path(out), sequence)
     return len(sequence.frames)
 

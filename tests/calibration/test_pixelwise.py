@@ -5,7 +5,8 @@ import pytest
 from analytic_rig import BOARD, PERIOD, PROJECTOR, board_poses, cv_project, observation, rig
 
 from slviewer.calibration.moments import RationalMoments
-from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
+from slviewer.calibration.observe import Observation
+from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise, pixel_samples
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap
@@ -79,9 +80,19 @@ def test_predicted_noise_is_the_measured_one(model: PixelwiseModel) -> None:
 
 
 def test_it_survives_saving(model: PixelwiseModel) -> None:
-    again = PixelwiseModel.from_arrays(model.to_arrays())
+    again = PixelwiseModel.restored(model.to_dict(), model.to_arrays())
     phase, _ = phase_of_plane(600.0)
     assert np.array_equal(again.points(phase), model.points(phase), equal_nan=True)
+
+
+def test_the_samples_of_a_pixel_lie_on_its_curve(model: PixelwiseModel) -> None:
+    stereo = calibrate_stereo(OBSERVATIONS, PROJECTOR, str(BOARD))
+    saved = [Observation.from_arrays(o.name, o.to_arrays()) for o in OBSERVATIONS]
+    phase, points = pixel_samples(saved, stereo, model, "x", (200, 150))
+    c = model.fits["x"].coefficients[:, 150, 200]
+    assert len(phase) == model.fits["x"].poses[150, 200]
+    residual = points[:, 2] - (c[0] + c[1] * phase) / (1 + c[2] * phase)
+    assert np.sqrt(np.mean(residual**2)) == pytest.approx(float(model.fits["x"].rms_mm[0, 150, 200]), rel=0.05)
 
 
 def test_too_few_poses_are_rejected() -> None:
