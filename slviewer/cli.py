@@ -208,7 +208,7 @@ def _verify(
         shape: What the captures show.
         model: Which calibrations to compare; by default all there are.
         range: Near and far end of the calibrated depths R2, mm; by default those of the board poses.
-        radius: Known radius of the sphere, mm: fixes it in the fit.
+        radius: Nominal radius of the sphere, mm: helps to find it; the fitted radius stays free.
         axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
         json: Write the result to this file too.
     """

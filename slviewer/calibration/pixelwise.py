@@ -46,8 +46,7 @@ class PixelFit:
 class PixelwiseModel:
     """The Letter's calibration: a rational function of the phase for each camera pixel and captured axis.
 
-    ``planes`` are the ideal planes of the target poses (eq. 12), and ``depth_axis`` the axis that they were reconstructed
-    from.
+    ``planes`` are the ideal planes of the target poses (eq. 12), reconstructed from ``depth_axis``.
     """
 
     fits: Mapping[Axis, PixelFit]
@@ -80,21 +79,21 @@ class PixelwiseModel:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Flat named arrays, for saving."""
-        return {
-            f"{axis}_{key}": getattr(fit, key) for axis, fit in self.fits.items() for key in PixelFit.__annotations__
-        }
+        keys = PixelFit.__annotations__
+        return {f"{axis}_{key}": getattr(fit, key) for axis, fit in self.fits.items() for key in keys}
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is not an image, JSON-able."""
+        planes = {name: [*plane.normal.tolist(), plane.offset] for name, plane in self.planes.items()}
+        return {"axes": list(self.fits), "planes": planes, "depth_axis": self.depth_axis}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "PixelwiseModel":
-        """The inverse of ``to_arrays``."""
-        axes: tuple[Axis, ...] = ("x", "y")
-        return cls(
-            {
-                axis: PixelFit(**{key: arrays[f"{axis}_{key}"] for key in PixelFit.__annotations__})
-                for axis in axes
-                if f"{axis}_coefficients" in arrays
-            }
-        )
+    def restored(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "PixelwiseModel":
+        """The inverse of ``to_dict`` and ``to_arrays``."""
+        keys = PixelFit.__annotations__
+        fits = {axis: PixelFit(**{key: arrays[f"{axis}_{key}"] for key in keys}) for axis in data["axes"]}
+        planes = {name: Plane(np.array(values[:3]), values[3]) for name, values in data["planes"].items()}
+        return cls(fits, planes, data["depth_axis"])
 
 
 def calibrate_pixelwise(

@@ -67,7 +67,7 @@ class Frame:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Frame":
-        """The frame that `to_dict` or a `[[frame]]` table describes; entries that its kind does not need are ignored."""
+        """The frame of a `[[frame]]` table or of `to_dict`; entries that its kind does not need are ignored."""
         known = {"kind", "axis", "step", "steps", "period_px", "bit", "bits"}
         unknown = sorted(set(data) - known - {"file"})
         if unknown:
@@ -75,14 +75,14 @@ class Frame:
         if "kind" not in data:
             raise InputError('a frame does not say its kind: add kind = "phase", "gray", ...')
         try:
-            numbers = {name: int(data[name]) for name in ("step", "steps", "bit", "bits") if name in data}
-            period = float(data.get("period_px", 0.0))
+            numbers: dict[str, Any] = {
+                name: int(data[name]) for name in ("step", "steps", "bit", "bits") if name in data
+            }
+            numbers["period_px"] = float(data.get("period_px", 0.0))
         except (TypeError, ValueError) as error:
             raise InputError(f"a {data['kind']} frame has an entry that is no number ({error}): mend it") from error
         kind = data["kind"]
-        values = {
-            name: value for name, value in (numbers | {"period_px": period}).items() if name in _FIELDS.get(kind, ())
-        }
+        values = {name: value for name, value in numbers.items() if name in _FIELDS.get(kind, ())}
         return cls(kind=kind, axis=data.get("axis"), **values)
 
 

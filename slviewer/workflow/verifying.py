@@ -48,7 +48,8 @@ def verify(
 ) -> Verification:
     """Fit a plane or a sphere to each capture, by each model, over the pixels that all of them measure.
 
-    ``depth_range`` bounds R2 in mm; by default the depths of the board poses. ``radius`` mm fixes a sphere's.
+    ``depth_range`` bounds R2 in mm; by default the depths of the board poses. ``radius`` mm,
+    roughly, helps to find a sphere; the fitted radius stays free, as in the Letter's Table 2.
     """
     if not captures:
         raise InputError("no capture named: give the captures to measure, for instance plane_01 plane_02")

@@ -23,6 +23,7 @@ from slviewer.session.importers.imported import (
 
 _STEPS, _PERIOD_PX, _BITS = 18, 18.0, 7
 _CODED = _STEPS + _BITS
+_REACH_PX = 2**_BITS * _PERIOD_PX
 _TEXTURES = (_CODED, _CODED + 1)
 _AXES: dict[str, Axis] = {"v": "x", "h": "y"}
 _FILE = re.compile(r"p18_f(\d+)", re.IGNORECASE)
@@ -50,9 +51,9 @@ def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Recor
     warnings: list[str] = []
     for folder, axis in _axis_folders(pose):
         extent = projector[0] if axis == "x" else projector[1]
-        if 2**_BITS * _PERIOD_PX < extent:
+        if extent > _REACH_PX:
             raise InputError(
-                f"{_BITS} Gray bits of {_PERIOD_PX:g} px number {2**_BITS * _PERIOD_PX:g} px of the projector's {extent} "
+                f"{_BITS} Gray bits of {_PERIOD_PX:g} px reach {_REACH_PX:g} px, and the projector has {extent} "
                 f"along {axis}: give the size of the projector that was used, or describe the frames in a TOML"
             )
         numbered, more = _numbered(folder)
