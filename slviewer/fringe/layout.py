@@ -1,0 +1,130 @@
+"""Where in a stack of frames the parts of one axis' pattern lie."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis, Kind, PatternSequence
+
+WHITE_LEVELS = (255, 1023, 4095, 16383, 65535)
+"""Full scale of the cameras whose grey levels arrive as uint16."""
+LEFT_ALIGNED_WHITE = (65472, 65520, 65532)
+"""Full scale of 10, 12 and 14 bits that fill a uint16 from its top."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """The frames of one period, by step."""
+
+    period_px: float
+    indices: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Frame indices of one axis, and the conventions of its sequence.
+
+    ``shifts`` longest period first; ``gray`` most significant bit first; ``inverse`` like ``gray``, or empty.
+    """
+
+    axis: Axis
+    extent: int
+    sign: int
+    gray_origin_px: float
+    shifts: tuple[Shift, ...]
+    gray: tuple[int, ...]
+    inverse: tuple[int, ...]
+    complementary: int | None
+    white: int | None
+    black: int | None
+
+    @property
+    def period_px(self) -> float:
+        """The finest period; 1.0 for Gray code alone."""
+        return self.shifts[-1].period_px if self.shifts else 1.0
+
+    @property
+    def steps(self) -> int:
+        """Phase steps of the finest period; 0 for Gray code alone."""
+        return len(self.shifts[-1].indices) if self.shifts else 0
+
+    @property
+    def origin_rad(self) -> float:
+        """The finest period's phase at which Gray code 0 begins."""
+        return 2 * np.pi * self.gray_origin_px / self.period_px
+
+
+def layout(sequence: PatternSequence, axis: Axis) -> Layout:
+    """The layout of one axis. Raises InputError where its frames cannot give an absolute phase."""
+    if axis not in sequence.axes:
+        raise InputError(
+            f"the frames carry no pattern along axis {axis}: there is {' and '.join(sequence.axes) or 'none'}"
+        )
+    shifts = tuple(_shift(sequence, axis, period) for period in sequence.periods_px(axis))
+    gray, inverse, complementary, white, black = (
+        _by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
+    )
+    found = Layout(
+        axis,
+        sequence.extent(axis),
+        sequence.phase_sign,
+        sequence.gray_origin_px,
+        shifts,
+        gray,
+        inverse,
+        complementary[0] if complementary else None,
+        white[0] if white else None,
+        black[0] if black else None,
+    )
+    if not shifts and not inverse and not (white and black):
+        raise InputError(f"axis {axis}: Gray code alone needs its inverses, or a white and a black frame: add them")
+    if gray or complementary:
+        _check_code(found)
+    return found
+
+
+def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
+    """Raise InputError unless the stack is (n, h, w) uint8 or uint16 with one frame for each of the sequence."""
+    if not isinstance(stack, np.ndarray):
+        sizes = sorted({np.shape(frame) for frame in stack})
+        raise InputError(f"the frames are no single array (their shapes: {sizes}): stack frames of one size")
+    if stack.ndim != 3 or 0 in stack.shape:
+        raise InputError(f"the stack has shape {stack.shape}: give (frames, rows, columns), one channel")
+    if stack.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"the frames hold {stack.dtype} values: give uint8 or uint16")
+    if len(stack) != len(sequence.frames):
+        raise InputError(f"{len(stack)} frames for a sequence of {len(sequence.frames)}: give one image for each frame")
+
+
+def white_level(stack: np.ndarray, indices: list[int]) -> float:
+    """The grey level at which the camera clips: 255 for uint8; for uint16 the depth that the largest value asks for."""
+    if stack.dtype == np.uint8:
+        return 255.0
+    largest = max(int(stack[i].max()) for i in indices)
+    if largest in LEFT_ALIGNED_WHITE:
+        return float(largest)
+    return float(next(level for level in WHITE_LEVELS if level >= largest))
+
+
+def _shift(sequence: PatternSequence, axis: Axis, period: float) -> Shift:
+    frames = [i for i in sequence.find("phase", axis) if sequence.frames[i].period_px == period]
+    return Shift(period, tuple(sorted(frames, key=lambda i: sequence.frames[i].step)))
+
+
+def _by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:
+    return tuple(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
+
+
+def _check_code(found: Layout) -> None:
+    where = f"axis {found.axis}"
+    if not found.gray:
+        raise InputError(f"{where}: a complementary bit without Gray bits says nothing: add them")
+    if len(found.shifts) > 1:
+        raise InputError(f"{where}: Gray code and {len(found.shifts)} fringe periods: use one period with Gray code")
+    cells = (found.extent - 0.5 - found.gray_origin_px) / found.period_px
+    if 2 ** len(found.gray) < cells - 0.5:
+        raise InputError(
+            f"{where}: {len(found.gray)} Gray bits number {2 ** len(found.gray)} periods, and {found.extent} px hold "
+            f"{cells:.0f}: give the size of the projector that was used, or the missing bits"
+        )

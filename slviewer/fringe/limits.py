@@ -1,0 +1,41 @@
+"""What a pixel must fulfil, in one place for the NumPy definition and the kernels."""
+
+DARK_LEVELS = 3.0
+"""Modulation, in grey levels of 255, below which a pixel is DARK whatever its noise."""
+DARK_SIGMAS = 4.0
+"""Modulation in standard deviations of a grey level, below which a pixel is DARK: a Gray bit, whose amplitude is at
+least the modulation, would flip in 1 pixel of 30,000 at this limit, and in 1 of 160 at 2.5."""
+
+EDGE = 0.15
+"""Part of a period on either side of a code edge within which a blurred bit may be read as its neighbour's."""
+WEAK_BIT = 0.35
+"""A bit closer to its threshold than this part of the modulation may have been misread at its edge."""
+WEAKER = 0.5
+"""... and only if it is closer by this factor than the bit of the cell's other edge."""
+UNDECIDED_BIT = 0.15
+"""A bit closer to its threshold than this part of the modulation, and away from its edges, says nothing."""
+GRAY_UNDECIDED_SIGMAS = 2.0
+"""Gray code alone: a bit within so many of its own standard deviations of its threshold is undecided."""
+GRAY_UNDECIDED_PART = 0.05
+"""... or within this part of the contrast: interreflected light alone makes such differences."""
+
+LEVEL_MISFIT = 0.3
+"""Multi-frequency: largest distance, in periods, between a coordinate and the one that the longer period predicts."""
+
+OUTSIDE_PX = 0.5
+"""Noise that a coordinate at the projector's border is allowed before it counts as OUTSIDE."""
+
+WINDOW = 2
+"""Half the side of the neighbourhood that decides about spikes: 5 x 5 pixels."""
+SPIKE_MAJORITY = 0.65
+"""Part of the neighbours that must agree on one whole period before a pixel at a code edge is moved by it."""
+SPIKE_NEIGHBOURS = 8
+"""Valid neighbours that such a majority needs."""
+WHOLE_PERIOD = 0.25
+"""How far, in periods, a difference may be from a whole period to count as a misread edge and not as a depth step."""
+LONELY = 0.15
+"""A pixel that fewer of its neighbours agree with is INCONSISTENT."""
+LONELY_NEIGHBOURS = 3
+"""... and so is one with fewer valid neighbours than this: nothing vouches for it."""
+GRAY_CELL_PX = 16.0
+"""Gray code alone has no period: neighbours that differ by less than half of this many px agree."""

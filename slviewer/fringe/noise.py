@@ -1,0 +1,142 @@
+"""The camera's noise, measured from the frames of one capture."""
+
+import numpy as np
+
+from slviewer.fringe.layout import Layout
+
+ROWS = 24
+"""Image rows that are sampled."""
+BLOCK = 8
+"""Neighbouring pixels whose variances are averaged before medians are taken: single variances are too skewed."""
+BINS = 16
+HARMONICS = 6
+"""Highest harmonic of the fringes that projector and camera gamma are taken to produce."""
+
+
+def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[float, float]:
+    """(a, b): the variance of one frame's grey level is a + b * level, in squared grey levels; both non-negative.
+
+    From what an n-step phase shift cannot explain: per pixel, cosines up to a harmonic that n allows are removed; then,
+    from all pixels together, what the remaining harmonics have in common with the fringe, so that gamma is not taken
+    for noise. Three steps, and Gray code alone, leave no such remainder: then from differences along the rows, or from
+    the constancy of Gray + inverse. Sampled from a few rows of the image.
+    """
+    if layout.steps >= 4:
+        levels, variances, freedom = _from_phase(_sample(stack, layout.shifts[-1].indices), white)
+    elif len(layout.inverse) >= 2:
+        levels, variances, freedom = _from_inverses(_sample(stack, layout.gray), _sample(stack, layout.inverse), white)
+    else:
+        frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
+        levels, variances, freedom = _from_differences(_sample(stack, tuple(i for i in frames if i is not None)), white)
+    return _fit_line(*_binned(levels, variances, freedom))
+
+
+def _sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
+    """(n, rows, blocks, BLOCK) float32 of evenly spread rows; all pixels of a row that fill whole blocks."""
+    height, width = stack.shape[1:]
+    rows = np.unique(np.linspace(0, height - 1, min(ROWS, height)).round().astype(int))
+    block = BLOCK if width >= BLOCK else 1
+    step = max(1, width // (block * 64))
+    columns = (np.arange(0, width // block, step)[:, None] * block + np.arange(block)).ravel()
+    return (
+        np.stack([stack[i][rows[:, None], columns] for i in indices])
+        .astype(np.float32)
+        .reshape(len(indices), len(rows), -1, block)
+    )
+
+
+def _from_phase(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+    n = len(samples)
+    samples = samples[:, _usable(samples, white)]  # (n, blocks, BLOCK)
+    own = max(1, min(4, (n - 1) // 2 - 2))
+    k = 2 * np.pi * np.arange(n) / n
+    harmonics = [np.ones(n)] + [f(h * k) for h in range(1, own + 1) for f in (np.cos, np.sin)]
+    basis, _ = np.linalg.qr(np.stack(harmonics, axis=1))
+    residue = _project_out(basis, samples)
+    mean = samples.mean(axis=0)
+    cosine, sine = (_combine(f(k) * (2 / n), samples) for f in (np.cos, np.sin))
+    residue = _without_common_harmonics(residue, basis, cosine, sine, own)
+    freedom = n - basis.shape[1]
+    return mean.mean(axis=-1), (residue**2).sum(axis=0).mean(axis=-1) / freedom, freedom * samples.shape[-1]
+
+
+def _without_common_harmonics(
+    residue: np.ndarray, basis: np.ndarray, cosine: np.ndarray, sine: np.ndarray, own: int
+) -> np.ndarray:
+    """Residues less their regression, over all pixels, on harmonics of each pixel's own fringe."""
+    n = len(residue)
+    amplitude, phase = np.hypot(cosine, sine), np.arctan2(-sine, cosine)
+    k = (2 * np.pi * np.arange(n) / n).astype(np.float32).reshape(n, 1, 1)
+    regressors = [
+        _project_out(basis, amplitude * f(h * (phase + k)))
+        for h in range(own + 1, HARMONICS + 1)
+        for f in (np.cos, np.sin)
+    ]
+    # Some of them vanish (harmonic n + 1 is the fringe again): the pseudo-inverse leaves them out.
+    gram = np.array([[(p * q).sum() for q in regressors] for p in regressors], np.float64)
+    moment = np.array([(p * residue).sum() for p in regressors], np.float64)
+    if not regressors or not gram.any():
+        return residue
+    for weight, regressor in zip(np.linalg.pinv(gram, rcond=1e-6) @ moment, regressors, strict=True):
+        residue = residue - np.float32(weight) * regressor
+    return residue
+
+
+def _from_inverses(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+    usable = _usable(np.concatenate([gray, inverse]), white)
+    total = (gray + inverse)[:, usable]
+    variance = total.var(axis=0, ddof=1).mean(axis=-1) / 2
+    return total.mean(axis=(0, -1)) / 2, variance, (len(total) - 1) * total.shape[-1]
+
+
+def _from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Variance from third differences along the row: fringes and shading are nearly quadratic over four pixels."""
+    if samples.shape[-1] < BLOCK:
+        return np.zeros(0), np.zeros(0), 1.0
+    usable = _usable(samples, white)
+    samples = samples[:, usable].reshape(-1, samples.shape[-1])  # each frame has its own level
+    third = np.diff(samples, n=3, axis=-1)
+    return samples.mean(axis=-1), (third**2).mean(axis=-1) / 20, 3.0  # 1 + 9 + 9 + 1; overlapping differences
+
+
+def _usable(samples: np.ndarray, white: float) -> np.ndarray:
+    """(rows, blocks): neither clipped at white nor at black, which would hide noise."""
+    return (samples.max(axis=(0, -1)) < white) & (samples.min(axis=(0, -1)) > 0)
+
+
+def _project_out(basis: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    residue = samples.copy()
+    for vector in basis.T.astype(np.float32):
+        residue -= vector.reshape(-1, 1, 1) * _combine(vector, samples)
+    return residue
+
+
+def _combine(weights: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    # Not a matrix product: BLAS would start its threads for this little, and they get in the way of numba's.
+    return np.einsum("k,kij->ij", weights.astype(np.float32), samples)
+
+
+def _binned(levels: np.ndarray, variances: np.ndarray, freedom: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean level, robust variance and number of blocks in bins of equal count."""
+    order = np.argsort(levels)
+    bins = [b for b in np.array_split(order, min(BINS, max(1, len(order) // 24))) if len(b)]
+    to_mean = (1 - 2 / (9 * freedom)) ** 3  # the median of chi squared over its mean
+    return (
+        np.array([levels[b].mean() for b in bins], np.float64),
+        np.array([np.median(variances[b]) for b in bins], np.float64) / to_mean,
+        np.array([len(b) for b in bins], np.float64),
+    )
+
+
+def _fit_line(levels: np.ndarray, variances: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
+    """Non-negative (a, b) of variance = a + b level, each bin weighted by its own precision."""
+    if len(levels) == 0:
+        return 0.0, 0.0
+    weight = np.sqrt(counts) / np.maximum(variances, 0.1 * variances.mean() + 1e-12)
+    design = np.stack([np.ones_like(levels), levels], axis=1) * weight[:, None]
+    target = variances * weight
+    candidates = [np.linalg.lstsq(design, target, rcond=None)[0]] if len(levels) > 1 else []
+    candidates += [np.array([(design[:, 0] @ target) / (design[:, 0] @ design[:, 0]), 0.0])]
+    candidates += [np.array([0.0, (design[:, 1] @ target) / max(design[:, 1] @ design[:, 1], 1e-12)])]
+    a, b = min((c for c in candidates if c.min() >= 0), key=lambda c: float(np.sum((design @ c - target) ** 2)))
+    return float(a), float(b)

@@ -1,0 +1,49 @@
+"""The images that the projector shows."""
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence
+
+
+def render(sequence: PatternSequence, index: int) -> np.ndarray:
+    """(height, width) uint8: frame ``index`` as the projector shows it."""
+    width, height = sequence.projector
+    axis, row = profile(sequence, index)
+    shown = row[:, None] if axis == "y" else row[None, :]
+    return np.ascontiguousarray(np.broadcast_to(shown, (height, width)))
+
+
+def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndarray]:
+    """The axis along which frame ``index`` varies, and its uint8 grey levels along it.
+
+    A frame without an axis gives (None, one level per projector column). Cosines span 0 ... 255, bits are 0 or 255.
+    """
+    if not 0 <= index < len(sequence.frames):
+        raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
+    frame = sequence.frames[index]
+    if frame.axis is None or frame.kind in ("white", "black", "texture"):
+        return None, np.full(sequence.projector[0], 0 if frame.kind == "black" else 255, np.uint8)
+    if frame.kind == "phase":
+        u = np.arange(sequence.extent(frame.axis), dtype=np.float64)
+        angle = 2 * np.pi * (u / frame.period_px + sequence.phase_sign * frame.step / frame.steps)
+        return frame.axis, np.floor(127.5 + 127.5 * np.cos(angle) + 0.5).astype(np.uint8)
+    return frame.axis, np.where(_bit(sequence, frame.axis, frame), 255, 0).astype(np.uint8)
+
+
+def _bit(sequence: PatternSequence, axis: Axis, frame: Frame) -> np.ndarray:
+    """(extent,) bool: the Gray bit at the centre of each projector column or row."""
+    bits = len(sequence.find("gray", axis))
+    period = sequence.periods_px(axis)[0] if sequence.periods_px(axis) else 1.0
+    half = frame.kind == "complementary"
+    # A column belongs to the cell that holds its left edge plus half a pixel, less the origin's own half.
+    u = np.arange(sequence.extent(axis), dtype=np.float64) - sequence.gray_origin_px - 0.5
+    code = np.floor((2 if half else 1) * u / period + 1e-9).astype(np.int64)
+    if code.min() < 0 or code.max() >= 1 << (bits + half):
+        raise InputError(
+            f"{bits} Gray bits cannot number {sequence.extent(axis)} px from {sequence.gray_origin_px:g} px on "
+            f"in periods of {period:g} px: use more bits, or the origin -0.5"
+        )
+    gray = code ^ (code >> 1)
+    bit = (gray >> (0 if half else bits - 1 - frame.bit)) & 1
+    return bit == (0 if frame.kind == "inverse" else 1)

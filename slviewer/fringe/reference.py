@@ -1,0 +1,192 @@
+"""Decoding as it is meant, in NumPy: the definition that the kernels must reproduce."""
+
+import numpy as np
+
+from slviewer.fringe import limits
+from slviewer.fringe.layout import Layout, check_stack, layout, white_level
+from slviewer.fringe.levels import plan_levels
+from slviewer.fringe.noise import measure_noise
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.reference_spikes import settle
+from slviewer.fringe.sequence import Axis, PatternSequence
+
+TWO_PI = 2 * np.pi
+
+
+def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
+    """What `decode.decode` returns, computed without kernels: same wrapped phase to 1e-5 rad, absolute to 1e-4 rad."""
+    check_stack(sequence, stack)
+    found = layout(sequence, axis)
+    white = white_level(stack, sequence.select(axis))
+    noise = measure_noise(found, stack, white)
+    if not found.shifts:
+        phase, modulation, background, inconsistent = _gray_alone(found, stack, noise)
+        wrapped = np.full_like(phase, np.nan)
+        weakest, saturated = modulation, np.zeros(phase.shape, bool)
+    else:
+        shifted = [phase_shift(stack, shift.indices, found.sign) for shift in found.shifts]
+        wrapped, modulation, background, _ = shifted[-1]
+        weakest = np.minimum.reduce([b for _, b, _, _ in shifted])
+        saturated = np.logical_or.reduce([(peak >= white) & (a + b >= white) for _, b, a, peak in shifted])
+        if found.gray:
+            order, inconsistent = _order(found, stack, wrapped, modulation, background)
+        else:
+            order, inconsistent = _order_by_levels(found, [psi for psi, _, _, _ in shifted])
+        phase = (wrapped + TWO_PI * order).astype(np.float32)
+    dark = weakest < dark_limit(background, noise, white)
+    reason = np.select(
+        [dark, saturated, inconsistent], [Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT], Reason.VALID
+    ).astype(np.uint8)
+    phase[reason != Reason.VALID] = np.nan
+    phase, reason = settle(found, phase, reason)
+    return PhaseMap(axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps)
+
+
+def phase_shift(
+    stack: np.ndarray, indices: tuple[int, ...], sign: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(wrapped phase rad, modulation, background, largest sample) of one period, float32 (h, w) each."""
+    n = len(indices)
+    first = stack[indices[0]].astype(np.float32)
+    cosine, sine, total = np.zeros_like(first), np.zeros_like(first), np.zeros_like(first)
+    peak = first.copy()
+    for k, i in enumerate(indices):
+        frame = stack[i].astype(np.float32)
+        np.maximum(peak, frame, out=peak)
+        frame -= first  # drops out of the sums, and keeps them exact in float32
+        cosine += np.float32(np.cos(TWO_PI * k / n)) * frame
+        sine += np.float32(np.sin(TWO_PI * k / n)) * frame
+        total += frame
+    wrapped = np.arctan2(-sign * sine, cosine)
+    return wrapped, np.hypot(cosine, sine) * np.float32(2 / n), first + total * np.float32(1 / n), peak
+
+
+def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float) -> np.ndarray:
+    """(h, w) float32: the modulation below which a pixel is DARK."""
+    sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background)
+    return np.maximum(np.float32(limits.DARK_LEVELS * white / 255), np.float32(limits.DARK_SIGMAS) * sigma)
+
+
+def bit_heights(found: Layout, stack: np.ndarray, index: int, threshold: np.ndarray) -> np.ndarray:
+    """(h, w) float32 grey levels by which a bit lies above its threshold: half of gray - inverse where there is one."""
+    frame = stack[index].astype(np.float32)
+    if index in found.gray and found.inverse:
+        inverse = stack[found.inverse[found.gray.index(index)]].astype(np.float32)
+        return (frame - inverse) * np.float32(0.5)
+    return frame - threshold
+
+
+def _order(
+    found: Layout, stack: np.ndarray, wrapped: np.ndarray, modulation: np.ndarray, background: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What to add to the wrapped phase, in periods, and where it cannot be known."""
+    threshold = background
+    heights = [bit_heights(found, stack, i, threshold) for i in found.gray]
+    code = np.zeros(wrapped.shape, np.int32)
+    bit = np.zeros(wrapped.shape, np.int32)
+    least = np.full(wrapped.shape, np.inf, np.float32)
+    for height in heights:
+        bit ^= height > 0  # the binary digit is the parity of all Gray bits so far
+        code = 2 * code + bit
+        np.minimum(least, np.abs(height), out=least)
+    turns = wrapped * np.float32(1 / TWO_PI) - np.float32(found.gray_origin_px / found.period_px)
+    whole = np.floor(turns)
+    part = turns - whole  # of a period, since the code edge
+    undecided = np.float32(limits.UNDECIDED_BIT) * modulation
+    middle = (part >= 0.25) & (part < 0.75)
+    if found.complementary is not None:
+        last = bit_heights(found, stack, found.complementary, threshold)
+        half = 2 * code + (bit ^ (last > 0))
+        # Near an order's edge the half-period cell before it counts as the one after it, and the phase says which.
+        order = np.where(middle, half >> 1, ((half + 1) >> 1) - (part >= 0.75))
+        inconsistent = np.where(middle, least, np.abs(last)) < undecided
+    else:
+        order = code + _misread(code, heights, part, modulation)
+        inner = (part >= np.float32(limits.EDGE)) & (part < np.float32(1 - limits.EDGE))
+        inconsistent = inner & (least < undecided)
+    return order - whole, inconsistent
+
+
+def _misread(code: np.ndarray, heights: list[np.ndarray], part: np.ndarray, modulation: np.ndarray) -> np.ndarray:
+    """+1 or -1 where a plain Gray code was read from the wrong side of its edge.
+
+    The bit that lies near its threshold tells which edge the pixel is at; the phase tells on which side of it.
+    """
+    lower, upper = (np.full(code.shape, np.inf, np.float32) for _ in range(2))
+    for from_least, height in enumerate(reversed(heights)):
+        # Counting from k - 1 to k changes the Gray bit that is the number of trailing zeros of k, from k to k + 1 that of
+        # its trailing ones.
+        low_bits = code & ((2 << from_least) - 1)
+        lower = np.where(low_bits == 1 << from_least, np.abs(height), lower)
+        upper = np.where(low_bits == (1 << from_least) - 1, np.abs(height), upper)
+    weak, weaker = np.float32(limits.WEAK_BIT) * modulation, np.float32(limits.WEAKER)
+    ahead = (part < np.float32(limits.EDGE)) & (upper < weak) & (upper < weaker * lower)
+    behind = (part >= np.float32(1 - limits.EDGE)) & (lower < weak) & (lower < weaker * upper)
+    return ahead.astype(np.int32) - behind.astype(np.int32)
+
+
+def _order_by_levels(found: Layout, wrapped: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """What to add to the finest wrapped phase, in periods, and where the levels contradict each other."""
+    levels = plan_levels(tuple(shift.period_px for shift in found.shifts), found.extent)
+    inconsistent = np.zeros(wrapped[0].shape, bool)
+    coordinate, order = np.zeros(wrapped[0].shape), np.zeros(wrapped[0].shape)
+    for number, level in enumerate(levels):
+        angle = sum(w * psi.astype(np.float64) for w, psi in zip(level.weights, wrapped, strict=True) if w)
+        own = angle * (level.period_px / TWO_PI)
+        if number == 0:
+            low = lowest_coordinate(level.period_px, found.extent)
+            order = -np.floor((own - low) / level.period_px)
+        else:
+            turns = (coordinate - own) / level.period_px
+            order = np.rint(turns)
+            inconsistent |= np.abs(turns - order) > limits.LEVEL_MISFIT
+        coordinate = own + order * level.period_px
+    return order, inconsistent
+
+
+def lowest_coordinate(period_px: float, extent: int) -> float:
+    """Where the longest period is cut: what it has beyond the projector is split evenly between both ends."""
+    return -0.5 - (period_px - extent) / 2
+
+
+def _gray_alone(
+    found: Layout, stack: np.ndarray, noise: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(phase, modulation, background, inconsistent) from Gray bits alone.
+
+    One undecided bit whose two readings are neighbouring columns puts the pixel on the border between them.
+    """
+    modulation, background = contrast(found, stack)
+    part_of_sigma = np.sqrt(0.5 if found.inverse else 1.5)
+    sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background) * np.float32(part_of_sigma)
+    limit = np.maximum(
+        np.float32(limits.GRAY_UNDECIDED_SIGMAS) * sigma, np.float32(limits.GRAY_UNDECIDED_PART) * modulation
+    )
+    code, other = np.zeros(modulation.shape, np.int32), np.zeros(modulation.shape, np.int32)
+    bit, flipped = np.zeros_like(code), np.zeros_like(code)
+    doubts = np.zeros_like(code)
+    for i in found.gray:
+        height = bit_heights(found, stack, i, background)
+        doubt = np.abs(height) < limit
+        bit ^= height > 0
+        flipped ^= (height > 0) ^ doubt
+        code, other = 2 * code + bit, 2 * other + flipped
+        doubts += doubt
+    inconsistent = (doubts > 1) | (np.abs(code - other) > 1)
+    centre = np.float32(0.5) * (code + other) + np.float32(found.gray_origin_px + 0.5)
+    return (np.float32(TWO_PI) * centre).astype(np.float32), modulation, background, inconsistent
+
+
+def contrast(found: Layout, stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(modulation, background) of Gray code alone: half of white - black and their mean, else from the inverses."""
+    if found.white is not None and found.black is not None:
+        white, black = (stack[i].astype(np.float32) for i in (found.white, found.black))
+        return (white - black) * np.float32(0.5), (white + black) * np.float32(0.5)
+    modulation = np.zeros(stack.shape[1:], np.float32)
+    background = np.zeros(stack.shape[1:], np.float32)
+    for i, j in zip(found.gray, found.inverse, strict=True):
+        gray, inverse = stack[i].astype(np.float32), stack[j].astype(np.float32)
+        modulation += np.abs(gray - inverse)
+        background += gray + inverse
+    scale = np.float32(0.5 / len(found.gray))
+    return modulation * scale, background * scale
