@@ -6,6 +6,7 @@ to target poses that stereo reconstructed and that were projected onto their ide
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import prange
