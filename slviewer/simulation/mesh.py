@@ -1,0 +1,105 @@
+"""A triangle mesh before the rig, by ray casting."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.registration.open3d_loader import open3d
+from slviewer.simulation.assets import asset
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.scenes import Surface
+
+_LIFT_MM = 0.02  # shadow rays start this far above the surface: Open3D casts in float32, 1e-4 mm at these depths
+
+
+@dataclass(frozen=True)
+class MeshScene:
+    """A diffuse mesh: vertices (n, 3) mm in a frame of its own, triangles (m, 3) int, placed by `pose`.
+
+    Depths are those of the flat triangles, in float64; shading follows normals interpolated between the vertices.
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    pose: Pose
+    albedo: float = 0.8
+
+    def __post_init__(self) -> None:
+        for name, values in (("vertices", self.vertices), ("triangles", self.triangles)):
+            if values.ndim != 2 or values.shape[1] != 3 or not len(values):
+                raise InputError(f"a mesh needs {name} (n, 3), got the shape {values.shape}")
+
+    @cached_property
+    def placed(self) -> np.ndarray:
+        """Vertices (n, 3) float64 in the camera frame."""
+        return self.pose.to_camera(self.vertices.astype(np.float64))
+
+    def trace(self, rays: np.ndarray) -> Surface:
+        """The first triangle that each ray meets; triangles seen from behind count as nothing."""
+        shape = rays.shape[:2]
+        directions = np.concatenate([rays, np.ones((*shape, 1))], -1)
+        origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
+        hits = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
+        index = hits["primitive_ids"].numpy()
+        hit = np.isfinite(hits["t_hit"].numpy())
+        corners = self.triangles[index[hit]]
+        a, b, c = (self.placed[corners[:, k]] for k in range(3))
+        flat = np.cross(b - a, c - a)
+        along = directions[hit]
+        facing = (flat * along).sum(-1)
+        points = along * ((flat * a).sum(-1) / facing)[:, None]
+        s, t = hits["primitive_uvs"].numpy()[hit].T[..., None].astype(float)
+        n = self._vertex_normals
+        smooth = (1 - s - t) * n[corners[:, 0]] + s * n[corners[:, 1]] + t * n[corners[:, 2]]
+        smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
+        front = facing < 0
+        hit[hit] = front
+        surface = Surface(np.full((*shape, 3), np.nan), np.full((*shape, 3), np.nan), np.zeros(shape, np.float32))
+        surface.points[hit], surface.normals[hit], surface.albedo[hit] = points[front], smooth[front], self.albedo
+        return surface
+
+    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """Whether the mesh stands between `points` and `source`."""
+        way = source - points
+        lift = _LIFT_MM / np.linalg.norm(way, axis=-1, keepdims=True)
+        cast = np.concatenate([points + lift * way, (1 - lift) * way], -1).astype(np.float32)
+        return self._caster.test_occlusions(open3d().core.Tensor(cast), 0.0, 1.0).numpy()
+
+    @cached_property
+    def _vertex_normals(self) -> np.ndarray:
+        corners = self.placed[self.triangles]
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # twice the area: a fair weight
+        normals = np.zeros_like(self.placed)
+        for k in range(3):
+            np.add.at(normals, self.triangles[:, k], flat)
+        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+    @cached_property
+    def _caster(self) -> Any:
+        core = open3d().core
+        scene = open3d().t.geometry.RaycastingScene()
+        scene.add_triangles(
+            core.Tensor(self.placed.astype(np.float32)), core.Tensor(self.triangles.astype(np.uint32))
+        )
+        return scene
+
+
+def demo_object(pose: Pose) -> MeshScene:
+    """The ammonite of ``assets/objects/ammonite.ply``: about 140 mm wide, its front towards -z of its own frame."""
+    vertices, triangles = read_mesh(asset("objects/ammonite.ply"))
+    return MeshScene(vertices, triangles, pose)
+
+
+def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float64 and triangles (m, 3) int64 of a mesh file. Raises `InputError` if it holds none."""
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+        return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    except (OSError, ValueError, AttributeError) as error:
+        raise InputError(f"{path.name} cannot be read as a mesh ({error}): give a PLY, STL or OBJ file") from error
