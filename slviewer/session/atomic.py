@@ -75,10 +75,16 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def replace_json(path: Path, data: Any) -> None:
     """Replace a JSON file by a new one in one step."""
+    replace_file(path, to_json(data))
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Replace a file by a new one in one step. Raises SessionError where the disk refuses; the old one then stays."""
     temporary = _beside(path, "tmp")
-    with _disk_errors(path.parent):
+    with _disk_errors(path.parent, len(data)):
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            write_json(temporary, data)
+            write_bytes(temporary, data)
             os.replace(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)

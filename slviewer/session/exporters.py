@@ -1,0 +1,88 @@
+"""Files for other programs: calibrations for OpenCV and for people, pattern images for any projector."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.patterns import render
+from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.session.atomic import commit, replace_file, staged_folder, to_json, write_bytes
+
+
+def write_calibration(path: Path, entries: Mapping[str, Any]) -> None:
+    """Write named matrices, numbers and words; the suffix says how.
+
+    .yml, .yaml and .xml are OpenCV FileStorage, .json is plain JSON with matrices as nested lists; `import
+    opencv-calibration` reads them all. Replaces a file of that name in one step.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        data = to_json(dict(entries))
+    elif suffix in (".yml", ".yaml", ".xml"):
+        data = _file_storage(suffix, entries).encode()
+    else:
+        raise InputError(f"{path.name}: a calibration is written as .yml, .xml or .json: choose one of these")
+    replace_file(path, data)
+
+
+def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
+    """Write each frame of the sequence as PNG, and `sequence.toml`, which `import frames` reads back.
+
+    Raises InputError where the folder holds something already, so that two sequences never mix.
+    """
+    folder = Path(folder).expanduser().absolute()
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder} is not empty: choose a new folder for the patterns")
+    names = [f"{index:02d}_{_words(frame)}.png" for index, frame in enumerate(sequence.frames)]
+    with staged_folder(folder, len(names) * 4096) as staged:
+        for index, name in enumerate(names):
+            done, data = cv2.imencode(".png", render(sequence, index))
+            if not done:
+                raise InputError(f"pattern {name} could not be encoded as PNG: is the projector's size right?")
+            write_bytes(staged / name, data.data)
+        write_bytes(staged / "sequence.toml", _toml(sequence, names).encode())
+    commit(staged, folder)
+
+
+def _words(frame: Frame) -> str:
+    parts: list[Any] = [frame.kind, frame.axis]
+    if frame.kind == "phase":
+        parts += [f"{frame.period_px:g}px", f"{frame.step:02d}"]
+    elif frame.kind in ("gray", "inverse"):
+        parts += [f"bit{frame.bit:02d}"]
+    return "_".join(str(part) for part in parts if part)
+
+
+def _toml(sequence: PatternSequence, names: list[str]) -> str:
+    """The `frames` TOML; all its values are numbers and plain words."""
+    described = sequence.to_dict()
+    frames = described.pop("frame")
+    lines = [_line(key, value) for key, value in described.items()]
+    for name, frame in zip(names, frames, strict=True):
+        lines += ["", "[[frame]]", *(_line(key, value) for key, value in {"file": name, **frame}.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _line(key: str, value: str | int | float) -> str:
+    return f"{key} = {json.dumps(value)}"
+
+
+def _file_storage(suffix: str, entries: Mapping[str, Any]) -> str:
+    storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    for key, value in entries.items():
+        if isinstance(value, str | int | float) and not isinstance(value, bool):
+            storage.write(key, value)
+            continue
+        matrix = np.asarray(value)
+        if matrix.ndim not in (1, 2) or matrix.dtype.kind not in "iuf":
+            raise InputError(f"{key} is no number, word or matrix: an OpenCV file cannot hold it, write .json instead")
+        # a vector as a column: OpenCV's own files hold T so, and D is read either way
+        column = matrix if matrix.ndim == 2 else matrix[:, None]
+        storage.write(key, np.ascontiguousarray(column, np.float64 if matrix.dtype.kind == "f" else np.int32))
+    return storage.releaseAndGetString()
