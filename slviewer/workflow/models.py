@@ -89,6 +89,12 @@ def load_stereo(store: Session) -> StereoModel:
     return StereoModel.made_elsewhere(rig)
 
 
+def load_residuals(store: Session) -> dict[str, np.ndarray]:
+    """{pose: (n, 4) px} camera and projector residuals of the stereo calibration; empty for one made elsewhere."""
+    arrays = store.load_result("calibration/stereo")[1]
+    return {name.removeprefix("residuals_"): r for name, r in arrays.items() if name.startswith("residuals_")}
+
+
 def load_model(store: Session, name: str) -> Model:
     """One calibration by name."""
     if name not in available(store):

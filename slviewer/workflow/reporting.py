@@ -1,0 +1,154 @@
+"""A session as one self-contained HTML file."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.calibration.observe import Observation
+from slviewer.calibration.pixelwise import PixelwiseModel, pixel_samples
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.lens import Lens
+from slviewer.report.data import (
+    CalibrationView,
+    CaptureRow,
+    DeviceParameters,
+    PixelCurve,
+    PixelFitView,
+    PoseResiduals,
+    SessionData,
+)
+from slviewer.report.page import write_page
+from slviewer.report.session import session_headlines, session_sections, session_title
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
+from slviewer.workflow.models import available, load_model, load_observations, load_residuals, load_stereo
+
+
+def report(session: Path | str, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> None:
+    """Write what a session holds and how well it is calibrated to ``out``."""
+    if Path(out).suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{out} is no HTML file: end its name in .html")
+    with Session.open(session) as store:
+        progress(0.1, "reading the session")
+        data = _data(store)
+        for message in data.warnings:
+            warn(message)
+        progress(0.4, "drawing")
+        title, subtitle = session_title(data)
+        write_page(out, title, subtitle, session_headlines(data), session_sections(data))
+    progress(1.0, "written")
+
+
+def _data(store: Session) -> SessionData:
+    stereo = load_stereo(store) if "stereo" in available(store) else None
+    observations = {o.name: o for o in load_observations(store)} if stereo and stereo.poses else {}
+    stale = [
+        f"The {name} calibration was made from target poses that have since changed: run calibrate again."
+        for name in available(store)
+        if store.state_of(f"calibration/{name}") == "stale"
+    ]
+    fits: list[PixelFitView] = []
+    if stereo is not None and "pixelwise" in available(store):
+        model = load_model(store, "pixelwise")
+        assert isinstance(model, PixelwiseModel)
+        fits = [_pixel_fit(model, stereo, observations, axis) for axis in model.fits]
+    excluded = store.excluded()
+    return SessionData(
+        name=store.folder.name,
+        captures=[_capture_row(c, stereo, excluded) for c in store.captures()],
+        calibration=None if stereo is None else _calibration(store, stereo, observations),
+        pixel_fits=fits,
+        warnings=stale,
+    )
+
+
+def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:
+    sequence = capture.sequence
+    why = ""
+    if capture.role == "scan":
+        state = "scan"
+    elif capture.name in excluded:
+        state, why = "excluded", excluded[capture.name]
+    elif stereo is None or not stereo.poses:
+        state = "waiting"
+    elif capture.name in stereo.poses:
+        state = "used"
+    else:
+        state, why = "left out", stereo.left_out.get(capture.name, "added after the calibration")
+    return CaptureRow(
+        name=capture.name,
+        role=capture.role,
+        state=state,  # type: ignore[arg-type]
+        camera=capture.size,
+        projector=sequence.projector,
+        frames=len(sequence.frames),
+        periods_px={axis: sequence.period_px(axis) for axis in sequence.axes},
+        why=why,
+        made=str(capture.meta.get("created", "")),
+    )
+
+
+def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str, Observation]) -> CalibrationView:
+    residuals = {}
+    for name, r in load_residuals(store).items():
+        if name in observations:
+            o = observations[name]
+            residuals[name] = PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
+    rig = stereo.rig
+    return CalibrationView(
+        camera=_parameters(rig.camera, stereo.focal_sigma_px.get("camera", np.nan)),
+        projector=_parameters(rig.projector, stereo.focal_sigma_px.get("projector", np.nan)),
+        R=rig.R,
+        t=rig.t,
+        target=stereo.board,
+        depth_range_mm=stereo.depth_range_mm or (np.nan, np.nan),
+        reprojection_rms_px=stereo.reprojection_rms_px,
+        pose_rms_px=stereo.pose_rms_px,
+        residuals=residuals,
+        features_set_aside=stereo.features_set_aside,
+    )
+
+
+def _parameters(lens: Lens, sigma: float) -> DeviceParameters:
+    return DeviceParameters(lens.K, lens.D, lens.size, sigma)
+
+
+def _pixel_fit(
+    model: PixelwiseModel, stereo: StereoModel, observations: Mapping[str, Observation], axis: Axis
+) -> PixelFitView:
+    fit = model.fits[axis]
+    return PixelFitView(axis, fit.rms_mm, fit.poses, _middle_curve(model, stereo, observations, axis))
+
+
+def _middle_curve(
+    model: PixelwiseModel, stereo: StereoModel, observations: Mapping[str, Observation], axis: Axis
+) -> PixelCurve | None:
+    """The curves of a pixel that saw as many poses as any, nearest to the middle of the image."""
+    fit = model.fits[axis]
+    v, u = np.nonzero((fit.poses == fit.poses.max()) & np.isfinite(fit.coefficients[0]))
+    if not len(v):
+        return None
+    height, width = fit.poses.shape
+    k = int(np.argmin((v - height / 2) ** 2 + (u - width / 2) ** 2))
+    return curve_at((int(u[k]), int(v[k])), model, stereo, list(observations.values()), axis)
+
+
+def curve_at(
+    pixel: tuple[int, int],
+    model: PixelwiseModel,
+    stereo: StereoModel,
+    observations: Sequence[Observation],
+    axis: Axis,
+) -> PixelCurve | None:
+    """The data and the fit of one pixel (u, v); None where it was not fitted."""
+    u, v = pixel
+    fit = model.fits[axis]
+    phase, points = pixel_samples(observations, stereo, model, axis, pixel)
+    if not len(phase) or not np.isfinite(fit.coefficients[0, v, u]):
+        return None
+    x, y, z = points.T
+    return PixelCurve(pixel, axis, phase, z, x, y, fit.coefficients[:, v, u], fit.rms_mm[:, v, u])

@@ -1,0 +1,209 @@
+"""The Letter's experiments on the simulated rig, its figures remade, and its tables beside ours."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.evaluation import letter
+from slviewer.evaluation.compare import Comparison
+from slviewer.evaluation.render import render
+from slviewer.evaluation.sphere import SphereResult
+from slviewer.evaluation.tables import rows
+from slviewer.session.store import Session, is_session
+from slviewer.workflow.calibrating import calibrate
+from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.workflow.merging import Merge, merge
+from slviewer.workflow.models import load_observations
+from slviewer.workflow.simulating import TARGET, TRUTH, simulate
+from slviewer.workflow.verifying import verify
+
+MODELS = ("stereo", "pixelwise")
+QUICK_SCALE = 0.5
+PIXEL = (500, 500)
+"""Where the Letter shows its curves, at full resolution."""
+OBJECTS = ("object_r1", "object_r2", "object_r3")
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """Everything that the experiments gave."""
+
+    quick: bool
+    stereo: StereoModel
+    pixelwise: PixelwiseModel
+    planes: Mapping[str, Comparison]
+    spheres: Mapping[str, Comparison]
+    spacings_mm: Mapping[str, tuple[float, Mapping[str, float]]]
+    merged: Merge
+    report: Path
+
+    @property
+    def in_range_ratio(self) -> float:
+        """Mean stereo RMS over mean pixelwise RMS, over the planes that lie at least 87 % in R2."""
+        inside = [c for c in self.planes.values() if c.incidence and c.incidence["R2"] >= 87.0]
+        means = [float(np.mean([c.results[m].rms_mm for c in inside])) for m in MODELS]
+        return means[0] / means[1]
+
+    @property
+    def spacing_rms_mm(self) -> dict[str, float]:
+        """RMS error of the distances between all pairs of sphere centres, by model."""
+        return {
+            m: float(np.sqrt(np.mean([(found[m] - known) ** 2 for known, found in self.spacings_mm.values()])))
+            for m in MODELS
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Every figure that ``text`` shows, and what stands behind it."""
+        return {
+            "quick": self.quick,
+            "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
+            "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.depth_axis),
+            "planes": {name: c.to_dict() for name, c in self.planes.items()},
+            "spheres": {name: c.to_dict() for name, c in self.spheres.items()},
+            "in_range_ratio": self.in_range_ratio,
+            "spacing_rms_mm": self.spacing_rms_mm,
+            "merge": self.merged.to_json(),
+            "report": str(self.report),
+        }
+
+    def text(self) -> str:
+        """Both tables with the Letter's figures beside ours, and what else there is to know."""
+        rms, theirs = self.stereo.reprojection_rms_px, letter.REPROJECTION_RMS_PX
+        icp = letter.EXPERIMENT_3_ICP_RMS_MM
+        spacing = self.spacing_rms_mm
+        pairs = [
+            f"  {name}: RMS {pair.inlier_rmse_mm:.3f} mm point to point (the Letter: {icp[name[-2:].upper()]:.2f}), "
+            f"{pair.rms_mm:.3f} mm point to plane, overlap {100 * pair.overlap:.0f} %"
+            for name, pair in self.merged.merged.pairs.items()
+        ]
+        size = "x".join(map(str, self.stereo.rig.camera.size))
+        return "\n".join(
+            [
+                f"Simulated rig, camera {size}, {len(self.stereo.poses)} target poses. RMS in mm.",
+                f"Reprojection RMS: camera {rms['camera']:.3f} px, projector {rms['projector']:.3f} px "
+                f"(the Letter: {theirs['camera']:.3f}, {theirs['projector']:.3f}).",
+                "",
+                "Flat board (Table 1)",
+                render(_shown(rows(self.planes, letter=True))),
+                f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
+                "",
+                f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
+                render(_shown(rows(self.spheres, letter=True))),
+                "Distances between the sphere centres, RMS error: "
+                + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
+                + ".",
+                "",
+                f"Object at three depths (experiment 3), reference {self.merged.reference}",
+                *pairs,
+                "",
+                f"Report: {self.report}",
+            ]
+        )
+
+
+def reproduce(
+    out: Path | str,
+    *,
+    quick: bool = False,
+    seed: int = 0,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Reproduction:
+    """Simulate, calibrate, verify planes and spheres, merge the object, and write ``report.html`` into ``out``.
+
+    ``quick`` halves the camera's resolution. The session stays in ``out/session`` and is used again by the next run with
+    the same settings.
+    """
+    from slviewer.workflow.reproduction_report import write_reproduction
+
+    out = Path(out)
+    session = out / "session"
+    scale = QUICK_SCALE if quick else 1.0
+    _simulated(session, scale, seed, part(progress, 0.0, 0.4))
+    found = calibrate(session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn)
+    assert found.pixelwise is not None
+    with Session.open(session) as store:
+        names = store.capture_names("scan")
+        observations = load_observations(store)
+    planes = verify(
+        session,
+        [n for n in names if n.startswith("plane_")],
+        "plane",
+        models=MODELS,
+        depth_range=letter.DEPTH_RANGE_MM,
+        progress=part(progress, 0.65, 0.75),
+        warn=warn,
+    ).captures
+    spheres = verify(
+        session,
+        [n for n in names if n.startswith("sphere_")],
+        "sphere",
+        models=MODELS,
+        depth_range=letter.DEPTH_RANGE_MM,
+        radius=letter.SPHERE_RADIUS_MM,
+        progress=part(progress, 0.75, 0.82),
+        warn=warn,
+    ).captures
+    merged = merge(
+        session, OBJECTS, OBJECTS[-1], out / "merged.ply", model="pixelwise", progress=part(progress, 0.82, 0.9)
+    )
+    result = Reproduction(
+        quick=quick,
+        stereo=found.stereo,
+        pixelwise=found.pixelwise,
+        planes=planes,
+        spheres=spheres,
+        spacings_mm=_spacings(session, spheres),
+        merged=merged,
+        report=out / "report.html",
+    )
+    progress(0.92, "drawing the report")
+    pixel = (round((PIXEL[0] + 0.5) * scale - 0.5), round((PIXEL[1] + 0.5) * scale - 0.5))
+    write_reproduction(result, observations, pixel, seed)
+    progress(1.0, "reproduced")
+    return result
+
+
+def _simulated(session: Path, scale: float, seed: int, progress: Progress) -> None:
+    """The session of this scale and seed; refuses a folder that holds another one."""
+    if is_session(session):
+        import json
+
+        truth = session / TRUTH
+        made = json.loads(truth.read_text()) if truth.is_file() else {}
+        if (made.get("scale"), made.get("seed"), made.get("complete")) == (scale, seed, True):
+            return
+        raise InputError(f"{session} holds another simulation: choose another folder with --out, or delete it")
+    simulate(session, scale=scale, seed=seed, progress=progress)
+
+
+def _spacings(session: Path, spheres: Mapping[str, Comparison]) -> dict[str, tuple[float, dict[str, float]]]:
+    """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the simulation's truth."""
+    import json
+
+    truth = json.loads((session / TRUTH).read_text())["spheres"]
+    names = list(spheres)
+    found = {}
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            known = float(np.linalg.norm(np.subtract(truth[a]["centre"], truth[b]["centre"])))
+            measured = {m: float(np.linalg.norm(_centre(spheres[a], m) - _centre(spheres[b], m))) for m in MODELS}
+            found[f"{a} - {b}"] = (known, measured)
+    return found
+
+
+def _centre(comparison: Comparison, model: str) -> np.ndarray:
+    result = comparison.results[model]
+    assert isinstance(result, SphereResult)
+    return result.sphere.centre
+
+
+def _shown(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The columns that fit a terminal; coverage and points set aside stand in the report."""
+    return [{k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k} for row in table]

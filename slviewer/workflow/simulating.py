@@ -1,0 +1,99 @@
+"""A session filled by the simulated rig, with the truth in a file of its own."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.session.importers.imported import ImportedCapture
+from slviewer.session.store import Session
+from slviewer.simulation.boards import BoardScene
+from slviewer.simulation.mesh import MeshScene
+from slviewer.simulation.plans import letter_plan
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.scenes import Scene, Spheres
+from slviewer.target.board import Board
+from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
+
+TARGET = "circles:21x16:9"
+TRUTH = "truth.json"
+"""In the session's folder: read by nothing but what scores a result."""
+KINDS = ("pose", "plane", "sphere", "object")
+MIN_POSES = 3
+
+
+def simulate(
+    session: Path | str,
+    *,
+    preset: str = "letter",
+    scale: float = 1.0,
+    poses: int = 25,
+    seed: int = 0,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> list[str]:
+    """Make a session with ``pose_XX`` (both axes), ``plane_01`` ... ``plane_10``, ``sphere_1`` ... ``sphere_6`` and
+    ``object_r1`` ... ``object_r3`` (axis x), as the simulated rig sees them; returns their names.
+    """
+    if preset != "letter":
+        raise InputError(f"no rig preset is called {preset!r}: use letter")
+    if not MIN_POSES <= poses <= 200:
+        raise InputError(f"{poses} target poses cannot be simulated: ask for {MIN_POSES} to 200")
+    board = Board.parse(TARGET)
+    rig = letter(scale, seed)
+    plan = letter_plan(board, poses, seed)
+    both = p18(rig.projector.size)
+    only_x = one_axis(both, "x")
+    truth: dict[str, Any] = {"preset": preset, "scale": scale, "seed": seed, "target": TARGET, "rig": rig_truth(rig)}
+
+    def rendered(poses_or_scans: dict[str, Scene], sequence: PatternSequence) -> Iterator[ImportedCapture]:
+        for name, scene in poses_or_scans.items():
+            i = list(plan).index(name)
+            progress(i / len(plan), f"rendering {name}")
+            frames = Renderer(rig, scene).capture(sequence, seed=i)
+            yield ImportedCapture(name, sequence, frames, None, f"simulated: {preset}, scale {scale:g}, seed {seed}")
+
+    with Session.create(session) as store:
+        groups = {kind: {n: s for n, s in plan.items() if n.startswith(f"{kind}_")} for kind in KINDS}
+        scans = {n: s for n, s in plan.items() if n not in groups["pose"]}
+        saved = store.save_captures(rendered(groups["pose"], both), "calibration", board=board)
+        saved += store.save_captures(rendered(scans, only_x), "scan")
+        for kind, scenes in groups.items():
+            truth[f"{kind}s"] = {name: scene_truth(scene) for name, scene in scenes.items()}
+        (store.folder / TRUTH).write_text(json.dumps({**truth, "complete": True}, indent=1) + "\n")
+    progress(1.0, "simulated")
+    return [capture.name for capture in saved]
+
+
+def one_axis(sequence: PatternSequence, axis: Axis) -> PatternSequence:
+    """The frames of one axis, and one texture."""
+    frames = [f for f in sequence.frames if f.axis == axis]
+    texture = [f for f in sequence.frames if f.kind == "texture"][:1]
+    return PatternSequence(sequence.projector, (*frames, *texture), sequence.phase_sign, sequence.gray_origin_px)
+
+
+def scene_truth(scene: Scene) -> dict[str, Any]:
+    """Where a scene stands, mm in the camera's frame, JSON-able."""
+    if isinstance(scene, Spheres):
+        centre = scene.centres[0].tolist() if len(scene.centres) == 1 else scene.centres.tolist()
+        return {"centre": centre, "radius_mm": scene.radius_mm}
+    if isinstance(scene, BoardScene | MeshScene):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = scene.pose.R, scene.pose.t
+        return {"T_camera_scene": T.tolist()}
+    raise InputError(f"nothing is known of where a {type(scene).__name__} stands: add it to scene_truth")
+
+
+def rig_truth(rig: SimulatedRig) -> dict[str, Any]:
+    """The rig's arrangement and lenses, JSON-able."""
+    lenses = {
+        name: {"size": list(lens.size), "focal_px": list(lens.focal_px), "brown": list(lens.brown)}
+        for name, lens in (("camera", rig.camera), ("projector", rig.projector))
+    }
+    return {"R": rig.R.tolist(), "t": rig.t.tolist(), **lenses}
