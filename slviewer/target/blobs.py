@@ -35,7 +35,8 @@ def find_blobs(grey: np.ndarray, pitch: float) -> Iterator[Blobs]:
 
     ``pitch`` px is the largest distance that neighbouring circles can have. Each attempt compares pixels with the
     middle between the darkest and the brightest of a neighbourhood (or with its mean, where reflections spoil the
-    brightest), for neighbourhoods of different sizes: a small one follows uneven light, a large one holds large circles.
+    brightest), for neighbourhoods of different sizes: a small one follows uneven light, a large one holds large
+    circles.
     """
     smooth = cv2.GaussianBlur(grey, (3, 3), 0)
     for inverted in (False, True):
@@ -66,7 +67,7 @@ def _by_mean(image: np.ndarray, window: float) -> np.ndarray:
     """(h, w) uint8: 1 where darker than the neighbourhood's mean by a twelfth of it and by 4 grey levels."""
     reach = 2 * round(window * 0.75) + 1
     mean = cv2.blur(image, (reach, reach))
-    return np.asarray(image < cv2.subtract(mean, cv2.max(mean // 12, 4)), np.uint8)
+    return np.asarray(image < cv2.subtract(mean, np.maximum(mean // 12, 4)), np.uint8)
 
 
 def _elliptical(mask: np.ndarray, inverted: bool) -> Blobs:

@@ -141,7 +141,7 @@ class Board:
         return points
 
     def outline(self, margin_mm: float | None = None) -> np.ndarray:
-        """(4, 3) float64 mm: a rectangle around the features, in the order top left, top right, bottom right, bottom left.
+        """(4, 3) float64 mm: a rectangle around the features, from top left over top right to bottom left.
 
         ``margin_mm`` beyond the outermost features; by default as much as surely belongs to the board: half a pitch
         for circles, 0.95 of a square for a chessboard's inner corners, the whole sheet of squares for ChArUco.

@@ -16,9 +16,9 @@ def refine_centres(image: np.ndarray, centres: np.ndarray, covariances: np.ndarr
     """(n, 2) float64 px: the centroid of each circle's ink, by the image's own brightness around it.
 
     ``image`` (h, w) float32; ``centres`` (n, 2) px and ``covariances`` (n, 2, 2) px² describe the circles' ellipses to
-    some tenths of a pixel; ``inverted`` for bright circles on dark ground. Ink is ``1 - I / W`` with W the plane through
-    the paper's brightness next to the circle, so that uneven light does not move the centroid. NaN where there is no
-    paper to compare with, or where the result lies outside the circle's core.
+    some tenths of a pixel; ``inverted`` for bright circles on dark ground. Ink is ``1 - I / W`` with W the plane
+    through the paper's brightness next to the circle, so that uneven light does not move the centroid. NaN where there
+    is no paper to compare with, or where the result lies outside the circle's core.
     """
     ring_px = _ring_widths(centres, covariances)
     refined = np.full(centres.shape, np.nan)

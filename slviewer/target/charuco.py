@@ -5,9 +5,9 @@ import numpy as np
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
-from slviewer.target.corners import SEARCH_PX, refine_corners
-from slviewer.target.images import BoardImage, advice
+from slviewer.target.images import SEARCH_PX, BoardImage, advice, resized
 from slviewer.target.numbering import check_grid
+from slviewer.target.saddle import refine_corners
 
 FEWEST = 8
 """Corners that a pose needs."""
@@ -26,7 +26,7 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndar
     best: tuple[np.ndarray, np.ndarray] | None = None
     markers = 0
     for factor in dict.fromkeys((first, 1.0, first / 2)):
-        small = cv2.resize(image.grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        small = resized(image.grey, factor)
         corners, ids, _, marker_ids = detector.detectBoard(small)
         markers = max(markers, 0 if marker_ids is None else len(marker_ids))
         if ids is not None and len(ids) and (best is None or len(ids) > len(best[1])):
@@ -36,11 +36,12 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndar
             break
     seen = 0 if best is None else len(best[1])
     if best is None or seen < FEWEST:
+        there = board.columns * board.rows // 2
         raise DetectionError(
-            f"{seen} of {len(board.points)} corners and {markers} of {board.columns * board.rows // 2} markers of {board} "
-            f"found, and a pose needs {FEWEST} corners: {advice(image.grey)}"
+            f"{seen} of {len(board.points)} corners and {markers} of {there} markers of {board} found, and "
+            f" a pose needs {FEWEST}: {advice(image.grey)}"
         )
     pixels, ids = best
-    pixels = refine_corners(image.deep, pixels, board.points[ids][:, :2], board.pitch_mm)
+    pixels = refine_corners(image.deep, pixels, board.points[ids][:, :2], board.pitch_mm, board.marker_mm)
     check_grid(board, pixels, ids, "corners")
     return pixels, ids

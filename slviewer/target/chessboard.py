@@ -7,9 +7,10 @@ import numpy as np
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
-from slviewer.target.corners import SEARCH_PX, crossing, refine_corners
-from slviewer.target.images import BoardImage, advice, evenly_lit
+from slviewer.target.corners import crossing
+from slviewer.target.images import SEARCH_PX, BoardImage, advice, evenly_lit, resized
 from slviewer.target.numbering import check_grid, upright
+from slviewer.target.saddle import refine_corners
 
 
 def detect_chessboard(board: Board, image: BoardImage) -> np.ndarray:
@@ -17,45 +18,71 @@ def detect_chessboard(board: Board, image: BoardImage) -> np.ndarray:
 
     A board whose columns + rows are odd is numbered so that its top-left square is dark.
     """
-    most = 0
-    for pixels in _attempts(board, image.grey):
-        most = max(most, len(pixels))
-        if len(pixels) == len(board.points):
-            break
-    else:
-        raise DetectionError(f"{most} of {len(board.points)} corners of {board} found: {advice(image.grey)}")
+    grid = next(_attempts(board, image.grey), None)
+    if grid is None:
+        raise DetectionError(_not_found(board, image.grey))
     # the finders' own order may be mirrored; all that is kept of it is what lies beside what
-    grid = pixels.reshape(board.rows, board.columns, 2)
-    if np.cross(*(np.mean(np.diff(grid, axis=axis), axis=(0, 1)) for axis in (1, 0))) < 0:
+    if _turn(grid) < 0:
         grid = grid[:, ::-1]
     pixels = refine_corners(image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm)
     check_grid(board, pixels, np.arange(len(pixels)), "corners")
     grid = pixels.reshape(grid.shape)
     first_is_dark = _first_is_dark(image.deep, grid)
-    _refuse_larger(board, image.deep, grid, first_is_dark)
+    _refuse_larger(board, image.deep, grid)
     return upright(board, [g.reshape(-1, 2) for g in _numberings(grid, first_is_dark)])
 
 
 def _attempts(board: Board, grey: np.ndarray) -> Iterator[np.ndarray]:
-    """Corners, row by row or as many as were seen: the quickest search first."""
-    first = min(1.0, SEARCH_PX / max(grey.shape))
+    """Corners (rows, columns, 2), the quickest search first."""
+    shape = (board.rows, board.columns, 2)
+    full = min(1.0, SEARCH_PX / max(grey.shape))
     accurate, thorough = cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
-    searches = [(first / 2, False, 0), (first, False, 0), (first / 2, True, thorough), (first, True, thorough)]
-    if first < 1:
+    searches = [(full / 2, False, 0), (full, False, 0), (full / 2, True, thorough), (full, True, thorough)]
+    if full < 1:
         searches.append((1.0, False, accurate))
     for factor, even, flags in searches:
-        image = _resized(evenly_lit(grey) if even else grey, factor)
+        image = resized(evenly_lit(grey) if even else grey, factor)
         found, corners = cv2.findChessboardCornersSB(image, board.features, flags=flags)
         if found:
-            yield (corners.reshape(-1, 2).astype(float) + 0.5) / factor - 0.5
-    for even in (False, True):
-        image = _resized(evenly_lit(grey) if even else grey, first / 2)
-        _, corners = cv2.findChessboardCorners(image, board.features)
-        yield np.zeros((0, 2)) if corners is None else (corners.reshape(-1, 2).astype(float) + 0.5) * 2 / first - 0.5
+            yield _in_full(corners, factor).reshape(shape)
+    largest = _largest(grey)
+    if largest is not None and largest.shape == shape:
+        yield largest
+    elif largest is not None and largest.shape == (*shape[1::-1], 2):
+        yield largest.transpose(1, 0, 2)
+    found, corners = cv2.findChessboardCorners(resized(grey, full), board.features)
+    if found:
+        yield _in_full(corners, full).reshape(shape)
 
 
-def _resized(grey: np.ndarray, factor: float) -> np.ndarray:
-    return cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else grey
+def _largest(grey: np.ndarray) -> np.ndarray | None:
+    """(rows, columns, 2) px: the largest grid of corners of any chessboard, if there is one of 3x3 or more."""
+    factor = min(1.0, SEARCH_PX / max(grey.shape)) / 2
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+    found, corners, cells = cv2.findChessboardCornersSBWithMeta(resized(evenly_lit(grey), factor), (3, 3), flags)
+    return _in_full(corners, factor).reshape(*cells.shape[:2], 2) if found else None
+
+
+def _in_full(corners: np.ndarray, factor: float) -> np.ndarray:
+    """Pixels of the full image from those of an image ``factor`` times its size."""
+    return (corners.astype(float) + 0.5) / factor - 0.5
+
+
+def _turn(grid: np.ndarray) -> float:
+    """Positive where the step along a row turns clockwise in the image into the step along a column."""
+    (a, b), (c, d) = (np.diff(grid, axis=axis).mean((0, 1)) for axis in (1, 0))
+    return float(a * d - b * c)
+
+
+def _not_found(board: Board, grey: np.ndarray) -> str:
+    """What the operator reads: the largest chessboard that can be seen, if any, and what to do."""
+    largest = _largest(grey)
+    if largest is None:
+        return f"no chessboard found where {board} has {len(board.points)} corners: {advice(grey)}"
+    rows, columns = largest.shape[:2]
+    if rows * columns <= len(board.points):
+        return f"{rows * columns} of {len(board.points)} corners of {board} found ({columns}x{rows}): {advice(grey)}"
+    return f"a chessboard of {columns}x{rows} inner corners found where {board} is expected: check its columns and rows"
 
 
 def _first_is_dark(image: np.ndarray, grid: np.ndarray) -> bool:
@@ -72,7 +99,7 @@ def _first_is_dark(image: np.ndarray, grid: np.ndarray) -> bool:
     return bool(colours[0, 0] > 0)
 
 
-def _refuse_larger(board: Board, image: np.ndarray, grid: np.ndarray, first_is_dark: bool) -> None:
+def _refuse_larger(board: Board, image: np.ndarray, grid: np.ndarray) -> None:
     """Raises DetectionError where the squares go on beyond the grid: it may be shifted by a row."""
     for side in range(4):
         turned = np.rot90(grid, side)

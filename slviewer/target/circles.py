@@ -3,19 +3,15 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError
 from slviewer.target.blobs import Blobs, find_blobs
 from slviewer.target.board import Board
 from slviewer.target.centroid import refine_centres
-from slviewer.target.images import BoardImage, advice
+from slviewer.target.images import SEARCH_PX, BoardImage, advice, resized
 from slviewer.target.lattice import Lattice, grow_lattices, lay_pattern
 from slviewer.target.numbering import check_grid, upright
-
-SEARCH_PX = 1600
-"""Longest side of the image in which circles are searched first; their centres come from the full image."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ def _attempts(board: Board, grey: np.ndarray) -> Iterator[Blobs]:
     """Blobs at the search resolution, then coarser, where noise averages out, then in the full image."""
     first = min(1.0, SEARCH_PX / max(grey.shape))
     for factor in dict.fromkeys((first, first / 2, 1.0)):
-        small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else grey
+        small = resized(grey, factor)
         scale = np.array(grey.shape[::-1]) / np.array(small.shape[::-1])
         pitch = max(small.shape) / (min(board.columns, board.rows) - 1)
         for blobs in find_blobs(small, pitch):

@@ -1,31 +1,14 @@
-"""Sub-pixel corners of chessboards, and whether they are corners where four squares meet."""
+"""Whether dark and bright squares meet at a corner."""
 
 import cv2
 import numpy as np
 
-SEARCH_PX = 1600
-"""Longest side of the image in which corners are searched first; their places come from the full image."""
 LEAST_CONTRAST = 1.12
 """Bright over dark squares around a corner."""
 
 
-def refine_corners(image: np.ndarray, pixels: np.ndarray, points: np.ndarray, pitch: float) -> np.ndarray:
-    """(n, 2) float64 px: each corner where the edges around it meet, from the image's gradients.
-
-    ``image`` (h, w) float32, ``pixels`` (n, 2) px good to a few px, ``points`` (n, 2) mm on the board. The window
-    reaches over a third of the shortest side of a square as the camera sees it.
-    """
-    H, _ = cv2.findHomography(points, pixels)
-    steps = [cv2.perspectiveTransform((points + s)[None], H)[0] - pixels for s in np.eye(2) * pitch]
-    side = float(np.percentile(np.minimum(*(np.linalg.norm(step, axis=1) for step in steps)), 10))
-    reach = int(np.clip(round(side / 3), 2, 12))
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
-    start = np.ascontiguousarray(pixels[:, None], np.float32)
-    return cv2.cornerSubPix(image, start, (reach, reach), (-1, -1), criteria).reshape(-1, 2).astype(float)
-
-
 def crossing(image: np.ndarray, corners: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """(...,) int8: +1 where the square towards -x, -y of a corner is dark, -1 where it is bright, 0 where no squares meet.
+    """(...,) int8: +1 where the square towards -x, -y of a corner is dark, -1 where bright, 0 where no squares meet.
 
     ``corners``, ``across``, ``down`` (..., 2) px: the corner, and the steps to the next ones along x and y. The two
     squares on one diagonal must both be brighter than the two on the other. A corner too near the image's border

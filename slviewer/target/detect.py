@@ -11,6 +11,7 @@ from slviewer.target.charuco import detect_charuco
 from slviewer.target.chessboard import detect_chessboard
 from slviewer.target.circles import detect_circles
 from slviewer.target.images import BoardImage
+from slviewer.target.planar import fit_homography, to_image
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,9 @@ class Detection:
 def detect(board: Board, image: np.ndarray) -> Detection:
     """The board's features in an image (h, w), or (h, w, 3) RGB, uint8 or uint16.
 
-    The numbering's x axis turns clockwise into its y axis in the image, always; which of a symmetric board's numberings
-    is taken, ``slviewer.target.numbering`` says. Raises DetectionError, whose message says what was seen and what to do,
-    rather than return a grid with a feature missing, misplaced or shifted.
+    The numbering's x axis turns clockwise into its y axis in the image, always; which of a symmetric board's
+    numberings is taken, ``slviewer.target.numbering`` says. Raises DetectionError, whose message says what was seen
+    and what to do, rather than return a grid with a feature missing, misplaced or shifted.
     """
     board_image = BoardImage.of(image)
     if board.kind == "charuco":
@@ -47,8 +48,8 @@ def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> np
     """
     if len(detection.ids) < 4:
         raise InputError(f"{len(detection.ids)} features do not give a board's outline: detect at least 4")
-    H, _ = cv2.findHomography(board.points[detection.ids][:, :2], np.asarray(detection.pixels, float))
-    corners = cv2.perspectiveTransform(board.outline()[None, :, :2], H)[0]
+    H = fit_homography(board.points[detection.ids][:, :2], np.asarray(detection.pixels, float))
+    corners = to_image(H, board.outline()[:, :2])
     mask = np.zeros(shape[:2], np.uint8)
     cv2.fillConvexPoly(mask, np.round(corners * 16).astype(np.int32), 1, shift=4)
     return mask.astype(bool)

@@ -7,6 +7,9 @@ import numpy as np
 
 from slviewer.errors import InputError
 
+SEARCH_PX = 1600
+"""Longest side of the image in which boards are searched first; features are measured in the full image."""
+
 
 @dataclass(frozen=True)
 class BoardImage:
@@ -37,17 +40,20 @@ class BoardImage:
 
 def advice(grey: np.ndarray) -> str:
     """What the operator should try, by how bright the image is."""
-    sample = grey[::4, ::4]
-    saturated = float(np.mean(sample >= 255))
-    if saturated > 0.02:
-        return f"lower the exposure ({saturated:.0%} of the image is saturated), or move the board so that all of it is in view"
-    return "move the board so that all of it is in view, evenly lit and in focus"
+    saturated = float(np.mean(grey[::4, ::4] == 255))
+    exposure = f"lower the exposure ({saturated:.0%} of the image is saturated), or " if saturated > 0.02 else ""
+    return f"{exposure}move the board so that all of it is in view, evenly lit and in focus"
+
+
+def resized(image: np.ndarray, factor: float) -> np.ndarray:
+    """The image at ``factor`` <= 1 of its size, averaged."""
+    return cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
 
 
 def evenly_lit(grey: np.ndarray) -> np.ndarray:
-    """(h, w) uint8: the image over the brightest of each neighbourhood, an eighth of it wide, so that paper is white."""
+    """(h, w) uint8: the image over the brightest of each neighbourhood, a seventh of it wide: paper becomes white."""
     factor = 64 / max(grey.shape)
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     white = cv2.GaussianBlur(cv2.dilate(small, np.ones((9, 9), np.uint8)), (9, 9), 0)
     white = cv2.resize(white, grey.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return cv2.divide(grey, cv2.max(white, 8), scale=230)
+    return cv2.divide(grey, np.maximum(white, 8), scale=230)

@@ -8,11 +8,11 @@ feature, a board whose rows run vertically counts from the top right, and neithe
 numberings, the one whose x axis points most to the right.
 """
 
-import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
+from slviewer.target.planar import fit_homography, jacobians, to_image
 
 MOST_OFF = 0.08
 """How far, in pitches, a feature may lie from the grid that all features together describe."""
@@ -41,13 +41,12 @@ def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> 
     """
     advice = "keep the board flat and in focus, without reflections, and take the pose again"
     points = board.points[ids][:, :2] / board.pitch_mm
-    H, _ = cv2.findHomography(points, pixels)
-    if H is None:
-        raise DetectionError(f"the {len(ids)} {what} found lie on one line: turn the board towards the camera")
-    if np.linalg.det(H) <= 0:  # with w > 0 on the board, its sign is the handedness
+    H = fit_homography(points, pixels)
+    areas = np.linalg.det(jacobians(H, points))
+    if areas.max() <= 0:
         raise DetectionError(f"the {what} appear mirrored: show the board to the camera directly, not in a mirror")
-    left_over = pixels - cv2.perspectiveTransform(points[None], H)[0]
-    pitch = np.sqrt(np.abs(np.linalg.det(np.array([_jacobian(H, point) for point in points]))))
+    pitch = np.sqrt(np.maximum(areas, 1e-9))
+    left_over = pixels - to_image(H, points)
     if (np.linalg.norm(left_over, axis=1) > MOST_BENT * pitch).any():
         raise DetectionError(f"the {what} found do not lie on a flat grid: {advice}")
     x, y = (2 * (points - points.min(0)) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1).T
@@ -60,12 +59,6 @@ def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> 
         worst = int(np.argmax(off / pitch))
         u, v = pixels[worst]
         raise DetectionError(
-            f"{np.count_nonzero(wrong)} of {len(ids)} {what} do not fit the grid (the worst, at pixel {u:.0f}, {v:.0f}, "
-            f"is {off[worst]:.1f} px off): {advice}"
+            f"{np.count_nonzero(wrong)} of {len(ids)} {what} do not fit the grid "
+            f"(the worst, at pixel {u:.0f}, {v:.0f}, is {off[worst]:.1f} px off): {advice}"
         )
-
-
-def _jacobian(H: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """(2, 2) px per pitch at a point of the board."""
-    p = H @ np.array([*point, 1.0])
-    return np.asarray((H[:2, :2] - np.outer(p[:2] / p[2], H[2, :2])) / p[2])

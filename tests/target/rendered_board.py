@@ -81,18 +81,19 @@ class View:
         width, height = self.size
         s = self.supersample
         inverse = np.linalg.inv(self.homography(board))
-        fine = (np.arange(s) + 0.5) / s - 0.5
+        # a sheared grid of samples: an edge along a pixel row meets s² different heights rather than s
+        b, a = np.meshgrid(np.arange(s), np.arange(s), indexing="ij")
+        fine_u, fine_v = ((a + (b + 0.5) / s) / s - 0.5, (b + (a + 0.5) / s) / s - 0.5)
         image = np.empty((height, width))
         for v0 in range(0, height, 32):
             rows = np.arange(v0, min(v0 + 32, height))
-            v, u = np.meshgrid(
-                (rows[:, None] + fine).ravel(), (np.arange(width)[:, None] + fine).ravel(), indexing="ij"
-            )
+            u = np.arange(width)[None, None, :, None] + fine_u[None, :, None, :] + np.zeros((len(rows), 1, 1, 1))
+            v = rows[:, None, None, None] + fine_v[None, :, None, :] + np.zeros((1, 1, width, 1))
             if self.k1:
                 u, v = np.moveaxis(self._undistort(np.stack([u, v], -1)), -1, 0)
             x, y, w = (row[0] * u + row[1] * v + row[2] for row in inverse)
             albedo = self.albedo(board, x / w, y / w)
-            image[rows] = albedo.reshape(len(rows), s, width, s).mean((1, 3))
+            image[rows] = albedo.mean((1, 3))
         u, v = np.meshgrid(np.arange(width), np.arange(height))
         image = self.paper * image * self.gain(u, v)
         if self.blur:
