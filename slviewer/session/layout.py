@@ -34,18 +34,19 @@ def session_folder(path: str | Path) -> Path:
 
 
 def new_folder(path: str | Path) -> Path:
-    """A folder that a session may be made in: new, or empty but for hidden files; SessionError otherwise."""
+    """A folder that a session may be made in, new or empty; SessionError otherwise."""
     folder = _absolute(path)
     if is_session(folder):
         raise SessionError(f"{folder} is a session already: open it, or choose another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        strangers = [entry.name for entry in folder.iterdir() if not entry.name.startswith(".")]
+        strangers = [entry.name for entry in folder.iterdir() if not _is_ours(entry)]
     except OSError as error:
         raise SessionError(f"{folder} cannot be made ({error}): choose a folder that you may write to") from error
-    # the rooms of a session whose making was cut short are no strangers
-    if any(name not in ("captures", "results") or inner_folders(folder / name) for name in strangers):
-        raise SessionError(f"{folder} holds other things: choose a new or an empty folder for the session")
+    if strangers:
+        raise SessionError(
+            f"{folder} holds other things ({strangers[0]}): choose a new or an empty folder for the session"
+        )
     return folder
 
 
@@ -62,6 +63,13 @@ def inner_folders(folder: Path) -> list[str]:
     if not folder.is_dir():
         return []
     return [entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
+
+
+def _is_ours(entry: Path) -> bool:
+    """Whether this may be left from a session whose making was cut short, or is what macOS leaves everywhere."""
+    if entry.name in ("captures", "results"):
+        return entry.is_dir() and not any(entry.iterdir())
+    return entry.name in (".lock", ".lock-holder", ".DS_Store") or entry.name.startswith(".session.json.tmp-")
 
 
 def _absolute(path: str | Path) -> Path:

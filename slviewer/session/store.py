@@ -140,6 +140,7 @@ class Session:
                 staged[new.name] = self._stage(
                     new.name, role, new.sequence, new.frames, new.texture, new.source, new.settings, board, force
                 )
+                del new  # before the next one is made
         except BaseException:
             for folder in staged.values():
                 atomic.discard(folder)

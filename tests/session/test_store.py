@@ -138,7 +138,7 @@ def test_damage_is_an_error_and_never_a_black_frame(session, sequence, frames, d
         meta.write_bytes(meta.read_bytes()[:100])
     else:
         meta.write_text("{}")
-    with pytest.raises(SessionError, match="again|copy"):
+    with pytest.raises(SessionError, match=r"again|copy"):
         _ = session.load_capture("a").frames
 
 
@@ -224,7 +224,7 @@ def test_decisions_are_kept(session, sequence, frames):
 
 def test_one_writer_and_any_number_of_readers(session, sequence, frames):
     session.save_capture("a", "scan", sequence, frames, source="")
-    with pytest.raises(SessionError, match="process \\d+ on"):
+    with pytest.raises(SessionError, match=r"process \d+ on"):
         Session.open(session.folder, write=True)
     code = f"""
 import sys
@@ -255,7 +255,7 @@ except SessionError as error:
 
 
 def test_folders_that_are_no_session(tmp_path):
-    with pytest.raises(SessionError, match="not a session folder.*slviewer import"):
+    with pytest.raises(SessionError, match=r"not a session folder.*slviewer import"):
         Session.open(tmp_path)
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(SessionError, match="other things"):

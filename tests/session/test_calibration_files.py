@@ -1,0 +1,121 @@
+"""Calibrations from and for other programs."""
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.errors import InputError
+from slviewer.session.exporters import write_calibration
+from slviewer.session.importers import opencv_calibration
+
+KEYS = ("M1", "D1", "M2", "D2", "rot", "trans")
+
+
+def rig() -> dict[str, np.ndarray]:
+    return {
+        "M1": np.array([[3450.5, 0, 583.25], [0, 3449.5, 525.125], [0, 0, 1]]),
+        "D1": np.array([[-0.08, 0.11, 1e-3, -2e-3, 0.03]]),
+        "M2": np.array([[1890.0, 0, 484], [0, 1892.0, 855], [0, 0, 1]]),
+        "D2": np.array([[0.02, 0.01, -1e-3, 2e-3]]),
+        "rot": cv2.Rodrigues(np.array([0.1, -0.2, 0.3]))[0],
+        "trans": np.array([[94.6], [-625.7], [-247.1]]),
+    }
+
+
+def write(path, entries):
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in entries.items():
+        storage.write(key, value)
+    storage.release()
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
+def test_a_file_of_opencv_is_read(tmp_path, suffix):
+    read = opencv_calibration.read(write(tmp_path / f"a{suffix}", {"note": "made elsewhere", **rig()}), KEYS)
+    assert list(read) == list(opencv_calibration.ENTRIES)
+    for key, entry in zip(KEYS, opencv_calibration.ENTRIES, strict=True):
+        expected = np.append(rig()[key], 0.0) if key == "D2" else rig()[key]
+        shape = {"D": (5,), "T": (3,)}.get(entry[0], (3, 3))
+        assert read[entry].shape == shape and read[entry].dtype == np.float64
+        np.testing.assert_allclose(read[entry], expected.reshape(shape), rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".yaml", ".xml", ".json"])
+def test_what_is_written_is_read_back(tmp_path, suffix):
+    entries = dict(zip(opencv_calibration.ENTRIES, rig().values(), strict=True))
+    entries["D_projector"] = np.append(entries["D_projector"], 0.5)
+    entries["T"] = entries["T"].ravel()
+    path = tmp_path / f"calibration{suffix}"
+    for _ in range(2):  # the second replaces the first
+        write_calibration(path, {**entries, "rms_px": 0.25, "camera_size": (1600, 1200), "program": "slviewer"})
+    read = opencv_calibration.read(path)
+    for key, value in entries.items():
+        np.testing.assert_allclose(read[key], value.reshape(read[key].shape), rtol=1e-14, atol=1e-14)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_what_cannot_be_written_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.yml"
+    write_calibration(path, {"a": 1})
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="b is no number"):
+        write_calibration(path, {"a": 1, "b": np.zeros((2, 2, 2))})
+    with pytest.raises(InputError, match="choose one of these"):
+        write_calibration(tmp_path / "a.txt", {"a": 1})
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"T": None, "trans": None}, "has no trans: its keys are M1, D1, M2, D2, rot"),
+        ({"rot": np.eye(3) * 1.01}, "rot is no rotation"),
+        ({"rot": -np.eye(3)}, "rot is no rotation"),
+        ({"rot": np.zeros((3, 1))}, r"rot has shape \(3, 1\)"),
+        ({"trans": np.zeros((2, 1))}, r"trans has shape \(2, 1\)"),
+        ({"trans": np.array([[0.3, 0.0, 0.0]])}, "in mm"),
+        ({"M1": np.eye(4)}, "a camera matrix is 3x3"),
+        ({"M1": rig()["M1"].T}, "no camera matrix"),
+        ({"M1": rig()["M1"] + np.array([[0, 2, 0], [0, 0, 0], [0, 0, 0]])}, "skew"),
+        ({"M1": rig()["M1"] * np.nan}, "not finite"),
+        ({"D1": np.full((1, 8), 0.1)}, "8 coefficients .* cannot represent"),
+        ({"D1": np.zeros((1, 6))}, "4, 5, 8, 12 or 14"),
+        ({"M2": "words"}, "M2 is no matrix"),
+    ],
+)
+def test_what_cannot_be_used_is_named(tmp_path, change, message):
+    entries = {key: value for key, value in {**rig(), **change}.items() if value is not None}
+    with pytest.raises(InputError, match=message):
+        opencv_calibration.read(write(tmp_path / "a.yml", entries), KEYS)
+
+
+def test_other_shapes_that_mean_the_same(tmp_path):
+    changed = {
+        "D1": np.concatenate([rig()["D1"], np.zeros((1, 3))], axis=1).T,
+        "trans": rig()["trans"].T,
+        "rot": rig()["rot"].round(6),
+    }
+    read = opencv_calibration.read(write(tmp_path / "a.yml", {**rig(), **changed}), KEYS)
+    np.testing.assert_array_equal(read["D_camera"], rig()["D1"].ravel())
+    np.testing.assert_array_equal(read["T"], rig()["trans"].ravel())
+    np.testing.assert_allclose(read["R"], rig()["rot"], atol=2e-6)
+    np.testing.assert_allclose(read["R"] @ read["R"].T, np.eye(3), atol=1e-14)
+
+
+@pytest.mark.parametrize("content", ["", "no storage", "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3"])
+def test_files_that_are_no_storage(tmp_path, content):
+    for suffix in (".yml", ".xml", ".json"):
+        path = tmp_path / f"a{suffix}"
+        path.write_text(content)
+        with pytest.raises(InputError, match=f"a{suffix}"):
+            opencv_calibration.read(path, KEYS)
+    with pytest.raises(InputError, match="is no file"):
+        opencv_calibration.read(tmp_path / "absent.yml", KEYS)
+    with pytest.raises(InputError, match="2 keys were given"):
+        opencv_calibration.read(path, KEYS[:2])
+
+
+def test_a_real_file_in_two_parts(real_data):
+    with pytest.raises(InputError, match=r"intrinsic.yml has no R, T: its keys are M1, D1, M2, D2"):
+        opencv_calibration.read(real_data / "slmaster_david" / "intrinsic.yml", ("M1", "D1", "M2", "D2", "R", "T"))

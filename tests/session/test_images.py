@@ -1,0 +1,91 @@
+"""An image is read whole or refused by name."""
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.errors import InputError
+from slviewer.session.importers.images import read_frames, read_image
+
+PIXELS = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
+FORMATS = [".png", ".jpg", ".bmp", ".tif", ".pgm"]
+
+
+def encoded(suffix: str, pixels: np.ndarray = PIXELS) -> bytes:
+    return cv2.imencode(suffix, pixels)[1].tobytes()
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("colour", [False, True])
+def test_whole_images_are_read(tmp_path, suffix, colour):
+    pixels = np.dstack([PIXELS, PIXELS[::-1], PIXELS.T.reshape(PIXELS.shape)]) if colour else PIXELS
+    suffix = ".ppm" if colour and suffix == ".pgm" else suffix
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(encoded(suffix, pixels))
+    image = read_image(path)
+    assert image.shape == pixels.shape
+    if suffix != ".jpg":
+        np.testing.assert_array_equal(image, pixels)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.9, 0.99])
+def test_cut_short_images_are_refused(tmp_path, suffix, kept):
+    data = encoded(suffix)
+    path = tmp_path / "pose_1" / "V" / f"P18_F07{suffix}"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(InputError, match="pose_1/V/P18_F07"):
+        read_image(path)
+
+
+def test_a_damaged_png_is_refused(tmp_path):
+    data = bytearray(encoded(".png"))
+    data[len(data) // 2] ^= 1
+    path = tmp_path / "a.png"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="damaged"):
+        read_image(path)
+
+
+def test_a_thumbnail_does_not_end_a_jpeg(tmp_path):
+    whole = encoded(".jpg")
+    thumbnail = b"\xff\xe1" + struct.pack(">H", 2 + len(whole)) + whole
+    path = tmp_path / "a.jpg"
+    path.write_bytes(whole[:2] + thumbnail + whole[2:] + b"\0\0 padding")
+    assert read_image(path).shape == PIXELS.shape
+    path.write_bytes(whole[:2] + thumbnail + whole[2 : len(whole) // 2])
+    with pytest.raises(InputError, match="cut short"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [
+        (PIXELS[:, :60], "is 60x48 px, .*a.png is 64x48"),
+        (PIXELS.astype(np.uint16) * 257, "has 16 bits, .*a.png has 8"),
+        (np.dstack([PIXELS] * 4), "has 4 channels: .* without alpha"),
+    ],
+)
+def test_frames_that_differ_are_refused(tmp_path, pixels, message):
+    for name, image in (("a.png", PIXELS), ("b.png", pixels)):
+        (tmp_path / name).write_bytes(encoded(".png", image))
+    with pytest.raises(InputError, match="b.png " + message):
+        read_frames([tmp_path / "a.png", tmp_path / "b.png"])
+
+
+def test_what_is_no_frame_is_refused(tmp_path):
+    (tmp_path / "a.png").write_text("no image at all")
+    (tmp_path / "b.tif").write_bytes(encoded(".tif", PIXELS.astype(np.float32)))
+    for name, message in (("a.png", "not a readable image"), ("b.tif", "float32"), ("c.png", "cannot be read")):
+        with pytest.raises(InputError, match=message):
+            read_frames([tmp_path / name])
+
+
+def test_grey_stored_as_colour_has_no_colours(tmp_path):
+    (tmp_path / "a.png").write_bytes(encoded(".png", np.dstack([PIXELS] * 3)))
+    stack, colours = read_frames([tmp_path / "a.png"], 0)
+    np.testing.assert_array_equal(stack[0], PIXELS)
+    assert colours is None
