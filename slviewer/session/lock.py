@@ -20,10 +20,10 @@ class WriterLock:
         self._lock = FileLock(folder / ".lock", thread_local=False)  # closed by another thread than opened it
         self._holder = folder / ".lock-holder"
 
-    def acquire(self) -> None:
+    def acquire(self, patience_s: float = _PATIENCE_S) -> None:
         """Take the lock or raise a SessionError that says which process holds it."""
         try:
-            self._lock.acquire(timeout=_PATIENCE_S, poll_interval=0.02)
+            self._lock.acquire(timeout=patience_s, poll_interval=0.02)
         except Timeout as error:
             raise SessionError(
                 f"{self._folder} is open for writing in {self._who()}: close it there, or wait until it has finished"

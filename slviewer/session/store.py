@@ -257,7 +257,7 @@ class Session:
             return
         lock = WriterLock(self.folder)
         with contextlib.suppress(SessionError, OSError):
-            lock.acquire()
+            lock.acquire(patience_s=0)
             try:
                 atomic.recover(self.folder, self.folder / "trash")
             finally:

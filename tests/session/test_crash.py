@@ -99,6 +99,15 @@ def test_a_replacement_cut_short_anywhere_leaves_the_old_or_the_new(session, seq
         assert len(list((session.folder / "trash").iterdir())) == 1
 
 
+def test_a_reader_leaves_a_working_writer_alone(session, sequence, frames):
+    with atomic.staged_folder(session.folder / "captures" / "a", 1) as staged:
+        begun = time.monotonic()
+        assert Session.open(session.folder).capture_names() == []
+        assert time.monotonic() - begun < 0.2
+        assert staged.is_dir()
+    atomic.discard(staged)
+
+
 def test_a_save_that_the_disk_has_no_room_for_is_refused(session, sequence, frames, monkeypatch):
     session.save_capture("a", "scan", sequence, frames, source="")
     usage = namedtuple("usage", "total used free")

@@ -1,5 +1,6 @@
 """What an importer hands back, and how it finds the capture folders in a source."""
 
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -62,7 +63,7 @@ def find_captures(source: Path, is_capture: Callable[[Path], bool], looks_like: 
     Raises InputError where there are none (it should look like `looks_like`), or where a folder that is named like the
     captures beside it has nothing of one inside.
     """
-    source = Path(source).expanduser().resolve()
+    source = Path(os.path.abspath(Path(source).expanduser()))  # a link keeps its own name
     if not source.is_dir():
         raise InputError(f"{source} is no folder: give the folder of a capture, or a folder of such folders")
     if is_capture(source):
