@@ -111,9 +111,10 @@ class Board:
         size = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", fields[0])
         if not size:
             raise InputError(f"board '{notation}': '{fields[0]}' is not columns x rows, as in '{example}'")
-        lengths = [_millimetres(notation, text, example) for text in fields[1:3]]
+        pitch = _millimetres(notation, fields[1], example)
+        marker = _millimetres(notation, fields[2], example) if len(fields) > 2 else 0.0
         dictionary = fields[3].strip().upper() if len(fields) > 3 else ""
-        return cls(cast(Kind, kind), int(size[1]), int(size[2]), *lengths, dictionary=dictionary)
+        return cls(cast(Kind, kind), int(size[1]), int(size[2]), pitch, marker, dictionary)
 
     def __str__(self) -> str:
         fields = [self.kind, f"{self.columns}x{self.rows}", _number(self.pitch_mm)]
@@ -160,6 +161,9 @@ def _number(value: float) -> str:
 
 def _millimetres(notation: str, text: str, example: str) -> float:
     try:
-        return float(text)
+        length = float(text)
     except ValueError:
-        raise InputError(f"board '{notation}': '{text}' is not a length in mm, as in '{example}'") from None
+        length = math.nan
+    if not length > 0:
+        raise InputError(f"board '{notation}': '{text}' is not a length in mm, as in '{example}'")
+    return length

@@ -39,7 +39,7 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndar
         there = board.columns * board.rows // 2
         raise DetectionError(
             f"{seen} of {len(board.points)} corners and {markers} of {there} markers of {board} found, and "
-            f" a pose needs {FEWEST}: {advice(image.grey)}"
+            f"a pose needs {FEWEST}: {advice(image.grey)}"
         )
     pixels, ids = best
     pixels = refine_corners(image.deep, pixels, board.points[ids][:, :2], board.pitch_mm, board.marker_mm)

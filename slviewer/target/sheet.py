@@ -1,0 +1,96 @@
+"""Printable boards, to exact scale."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.target.board import Board
+from slviewer.target.charuco import opencv_board
+from slviewer.target.drawing import LARGEST_PDF_MM, Drawing
+
+CIRCLE_SHARE = 0.5
+"""Diameter of a printed circle over the distance to its nearest neighbour."""
+FOOT_MM = 12.0
+"""Strip below the board for the scale bar and the text."""
+
+
+def write_sheet(board: Board, path: Path | str, margin_mm: float | None = None) -> None:
+    """Write a board as a .pdf or .svg page of the board's size, with a scale bar to check the print by.
+
+    ``margin_mm`` is the paper left around the board: by default half a pitch, and 10 mm or more. The page's right and
+    down are the board's x and y. Raises InputError for other suffixes, for pages that PDF cannot hold, and where the
+    file cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".pdf", ".svg"):
+        raise InputError(f"a sheet cannot be written as '{path.name}': give a name that ends in .pdf or .svg")
+    drawing = draw(board, margin_mm)
+    if suffix == ".pdf" and max(drawing.width, drawing.height) > LARGEST_PDF_MM:
+        raise InputError(
+            f"a page of {drawing.width:.0f}x{drawing.height:.0f} mm is more than a PDF can hold "
+            f"({LARGEST_PDF_MM:.0f} mm): write .svg instead"
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(drawing.pdf() if suffix == ".pdf" else drawing.svg())
+    except OSError as error:
+        raise InputError(f"'{path}' cannot be written ({error.strerror}): choose another place") from error
+
+
+def draw(board: Board, margin_mm: float | None = None) -> Drawing:
+    """The board on its page."""
+    margin = max(10.0, board.pitch_mm / 2) if margin_mm is None else margin_mm
+    if not margin >= 0:
+        raise InputError(f"a margin of {margin} mm is not possible: give 0 or more")
+    radius = CIRCLE_SHARE / 2 * board.pitch_mm * (2**0.5 if board.kind == "acircles" else 1)
+    beyond = radius if board.kind in ("circles", "acircles") else board.pitch_mm
+    first = np.array([margin + beyond, margin + beyond])
+    extent = np.ptp(board.points[:, :2], axis=0) + 2 * (margin + beyond)
+    width, bottom = max(float(extent[0]), 40.0), float(extent[1])
+    drawing = Drawing(width, bottom + FOOT_MM)
+    if board.kind in ("circles", "acircles"):
+        drawing.circles = [(x, y, radius) for x, y in (board.points[:, :2] + first).tolist()]
+    else:
+        drawing.rectangles = [(x + first[0], y + first[1], w, h) for x, y, w, h in _squares(board)]
+    _add_foot(board, drawing, bottom)
+    return drawing
+
+
+def _squares(board: Board) -> list[tuple[float, float, float, float]]:
+    """(x, y, width, height) mm of what is black, from the first inner corner; the top-left square is."""
+    p = board.pitch_mm
+    columns, rows = board.features
+    dark = [((j - 1) * p, (i - 1) * p, p, p) for i in range(rows + 1) for j in range(columns + 1) if (i + j) % 2 == 0]
+    return dark + _markers(board) if board.kind == "charuco" else dark
+
+
+def _markers(board: Board) -> list[tuple[float, float, float, float]]:
+    """The black cells of the markers, those side by side in one piece."""
+    charuco = opencv_board(board)
+    dictionary = charuco.getDictionary()
+    cells = dictionary.markerSize + 2
+    side = board.marker_mm / cells
+    black: list[tuple[float, float, float, float]] = []
+    for number, corners in zip(np.ravel(charuco.getIds()), charuco.getObjPoints(), strict=True):
+        left, top = (np.reshape(corners, (-1, 3))[:, :2].min(0).astype(float) - board.pitch_mm).tolist()
+        image = cv2.aruco.generateImageMarker(dictionary, int(number), cells, borderBits=1)
+        for i, row in enumerate(np.pad(image == 0, ((0, 0), (1, 1))).astype(int)):
+            starts, ends = np.nonzero(np.diff(row) == 1)[0], np.nonzero(np.diff(row) == -1)[0]
+            black += [
+                (left + a * side, top + i * side, (b - a) * side, side) for a, b in zip(starts, ends, strict=True)
+            ]
+    return black
+
+
+def _add_foot(board: Board, drawing: Drawing, top: float) -> None:
+    """A scale bar, of 100 mm where the page is wide enough, and what to mind when printing."""
+    left = 5.0
+    length = next(bar for bar in (100, 50, 20) if bar <= drawing.width - 2 * left)
+    for x in range(0, length + 1, 10):
+        drawing.rectangles.append((left + x - 0.1, top + 1.0, 0.2, 2.0))
+    drawing.rectangles.append((left, top + 2.8, float(length), 0.2))
+    text = f"{board}   print at 100 %, without fitting to the page: the bar is {length} mm long"
+    drawing.texts.append((left, top + 7.5, min(3.5, 2 * (drawing.width - 2 * left) / len(text)), text))
