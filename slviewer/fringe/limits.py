@@ -5,6 +5,11 @@ DARK_LEVELS = 3.0
 DARK_SIGMAS = 4.0
 """Modulation in standard deviations of a grey level, below which a pixel is DARK: a Gray bit, whose amplitude is at
 least the modulation, would flip in 1 pixel of 30,000 at this limit, and in 1 of 160 at 2.5."""
+LEVEL_SIGMA = 0.175
+"""Multi-frequency: standard deviation, in periods, of the step from one level to the next, above which a pixel is DARK:
+at this limit the misfit that is refused below hides a wrong order in 1 pixel of 30,000."""
+DARK_BITS = 3
+"""Gray code alone: undecided bits that make a pixel DARK; it sees white light, scattered, but no stripes."""
 
 EDGE = 0.15
 """Part of a period on either side of a code edge within which a blurred bit may be read as its neighbour's."""
@@ -33,8 +38,9 @@ SPIKE_NEIGHBOURS = 8
 """Valid neighbours that such a majority needs."""
 WHOLE_PERIOD = 0.25
 """How far, in periods, a difference may be from a whole period to count as a misread edge and not as a depth step."""
-LONELY = 0.15
-"""A pixel that fewer of its neighbours agree with is INCONSISTENT."""
+LONELY = 0.25
+"""A pixel that fewer of its neighbours agree with is INCONSISTENT: less than a corner of an object has, more than a
+line one pixel wide, in which light of two surfaces is mixed."""
 LONELY_NEIGHBOURS = 3
 """... and so is one with fewer valid neighbours than this: nothing vouches for it."""
 GRAY_CELL_PX = 16.0

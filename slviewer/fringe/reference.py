@@ -4,7 +4,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import Layout, check_stack, layout, white_level
-from slviewer.fringe.levels import plan_levels
+from slviewer.fringe.levels import Level, needed_modulation, plan_levels
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference_spikes import settle
@@ -20,7 +20,7 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     white = white_level(stack, sequence.select(axis))
     noise = measure_noise(found, stack, white)
     if not found.shifts:
-        phase, modulation, background, inconsistent = _gray_alone(found, stack, noise)
+        phase, modulation, background, inconsistent, dark = _gray_alone(found, stack, noise)
         wrapped = np.full_like(phase, np.nan)
         weakest, saturated = modulation, np.zeros(phase.shape, bool)
     else:
@@ -33,7 +33,8 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
         else:
             order, inconsistent = _order_by_levels(found, [psi for psi, _, _, _ in shifted])
         phase = (wrapped + TWO_PI * order).astype(np.float32)
-    dark = weakest < dark_limit(background, noise, white)
+        dark = np.zeros(phase.shape, bool)
+    dark |= weakest < dark_limit(background, noise, white, dark_sigmas(found))
     reason = np.select(
         [dark, saturated, inconsistent], [Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT], Reason.VALID
     ).astype(np.uint8)
@@ -57,14 +58,22 @@ def phase_shift(
         cosine += np.float32(np.cos(TWO_PI * k / n)) * frame
         sine += np.float32(np.sin(TWO_PI * k / n)) * frame
         total += frame
-    wrapped = np.arctan2(-sign * sine, cosine)
+    wrapped = np.arctan2(0 - sign * sine, cosine)  # a zero without sign, for pi rather than -pi
     return wrapped, np.hypot(cosine, sine) * np.float32(2 / n), first + total * np.float32(1 / n), peak
 
 
-def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float) -> np.ndarray:
+def dark_sigmas(found: Layout) -> float:
+    """The modulation, in standard deviations of a grey level, below which a pixel is DARK."""
+    if found.gray:
+        return limits.DARK_SIGMAS
+    steps = min(len(shift.indices) for shift in found.shifts)
+    return max(limits.DARK_SIGMAS, needed_modulation(found_levels(found), steps))
+
+
+def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float, sigmas: float) -> np.ndarray:
     """(h, w) float32: the modulation below which a pixel is DARK."""
     sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background)
-    return np.maximum(np.float32(limits.DARK_LEVELS * white / 255), np.float32(limits.DARK_SIGMAS) * sigma)
+    return np.maximum(np.float32(limits.DARK_LEVELS * white / 255), np.float32(sigmas) * sigma)
 
 
 def bit_heights(found: Layout, stack: np.ndarray, index: int, threshold: np.ndarray) -> np.ndarray:
@@ -114,8 +123,8 @@ def _misread(code: np.ndarray, heights: list[np.ndarray], part: np.ndarray, modu
     """
     lower, upper = (np.full(code.shape, np.inf, np.float32) for _ in range(2))
     for from_least, height in enumerate(reversed(heights)):
-        # Counting from k - 1 to k changes the Gray bit that is the number of trailing zeros of k, from k to k + 1 that of
-        # its trailing ones.
+        # From k - 1 to k the Gray bit changes whose number, from the least, is the count of trailing zeros of k; from k
+        # to k + 1 that of its trailing ones.
         low_bits = code & ((2 << from_least) - 1)
         lower = np.where(low_bits == 1 << from_least, np.abs(height), lower)
         upper = np.where(low_bits == (1 << from_least) - 1, np.abs(height), upper)
@@ -127,7 +136,7 @@ def _misread(code: np.ndarray, heights: list[np.ndarray], part: np.ndarray, modu
 
 def _order_by_levels(found: Layout, wrapped: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """What to add to the finest wrapped phase, in periods, and where the levels contradict each other."""
-    levels = plan_levels(tuple(shift.period_px for shift in found.shifts), found.extent)
+    levels = found_levels(found)
     inconsistent = np.zeros(wrapped[0].shape, bool)
     coordinate, order = np.zeros(wrapped[0].shape), np.zeros(wrapped[0].shape)
     for number, level in enumerate(levels):
@@ -144,6 +153,11 @@ def _order_by_levels(found: Layout, wrapped: list[np.ndarray]) -> tuple[np.ndarr
     return order, inconsistent
 
 
+def found_levels(found: Layout) -> tuple[Level, ...]:
+    """The levels of a multi-frequency layout."""
+    return plan_levels(tuple(shift.period_px for shift in found.shifts), found.extent)
+
+
 def lowest_coordinate(period_px: float, extent: int) -> float:
     """Where the longest period is cut: what it has beyond the projector is split evenly between both ends."""
     return -0.5 - (period_px - extent) / 2
@@ -151,8 +165,8 @@ def lowest_coordinate(period_px: float, extent: int) -> float:
 
 def _gray_alone(
     found: Layout, stack: np.ndarray, noise: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(phase, modulation, background, inconsistent) from Gray bits alone.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(phase, modulation, background, inconsistent, dark) from Gray bits alone.
 
     One undecided bit whose two readings are neighbouring columns puts the pixel on the border between them.
     """
@@ -174,7 +188,8 @@ def _gray_alone(
         doubts += doubt
     inconsistent = (doubts > 1) | (np.abs(code - other) > 1)
     centre = np.float32(0.5) * (code + other) + np.float32(found.gray_origin_px + 0.5)
-    return (np.float32(TWO_PI) * centre).astype(np.float32), modulation, background, inconsistent
+    phase = (np.float32(TWO_PI) * centre).astype(np.float32)
+    return phase, modulation, background, inconsistent, doubts >= limits.DARK_BITS
 
 
 def contrast(found: Layout, stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,9 +18,9 @@ OFFSETS = [
 def settle(found: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Phase and reason after a look at each pixel's neighbourhood; (h, w) each, new arrays.
 
-    A plain Gray code may be read from the wrong side of its edge: where a clear majority of the neighbours says so, such
-    a pixel is moved by the one period. What then still stands alone is INCONSISTENT. A depth step has enough neighbours
-    on its own side, and is left as it is.
+    A plain Gray code may be read from the wrong side of its edge: where a clear majority of the neighbours says so,
+    such a pixel is moved by the one period. What then still stands alone is INCONSISTENT. A depth step has enough
+    neighbours on its own side, and is left as it is.
     """
     cell = cell_rad(found)
     plain = is_plain(found)

@@ -1,0 +1,167 @@
+"""From the frames of a capture to a phase map: the fast way. `reference` is the definition."""
+
+import numpy as np
+
+from slviewer.fringe import kernels, kernels_gray, kernels_levels, kernels_spikes, limits
+from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
+from slviewer.fringe.noise import measure_noise
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.reference import dark_sigmas, decode_reference, found_levels, lowest_coordinate, phase_shift
+from slviewer.fringe.reference_spikes import border_rad, cell_rad, is_plain
+from slviewer.fringe.sequence import Axis, PatternSequence
+
+__all__ = ["decode", "decode_reference", "texture"]
+
+
+def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
+    """The phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
+
+    A pixel is masked, with a reason, rather than given a doubtful phase. Raises InputError when the frames are not
+    those of the sequence, or cannot give an absolute phase.
+    """
+    check_stack(sequence, stack)
+    found = layout(sequence, axis)
+    stack = np.ascontiguousarray(stack)
+    white = white_level(stack, sequence.select(axis))
+    noise = measure_noise(found, stack, white)
+    scale = kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(found), white)
+    if not found.shifts:
+        maps = _gray_alone(found, stack, scale)
+    elif found.gray:
+        maps = _coded(found, stack, scale)
+    else:
+        maps = _levels(found, stack, scale)
+    phase, wrapped, modulation, background, reason = maps
+    phase = _settled(found, phase, reason)
+    return PhaseMap(axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps)
+
+
+def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
+    """(h, w) of the stack's dtype: the scene under white light.
+
+    The texture frame, else the white frame, else the background of the first axis' finest phase steps, else the
+    brightest level of each pixel.
+    """
+    check_stack(sequence, stack)
+    for kind in ("texture", "white"):
+        for i, frame in enumerate(sequence.frames):
+            if frame.kind == kind:
+                return stack[i].copy()
+    for axis in sequence.axes:
+        if sequence.periods_px(axis):
+            shift = layout(sequence, axis).shifts[-1]
+            _, _, background, _ = phase_shift(stack, shift.indices, sequence.phase_sign)
+            return np.rint(background).astype(stack.dtype)
+    return stack.max(axis=0)
+
+
+def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
+    phase, wrapped, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(4))
+    reason = np.empty(stack.shape[1:], np.uint8)
+    rules = kernels.CodeRules(
+        found.gray_origin_px / found.period_px,
+        limits.EDGE,
+        limits.WEAK_BIT,
+        limits.WEAKER,
+        limits.UNDECIDED_BIT,
+    )
+    kernels.decode_coded(
+        stack,
+        *_waves(found.shifts[0], found.sign),
+        np.array(found.gray, np.int64),
+        np.array(found.inverse, np.int64),
+        -1 if found.complementary is None else found.complementary,
+        scale,
+        rules,
+        phase,
+        wrapped,
+        modulation,
+        background,
+        reason,
+    )
+    return phase, wrapped, modulation, background, reason
+
+
+def _levels(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
+    shape = stack.shape[1:]
+    levels = found_levels(found)
+    wrapped = np.empty((len(found.shifts), *shape), np.float32)
+    phase, modulation, background = (np.empty(shape, np.float32) for _ in range(3))
+    weakest, clipped, reason = np.full(shape, np.inf, np.float32), np.zeros(shape, bool), np.empty(shape, np.uint8)
+    for shift, psi in zip(found.shifts, wrapped, strict=True):  # the finest is last, and its maps stay
+        waves = _waves(shift, found.sign)
+        kernels_levels.decode_shift(stack, *waves, scale, psi, modulation, background, weakest, clipped)
+    kernels_levels.unwrap_levels(
+        wrapped,
+        np.array([level.weights for level in levels], np.float64),
+        np.array([level.period_px for level in levels], np.float64),
+        lowest_coordinate(levels[0].period_px, found.extent),
+        limits.LEVEL_MISFIT,
+        background,
+        weakest,
+        clipped,
+        scale,
+        phase,
+        reason,
+    )
+    return phase, wrapped[-1].copy(), modulation, background, reason
+
+
+def _gray_alone(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
+    phase, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(3))
+    reason = np.empty(stack.shape[1:], np.uint8)
+    rules = kernels_gray.GrayRules(
+        found.gray_origin_px + 0.5,
+        np.sqrt(0.5 if found.inverse else 1.5),
+        limits.GRAY_UNDECIDED_SIGMAS,
+        limits.GRAY_UNDECIDED_PART,
+        limits.DARK_BITS,
+    )
+    kernels_gray.decode_gray(
+        stack,
+        np.array(found.gray, np.int64),
+        np.array(found.inverse, np.int64),
+        -1 if found.white is None else found.white,
+        -1 if found.black is None else found.black,
+        scale,
+        rules,
+        phase,
+        modulation,
+        background,
+        reason,
+    )
+    return phase, np.full_like(phase, np.nan), modulation, background, reason
+
+
+def _settled(found: Layout, phase: np.ndarray, reason: np.ndarray) -> np.ndarray:
+    """The phase that stands after a look at each neighbourhood; ``reason`` learns why the rest does not."""
+    rules = kernels_spikes.SpikeRules(
+        cell_rad(found),
+        is_plain(found),
+        found.origin_rad,
+        limits.EDGE,
+        limits.WINDOW,
+        limits.SPIKE_MAJORITY,
+        limits.SPIKE_NEIGHBOURS,
+        limits.WHOLE_PERIOD,
+        limits.LONELY,
+        limits.LONELY_NEIGHBOURS,
+        *border_rad(found),
+    )
+    phase[reason != Reason.VALID] = np.nan
+    other = np.empty_like(phase)
+    if rules.plain:
+        kernels_spikes.repair(phase, rules, other)
+        phase, other = other, phase
+    kernels_spikes.settle(phase, reason, rules, other)
+    return other
+
+
+def _waves(shift: Shift, sign: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frame indices of a period by step, and the cosines and sines that they are weighed with."""
+    angle = 2 * np.pi * np.arange(len(shift.indices)) / len(shift.indices)
+    return (
+        np.array(shift.indices, np.int64),
+        np.cos(angle).astype(np.float32),
+        (sign * np.sin(angle)).astype(np.float32),
+    )

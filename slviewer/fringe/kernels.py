@@ -1,0 +1,219 @@
+"""The phase shift and its Gray code in one pass over the frames; `reference` is what they must agree with.
+
+A row of the image at a time, so that sums and codes stay in the cache while each frame is read once. Loops over a row
+have no branches and no library calls: the compiler turns them into vector instructions.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from slviewer.fringe.phase import Reason
+from slviewer.geometry.jit import kernel
+
+VALID, DARK, SATURATED, INCONSISTENT = (
+    np.uint8(r) for r in (Reason.VALID, Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT)
+)
+TWO_PI = 2 * np.pi
+PER_TURN = np.float32(1 / TWO_PI)
+
+
+class Scale(NamedTuple):
+    """Grey levels that decide about a pixel: noise (a, b), DARK floor and sigmas, white level."""
+
+    noise_a: float
+    noise_b: float
+    dark_levels: float
+    dark_sigmas: float
+    white: float
+
+
+class CodeRules(NamedTuple):
+    """How Gray bits are read; see `limits`."""
+
+    origin_turns: float
+    edge: float
+    weak: float
+    weaker: float
+    undecided: float
+
+
+@numba.njit(inline="always")
+def arctan2(y, x):
+    """float32 arctangent without branches, good to 3e-7 rad (Abramowitz and Stegun, 4.4.49); 0 where both are 0."""
+    ax, ay = abs(x), abs(y)
+    a = min(ax, ay) / (max(ax, ay) + np.float32(1e-30))
+    s = a * a
+    r = np.float32(0.0028662257) * s + np.float32(-0.0161657367)
+    r = r * s + np.float32(0.0429096138)
+    r = r * s + np.float32(-0.0752896400)
+    r = r * s + np.float32(0.1065626393)
+    r = r * s + np.float32(-0.1420889944)
+    r = r * s + np.float32(0.1999355085)
+    r = r * s + np.float32(-0.3333314528)
+    r = r * s * a + a
+    r = np.float32(np.pi / 2) - r if ay > ax else r
+    r = np.float32(np.pi) - r if x < 0 else r
+    return -r if y < 0 else r
+
+
+@numba.njit(inline="always")
+def shift_row(stack, frames, cosines, sines, row, wrapped, modulation, background, peak):
+    """Wrapped phase, modulation, background and largest sample of one image row."""
+    width = stack.shape[2]
+    cosine, sine = np.zeros(width, np.float32), np.zeros(width, np.float32)
+    first = stack[frames[0], row]
+    for x in range(width):
+        background[x] = np.float32(0)
+        peak[x] = np.float32(first[x])
+    for k in range(1, len(frames)):
+        frame, c, s = stack[frames[k], row], cosines[k], sines[k]
+        for x in range(width):
+            value = np.float32(frame[x])
+            peak[x] = max(peak[x], value)
+            value -= np.float32(first[x])
+            cosine[x] += c * value
+            sine[x] += s * value
+            background[x] += value
+    per_two, per_one = np.float32(2 / len(frames)), np.float32(1 / len(frames))
+    for x in range(width):
+        wrapped[x] = arctan2(np.float32(0) - sine[x], cosine[x])
+        modulation[x] = np.sqrt(cosine[x] * cosine[x] + sine[x] * sine[x]) * per_two
+        background[x] = np.float32(first[x]) + background[x] * per_one
+
+
+@numba.njit(inline="always")
+def is_dark(modulation, background, scale):
+    """Whether the modulation is too small for the noise at this brightness."""
+    sigma = np.sqrt(np.float32(scale.noise_a) + np.float32(scale.noise_b) * background)
+    return modulation < max(np.float32(scale.dark_levels), np.float32(scale.dark_sigmas) * sigma)
+
+
+@numba.njit(inline="always")
+def is_clipped(modulation, background, peak, scale):
+    """Whether the fringe reaches the white level, in a sample and as fitted: noise alone does not do both."""
+    return (peak >= np.float32(scale.white)) & (background + modulation >= np.float32(scale.white))
+
+
+@numba.njit(inline="always")
+def verdict(dark, clipped, inconsistent):
+    """The first reason that applies."""
+    lit = SATURATED if clipped else (INCONSISTENT if inconsistent else VALID)
+    return DARK if dark else lit
+
+
+@numba.njit(inline="always")
+def bit_height(stack, frames, inverses, bit, row, x, threshold):
+    """Grey levels by which a Gray bit lies above its threshold."""
+    value = np.float32(stack[frames[bit], row, x])
+    if len(inverses):
+        return (value - np.float32(stack[inverses[bit], row, x])) * np.float32(0.5)
+    return value - threshold
+
+
+@numba.njit(inline="always")
+def code_row(stack, frames, inverses, row, threshold, code, least):
+    """Binary code of one row's Gray bits, and the smallest distance of a bit from its threshold."""
+    width = stack.shape[2]
+    digit = np.zeros(width, np.int32)
+    for x in range(width):
+        code[x] = 0
+        least[x] = np.float32(np.inf)
+    for b in range(len(frames)):
+        frame = stack[frames[b], row]
+        if len(inverses):
+            inverse = stack[inverses[b], row]
+            for x in range(width):
+                height = (np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
+                digit[x] ^= np.int32(height > 0)
+                code[x] = 2 * code[x] + digit[x]
+                least[x] = min(least[x], abs(height))
+        else:
+            for x in range(width):
+                height = np.float32(frame[x]) - threshold[x]
+                digit[x] ^= np.int32(height > 0)
+                code[x] = 2 * code[x] + digit[x]
+                least[x] = min(least[x], abs(height))
+
+
+@numba.njit
+def misread(stack, frames, inverses, row, x, threshold, modulation, code, part, rules):
+    """+1 or -1 where the bit near its threshold and the phase disagree about the side of a code edge, else 0."""
+    last = len(frames) - 1
+    zeros, ones = 0, 0
+    while zeros <= last and not (code >> zeros) & 1:
+        zeros += 1
+    while ones <= last and (code >> ones) & 1:
+        ones += 1
+    # Codes 0 and 2^bits - 1 have no lower and no upper edge.
+    lower, upper = np.float32(np.inf), np.float32(np.inf)
+    if zeros <= last:
+        lower = abs(bit_height(stack, frames, inverses, last - zeros, row, x, threshold))
+    if ones <= last:
+        upper = abs(bit_height(stack, frames, inverses, last - ones, row, x, threshold))
+    weak, weaker = np.float32(rules.weak) * modulation, np.float32(rules.weaker)
+    if part < np.float32(0.5):
+        return 1 if upper < weak and upper < weaker * lower else 0
+    return -1 if lower < weak and lower < weaker * upper else 0
+
+
+@kernel(parallel=True)
+def decode_coded(
+    stack,
+    shift,
+    cosines,
+    sines,
+    gray,
+    inverse,
+    complementary,
+    scale,
+    rules,
+    phase,
+    wrapped,
+    modulation,
+    background,
+    reason,
+):
+    """Phase shift with a plain (``complementary`` < 0) or complementary Gray code; fills the five (h, w) maps."""
+    _, height, width = stack.shape
+    for row in numba.prange(height):
+        peak, least = np.empty(width, np.float32), np.empty(width, np.float32)
+        code, doubtful = np.empty(width, np.int32), np.empty(width, np.bool_)
+        psi, B, A = wrapped[row], modulation[row], background[row]
+        shift_row(stack, shift, cosines, sines, row, psi, B, A, peak)
+        code_row(stack, gray, inverse, row, A, code, least)
+        origin, undecided = np.float32(rules.origin_turns), np.float32(rules.undecided)
+        edge, far_edge, weak = np.float32(rules.edge), np.float32(1 - rules.edge), np.float32(rules.weak)
+        if complementary >= 0:
+            extra = stack[complementary, row]
+            for x in range(width):
+                turns = psi[x] * PER_TURN - origin
+                whole = np.floor(turns)
+                part = turns - whole
+                last = np.float32(extra[x]) - A[x]
+                half = 2 * code[x] + ((code[x] & 1) ^ np.int32(last > 0))
+                middle = (part >= np.float32(0.25)) & (part < np.float32(0.75))
+                beside = ((half + 1) >> 1) - np.int32(part >= np.float32(0.75))
+                order = half >> 1 if middle else beside
+                unclear = (least[x] if middle else abs(last)) < undecided * B[x]
+                phase[row, x] = np.float32(psi[x] + TWO_PI * (order - whole))
+                dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
+                reason[row, x] = verdict(dark, clipped, unclear)
+        else:
+            for x in range(width):
+                turns = psi[x] * PER_TURN - origin
+                whole = np.floor(turns)
+                part = turns - whole
+                beside = (part < edge) | (part >= far_edge)
+                unclear = (least[x] < undecided * B[x]) & (not beside)
+                phase[row, x] = np.float32(psi[x] + TWO_PI * (code[x] - whole))
+                dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
+                reason[row, x] = verdict(dark, clipped, unclear)
+                doubtful[x] = beside & (least[x] < weak * B[x])
+            for x in range(width):  # the few pixels on a blurred edge
+                if doubtful[x] and reason[row, x] == VALID:
+                    turns = psi[x] * PER_TURN - origin
+                    whole = np.floor(turns)
+                    order = code[x] + misread(stack, gray, inverse, row, x, A[x], B[x], code[x], turns - whole, rules)
+                    phase[row, x] = np.float32(psi[x] + TWO_PI * (order - whole))

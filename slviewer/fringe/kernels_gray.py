@@ -1,0 +1,55 @@
+"""Gray code alone, compiled; `reference` is what this must agree with."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from slviewer.fringe.kernels import bit_height, is_dark, verdict
+from slviewer.geometry.jit import kernel
+
+TWO_PI = np.float32(2 * np.pi)
+
+
+class GrayRules(NamedTuple):
+    """How bits without a phase are read; see `limits`. ``sigma_part``: noise of a bit over that of a grey level."""
+
+    centre: float
+    sigma_part: float
+    undecided_sigmas: float
+    undecided_part: float
+    dark_bits: int
+
+
+@kernel(parallel=True)
+def decode_gray(stack, gray, inverse, white, black, scale, rules, phase, modulation, background, reason):
+    """Projector column or row from Gray bits; ``white`` and ``black`` are frames, or -1. Fills the four (h, w) maps."""
+    _, height, width = stack.shape
+    for row in numba.prange(height):
+        for x in range(width):
+            B, A = np.float32(0), np.float32(0)
+            if white >= 0 and black >= 0:
+                bright, dim = np.float32(stack[white, row, x]), np.float32(stack[black, row, x])
+                B, A = (bright - dim) * np.float32(0.5), (bright + dim) * np.float32(0.5)
+            else:
+                for b in range(len(gray)):
+                    bright, dim = np.float32(stack[gray[b], row, x]), np.float32(stack[inverse[b], row, x])
+                    B += abs(bright - dim)
+                    A += bright + dim
+                B *= np.float32(0.5 / len(gray))
+                A *= np.float32(0.5 / len(gray))
+            sigma = np.sqrt(np.float32(scale.noise_a) + np.float32(scale.noise_b) * A) * np.float32(rules.sigma_part)
+            limit = max(np.float32(rules.undecided_sigmas) * sigma, np.float32(rules.undecided_part) * B)
+            code, other, bit, flipped, doubts = 0, 0, 0, 0, 0
+            for b in range(len(gray)):
+                bit_above = bit_height(stack, gray, inverse, b, row, x, A)
+                doubt = int(abs(bit_above) < limit)
+                bit ^= int(bit_above > 0)
+                flipped ^= int(bit_above > 0) ^ doubt
+                code, other = 2 * code + bit, 2 * other + flipped
+                doubts += doubt
+            unclear = doubts > 1 or abs(code - other) > 1
+            phase[row, x] = TWO_PI * np.float32(np.float64(0.5) * (code + other) + np.float32(rules.centre))
+            modulation[row, x], background[row, x] = B, A
+            dark = doubts >= rules.dark_bits or is_dark(B, A, scale)
+            reason[row, x] = verdict(dark, False, unclear)

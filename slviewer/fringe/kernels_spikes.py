@@ -1,0 +1,127 @@
+"""Spikes and lonely pixels, compiled; `reference_spikes` is what this must agree with.
+
+Nearly every pixel agrees with its four neighbours, and is passed over at the speed of memory.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from slviewer.fringe.phase import Reason
+from slviewer.geometry.jit import kernel
+
+VALID, INCONSISTENT, OUTSIDE = (np.uint8(r) for r in (Reason.VALID, Reason.INCONSISTENT, Reason.OUTSIDE))
+TWO_PI = 2 * np.pi
+PER_TURN = np.float32(1 / TWO_PI)
+
+
+class SpikeRules(NamedTuple):
+    """How a neighbourhood decides; see `limits`."""
+
+    cell_rad: float
+    plain: bool
+    origin_rad: float
+    edge: float
+    window: int
+    majority: float
+    neighbours: int
+    whole: float
+    lonely: float
+    lonely_neighbours: int
+    low_rad: float
+    high_rad: float
+
+
+@numba.njit
+def differs(phase, row, x, per_cell):
+    """Whether one of the four neighbours is missing, invalid, or half a cell or more away."""
+    height, width = phase.shape
+    if row == 0 or x == 0 or row == height - 1 or x == width - 1:
+        return True
+    centre, half = phase[row, x], np.float32(0.5)
+    near = (abs((phase[row, x - 1] - centre) * per_cell) <= half) & (
+        abs((phase[row, x + 1] - centre) * per_cell) <= half
+    )
+    far = (abs((phase[row - 1, x] - centre) * per_cell) <= half) & (
+        abs((phase[row + 1, x] - centre) * per_cell) <= half
+    )
+    return not (near & far)
+
+
+@numba.njit
+def votes(phase, row, x, rules):
+    """(valid, agree, whole, above, below) neighbours in the window; see `reference_spikes`."""
+    height, width = phase.shape
+    per_cell, nearly = np.float32(1 / rules.cell_rad), np.float32(rules.whole)
+    valid, agree, whole, above, below = 0, 0, 0, 0, 0
+    for v in range(max(0, row - rules.window), min(height, row + rules.window + 1)):
+        for u in range(max(0, x - rules.window), min(width, x + rules.window + 1)):
+            cells = (phase[v, u] - phase[row, x]) * per_cell
+            if (v == row and u == x) or np.isnan(cells):
+                continue
+            nearest = np.rint(cells)
+            valid += 1
+            if nearest == 0:
+                agree += 1
+            elif abs(cells - nearest) < nearly:
+                whole += 1
+                above += nearest == 1
+                below += nearest == -1
+    return valid, agree, whole, above, below
+
+
+@numba.njit
+def at_edge(phase, rules):
+    """Whether an absolute phase lies beside a code edge."""
+    part = (phase - np.float32(rules.origin_rad)) * PER_TURN
+    part -= np.floor(part)
+    return part < np.float32(rules.edge) or part >= np.float32(1 - rules.edge)
+
+
+@kernel(parallel=True)
+def repair(phase, rules, out):
+    """Fill ``out`` (h, w) with the phase, moved by a period where a clear majority at a code edge says so."""
+    height, width = phase.shape
+    per_cell = np.float32(1 / rules.cell_rad)
+    for row in numba.prange(height):
+        for x in range(width):
+            out[row, x] = phase[row, x]
+            if np.isnan(phase[row, x]) or not differs(phase, row, x, per_cell):
+                continue
+            if not at_edge(phase[row, x], rules):
+                continue
+            valid, _, _, above, below = votes(phase, row, x, rules)
+            if valid >= rules.neighbours:
+                if above >= rules.majority * valid:
+                    out[row, x] = phase[row, x] + np.float32(TWO_PI)
+                elif below >= rules.majority * valid:
+                    out[row, x] = phase[row, x] - np.float32(TWO_PI)
+
+
+@kernel(parallel=True)
+def settle(phase, reason, rules, out):
+    """Fill ``out`` with the phase that stands, and mark the others in ``reason``; ``phase`` is only read."""
+    height, width = phase.shape
+    per_cell = np.float32(1 / rules.cell_rad)
+    low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
+    for row in numba.prange(height):
+        for x in range(width):
+            own = phase[row, x]
+            out[row, x] = own
+            if np.isnan(own):
+                continue
+            seen = VALID
+            if differs(phase, row, x, per_cell):
+                valid, agree, whole, _, _ = votes(phase, row, x, rules)
+                if (
+                    valid < rules.lonely_neighbours
+                    or agree < rules.lonely * valid
+                    or (rules.plain and whole >= 0.5 * valid and at_edge(own, rules))
+                ):
+                    seen = INCONSISTENT
+            if seen == VALID and (own < low or own > high):
+                seen = OUTSIDE
+            if seen != VALID:
+                out[row, x] = np.nan
+                reason[row, x] = seen
