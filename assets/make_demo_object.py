@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from slviewer.reconstruction.ply import write_ply
+
 RINGS = 142  # triangles of half a millimetre on the front
 SIDE_RINGS = 6
 HALF_WIDTH_MM = 70.0
@@ -162,17 +164,6 @@ def build() -> tuple[np.ndarray, np.ndarray]:
     return points, np.concatenate(triangles)
 
 
-def write(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
-    """Binary PLY with float32 vertices."""
-    faces = np.empty(len(triangles), [("n", "u1"), ("index", "<i4", 3)])
-    faces["n"], faces["index"] = 3, triangles
-    header = (
-        "ply\nformat binary_little_endian 1.0\ncomment slviewer demo object, mm\n"
-        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    path.write_bytes(header.encode() + vertices.astype("<f4").tobytes() + faces.tobytes())
-
-
 if __name__ == "__main__":
-    write(Path(__file__).parent / "objects" / "ammonite.ply", *build())
+    corners, faces = build()
+    write_ply(Path(__file__).parent / "objects" / "ammonite.ply", corners, faces=faces)

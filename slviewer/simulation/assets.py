@@ -8,7 +8,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def asset(name: str) -> Path:
-    """Path of one shipped file, for example ``rigs/letter.toml``: beside the package in a checkout, inside it in a wheel.
+    """Path of a shipped file, such as ``rigs/letter.toml``: beside the package in a checkout, inside it in a wheel.
 
     Raises `InputError` if the installation lacks it.
     """

@@ -14,7 +14,7 @@ NORMAL_QUANTILES = ndtri((np.arange(65536) + 0.5) / 65536).astype(np.float32)
 
 def psf_taps(sigma_px: float) -> np.ndarray:
     """(2 r + 1,) float32: the discrete Gaussian, whose variance is sigma^2 at any sampling, also for small sigma."""
-    radius = 0 if sigma_px == 0 else max(1, int(np.ceil(3 * sigma_px)))
+    radius = 0 if sigma_px == 0 else max(2, int(np.ceil(3 * sigma_px)))
     taps = ive(np.abs(np.arange(-radius, radius + 1)), sigma_px**2)
     return (taps / taps.sum()).astype(np.float32)
 

@@ -23,7 +23,7 @@ class SimulatedLens:
     Pixel p = Brown(pinhole) in px of the full resolution, then p + W(p) with the waves W, then (p + 0.5) scale - 0.5:
     pixel centres at whole numbers, and the image's outer edges stay where they are.
 
-    focal_px, centre_px: (x, y) at full resolution; brown: k1, k2, p1, p2, k3 (OpenCV's order); full_size: (width, height).
+    full_size: (width, height); focal_px, centre_px: (x, y) at full resolution; brown: k1, k2, p1, p2, k3.
     """
 
     full_size: tuple[int, int]
@@ -46,7 +46,7 @@ class SimulatedLens:
             return self._apply(_project_kernel, points[..., :2] / z)
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
-        """Normalised coordinates (..., 2) = (x/z, y/z) whose projection is `pixels` (..., 2), by Newton; NaN if it fails."""
+        """Normalised (..., 2) = (x/z, y/z) that project to `pixels` (..., 2), by Newton; NaN if it fails."""
         return self._apply(_undistort_kernel, _checked(pixels, 2))
 
     @cached_property

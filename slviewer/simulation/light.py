@@ -7,7 +7,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import ndtr
 
 OVERSAMPLING = 8
-"""Table entries per projector px; linear between them costs a share of 2e-4 of an 18 px fringe's modulation, no phase."""
+"""Table entries per projector px; linear between them costs 2e-4 of an 18 px fringe's modulation, and no phase."""
 
 LEVELS = 9
 """Blurs that are tabulated, from sharpest to widest; linear between them."""

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.reconstruction.ply import read_ply
 from slviewer.registration.open3d_loader import open3d
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
@@ -82,24 +82,13 @@ class MeshScene:
     def _caster(self) -> Any:
         core = open3d().core
         scene = open3d().t.geometry.RaycastingScene()
-        scene.add_triangles(
-            core.Tensor(self.placed.astype(np.float32)), core.Tensor(self.triangles.astype(np.uint32))
-        )
+        scene.add_triangles(core.Tensor(self.placed.astype(np.float32)), core.Tensor(self.triangles.astype(np.uint32)))
         return scene
 
 
 def demo_object(pose: Pose) -> MeshScene:
     """The ammonite of ``assets/objects/ammonite.ply``: about 140 mm wide, its front towards -z of its own frame."""
-    vertices, triangles = read_mesh(asset("objects/ammonite.ply"))
-    return MeshScene(vertices, triangles, pose)
-
-
-def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float64 and triangles (m, 3) int64 of a mesh file. Raises `InputError` if it holds none."""
-    import trimesh
-
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-        return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
-    except (OSError, ValueError, AttributeError) as error:
-        raise InputError(f"{path.name} cannot be read as a mesh ({error}): give a PLY, STL or OBJ file") from error
+    mesh = read_ply(asset("objects/ammonite.ply"))
+    if mesh.faces is None:
+        raise InputError("the shipped file assets/objects/ammonite.ply has no triangles: install slviewer again")
+    return MeshScene(mesh.points.astype(np.float64), mesh.faces, pose)

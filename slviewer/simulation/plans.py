@@ -1,37 +1,42 @@
 """What the 'letter' preset puts before its rig: target poses, planes, spheres and objects, the same every time."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.simulation.boards import BoardScene, Pose, Shape, blank_board, printed_board
 from slviewer.simulation.mesh import MeshScene, demo_object
-from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene, Spheres, sphere
 from slviewer.target.board import Board
 
 R1_R2_MM, R2_R3_MM = 500.0, 700.0
 """Where the Letter's depth ranges meet: R1 in front of the calibrated depths, R2 inside, R3 behind."""
 
-_LEFT_FREE_PX = 14.0  # between the outermost features' centres and the image's edge, at full resolution
+BOARD_SHAPE = Shape(bow_x_mm=0.12, bow_y_mm=-0.07, twist_mm=0.05, misplaced_mm=0.01)
+"""The default target: flat and well printed as such plates are, not perfect."""
+
+_LEFT_FREE_PX = 12.0  # between the outermost circles' rims and the image's edge, at full resolution
 
 _PLANES = (
     # depth of the middle, x and y of it, tilts about x and y in degrees
     (452.0, 2.0, -3.0, 6.0, -8.0),
-    (468.0, -4.0, 3.0, -3.0, 19.0),
+    (471.5, -4.0, 3.0, -3.0, 19.0),
     (548.0, 6.0, 4.0, 12.0, -11.0),
     (596.0, -8.0, 2.0, -10.0, 14.0),
-    (702.5, 5.0, -6.0, 8.0, 17.0),
-    (735.0, -10.0, 5.0, -9.0, -12.5),
+    (703.5, 5.0, -6.0, 8.0, 17.0),
+    (734.0, -10.0, 5.0, -9.0, -12.5),
     (780.0, 8.0, 8.0, 6.0, 10.0),
     (755.0, -6.0, -9.0, -12.0, -8.0),
-    (540.0, 4.0, 2.0, 9.0, -21.0),
-    (668.0, 2.0, -5.0, 5.0, -24.0),
+    (544.5, 4.0, 2.0, 9.0, -21.0),
+    (668.5, 2.0, -5.0, 5.0, -24.0),
 )
 
 _SPHERES = (
     # centre of the 196 mm sphere: its front lies 98 mm nearer
-    (6.0, -4.0, 540.0),
-    (-12.0, 8.0, 562.0),
+    (6.0, -4.0, 534.0),
+    (-12.0, 8.0, 546.0),
     (14.0, 6.0, 640.0),
     (-16.0, -10.0, 690.0),
     (10.0, 12.0, 815.0),
@@ -46,29 +51,29 @@ _OBJECTS = {
 }
 
 
-def letter_plan(board: Board | None = None, poses: int = 25, seed: int = 0) -> dict[str, Scene]:
+def letter_plan(rig: SimulatedRig, board: Board | None = None, poses: int = 25) -> dict[str, Scene]:
     """Every capture of the preset by name: pose_01 ..., plane_01 ... plane_10, sphere_1 ... sphere_6, object_r1 ... r3.
 
     `board` defaults to the Letter's circles:21x16:9; its plate is bowed and twisted by a tenth of a millimetre or so,
-    its circles are misplaced by hundredths.
+    its circles are misplaced by hundredths. The rig's seed draws the target poses and the misplacement.
     """
     board = board or Board.parse("circles:21x16:9")
-    shape = Shape(bow_x_mm=0.12, bow_y_mm=-0.07, twist_mm=0.05, misplaced_mm=0.01)
     scenes: dict[str, Scene] = {}
-    for i, pose in enumerate(target_poses(board, poses, seed), 1):
-        scenes[f"pose_{i:02d}"] = printed_board(board, pose, shape, seed)
+    for i, pose in enumerate(target_poses(rig, board, poses), 1):
+        scenes[f"pose_{i:02d}"] = printed_board(board, pose, BOARD_SHAPE, rig.seed)
     return scenes | planes() | spheres() | objects()
 
 
-def target_poses(board: Board, n: int = 25, seed: int = 0, rig: SimulatedRig | None = None) -> list[Pose]:
+def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
     """`n` poses at 500 ... 700 mm, tilted by up to 28 degrees, that together reach the image's corners.
 
-    Every feature stays in the camera's view and in the projector's light, at any scale of the rig. `rig` is the rig
-    that they must suit, at full resolution (default: `letter()`, whose `seed`s differ by less than the room left).
-    Raises `InputError` for a board too large for that.
+    Every feature stays in the camera's view and in the projector's light. The poses are drawn by the rig's seed and do
+    not depend on its scale. Raises `InputError` for a board too large for that.
     """
-    rig = rig or letter(local_distortion_px=0)
-    rng = np.random.default_rng([seed, 0x705E])
+    smooth = np.zeros((0, 6))  # what is in view is no matter of tenths of a pixel
+    camera, projector = replace(rig.camera, scale=1.0, waves=smooth), replace(rig.projector, waves=smooth)
+    rig = replace(rig, camera=camera, projector=projector)
+    rng = np.random.default_rng([rig.seed, 0x705E])
     middle = (board.points.min(0) + board.points.max(0)) / 2
     # Spread evenly and without pattern: depths, tilts and directions are each shuffled strata.
     depths = 512 + 176 * (rng.permutation(n) + 0.5) / n
@@ -79,7 +84,7 @@ def target_poses(board: Board, n: int = 25, seed: int = 0, rig: SimulatedRig | N
     for i in range(n):
         axis = tilts[i] * np.array([np.cos(towards[i]), np.sin(towards[i]), 0])
         R = rotation(axis) @ rotation(np.array([0, 0, np.radians(rng.uniform(-8, 8))]))
-        poses.append(_placed(rig, board, R, middle, depths[i], offsets[i], rng.uniform(0.9, 1)))
+        poses.append(_placed(rig, board, R, middle, depths[i], offsets[i], rng.uniform(0.95, 1)))
     return poses
 
 
@@ -125,36 +130,34 @@ def _placed(
     rig: SimulatedRig, board: Board, R: np.ndarray, middle: np.ndarray, depth: float, offset: np.ndarray, share: float
 ) -> Pose:
     """The pose with its middle at `depth`, as far towards `offset` as keeps the board in view, times `share`."""
-
-    def pose(x: float, y: float) -> Pose:
-        return Pose(R, np.array([x, y, depth]) - R @ middle)
-
-    if not _in_view(rig, board, pose(0, 0)):
+    place = np.array([0.0, 0.0, depth])
+    rim = ((board.points == board.points.min(0)) | (board.points == board.points.max(0)))[:, :2].any(1)
+    features = (board.points[rim] - middle) @ R.T
+    if not _in_view(rig, board, features + place):
         raise InputError(
             f"the board {board} does not fit into the view at {depth:.0f} mm: take a smaller one, "
-            f"{board.pitch_mm * (board.columns - 1):.0f} mm wide is too much"
+            f"{np.ptp(board.points[:, 0]):.0f} x {np.ptp(board.points[:, 1]):.0f} mm is too much"
         )
-    place = np.zeros(2)
     for direction in (0, 1):  # first along x, then as far along y as is left
-        low, high = 0.0, 150.0
-        for _ in range(24):
-            trial = place.copy()
-            trial[direction] = offset[direction] * (low + high) / 2
-            low, high = ((low + high) / 2, high) if _in_view(rig, board, pose(*trial)) else (low, (low + high) / 2)
-        place[direction] = offset[direction] * low * share
-    return pose(*place)
+        reach, step = 0.0, 3.0
+        while step > 0.02:
+            trials = np.tile(place, (60, 1))
+            trials[:, direction] = offset[direction] * (reach + step * np.arange(60))
+            seen = _in_view(rig, board, features + trials[:, None])
+            reach += step * (len(seen) - 1 if seen.all() else int(np.argmin(seen)) - 1)
+            step /= 50
+        place[direction] = offset[direction] * reach * share
+    return Pose(R, place - R @ middle)
 
 
-def _in_view(rig: SimulatedRig, board: Board, pose: Pose) -> bool:
-    """Whether all features have room around them in the camera and in the projector."""
-    points = pose.to_camera(board.points)
+def _in_view(rig: SimulatedRig, board: Board, points: np.ndarray) -> np.ndarray:
+    """(...) bool: whether all features, (..., n, 3) mm in the camera frame, have room around them in both devices."""
     radius = board.pitch_mm / 4  # circles are half a pitch wide
+    fits = np.ones(points.shape[:-2], bool)
     for pixels, lens, depths in (
-        (rig.camera.project(points), rig.camera, points[:, 2:]),
-        (rig.project(points), rig.projector, (points @ rig.R.T + rig.t)[:, 2:]),
+        (rig.camera.project(points), rig.camera, points[..., 2:]),
+        (rig.project(points), rig.projector, (points @ rig.R.T + rig.t)[..., 2:]),
     ):
         room = _LEFT_FREE_PX + radius * np.array(lens.focal_px) / depths
-        size = np.array(lens.full_size)
-        if not np.all((pixels > room) & (pixels < size - 1 - room)):
-            return False
-    return True
+        fits &= ((pixels > room) & (pixels < np.array(lens.full_size) - 1 - room)).all((-2, -1))
+    return fits
