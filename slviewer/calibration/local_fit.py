@@ -4,6 +4,10 @@ import numpy as np
 
 from slviewer.geometry.jit import kernel
 
+ONE_SIDED = 0.35
+"""A window whose samples lie this far off its middle, in half widths, would extrapolate. Around a chessboard's corner
+two opposite squares are bright, and their middle is the corner."""
+
 
 def local_values(field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Value of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic fit over the window around each.
@@ -38,7 +42,7 @@ def _local_fits(field, weight, pixels, radius, out):  # type: ignore[no-untyped-
         u0, u1 = max(0, int(np.ceil(cu - r))), min(width - 1, int(np.floor(cu + r)))
         v0, v1 = max(0, int(np.ceil(cv - r))), min(height - 1, int(np.floor(cv + r)))
         count = 0
-        quadrants = np.zeros(4, np.int64)
+        mean_x = mean_y = 0.0
         for v in range(v0, v1 + 1, stride):
             for u in range(u0, u1 + 1, stride):
                 if weight[v, u] > 0 and count < 1024:
@@ -51,9 +55,10 @@ def _local_fits(field, weight, pixels, radius, out):  # type: ignore[no-untyped-
                     basis[count, 5] = y * y
                     value[count] = field[v, u]
                     base[count] = weight[v, u]
-                    quadrants[(1 if x > 0 else 0) + (2 if y > 0 else 0)] += 1
+                    mean_x += x
+                    mean_y += y
                     count += 1
-        if count < 30 or np.sum(quadrants >= 4) < 4:
+        if count < 30 or np.hypot(mean_x, mean_y) > ONE_SIDED * count:
             continue
         middle = np.median(value[:count])
         robust[:count] = 1.0

@@ -47,7 +47,7 @@ def simulate(
         raise InputError(f"{poses} target poses cannot be simulated: ask for {MIN_POSES} to 200")
     board = Board.parse(TARGET)
     rig = letter(scale, seed)
-    plan = letter_plan(board, poses, seed)
+    plan = letter_plan(rig, board, poses)
     both = p18(rig.projector.size)
     only_x = one_axis(both, "x")
     truth: dict[str, Any] = {"preset": preset, "scale": scale, "seed": seed, "target": TARGET, "rig": rig_truth(rig)}
