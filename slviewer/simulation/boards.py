@@ -11,7 +11,7 @@ from slviewer.simulation.scenes import Surface
 from slviewer.target.board import Board
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pose:
     """T_camera_board: X_camera = R X_board + t, mm."""
 
@@ -44,7 +44,7 @@ class Shape:
 FLAT = Shape()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BoardScene:
     """A white plate at `pose`, printed with `board`'s features, or blank if `board` is None.
 

@@ -34,9 +34,10 @@ def _mix(x):
 def expose(coordinate, level, gain, table, offset, per_px, taps, stray, noise, quantiles, keys, out):
     """Write one frame into `out` (h, w) uint8.
 
-    Light gain * table(level, coordinate) is blurred by `taps` in both directions; `stray` (h, w), blurred before, is
-    added. noise: dark level, read variance, shot variance. The noise depends on the pixel and on `keys` (two uint32)
-    alone, not on how the rows are shared among threads.
+    Light gain * table(level, coordinate) is blurred by `taps` (2 r + 1) in both directions; coordinate, level and gain
+    (h + 2 r, w + 2 r) reach r pixels beyond the frame. `stray` (h, w), blurred before, is added. noise: dark level,
+    read variance, shot variance. The noise depends on the pixel and on `keys` (two uint32) alone, not on how the rows
+    are shared among threads.
     """
     h, w = out.shape
     radius = taps.size // 2
@@ -47,10 +48,10 @@ def expose(coordinate, level, gain, table, offset, per_px, taps, stray, noise, q
     for task in numba.prange((h + _ROWS - 1) // _ROWS):
         first, end = task * _ROWS, min((task + 1) * _ROWS, h)
         blurred = np.zeros((_ROWS + 2 * radius, w), np.float32)
-        line = np.zeros(w + 2 * radius, np.float32)
+        line = np.empty(w + 2 * radius, np.float32)
         for k in range(end - first + 2 * radius):
-            i = min(max(first - radius + k, 0), h - 1)
-            for j in range(w):
+            i = first + k
+            for j in range(w + 2 * radius):
                 place = min(max(coordinate[i, j] * scale + start, np.float32(0)), last)
                 left = int(place)
                 share = place - np.float32(left)
@@ -59,9 +60,7 @@ def expose(coordinate, level, gain, table, offset, per_px, taps, stray, noise, q
                 mix = level[i, j] - np.float32(sharp)
                 a = table[sharp, left] + share * (table[sharp, left + 1] - table[sharp, left])
                 b = table[wide, left] + share * (table[wide, left + 1] - table[wide, left])
-                line[radius + j] = gain[i, j] * (a + mix * (b - a))
-            for j in range(radius):
-                line[j], line[w + radius + j] = line[radius], line[w + radius - 1]
+                line[j] = gain[i, j] * (a + mix * (b - a))
             for tap in range(taps.size):
                 weight = taps[tap]
                 for j in range(w):

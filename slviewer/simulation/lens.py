@@ -16,7 +16,7 @@ from slviewer.geometry.jit import kernel
 from slviewer.simulation.waves import Waves
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SimulatedLens:
     """A lens described at full resolution and used at `scale`.
 
@@ -49,12 +49,17 @@ class SimulatedLens:
         """Normalised (..., 2) = (x/z, y/z) that project to `pixels` (..., 2), by Newton; NaN if it fails."""
         return self._apply(_undistort_kernel, _checked(pixels, 2))
 
+    def rays(self, margin: int = 0) -> np.ndarray:
+        """(h + 2 margin, w + 2 margin, 2) float64: (x/z, y/z) of every pixel, and of so many beyond each edge."""
+        if margin not in self._ray_grids:
+            width, height = self.size
+            u, v = np.meshgrid(*(np.arange(-margin, n + margin, dtype=float) for n in (width, height)))
+            self._ray_grids[margin] = self.undistort(np.stack([u, v], -1))
+        return self._ray_grids[margin]
+
     @cached_property
-    def rays(self) -> np.ndarray:
-        """(h, w, 2) float64: normalised coordinates (x/z, y/z) of every pixel."""
-        width, height = self.size
-        u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-        return self.undistort(np.stack([u, v], -1))
+    def _ray_grids(self) -> dict[int, np.ndarray]:
+        return {}
 
     def _apply(self, function: Any, values: np.ndarray) -> np.ndarray:
         numbers = np.array([*self.focal_px, *self.centre_px, *self.brown, self.scale])

@@ -15,7 +15,7 @@ LEVELS = 9
 _MARGIN = 2  # px that a table holds beyond either end of the projector
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Profile:
     """Relative light 0 ... 1 along one axis: table (LEVELS, n) float32, entry i at (i - offset) / OVERSAMPLING px."""
 

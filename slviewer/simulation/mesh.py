@@ -16,7 +16,7 @@ from slviewer.simulation.scenes import Surface
 _LIFT_MM = 0.02  # shadow rays start this far above the surface: Open3D casts in float32, 1e-4 mm at these depths
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeshScene:
     """A diffuse mesh: vertices (n, 3) mm in a frame of its own, triangles (m, 3) int, placed by `pose`.
 

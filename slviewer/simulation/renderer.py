@@ -18,7 +18,7 @@ from slviewer.simulation.scenes import Scene
 _EXPOSURE_QUANTILE = 0.995  # of the lit pixels; a few brighter ones do not decide an exposure
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Truth:
     """What a perfect instrument would measure.
 
@@ -32,9 +32,13 @@ class Truth:
     mask: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Maps:
-    """(h, w) float32 of a scene at unit exposure: full white light, light of any kind but the pattern, blur levels."""
+    """A scene at unit exposure, (h + 2 r, w + 2 r) float32 with r the PSF's radius.
+
+    gain: full white light; stray: the room's light; level: blur, as a place among the tabulated `sigmas`; coordinates:
+    projector px along each axis.
+    """
 
     gain: np.ndarray
     stray: np.ndarray
@@ -76,13 +80,12 @@ class Renderer:
         rng = np.random.default_rng([rig.seed, seed, 0xF0])
         keys = rng.integers(0, 2**32, (len(sequence.frames), 2), dtype=np.uint32)
         lamp = 1 + rig.light.flicker * rng.standard_normal(len(sequence.frames))
-        taps = psf_taps(rig.sensor.psf_px * rig.camera.scale)
         exposure = self.exposure
         gain = (exposure * (1 - rig.light.black) * maps.gain).astype(np.float32)
         stray = exposure * (rig.light.black * maps.gain + maps.stray)
         for direction in (0, 1):
-            stray = correlate1d(stray, taps, axis=direction, mode="nearest")
-        stray = np.ascontiguousarray(stray, np.float32)
+            stray = correlate1d(stray, self._taps, axis=direction)
+        stray = np.ascontiguousarray(stray[self._frame], np.float32)
         sensor = rig.sensor
         noise = np.array([sensor.dark_level, sensor.read_variance, sensor.shot_variance])
         width, height = rig.camera.size
@@ -94,7 +97,7 @@ class Renderer:
             pattern = blurred_profile((grey_levels / 255.0) ** rig.light.gamma, sigmas)
             expose(
                 maps.coordinates[varies or "x"], maps.level, gain, np.float32(lamp[k]) * pattern.table, pattern.offset,
-                OVERSAMPLING, taps, stray, noise, NORMAL_QUANTILES, keys[k], stack[k],
+                OVERSAMPLING, self._taps, stray, noise, NORMAL_QUANTILES, keys[k], stack[k],
             )  # fmt: skip
             if progress is not None:
                 progress(k + 1, len(stack))
@@ -104,10 +107,20 @@ class Renderer:
     def exposure(self) -> float:
         """Grey levels of full white light on an albedo of 1 that faces the projector at its focus."""
         maps, sensor = self._maps, self.rig.sensor
-        lit = maps.gain[maps.truth.mask] + maps.stray[maps.truth.mask]
+        lit = (maps.gain + maps.stray)[self._frame][maps.truth.mask]
         if not lit.size:
             raise InputError("nothing in the scene is lit by the projector: move it to where both fields meet")
         return (sensor.peak_level - sensor.dark_level) / float(np.quantile(lit, _EXPOSURE_QUANTILE))
+
+    @cached_property
+    def _taps(self) -> np.ndarray:
+        return psf_taps(self.rig.sensor.psf_px * self.rig.camera.scale)
+
+    @property
+    def _frame(self) -> tuple[slice, slice]:
+        """The frame within the maps, which reach beyond it as far as the PSF does."""
+        margin, (width, height) = len(self._taps) // 2, self.rig.camera.size
+        return slice(margin, margin + height), slice(margin, margin + width)
 
     @property
     def _rows_per_column(self) -> float:
@@ -116,7 +129,7 @@ class Renderer:
     @cached_property
     def _maps(self) -> _Maps:
         rig, light = self.rig, self.rig.light
-        rays = rig.camera.rays
+        rays = rig.camera.rays(len(self._taps) // 2)
         surface = self.scene.trace(rays)
         hit = np.isfinite(surface.points[..., 2])
         projector = rig.project(surface.points)
@@ -143,7 +156,7 @@ class Renderer:
             level=level,
             sigmas=sigmas,
             coordinates={"x": _finite(u), "y": _finite(v)},
-            truth=Truth(surface.points, projector, hit & reached & inside),
+            truth=Truth(surface.points[self._frame], projector[self._frame], (hit & reached & inside)[self._frame]),
         )
 
 

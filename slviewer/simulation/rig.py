@@ -41,7 +41,7 @@ class Light:
     defocus_px_mm: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SimulatedRig:
     """Both lenses, their arrangement X_p = R X_c + t (mm), the sensor and the light; `seed` also keys the noise."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from slviewer.errors import InputError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surface:
     """What the rays of (h, w) pixels meet: points and unit normals (h, w, 3) float64, NaN where nothing is met;
     normals look towards the camera; albedo (h, w) float32, averaged over the pixel's area, 0 where nothing is met.
@@ -35,7 +35,7 @@ class Scene(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Spheres:
     """One or several diffuse spheres: centres (n, 3), one radius, nothing behind them."""
 

@@ -26,7 +26,7 @@ def test_a_blank_board_lies_on_its_plane():
 
 def test_a_bowed_board_has_the_shape_it_says():
     scene = blank_board(TILTED, shape=Shape(0.3, -0.2, 0.25))
-    surface = scene.trace(RIG.camera.rays)
+    surface = scene.trace(RIG.camera.rays())
     hit = np.isfinite(surface.points[..., 2])
     local = (surface.points[hit] - TILTED.t) @ TILTED.R
     X, Y = local[:, 0] / 110, local[:, 1] / 88
@@ -42,7 +42,7 @@ def test_printed_circles_cover_their_share_of_the_plate():
     board = Board.parse("circles:21x16:9")
     pose = Pose(np.eye(3), np.array([-90.0, -67.5, 620.0]))
     scene = printed_board(board, pose, Shape(misplaced_mm=0.02), margin_mm=9)
-    surface = scene.trace(RIG.camera.rays)
+    surface = scene.trace(RIG.camera.rays())
     per_pixel = np.prod(620 / np.array(RIG.camera.focal_px) / 0.25)  # mm^2, but for the lens's distortion
     local = surface.points[..., :2] - pose.t[:2]
     inner = ((local > -6) & (local < [186, 141])).all(-1)  # without the plate's rim, dark in part for its own reason
@@ -56,7 +56,7 @@ def test_printed_circles_cover_their_share_of_the_plate():
 def test_a_chessboard_s_corners_are_where_its_features_are():
     board = Board.parse("chessboard:9x7:15")
     pose = Pose(np.eye(3), np.array([-60.0, -45.0, 600.0]))
-    albedo = printed_board(board, pose).trace(letter(0.5).camera.rays).albedo
+    albedo = printed_board(board, pose).trace(letter(0.5).camera.rays()).albedo
     corners = letter(0.5).camera.project(pose.to_camera(board.points))
     offset = 6
     for u, v in np.rint(corners).astype(int):
