@@ -90,14 +90,14 @@ def _forward(x, y, numbers, waves):
     wu, wv, wuu, wuv, wvu, wvv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(waves.shape[0]):
         angle = waves[i, 0] * u + waves[i, 1] * v
-        a, b = angle + waves[i, 3], angle + waves[i, 5]
-        wu += waves[i, 2] * math.sin(a)
-        wv += waves[i, 4] * math.sin(b)
-        ca, cb = waves[i, 2] * math.cos(a), waves[i, 4] * math.cos(b)
-        wuu += ca * waves[i, 0]
-        wuv += ca * waves[i, 1]
-        wvu += cb * waves[i, 0]
-        wvv += cb * waves[i, 1]
+        sine, cosine = math.sin(angle), math.cos(angle)
+        wu += waves[i, 2] * sine + waves[i, 3] * cosine
+        wv += waves[i, 4] * sine + waves[i, 5] * cosine
+        au, av = waves[i, 2] * cosine - waves[i, 3] * sine, waves[i, 4] * cosine - waves[i, 5] * sine
+        wuu += au * waves[i, 0]
+        wuv += au * waves[i, 1]
+        wvu += av * waves[i, 0]
+        wvv += av * waves[i, 1]
     return (
         (u + wu + 0.5) * scale - 0.5,
         (v + wv + 0.5) * scale - 0.5,

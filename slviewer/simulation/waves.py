@@ -1,6 +1,6 @@
 """The local distortion of a simulated lens: what no Brown polynomial expresses.
 
-A sum of plane waves in random directions, each coordinate with amplitudes and phases of its own. Real lenses and DMD
+A sum of plane waves in random directions, each coordinate with amplitudes of its own. Real lenses and DMD
 optics leave such residuals of a tenth of a pixel or two after the best polynomial; they are what the pixel-wise model
 is there to learn.
 """
@@ -8,7 +8,7 @@ is there to learn.
 import numpy as np
 
 Waves = np.ndarray
-"""(n, 6) float64: wave vector (rad per px, u then v), amplitude and phase in u, amplitude and phase in v."""
+"""(n, 6) float64: wave vector (rad per px, u then v), amplitudes (px) of sine and cosine in u, then of both in v."""
 
 
 def random_waves(
@@ -27,22 +27,19 @@ def random_waves(
     # Drawn even when switched off, so that the rig's other random parameters stay the same.
     direction = rng.uniform(0, 2 * np.pi, count)
     length = size[0] * np.exp(rng.uniform(np.log(wavelengths[0]), np.log(wavelengths[1]), count))
-    amplitude, phase = rng.normal(size=(2, count)), rng.uniform(0, 2 * np.pi, (2, count))
+    amplitudes = rng.normal(size=(count, 4))
     if rms_px == 0:
         return np.zeros((0, 6))
     k = 2 * np.pi / length
-    waves = np.stack(
-        [k * np.cos(direction), k * np.sin(direction) / aspect, amplitude[0], phase[0], amplitude[1], phase[1]], 1
-    )
+    waves = np.column_stack([k * np.cos(direction), k * np.sin(direction) / aspect, amplitudes])
     u, v = np.meshgrid(np.linspace(0, size[0] - 1, 81), np.linspace(0, size[1] - 1, 81))
     displacement = displace(waves, np.stack([u, v], -1))
-    waves[:, (2, 4)] *= rms_px / np.sqrt(np.mean(displacement**2, axis=(0, 1)))
+    waves[:, 2:] *= np.repeat(rms_px / np.sqrt(np.mean(displacement**2, axis=(0, 1))), 2)
     return waves
 
 
 def displace(waves: Waves, pixels: np.ndarray) -> np.ndarray:
     """Displacement (..., 2) px at `pixels` (..., 2) px; the definition that the lens's kernel agrees with."""
     angle = pixels[..., 0, None] * waves[:, 0] + pixels[..., 1, None] * waves[:, 1]
-    du = (waves[:, 2] * np.sin(angle + waves[:, 3])).sum(-1)
-    dv = (waves[:, 4] * np.sin(angle + waves[:, 5])).sum(-1)
-    return np.stack([du, dv], -1)
+    sine, cosine = np.sin(angle), np.cos(angle)
+    return np.stack([sine @ waves[:, 2] + cosine @ waves[:, 3], sine @ waves[:, 4] + cosine @ waves[:, 5]], -1)
