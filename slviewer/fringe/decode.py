@@ -5,7 +5,7 @@ import numpy as np
 from slviewer.fringe import kernels, kernels_gray, kernels_levels, kernels_spikes, limits
 from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.reference import dark_sigmas, decode_reference, found_levels, lowest_coordinate, phase_shift
 from slviewer.fringe.reference_spikes import border_rad, cell_rad, is_plain
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -148,7 +148,6 @@ def _settled(found: Layout, phase: np.ndarray, reason: np.ndarray) -> np.ndarray
         limits.LONELY_NEIGHBOURS,
         *border_rad(found),
     )
-    phase[reason != Reason.VALID] = np.nan
     other = np.empty_like(phase)
     if rules.plain:
         kernels_spikes.repair(phase, rules, other)

@@ -43,7 +43,8 @@ class CodeRules(NamedTuple):
 def arctan2(y, x):
     """float32 arctangent without branches, good to 3e-7 rad (Abramowitz and Stegun, 4.4.49); 0 where both are 0."""
     ax, ay = abs(x), abs(y)
-    a = min(ax, ay) / (max(ax, ay) + np.float32(1e-30))
+    # np.divide: the operator would check for zero and raise, which no vector instruction can.
+    a = np.divide(min(ax, ay), max(ax, ay) + np.float32(1e-30))
     s = a * a
     r = np.float32(0.0028662257) * s + np.float32(-0.0161657367)
     r = r * s + np.float32(0.0429096138)
@@ -67,15 +68,22 @@ def shift_row(stack, frames, cosines, sines, row, wrapped, modulation, backgroun
     for x in range(width):
         background[x] = np.float32(0)
         peak[x] = np.float32(first[x])
-    for k in range(1, len(frames)):
-        frame, c, s = stack[frames[k], row], cosines[k], sines[k]
+    for k in range(1, len(frames), 3):  # three frames to a pass: the sums are read and written less often
+        # Beyond the last step the first one stands in: less itself it adds nothing.
+        j = k + 1 if k + 1 < len(frames) else 0
+        m = k + 2 if k + 2 < len(frames) else 0
+        frame_k, frame_j, frame_m = stack[frames[k], row], stack[frames[j], row], stack[frames[m], row]
+        cos_k, cos_j, cos_m = cosines[k], cosines[j], cosines[m]
+        sin_k, sin_j, sin_m = sines[k], sines[j], sines[m]
         for x in range(width):
-            value = np.float32(frame[x])
-            peak[x] = max(peak[x], value)
-            value -= np.float32(first[x])
-            cosine[x] += c * value
-            sine[x] += s * value
-            background[x] += value
+            value_k, value_j, value_m = np.float32(frame_k[x]), np.float32(frame_j[x]), np.float32(frame_m[x])
+            peak[x] = max(max(peak[x], value_k), max(value_j, value_m))
+            value_k -= np.float32(first[x])
+            value_j -= np.float32(first[x])
+            value_m -= np.float32(first[x])
+            cosine[x] = cosine[x] + cos_k * value_k + cos_j * value_j + cos_m * value_m
+            sine[x] = sine[x] + sin_k * value_k + sin_j * value_j + sin_m * value_m
+            background[x] += value_k + value_j + value_m
     per_two, per_one = np.float32(2 / len(frames)), np.float32(1 / len(frames))
     for x in range(width):
         wrapped[x] = arctan2(np.float32(0) - sine[x], cosine[x])
@@ -175,7 +183,10 @@ def decode_coded(
     background,
     reason,
 ):
-    """Phase shift with a plain (``complementary`` < 0) or complementary Gray code; fills the five (h, w) maps."""
+    """Phase shift with a plain (``complementary`` < 0) or complementary Gray code; fills the five (h, w) maps.
+
+    ``phase`` is NaN where ``reason`` is not VALID, here as in the other kernels.
+    """
     _, height, width = stack.shape
     for row in numba.prange(height):
         peak, least = np.empty(width, np.float32), np.empty(width, np.float32)
@@ -197,9 +208,10 @@ def decode_coded(
                 beside = ((half + 1) >> 1) - np.int32(part >= np.float32(0.75))
                 order = half >> 1 if middle else beside
                 unclear = (least[x] if middle else abs(last)) < undecided * B[x]
-                phase[row, x] = np.float32(psi[x] + TWO_PI * (order - whole))
                 dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
                 reason[row, x] = verdict(dark, clipped, unclear)
+                absolute = np.float32(psi[x] + TWO_PI * (order - whole))
+                phase[row, x] = np.float32(np.nan) if dark | clipped | unclear else absolute
         else:
             for x in range(width):
                 turns = psi[x] * PER_TURN - origin
@@ -207,9 +219,10 @@ def decode_coded(
                 part = turns - whole
                 beside = (part < edge) | (part >= far_edge)
                 unclear = (least[x] < undecided * B[x]) & (not beside)
-                phase[row, x] = np.float32(psi[x] + TWO_PI * (code[x] - whole))
                 dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
                 reason[row, x] = verdict(dark, clipped, unclear)
+                absolute = np.float32(psi[x] + TWO_PI * (code[x] - whole))
+                phase[row, x] = np.float32(np.nan) if dark | clipped | unclear else absolute
                 doubtful[x] = beside & (least[x] < weak * B[x])
             for x in range(width):  # the few pixels on a blurred edge
                 if doubtful[x] and reason[row, x] == VALID:

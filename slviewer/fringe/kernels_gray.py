@@ -49,7 +49,8 @@ def decode_gray(stack, gray, inverse, white, black, scale, rules, phase, modulat
                 code, other = 2 * code + bit, 2 * other + flipped
                 doubts += doubt
             unclear = doubts > 1 or abs(code - other) > 1
-            phase[row, x] = TWO_PI * np.float32(np.float64(0.5) * (code + other) + np.float32(rules.centre))
             modulation[row, x], background[row, x] = B, A
-            dark = doubts >= rules.dark_bits or is_dark(B, A, scale)
+            dark = (doubts >= rules.dark_bits) | is_dark(B, A, scale)
             reason[row, x] = verdict(dark, False, unclear)
+            absolute = TWO_PI * np.float32(np.float64(0.5) * (code + other) + np.float32(rules.centre))
+            phase[row, x] = np.float32(np.nan) if dark | unclear else absolute

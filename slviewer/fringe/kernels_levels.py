@@ -44,6 +44,7 @@ def unwrap_levels(wrapped, weights, periods, low, misfit, background, weakest, c
                     order = np.rint(turns)
                     worst = max(worst, abs(turns - order))
                 coordinate = own + order * periods[level]
-            phase[row, x] = np.float32(wrapped[count - 1, row, x] + TWO_PI * order)
-            dark = is_dark(weakest[row, x], background[row, x], scale)
-            reason[row, x] = verdict(dark, clipped[row, x], worst > misfit)
+            dark, unclear = is_dark(weakest[row, x], background[row, x], scale), worst > misfit
+            reason[row, x] = verdict(dark, clipped[row, x], unclear)
+            absolute = np.float32(wrapped[count - 1, row, x] + TWO_PI * order)
+            phase[row, x] = np.float32(np.nan) if dark | clipped[row, x] | unclear else absolute

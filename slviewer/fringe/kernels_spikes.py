@@ -11,7 +11,7 @@ import numpy as np
 from slviewer.fringe.phase import Reason
 from slviewer.geometry.jit import kernel
 
-VALID, INCONSISTENT, OUTSIDE = (np.uint8(r) for r in (Reason.VALID, Reason.INCONSISTENT, Reason.OUTSIDE))
+INCONSISTENT, OUTSIDE = np.uint8(Reason.INCONSISTENT), np.uint8(Reason.OUTSIDE)
 TWO_PI = 2 * np.pi
 PER_TURN = np.float32(1 / TWO_PI)
 
@@ -33,20 +33,23 @@ class SpikeRules(NamedTuple):
     high_rad: float
 
 
-@numba.njit
-def differs(phase, row, x, per_cell):
-    """Whether one of the four neighbours is missing, invalid, or half a cell or more away."""
+@numba.njit(inline="always")
+def suspects(phase, row, per_cell, suspect):
+    """Fill ``suspect`` (w,): one of the four neighbours is missing, invalid, or half a cell or more away."""
     height, width = phase.shape
-    if row == 0 or x == 0 or row == height - 1 or x == width - 1:
-        return True
-    centre, half = phase[row, x], np.float32(0.5)
-    near = (abs((phase[row, x - 1] - centre) * per_cell) <= half) & (
-        abs((phase[row, x + 1] - centre) * per_cell) <= half
-    )
-    far = (abs((phase[row - 1, x] - centre) * per_cell) <= half) & (
-        abs((phase[row + 1, x] - centre) * per_cell) <= half
-    )
-    return not (near & far)
+    if row == 0 or row == height - 1:
+        for x in range(width):
+            suspect[x] = True
+        return
+    over, own, under = phase[row - 1], phase[row], phase[row + 1]
+    half = np.float32(0.5)
+    for x in range(width):
+        vertical = (abs((over[x] - own[x]) * per_cell) <= half) & (abs((under[x] - own[x]) * per_cell) <= half)
+        suspect[x] = not vertical
+    for x in range(1, width - 1):
+        level = (abs((own[x - 1] - own[x]) * per_cell) <= half) & (abs((own[x + 1] - own[x]) * per_cell) <= half)
+        suspect[x] |= not level
+    suspect[0] = suspect[width - 1] = True
 
 
 @numba.njit
@@ -85,11 +88,11 @@ def repair(phase, rules, out):
     height, width = phase.shape
     per_cell = np.float32(1 / rules.cell_rad)
     for row in numba.prange(height):
+        suspect = np.empty(width, np.bool_)
+        suspects(phase, row, per_cell, suspect)
+        out[row] = phase[row]
         for x in range(width):
-            out[row, x] = phase[row, x]
-            if np.isnan(phase[row, x]) or not differs(phase, row, x, per_cell):
-                continue
-            if not at_edge(phase[row, x], rules):
+            if not suspect[x] or np.isnan(phase[row, x]) or not at_edge(phase[row, x], rules):
                 continue
             valid, _, _, above, below = votes(phase, row, x, rules)
             if valid >= rules.neighbours:
@@ -106,22 +109,18 @@ def settle(phase, reason, rules, out):
     per_cell = np.float32(1 / rules.cell_rad)
     low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
     for row in numba.prange(height):
+        suspect = np.empty(width, np.bool_)
+        suspects(phase, row, per_cell, suspect)
+        own = phase[row]
         for x in range(width):
-            own = phase[row, x]
-            out[row, x] = own
-            if np.isnan(own):
+            outside = (own[x] < low) | (own[x] > high)
+            out[row, x] = np.float32(np.nan) if outside else own[x]
+            reason[row, x] = OUTSIDE if outside else reason[row, x]
+        for x in range(width):
+            if not suspect[x] or np.isnan(own[x]):
                 continue
-            seen = VALID
-            if differs(phase, row, x, per_cell):
-                valid, agree, whole, _, _ = votes(phase, row, x, rules)
-                if (
-                    valid < rules.lonely_neighbours
-                    or agree < rules.lonely * valid
-                    or (rules.plain and whole >= 0.5 * valid and at_edge(own, rules))
-                ):
-                    seen = INCONSISTENT
-            if seen == VALID and (own < low or own > high):
-                seen = OUTSIDE
-            if seen != VALID:
+            valid, agree, whole, _, _ = votes(phase, row, x, rules)
+            few = valid < rules.lonely_neighbours or agree < rules.lonely * valid
+            if few or (rules.plain and whole >= 0.5 * valid and at_edge(own[x], rules)):
                 out[row, x] = np.nan
-                reason[row, x] = seen
+                reason[row, x] = INCONSISTENT

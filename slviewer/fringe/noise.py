@@ -4,13 +4,15 @@ import numpy as np
 
 from slviewer.fringe.layout import Layout
 
-ROWS = 24
+ROWS = 20
 """Image rows that are sampled."""
 BLOCK = 8
 """Neighbouring pixels whose variances are averaged before medians are taken: single variances are too skewed."""
 BINS = 16
-HARMONICS = 6
-"""Highest harmonic of the fringes that projector and camera gamma are taken to produce."""
+OWN_HARMONICS = 4
+"""Highest harmonic that is fitted pixel by pixel; what gamma makes beyond it is below the noise."""
+COMMON_HARMONICS = 6
+"""Highest harmonic that is fitted to all pixels together where n is too small for the former."""
 
 
 def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[float, float]:
@@ -48,14 +50,15 @@ def _sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
 def _from_phase(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
     n = len(samples)
     samples = samples[:, _usable(samples, white)]  # (n, blocks, BLOCK)
-    own = max(1, min(4, (n - 1) // 2 - 2))
+    own = max(1, min(OWN_HARMONICS, (n - 1) // 2 - 2))
     k = 2 * np.pi * np.arange(n) / n
     harmonics = [np.ones(n)] + [f(h * k) for h in range(1, own + 1) for f in (np.cos, np.sin)]
     basis, _ = np.linalg.qr(np.stack(harmonics, axis=1))
     residue = _project_out(basis, samples)
     mean = samples.mean(axis=0)
     cosine, sine = (_combine(f(k) * (2 / n), samples) for f in (np.cos, np.sin))
-    residue = _without_common_harmonics(residue, basis, cosine, sine, own)
+    if own < OWN_HARMONICS:
+        residue = _without_common_harmonics(residue, basis, cosine, sine, own)
     freedom = n - basis.shape[1]
     return mean.mean(axis=-1), (residue**2).sum(axis=0).mean(axis=-1) / freedom, freedom * samples.shape[-1]
 
@@ -69,13 +72,13 @@ def _without_common_harmonics(
     k = (2 * np.pi * np.arange(n) / n).astype(np.float32).reshape(n, 1, 1)
     regressors = [
         _project_out(basis, amplitude * f(h * (phase + k)))
-        for h in range(own + 1, HARMONICS + 1)
+        for h in range(own + 1, COMMON_HARMONICS + 1)
         for f in (np.cos, np.sin)
     ]
     # Some of them vanish (harmonic n + 1 is the fringe again): the pseudo-inverse leaves them out.
     gram = np.array([[(p * q).sum() for q in regressors] for p in regressors], np.float64)
     moment = np.array([(p * residue).sum() for p in regressors], np.float64)
-    if not regressors or not gram.any():
+    if not gram.any():
         return residue
     for weight, regressor in zip(np.linalg.pinv(gram, rcond=1e-6) @ moment, regressors, strict=True):
         residue = residue - np.float32(weight) * regressor
