@@ -10,8 +10,8 @@ SMALLEST_PX = 12
 """Pixels in the smallest blob whose shape says anything."""
 LONGEST = 4.0
 """Length over width of a blob beyond which it is no circle seen at a usable slant."""
-ROUNDEST = 0.88
-"""Least area over that of the ellipse with the same second moments: 1 for ellipses, 0.955 for rectangles."""
+ROUGHEST = 0.88
+"""Least roundness of what may be a circle."""
 
 
 @dataclass(frozen=True)
@@ -24,28 +24,34 @@ class Blobs:
     covariances: np.ndarray
     inverted: bool
 
+    @property
+    def roundness(self) -> np.ndarray:
+        """(n,) area over that of the ellipse with the same second moments: 1 for ellipses, 0.955 for rectangles."""
+        return np.asarray(self.areas / (4 * np.pi * np.sqrt(np.linalg.det(self.covariances))))
+
+    def chosen(self, which: np.ndarray) -> "Blobs":
+        """Some of the blobs, by index or mask."""
+        return Blobs(self.centres[which], self.areas[which], self.covariances[which], self.inverted)
+
     def scaled(self, scale: np.ndarray) -> "Blobs":
         """The same blobs in an image that is (2,) ``scale`` times as wide and as high, by pixel centres."""
         centres = (self.centres + 0.5) * scale - 0.5
         return Blobs(centres, self.areas * scale.prod(), self.covariances * np.outer(scale, scale), self.inverted)
 
 
-def find_blobs(grey: np.ndarray, pitch: float) -> Iterator[Blobs]:
-    """Blobs of an image (h, w) uint8, attempt by attempt: dark ones first, then bright ones.
+def find_blobs(grey: np.ndarray, pitch: float, inverted: bool) -> Iterator[Blobs]:
+    """Dark blobs of an image (h, w) uint8, or bright ones if ``inverted``, attempt by attempt.
 
     ``pitch`` px is the largest distance that neighbouring circles can have. Each attempt compares pixels with the
     middle between the darkest and the brightest of a neighbourhood (or with its mean, where reflections spoil the
     brightest), for neighbourhoods of different sizes: a small one follows uneven light, a large one holds large
     circles.
     """
-    smooth = cv2.GaussianBlur(grey, (3, 3), 0)
-    for inverted in (False, True):
-        image = 255 - smooth if inverted else smooth
-        for by_mean in (False, True):
-            for share in (0.5, 1.0, 0.25, 0.125):
-                window = share * pitch
-                if window >= 8:
-                    yield _elliptical(_by_mean(image, window) if by_mean else _by_extremes(image, window), inverted)
+    image = cv2.GaussianBlur(255 - grey if inverted else grey, (3, 3), 0)
+    for binarise in (_by_extremes, _by_mean):
+        for share in (0.5, 1.0, 0.25, 0.125):
+            if share * pitch >= 8:
+                yield _elliptical(binarise(image, share * pitch), inverted)
 
 
 def _by_extremes(image: np.ndarray, window: float) -> np.ndarray:
@@ -91,6 +97,5 @@ def _elliptical(mask: np.ndarray, inverted: bool) -> Blobs:
     covariances[:, 0, 0] = np.bincount(label, du * du, count) / n + 1 / 12  # a pixel is a square, not a point
     covariances[:, 1, 1] = np.bincount(label, dv * dv, count) / n + 1 / 12
     covariances[:, 0, 1] = covariances[:, 1, 0] = np.bincount(label, du * dv, count) / n
-    determinant = np.linalg.det(covariances) if count else np.zeros(0)
-    round_enough = n > ROUNDEST * 4 * np.pi * np.sqrt(np.maximum(determinant, 1e-9))
-    return Blobs(centres[plausible][round_enough], n[round_enough], covariances[round_enough], inverted)
+    found = Blobs(centres[plausible], n, covariances, inverted)
+    return found.chosen(found.roundness > ROUGHEST)

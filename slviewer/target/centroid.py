@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from slviewer.target.blobs import Blobs
+
 SOFT_PX = 2.5
 """How far, in px, the camera's PSF carries a circle's edge outwards."""
 RING_PX = 5.0
@@ -12,14 +14,15 @@ SMALLEST_RING = 12
 """Pixels that a plane through the ring needs."""
 
 
-def refine_centres(image: np.ndarray, centres: np.ndarray, covariances: np.ndarray, inverted: bool) -> np.ndarray:
+def refine_centres(image: np.ndarray, blobs: Blobs) -> np.ndarray:
     """(n, 2) float64 px: the centroid of each circle's ink, by the image's own brightness around it.
 
-    ``image`` (h, w) float32; ``centres`` (n, 2) px and ``covariances`` (n, 2, 2) px² describe the circles' ellipses to
-    some tenths of a pixel; ``inverted`` for bright circles on dark ground. Ink is ``1 - I / W`` with W the plane
-    through the paper's brightness next to the circle, so that uneven light does not move the centroid. NaN where there
+    ``image`` (h, w) float32; ``blobs`` describe the circles' ellipses to some tenths of a pixel. Ink is ``1 - I / W``
+    with W the plane through the paper's brightness next to the circle, so that uneven light does not move the centroid;
+    for bright circles, what they are brighter than the ground, over the plane of their own brightness. NaN where there
     is no paper to compare with, or where the result lies outside the circle's core.
     """
+    centres, covariances, inverted = blobs.centres, blobs.covariances, blobs.inverted
     ring_px = _ring_widths(centres, covariances)
     refined = np.full(centres.shape, np.nan)
     for k, (centre, covariance) in enumerate(zip(centres, covariances, strict=True)):

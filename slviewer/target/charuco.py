@@ -11,6 +11,8 @@ from slviewer.target.saddle import refine_corners
 
 FEWEST = 8
 """Corners that a pose needs."""
+ENOUGH = 0.8
+"""Share of the corners with which the search ends; with fewer it goes on in larger images."""
 
 
 def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
@@ -25,14 +27,14 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndar
     first = min(1.0, SEARCH_PX / max(image.grey.shape))
     best: tuple[np.ndarray, np.ndarray] | None = None
     markers = 0
-    for factor in dict.fromkeys((first, 1.0, first / 2)):
+    for factor in dict.fromkeys((first / 2, first, 1.0)):
         small = resized(image.grey, factor)
         corners, ids, _, marker_ids = detector.detectBoard(small)
         markers = max(markers, 0 if marker_ids is None else len(marker_ids))
         if ids is not None and len(ids) and (best is None or len(ids) > len(best[1])):
             pixels = (np.reshape(corners, (-1, 2)).astype(float) + 0.5) / factor - 0.5
             best = pixels, np.ravel(ids).astype(int)
-        if best is not None and 2 * len(best[1]) >= len(board.points):
+        if best is not None and len(best[1]) >= ENOUGH * len(board.points):
             break
     seen = 0 if best is None else len(best[1])
     if best is None or seen < FEWEST:

@@ -1,7 +1,5 @@
 """Find the inner corners of a chessboard."""
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 
@@ -18,41 +16,42 @@ def detect_chessboard(board: Board, image: BoardImage) -> np.ndarray:
 
     A board whose columns + rows are odd is numbered so that its top-left square is dark.
     """
-    grid = next(_attempts(board, image.grey), None)
+    largest = None
+    grid = _quick(board, image.grey)
     if grid is None:
-        raise DetectionError(_not_found(board, image.grey))
+        largest = _largest(image.grey)
+        grid = _matching(board, largest)
+    if grid is None:
+        grid = _classic(board, image.grey)
+    if grid is None:
+        raise DetectionError(_not_found(board, largest, image.grey))
     # the finders' own order may be mirrored; all that is kept of it is what lies beside what
     if _turn(grid) < 0:
         grid = grid[:, ::-1]
     pixels = refine_corners(image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm)
     check_grid(board, pixels, np.arange(len(pixels)), "corners")
     grid = pixels.reshape(grid.shape)
-    first_is_dark = _first_is_dark(image.deep, grid)
     _refuse_larger(board, image.deep, grid)
-    return upright(board, [g.reshape(-1, 2) for g in _numberings(grid, first_is_dark)])
+    numberings = _numberings(np.arange(len(pixels)).reshape(grid.shape[:2]), _first_is_dark(image.deep, grid))
+    return np.asarray(pixels[upright(board, pixels, numberings)])
 
 
-def _attempts(board: Board, grey: np.ndarray) -> Iterator[np.ndarray]:
-    """Corners (rows, columns, 2), the quickest search first."""
-    shape = (board.rows, board.columns, 2)
+def _quick(board: Board, grey: np.ndarray) -> np.ndarray | None:
+    """(rows, columns, 2) px by OpenCV's sector-based search, which needs to be no more than a pixel or two right."""
     full = min(1.0, SEARCH_PX / max(grey.shape))
-    accurate, thorough = cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
-    searches = [(full / 2, False, 0), (full, False, 0), (full / 2, True, thorough), (full, True, thorough)]
-    if full < 1:
-        searches.append((1.0, False, accurate))
-    for factor, even, flags in searches:
-        image = resized(evenly_lit(grey) if even else grey, factor)
-        found, corners = cv2.findChessboardCornersSB(image, board.features, flags=flags)
+    even = evenly_lit(grey)
+    thorough = cv2.CALIB_CB_EXHAUSTIVE
+    for source, factor, flags in (
+        (even, full / 2, 0),
+        (grey, full / 2, 0),
+        (even, full / 2, thorough),
+        (even, full, thorough),
+        (grey, full, 0),
+    ):
+        found, corners = cv2.findChessboardCornersSB(resized(source, factor), board.features, flags=flags)
         if found:
-            yield _in_full(corners, factor).reshape(shape)
-    largest = _largest(grey)
-    if largest is not None and largest.shape == shape:
-        yield largest
-    elif largest is not None and largest.shape == (*shape[1::-1], 2):
-        yield largest.transpose(1, 0, 2)
-    found, corners = cv2.findChessboardCorners(resized(grey, full), board.features)
-    if found:
-        yield _in_full(corners, full).reshape(shape)
+            return _in_full(corners, factor).reshape(board.rows, board.columns, 2)
+    return None
 
 
 def _largest(grey: np.ndarray) -> np.ndarray | None:
@@ -61,6 +60,20 @@ def _largest(grey: np.ndarray) -> np.ndarray | None:
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     found, corners, cells = cv2.findChessboardCornersSBWithMeta(resized(evenly_lit(grey), factor), (3, 3), flags)
     return _in_full(corners, factor).reshape(*cells.shape[:2], 2) if found else None
+
+
+def _matching(board: Board, largest: np.ndarray | None) -> np.ndarray | None:
+    """The largest grid, laid along the board's rows, if it has the board's size."""
+    if largest is None or sorted(largest.shape[:2]) != sorted(board.features):
+        return None
+    return largest if largest.shape[0] == board.rows else largest.transpose(1, 0, 2)
+
+
+def _classic(board: Board, grey: np.ndarray) -> np.ndarray | None:
+    """(rows, columns, 2) px by OpenCV's older search, which goes from square to square."""
+    factor = min(1.0, SEARCH_PX / max(grey.shape)) / 2
+    found, corners = cv2.findChessboardCorners(resized(grey, factor), board.features)
+    return _in_full(corners, factor).reshape(board.rows, board.columns, 2) if found else None
 
 
 def _in_full(corners: np.ndarray, factor: float) -> np.ndarray:
@@ -74,9 +87,8 @@ def _turn(grid: np.ndarray) -> float:
     return float(a * d - b * c)
 
 
-def _not_found(board: Board, grey: np.ndarray) -> str:
+def _not_found(board: Board, largest: np.ndarray | None, grey: np.ndarray) -> str:
     """What the operator reads: the largest chessboard that can be seen, if any, and what to do."""
-    largest = _largest(grey)
     if largest is None:
         return f"no chessboard found where {board} has {len(board.points)} corners: {advice(grey)}"
     rows, columns = largest.shape[:2]
@@ -112,13 +124,14 @@ def _refuse_larger(board: Board, image: np.ndarray, grid: np.ndarray) -> None:
             )
 
 
-def _numberings(grid: np.ndarray, first_is_dark: bool) -> list[np.ndarray]:
-    """The grids (rows, columns, 2), turned, that the colours of the squares allow."""
-    rows, columns = grid.shape[:2]
-    allowed = []
+def _numberings(order: np.ndarray, first_is_dark: bool) -> list[np.ndarray]:
+    """The orders (rows, columns) of the corners, turned, that the colours of the squares allow; flattened."""
+    rows, columns = order.shape
+    dark: list[np.ndarray] = []
+    bright: list[np.ndarray] = []
     for turns in range(0, 4, 1 if rows == columns else 2):
         # the square beyond the first corner, after turning, was the one beyond another corner of the grid
         i, j = ((0, 0), (0, columns), (rows, columns), (rows, 0))[turns]
-        allowed.append((np.rot90(grid, turns), first_is_dark == ((i + j) % 2 == 0)))
-    dark = [turned for turned, is_dark in allowed if is_dark]
-    return dark if 0 < len(dark) < len(allowed) else [turned for turned, _ in allowed]
+        same = dark if first_is_dark == ((i + j) % 2 == 0) else bright
+        same.append(np.rot90(order, turns).ravel())
+    return dark or bright

@@ -13,36 +13,63 @@ from slviewer.target.images import SEARCH_PX, BoardImage, advice, resized
 from slviewer.target.lattice import Lattice, grow_lattices, lay_pattern
 from slviewer.target.numbering import check_grid, upright
 
+GOOD_PART = 1 / 3
+"""Share of the board's circles in one lattice that no clutter has."""
+ROUND = 0.97
+"""Roundness between that of squares, 0.955, and of circles well resolved, 0.985 and more on real photographs."""
+RESOLVED_PX = 80.0
+"""Area of a circle beyond which more pixels do not help to find it."""
+
 
 @dataclass(frozen=True)
-class _Grid:
+class _Seen:
+    """A lattice among blobs."""
+
+    lattice: Lattice
     blobs: Blobs
-    numberings: list[np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.lattice.nodes)
 
 
 def detect_circles(board: Board, image: BoardImage) -> np.ndarray:
     """(n, 2) float64 px of every circle of the board; raises DetectionError with how many were seen."""
-    most = Lattice(np.zeros((0, 2), int), np.zeros(0, int))
-    for blobs in _attempts(board, image.grey):
-        for lattice in grow_lattices(blobs):
-            numberings = lay_pattern(board, lattice)
-            if numberings:
-                _refuse_larger(board, lattice, numberings)
-                return _centres(board, image, _Grid(blobs, numberings))
-            if len(lattice.nodes) > len(most.nodes):
-                most = lattice
+    most: _Seen | None = None
+    for seen in _attempts(board, image.grey):
+        numberings = lay_pattern(board, seen.lattice)
+        if numberings:
+            _refuse_larger(board, seen.lattice, numberings)
+            _refuse_squares(board, seen.blobs.chosen(numberings[0]))
+            return _centres(board, image, seen.blobs, numberings)
+        if most is None or len(seen) > len(most):
+            most = seen
     raise DetectionError(_not_found(board, image, most))
 
 
-def _attempts(board: Board, grey: np.ndarray) -> Iterator[Blobs]:
-    """Blobs at the search resolution, then coarser, where noise averages out, then in the full image."""
+def _attempts(board: Board, grey: np.ndarray) -> Iterator[_Seen]:
+    """Lattices at the search resolution, then coarser, where noise averages out, then in the full image.
+
+    Once a good part of the board has been seen, its circles are known to be dark or bright, and to be large enough for
+    the search resolution or not, and what remains to be tried is little.
+    """
     first = min(1.0, SEARCH_PX / max(grey.shape))
+    colours = [False, True]
+    resolved = False
     for factor in dict.fromkeys((first, first / 2, 1.0)):
+        if resolved and factor > first:
+            return
         small = resized(grey, factor)
         scale = np.array(grey.shape[::-1]) / np.array(small.shape[::-1])
         pitch = max(small.shape) / (min(board.columns, board.rows) - 1)
-        for blobs in find_blobs(small, pitch):
-            yield blobs.scaled(scale)
+        for inverted in colours:
+            for blobs in find_blobs(small, pitch, inverted):
+                for lattice in grow_lattices(blobs):
+                    if len(lattice.nodes) > GOOD_PART * len(board.points):
+                        colours = [inverted]
+                        resolved |= float(np.median(blobs.areas[lattice.blobs])) > RESOLVED_PX
+                    yield _Seen(lattice, blobs.scaled(scale))
+            if colours == [inverted]:
+                break
 
 
 def _refuse_larger(board: Board, lattice: Lattice, numberings: list[np.ndarray]) -> None:
@@ -55,11 +82,14 @@ def _refuse_larger(board: Board, lattice: Lattice, numberings: list[np.ndarray])
         )
 
 
-def _centres(board: Board, image: BoardImage, grid: _Grid) -> np.ndarray:
-    blobs = grid.blobs
-    chosen = upright(board, [blobs.centres[numbering] for numbering in grid.numberings])
-    order = next(n for n in grid.numberings if np.array_equal(blobs.centres[n], chosen))
-    pixels = refine_centres(image.deep, chosen, blobs.covariances[order], blobs.inverted)
+def _refuse_squares(board: Board, blobs: Blobs) -> None:
+    if np.median(blobs.areas) > 100 and np.median(blobs.roundness) < ROUND:
+        raise DetectionError(f"a grid of squares found where {board} has circles: check the board's kind")
+
+
+def _centres(board: Board, image: BoardImage, blobs: Blobs, numberings: list[np.ndarray]) -> np.ndarray:
+    order = upright(board, blobs.centres, numberings)
+    pixels = refine_centres(image.deep, blobs.chosen(order))
     lost = np.isnan(pixels).any(1)
     if lost.any():
         raise DetectionError(
@@ -70,14 +100,14 @@ def _centres(board: Board, image: BoardImage, grid: _Grid) -> np.ndarray:
     return pixels
 
 
-def _not_found(board: Board, image: BoardImage, most: Lattice) -> str:
-    count, total = len(most.nodes), len(board.points)
-    if count < 6:
+def _not_found(board: Board, image: BoardImage, most: _Seen | None) -> str:
+    total = len(board.points)
+    if most is None or len(most) < 6:
         return f"no grid of circles found where {board} has {total}: {advice(image.grey)}"
-    if count >= total:
-        longer, shorter = most.extent
+    if len(most) >= total:
+        longer, shorter = most.lattice.extent
         return (
-            f"{count} circles found in a grid of {longer}x{shorter} that does not hold all of {board}: "
+            f"{len(most)} circles found in a grid of {longer}x{shorter} that does not hold all of {board}: "
             "check the board's columns and rows, and that nothing covers it"
         )
-    return f"{count} of {total} circles found: {advice(image.grey)}"
+    return f"{len(most)} of {total} circles found: {advice(image.grey)}"

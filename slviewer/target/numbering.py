@@ -20,10 +20,10 @@ MOST_BENT = 0.6
 """How far, in pitches, a lens may bend the grid."""
 
 
-def upright(board: Board, numberings: list[np.ndarray]) -> np.ndarray:
-    """Of equally valid numberings (n, 2) px, the one that the rule above chooses."""
+def upright(board: Board, pixels: np.ndarray, numberings: list[np.ndarray]) -> np.ndarray:
+    """Of equally valid numberings, (n,) indices into ``pixels`` (m, 2), the one that the rule above chooses."""
     preferred = np.array([1.0, 0.0] if len(numberings) == 4 else [2.0, 1.0])
-    return max(numberings, key=lambda pixels: float(x_direction(board, pixels) @ preferred))
+    return max(numberings, key=lambda order: float(x_direction(board, pixels[order]) @ preferred))
 
 
 def x_direction(board: Board, pixels: np.ndarray) -> np.ndarray:

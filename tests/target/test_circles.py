@@ -1,0 +1,176 @@
+"""Grids of circles in rendered images: where their centres are, how they are numbered, and what is refused."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from rendered_board import View
+
+from slviewer.errors import DetectionError, InputError
+from slviewer.target.board import Board
+from slviewer.target.detect import board_mask, detect
+from slviewer.target.numbering import x_direction
+
+BOARD = Board.parse("circles:9x7:20")
+SMALL = View(size=(400, 300), supersample=4)
+
+
+def discs(board: Board, view: View) -> np.ndarray:
+    """(n, 2) px: centroids of the circles' images, which perspective moves away from the images of their centres."""
+    radius = view.diameter * board.pitch_mm / 2 * (2**0.5 if board.kind == "acircles" else 1)
+    r = radius * np.sqrt((np.arange(16) + 0.5) / 16)
+    a = np.arange(32) / 32 * 2 * np.pi
+    disc = np.stack([np.outer(r, np.cos(a)).ravel(), np.outer(r, np.sin(a)).ravel()], axis=1)
+    H = view.homography(board)
+    points = board.points[:, None, :2] + disc
+    seen = view.project(board, points.reshape(-1, 2)).reshape(points.shape)
+    area = (points @ H[2, :2] + H[2, 2]) ** -3  # px² per mm²
+    return (seen * area[..., None]).sum(1) / area.sum(1)[:, None]
+
+
+def rms(difference: np.ndarray) -> float:
+    return float(np.sqrt((difference**2).sum(1).mean()))
+
+
+@pytest.mark.parametrize("tilt", [0, 20, 35])
+def test_centroids_are_exact_to_a_hundredth_of_a_pixel_under_uneven_light(tilt: float) -> None:
+    view = View(size=(480, 360), tilt=tilt, axis=70, shade=4)
+    found = detect(BOARD, view.render(BOARD)).pixels
+    assert rms(found - discs(BOARD, view)) < 0.008
+    assert np.abs((found - discs(BOARD, view)).mean(0)).max() < 0.003
+    off = rms(found - view.truth(BOARD))  # perspective alone, which calibration corrects
+    assert off < 0.01 if tilt == 0 else 0.03 < off < 0.1
+
+
+@pytest.mark.parametrize(
+    ("notation", "view", "limit"),
+    [
+        ("circles:9x7:20", replace(SMALL, noise=3, shade=3, tilt=20), 0.04),
+        ("circles:9x7:20", replace(SMALL, blur=2.5, tilt=20), 0.02),
+        ("circles:9x7:20", replace(SMALL, tilt=45, axis=40, shade=2), 0.03),
+        ("circles:9x7:20", replace(SMALL, inverted=True, shade=3, noise=1, tilt=25), 0.04),
+        ("circles:9x7:20", replace(SMALL, shade=10), 0.03),
+        ("circles:9x7:20", replace(SMALL, fill=0.3, noise=1), 0.06),
+        ("circles:9x7:20", replace(SMALL, diameter=0.75, tilt=15), 0.02),
+        ("circles:9x7:20", replace(SMALL, diameter=0.25, tilt=15), 0.02),
+        ("circles:3x3:20", replace(SMALL, diameter=0.7, tilt=15), 0.02),
+        ("circles:9x7:20", replace(SMALL, k1=-0.4, tilt=20), 0.15),  # distortion moves centroids as well
+        ("circles:21x16:9", replace(SMALL, fill=0.9, tilt=20), 0.03),
+        ("acircles:4x11:20", replace(SMALL, tilt=25, shade=3, noise=1), 0.03),
+        ("acircles:7x6:20", replace(SMALL, tilt=40, axis=20, shade=3, noise=1), 0.03),
+    ],
+)
+def test_found_whatever_the_view(notation: str, view: View, limit: float) -> None:
+    board = Board.parse(notation)
+    detection = detect(board, view.render(board))
+    np.testing.assert_array_equal(detection.ids, np.arange(len(board.points)))
+    expected = discs(board, view)
+    assert 1e-5 < rms(detection.pixels - expected) < limit
+
+
+def test_other_image_types_give_the_same() -> None:
+    image = replace(SMALL, tilt=20).render(BOARD)
+    pixels = detect(BOARD, image).pixels
+    np.testing.assert_allclose(detect(BOARD, image.astype(np.uint16) * 16).pixels, pixels, atol=1e-3)
+    np.testing.assert_allclose(detect(BOARD, np.repeat(image[..., None], 3, axis=2)).pixels, pixels, atol=1e-3)
+    np.testing.assert_allclose(detect(BOARD, image // 5).pixels, pixels, atol=0.05)
+
+
+@pytest.mark.parametrize("image", [np.zeros((300, 400)), np.zeros((300, 400, 4), np.uint8), np.zeros((4, 4), np.uint8)])
+def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
+    with pytest.raises(InputError, match="uint8 or uint16"):
+        detect(BOARD, image)
+
+
+@pytest.mark.parametrize("notation", ["circles:9x7:20", "acircles:5x8:20", "circles:6x6:20"])
+@pytest.mark.parametrize("roll", [0, 50, 100, 180, 250, 330])
+def test_a_symmetric_board_starts_where_the_rule_says(notation: str, roll: float) -> None:
+    board, view = Board.parse(notation), replace(SMALL, roll=roll, tilt=20, fill=0.65)
+    pixels = detect(board, view.render(board)).pixels
+    preferred = (1, 0) if notation == "circles:6x6:20" else (2, 1)
+    direction = x_direction(board, pixels)
+    assert direction @ preferred > 0
+    if notation == "circles:6x6:20":
+        assert direction[0] > np.cos(np.deg2rad(50))
+    y = pixels[board.columns] - pixels[0]
+    assert direction[0] * y[1] - direction[1] * y[0] > 0, "x turns clockwise into y"
+    apart = np.linalg.norm(pixels[:, None] - view.truth(board)[None], axis=2)
+    assert sorted(apart.argmin(1)) == list(range(len(pixels))) and apart.min(1).max() < 0.5
+
+
+@pytest.mark.parametrize("roll", [0, 90, 145, 180, 270])
+def test_an_odd_asymmetric_board_is_numbered_by_its_own_pattern(roll: float) -> None:
+    board, view = Board.parse("acircles:4x9:20"), replace(SMALL, roll=roll, tilt=20, fill=0.65)
+    assert rms(detect(board, view.render(board)).pixels - view.truth(board)) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("notation", "hide"),
+    [
+        ("circles:9x7:20", (-30, -30, 190, 10)),  # the first row
+        ("circles:9x7:20", (150, -30, 190, 190)),  # the last column
+        ("circles:9x7:20", (70, 50, 90, 70)),  # one circle in the middle
+        ("acircles:4x11:20", (-30, -30, 190, 10)),
+        ("acircles:4x11:20", (-30, -30, 190, 30)),
+    ],
+)
+def test_hidden_circles_are_counted_not_guessed(notation: str, hide: tuple[float, float, float, float]) -> None:
+    board = Board.parse(notation)
+    x, y = board.points[:, :2].T
+    left = np.count_nonzero(~((x > hide[0]) & (y > hide[1]) & (x < hide[2]) & (y < hide[3])))
+    with pytest.raises(DetectionError, match=f"^{left} of {len(x)} circles found: .*move the board"):
+        detect(board, replace(SMALL, hide=hide, tilt=10).render(board))
+
+
+def test_a_board_partly_out_of_view_is_refused() -> None:
+    with pytest.raises(DetectionError, match="of 63 circles found"):
+        detect(BOARD, replace(SMALL, shift=(70, 0)).render(BOARD))
+
+
+@pytest.mark.parametrize("wrong", ["circles:8x7:20", "circles:9x6:20", "circles:7x7:20"])
+def test_a_larger_grid_than_stated_is_refused(wrong: str) -> None:
+    with pytest.raises(DetectionError, match="63 circles in one grid found where .* check the board's columns"):
+        detect(Board.parse(wrong), replace(SMALL, tilt=15).render(BOARD))
+
+
+def test_a_smaller_grid_than_stated_is_refused() -> None:
+    with pytest.raises(DetectionError, match="63 of 70 circles found"):
+        detect(Board.parse("circles:10x7:20"), replace(SMALL, tilt=15).render(BOARD))
+
+
+def test_a_transposed_notation_is_the_same_board_turned() -> None:
+    image = replace(SMALL, tilt=15).render(BOARD)
+    turned = detect(Board.parse("circles:7x9:20"), image).pixels.reshape(9, 7, 2)
+    np.testing.assert_allclose(np.rot90(detect(BOARD, image).pixels.reshape(7, 9, 2)), turned[::-1, ::-1], atol=1e-6)
+
+
+def test_squares_are_not_taken_for_circles() -> None:
+    chessboard = Board.parse("chessboard:9x7:20")
+    with pytest.raises(DetectionError, match="squares"):
+        detect(Board.parse("acircles:5x8:20"), replace(SMALL, blur=0.5, fill=0.5).render(chessboard))
+
+
+def test_overexposure_is_named() -> None:
+    with pytest.raises(DetectionError, match=r"lower the exposure \(\d+% of the image is saturated\)"):
+        detect(BOARD, replace(SMALL, paper=3000).render(BOARD))
+
+
+def test_an_empty_image_is_refused() -> None:
+    for level in (0, 128):
+        with pytest.raises(DetectionError, match="no grid of circles found"):
+            detect(BOARD, np.full((300, 400), level, np.uint8))
+
+
+def test_noise_is_refused() -> None:
+    with pytest.raises(DetectionError, match="circles found"):
+        detect(BOARD, np.random.default_rng(0).integers(0, 255, (300, 400), np.uint8))
+
+
+def test_board_mask_covers_half_a_pitch_beyond_the_circles() -> None:
+    view = replace(SMALL, tilt=30, axis=20)
+    mask = board_mask(BOARD, detect(BOARD, view.render(BOARD)), (300, 400))
+    expected = np.zeros((300, 400), np.uint8)
+    cv2.fillConvexPoly(expected, np.int32(np.round(view.project(BOARD, BOARD.outline()) * 16)), 1, shift=4)
+    assert mask.shape == (300, 400) and mask.dtype == bool
+    assert np.count_nonzero(mask != expected.astype(bool)) < 0.002 * np.count_nonzero(mask)

@@ -1,0 +1,112 @@
+"""Chessboards and ChArUco boards in rendered images."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rendered_board import View
+
+from slviewer.errors import DetectionError
+from slviewer.target.board import Board
+from slviewer.target.detect import board_mask, detect
+from slviewer.target.numbering import check_grid
+
+SMALL = View(size=(400, 300), supersample=4)
+CHESSBOARD = Board.parse("chessboard:9x7:20")
+
+
+def rms(difference: np.ndarray) -> float:
+    return float(np.sqrt((difference**2).sum(1).mean()))
+
+
+@pytest.mark.parametrize(
+    ("notation", "view", "limit"),
+    [
+        ("chessboard:9x7:20", View(size=(480, 360), shade=4), 0.006),
+        ("chessboard:9x7:20", View(size=(480, 360), shade=4, tilt=20, axis=70), 0.02),
+        ("chessboard:9x7:20", View(size=(480, 360), shade=4, tilt=45, axis=70, noise=2), 0.03),
+        ("chessboard:9x7:20", replace(SMALL, blur=2, noise=2, tilt=20), 0.05),
+        ("chessboard:9x7:20", replace(SMALL, shade=10, tilt=20), 0.04),
+        ("chessboard:9x7:20", replace(SMALL, k1=-0.4, tilt=20), 0.05),
+        ("charuco:8x6:20", View(size=(480, 360), shade=4, tilt=20, axis=70, noise=1), 0.02),
+        ("charuco:7x5:20:12:DICT_4X4_50", replace(SMALL, tilt=40, axis=20), 0.04),
+    ],
+)
+def test_corners_are_exact_to_hundredths_of_a_pixel(notation: str, view: View, limit: float) -> None:
+    board = Board.parse(notation)
+    detection = detect(board, view.render(board))
+    np.testing.assert_array_equal(detection.ids, np.arange(len(board.points)))
+    assert 1e-5 < rms(detection.pixels - view.truth(board)) < limit
+
+
+@pytest.mark.parametrize("notation", ["chessboard:8x7:20", "chessboard:7x8:20", "charuco:7x5:20", "charuco:6x6:20"])
+@pytest.mark.parametrize("roll", [0, 90, 150, 180, 270])
+def test_a_board_with_marks_of_its_own_keeps_its_numbers(notation: str, roll: float) -> None:
+    board, view = Board.parse(notation), replace(SMALL, roll=roll, tilt=20, fill=0.7)
+    detection = detect(board, view.render(board))
+    assert rms(detection.pixels - view.truth(board)[detection.ids]) < 0.1
+
+
+@pytest.mark.parametrize("roll", [0, 60, 180, 300])
+def test_a_symmetric_chessboard_is_numbered_from_the_left(roll: float) -> None:
+    view = replace(SMALL, roll=roll, tilt=20, fill=0.65)
+    pixels = detect(CHESSBOARD, view.render(CHESSBOARD)).pixels
+    truth = view.truth(CHESSBOARD)
+    assert rms(pixels - (truth[::-1] if roll == 180 else truth)) < 0.1
+
+
+def test_hidden_corners_are_counted_not_guessed() -> None:
+    with pytest.raises(DetectionError, match=r"of 63 corners of chessboard:9x7:20 found"):
+        detect(CHESSBOARD, replace(SMALL, hide=(-30, -30, 190, 10)).render(CHESSBOARD))
+
+
+def test_a_board_partly_out_of_view_is_refused() -> None:
+    with pytest.raises(DetectionError, match="of 63 corners"):
+        detect(CHESSBOARD, replace(SMALL, shift=(90, 0)).render(CHESSBOARD))
+
+
+@pytest.mark.parametrize("wrong", ["chessboard:8x7:20", "chessboard:9x6:20", "chessboard:7x5:20", "chessboard:6x7:20"])
+@pytest.mark.parametrize("tilt", [0, 25])
+def test_a_larger_chessboard_than_stated_is_refused(wrong: str, tilt: float) -> None:
+    with pytest.raises(DetectionError, match="check (its|the board's) columns and rows"):
+        detect(Board.parse(wrong), replace(SMALL, tilt=tilt).render(CHESSBOARD))
+
+
+def test_a_hidden_part_of_a_charuco_board_leaves_the_rest() -> None:
+    board, view = Board.parse("charuco:7x5:20"), replace(SMALL, hide=(-30, -30, 45, 90))
+    detection = detect(board, view.render(board))
+    assert 8 <= len(detection.ids) < len(board.points)
+    assert rms(detection.pixels - view.truth(board)[detection.ids]) < 0.1
+    mask = board_mask(board, detection, (300, 400))
+    whole = board_mask(board, detect(board, SMALL.render(board)), (300, 400))
+    assert np.count_nonzero(mask != whole) < 0.01 * np.count_nonzero(whole)
+
+
+def test_too_few_charuco_corners_are_refused() -> None:
+    board = Board.parse("charuco:7x5:20")
+    with pytest.raises(DetectionError, match=r"of 24 corners and \d+ of 17 markers .* found, and a pose needs 8"):
+        detect(board, replace(SMALL, hide=(-30, -30, 90, 90)).render(board))
+
+
+def test_another_dictionary_is_not_found() -> None:
+    image = SMALL.render(Board.parse("charuco:7x5:20:15:DICT_4X4_50"))
+    with pytest.raises(DetectionError, match="0 of 24 corners"):
+        detect(Board.parse("charuco:7x5:20"), image)
+
+
+def test_a_grid_with_a_misplaced_or_mirrored_feature_is_refused() -> None:
+    truth = replace(SMALL, tilt=30, k1=-0.3).truth(CHESSBOARD)
+    ids = np.arange(len(truth))
+    check_grid(CHESSBOARD, truth, ids, "corners")
+    off = truth.copy()
+    off[20] += (5.0, 0.0)
+    with pytest.raises(DetectionError, match="do not fit the grid"):
+        check_grid(CHESSBOARD, off, ids, "corners")
+    swapped = truth.copy()
+    swapped[[20, 21]] = swapped[[21, 20]]
+    with pytest.raises(DetectionError):
+        check_grid(CHESSBOARD, swapped, ids, "corners")
+    with pytest.raises(DetectionError, match="mirrored"):
+        check_grid(CHESSBOARD, truth * (-1, 1), ids, "corners")
+    with pytest.raises(DetectionError, match="one line"):
+        check_grid(CHESSBOARD, truth[:8], ids[:8], "corners")
