@@ -344,6 +344,22 @@ def _inspect(session: Positional[Path]) -> None:
     print(inspect(session))
 
 
+@_deferred
+def _bench(calibration: bool = False, scale: float = 1.0, json: Path | None = None) -> None:
+    """Time the main stages on this machine, beside what they cannot beat.
+
+    Args:
+        calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full size).
+        scale: Resolution of the camera, as a share of 1600x1200.
+        json: Write the figures to this file too.
+    """
+    from slviewer.workflow import bench
+
+    result = bench(calibration=calibration, scale=scale, progress=_progress)
+    _write_json(json, result.to_json())
+    print(result.text())
+
+
 def _union(commands: dict[str, Callable[..., Any]]) -> Any:
     choices = [Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)] for name, f in commands.items()]
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
@@ -385,6 +401,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "target": _target,
     "report": _report,
     "inspect": _inspect,
+    "bench": _bench,
 }
 
 

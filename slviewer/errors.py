@@ -10,6 +10,12 @@ class SlviewerError(Exception):
     exit_status = 1
 
 
+class UsageError(SlviewerError):
+    """A command that was not told what it needs."""
+
+    exit_status = 2
+
+
 class InputError(SlviewerError):
     """Frames, files or settings that cannot be used as they are."""
 

@@ -21,6 +21,7 @@ _HOMES = {
     "target": "printing",
     "report": "reporting",
     "inspect": "inspecting",
+    "bench": "benchmarking",
 }
 
 __all__ = list(_HOMES)

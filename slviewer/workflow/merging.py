@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from slviewer.errors import InputError
+from slviewer.errors import UsageError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.ply import write_ply
 from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_phases
@@ -62,7 +62,7 @@ def merge(
     """Reconstruct scans, register each to ``reference`` by point-to-plane ICP, and write them as one PLY."""
     names = list(dict.fromkeys([*captures, reference]))
     if len(names) < 2:
-        raise InputError(f"only {reference} was named: name the scans to merge with it")
+        raise UsageError(f"only {reference} was named: name the scans to merge with it")
     with Session.open(session) as store:
         fitted = load_model(store, model or best(store))
         warn_if_stale(store, warn)

@@ -55,7 +55,7 @@ def _data(store: Session) -> SessionData:
     if stereo is not None and "pixelwise" in available(store):
         model = load_model(store, "pixelwise")
         assert isinstance(model, PixelwiseModel)
-        fits = [_pixel_fit(model, stereo, observations, axis) for axis in model.fits]
+        fits = [PixelFitView(axis, fit.rms_mm, fit.poses) for axis, fit in model.fits.items()]
     excluded = store.excluded()
     return SessionData(
         name=store.folder.name,
@@ -115,26 +115,6 @@ def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str,
 
 def _parameters(lens: Lens, sigma: float) -> DeviceParameters:
     return DeviceParameters(lens.K, lens.D, lens.size, sigma)
-
-
-def _pixel_fit(
-    model: PixelwiseModel, stereo: StereoModel, observations: Mapping[str, Observation], axis: Axis
-) -> PixelFitView:
-    fit = model.fits[axis]
-    return PixelFitView(axis, fit.rms_mm, fit.poses, _middle_curve(model, stereo, observations, axis))
-
-
-def _middle_curve(
-    model: PixelwiseModel, stereo: StereoModel, observations: Mapping[str, Observation], axis: Axis
-) -> PixelCurve | None:
-    """The curves of a pixel that saw as many poses as any, nearest to the middle of the image."""
-    fit = model.fits[axis]
-    v, u = np.nonzero((fit.poses == fit.poses.max()) & np.isfinite(fit.coefficients[0]))
-    if not len(v):
-        return None
-    height, width = fit.poses.shape
-    k = int(np.argmin((v - height / 2) ** 2 + (u - width / 2) ** 2))
-    return curve_at((int(u[k]), int(v[k])), model, stereo, list(observations.values()), axis)
 
 
 def curve_at(

@@ -117,7 +117,7 @@ def reproduce(
 ) -> Reproduction:
     """Simulate, calibrate, verify planes and spheres, merge the object, and write ``report.html`` into ``out``.
 
-    ``quick`` halves the camera's resolution. The session stays in ``out/session`` and is used again by the next run with
+    ``quick`` halves the camera's resolution. The session stays in ``out/session``, and serves the next run with
     the same settings.
     """
     from slviewer.workflow.reproduction_report import write_reproduction

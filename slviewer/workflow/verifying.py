@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slviewer.errors import InputError
+from slviewer.errors import InputError, UsageError
 from slviewer.evaluation.compare import Comparison, compare
 from slviewer.fringe.sequence import Axis
 from slviewer.session.store import Session
@@ -52,11 +52,11 @@ def verify(
     roughly, helps to find a sphere; the fitted radius stays free, as in the Letter's Table 2.
     """
     if not captures:
-        raise InputError("no capture named: give the captures to measure, for instance plane_01 plane_02")
+        raise UsageError("no capture named: give the captures to measure, for instance plane_01 plane_02")
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
-        raise InputError(f"the range {depth_range[0]:g} {depth_range[1]:g} is empty: give near and far in mm")
+        raise UsageError(f"the range {depth_range[0]:g} {depth_range[1]:g} is empty: give near and far in mm")
     if radius is not None and not radius > 0:
-        raise InputError(f"a radius of {radius:g} mm is not possible: give a positive one")
+        raise UsageError(f"a radius of {radius:g} mm is not possible: give a positive one")
     results: dict[str, Comparison] = {}
     with Session.open(session) as store:
         chosen = load_models(store, models)

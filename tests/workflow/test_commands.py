@@ -1,0 +1,163 @@
+"""Every command of the command line, on a small simulated rig: from nothing to a merged cloud."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from slviewer.cli import main
+from slviewer.session.store import Session
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated") / "session"
+    assert main(["simulate", str(folder), "--scale", "0.3", "--poses", "9"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibrated(session: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
+    out = tmp_path_factory.mktemp("json") / "calibration.json"
+    assert main(["calibrate", str(session), "--target", "circles:21x16:9", "--json", str(out)]) == 0
+    return json.loads(out.read_text())
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def command(*arguments: object) -> tuple[int, str, str]:
+        status = main([str(a) for a in arguments])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return command
+
+
+def test_calibrate_reports_what_its_contract_says(calibrated: dict) -> None:
+    stereo = calibrated["models"]["stereo"]
+    assert set(stereo) >= {"reprojection_rms_px", "K_camera", "D_camera", "K_projector", "D_projector", "R", "T"}
+    assert 0.01 < stereo["reprojection_rms_px"]["stereo"] < 0.3
+    assert np.linalg.norm(stereo["T"]) == pytest.approx(180, abs=1.5)
+    assert stereo["K_projector"][1][1] / stereo["K_projector"][0][0] == pytest.approx(2, abs=0.02)
+    assert set(calibrated["models"]["pixelwise"]["fit_rms_mm"]) == {"z", "x", "y"}
+    assert len(calibrated["poses_used"]) == 9 and calibrated["poses_left_out"] == {}
+
+
+def test_verify_a_plane_inside_and_a_sphere(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "planes.json"
+    status, text, _ = run(
+        "verify", session, "plane_03", "plane_07", "--shape", "plane", "--range", 500, 700, "--json", out
+    )
+    assert status == 0 and "plane_03" in text
+    captures = json.loads(out.read_text())["captures"]
+    inside = captures["plane_03"]
+    assert inside["incidence"]["R2"] == pytest.approx(100)
+    assert captures["plane_07"]["incidence"]["R3"] == pytest.approx(100)
+    stereo, pixelwise = inside["models"]["stereo"], inside["models"]["pixelwise"]
+    assert pixelwise["noise_floor_mm"] < pixelwise["rms_mm"] < stereo["rms_mm"] < 0.5
+    assert stereo["coverage"] > 0.97 and stereo["set_aside"] < 0.02 * stereo["points"]
+    status, text, _ = run("verify", session, "sphere_3", "--shape", "sphere", "--model", "stereo", "--json", out)
+    sphere = json.loads(out.read_text())["captures"]["sphere_3"]["models"]
+    assert list(sphere) == ["stereo"] and 97.0 < sphere["stereo"]["radius_mm"] < 99.0
+
+
+def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    ply, grid = tmp_path / "board.ply", tmp_path / "board.npy"
+    status, text, _ = run("reconstruct", session, "pose_01", "--out", ply, "--grid", grid)
+    assert status == 0 and "axis x" in text and "coverage" in text and "stereo" in text and "pixelwise" in text
+    points = np.load(grid)
+    assert points.shape == (360, 480, 3) and points.dtype == np.float32
+    cloud = trimesh.load(ply)
+    assert 1000 < len(cloud.vertices) <= np.isfinite(points[..., 2]).sum()
+    status, text, _ = run("reconstruct", session, "object_r2", "--model", "stereo", "--axis", "x")
+    assert status == 0 and (session / "exports" / "object_r2_stereo.ply").exists()
+    status, _, error = run("reconstruct", session, "object_r2", "--axis", "y")
+    assert status == 1 and "axis" in error
+
+
+def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    ply, out = tmp_path / "merged.ply", tmp_path / "merge.json"
+    status, _, _ = run(
+        "merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--out", ply, "--json", out
+    )
+    assert status == 0
+    pairs = json.loads(out.read_text())["pairs"]
+    assert set(pairs) == {"object_r1", "object_r2"}
+    for pair in pairs.values():
+        assert 0.01 < pair["rms_mm"] < 0.5 and 0.5 < pair["overlap"] <= 1
+        assert np.shape(pair["T_reference_scan"]) == (4, 4)
+    assert len(trimesh.load(ply).vertices) > 10_000
+
+
+def test_report_and_inspect(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    assert run("report", session, "--out", page)[0] == 0
+    html = page.read_text()
+    assert "pose_01" in html and 'src="http' not in html
+    status, text, _ = run("inspect", session)
+    assert status == 0 and "44" not in text.splitlines()[0] and "calibration pixelwise: from 9 poses, fresh" in text
+
+
+def test_an_excluded_pose_is_left_out_and_named(calibrated: dict, session: Path, run: Run) -> None:
+    with Session.open(session, write=True) as store:
+        store.exclude("pose_02", "blurred")
+    try:
+        status, text, _ = run("calibrate", session, "--target", "circles:21x16:9", "--models", "stereo")
+        assert status == 0 and "pose_02: excluded by the operator: blurred" in text
+    finally:
+        with Session.open(session, write=True) as store:
+            store.include("pose_02")
+        run("calibrate", session, "--target", "circles:21x16:9")
+
+
+def test_patterns_come_back_as_the_columns_themselves(run: Run, tmp_path: Path) -> None:
+    folder, session = tmp_path / "patterns", tmp_path / "session"
+    assert run("patterns", "--preset", "p18", "--projector", "160x120", "--out", folder)[0] == 0
+    toml = next(folder.glob("*.toml"))
+    assert run("import", "frames", folder, session, "--sequence", toml, "--role", "scan")[0] == 0
+    with Session.open(session) as store:
+        from slviewer.workflow.decoding import decode_capture
+
+        phases = decode_capture(store.load_capture("patterns"))
+    assert np.nanmax(np.abs(phases["x"].coordinate - np.arange(160))) < 0.05
+    assert np.nanmax(np.abs(phases["y"].coordinate - np.arange(120)[:, None])) < 0.05
+
+
+def test_target_draws_a_sheet(run: Run, tmp_path: Path) -> None:
+    assert run("target", "circles:21x16:9", "--out", tmp_path / "board.pdf")[0] == 0
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+    status, _, error = run("target", "circles:21by16", "--out", tmp_path / "board.pdf")
+    assert status == 1 and "circles:21x16:9" in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "says"),
+    [
+        (["calibrate", "nowhere", "--target", "circles:21x16:9"], 1, "session"),
+        (["calibrate"], 2, ""),
+        (["reconstruct", "SESSION", "pose_99"], 1, "pose_99"),
+        (["verify", "SESSION", "--shape", "plane"], 2, "capture"),
+        (["calibrate", "SESSION", "--target", "chessboard:9x7:30"], 3, "usable pose"),
+        (["simulate", "SESSION"], 1, "session already"),
+        (["import", "p18", "SESSION", "SESSION"], 1, "captures"),
+    ],
+)
+def test_bad_input_ends_in_one_sentence(
+    session: Path,
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    status: int,
+    says: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = sorted(p.name for p in (session / "captures").iterdir())
+    got, out, error = run(*[session if a == "SESSION" else a for a in arguments])
+    assert got == status and says in error and "Traceback" not in error and out == ""
+    assert sorted(p.name for p in (session / "captures").iterdir()) == before
