@@ -18,7 +18,7 @@ Region = Literal["R1", "R2", "R3"]
 
 @dataclass(frozen=True)
 class PlaneRow:
-    """A flat board at one pose. ``incidence`` is its share in R1, R2 and R3 in percent; ``letter_*`` the Letter's own."""
+    """A flat board at one pose. ``incidence``: its share in R1, R2 and R3, percent; ``letter_*``: the Letter's own."""
 
     name: str
     incidence: Mapping[str, float]
@@ -203,7 +203,6 @@ class PixelFitView:
     axis: str
     rms_mm: np.ndarray
     poses: np.ndarray
-    curve: PixelCurve | None = None
 
 
 @dataclass(frozen=True, eq=False)

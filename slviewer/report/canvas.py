@@ -1,0 +1,164 @@
+"""What all figures share: a canvas without global state, the palette, and images made small enough for a page.
+
+matplotlib is used through its objects alone (no pyplot, no rcParams), so that reports may be written by any thread.
+"""
+
+import io
+import threading
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.report.page import Figure
+
+FULL = 1080
+"""CSS px: a figure as wide as the page's text column."""
+HALF = 528
+"""CSS px: two figures side by side."""
+DENSITY = 2
+"""Device pixels drawn for each CSS px."""
+
+INK, SOFT, RULE, EMPTY = "#1b2733", "#5a6877", "#e3e8ed", "#d5d9de"
+MODELS = {"stereo": "#d9692b", "pixelwise": "#2270b8", "splined": "#1f9673"}
+REGIONS = {"R1": "#7b5cc4", "R2": "#4f6375", "R3": "#b8436d"}
+BAND = "#e8eef4"
+_OTHERS = ("#8a6d3b", "#6f7d8c", "#a04f9e")
+TEXT_PT, SMALL_PT, TITLE_PT = 9.0, 8.2, 10.0
+
+# Agg's text layout shares one font cache
+_drawing = threading.Lock()
+
+
+def model_colour(model: str) -> str:
+    """The colour that stands for a model in every figure."""
+    return MODELS.get(model) or _OTHERS[sum(model.encode()) % len(_OTHERS)]
+
+
+def new_figure(width: int, height: int) -> Any:
+    """A matplotlib figure of ``width`` x ``height`` CSS px."""
+    from matplotlib.figure import Figure as Drawing
+
+    return Drawing(figsize=(width / 100, height / 100), dpi=100 * DENSITY, facecolor="white", layout="constrained")
+
+
+def finish(drawing: Any, caption: str, alt: str) -> Figure:
+    """Draw, and make it a report's figure: a PNG of 256 colours, less than half the size of full colour."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    with _drawing:
+        canvas = FigureCanvasAgg(drawing)
+        canvas.draw()
+        rgb = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    buffer = io.BytesIO()
+    _indexed(rgb).save(buffer, format="PNG", compress_level=7)
+    return Figure(buffer.getvalue(), caption, alt, rgb.shape[1] // DENSITY)
+
+
+def _indexed(rgb: np.ndarray) -> Any:
+    """A picture (h, w, 3) uint8 in 256 colours.
+
+    128 are its most frequent colours as they are, so that legends, titles and colour bars stay true; 128 lie between
+    the rest. Every pixel takes the nearest (Pillow's own search for it is coarse, and turns white to grey).
+    """
+    from PIL import Image
+
+    packed = rgb.astype(np.uint32) @ np.array([65536, 256, 1], np.uint32)
+    sparse = packed[::2, ::2]
+    colours, counts = np.unique(sparse, return_counts=True)
+    frequent = colours[np.argpartition(counts, -min(128, len(counts)))[-128:]]
+    palette = _unpacked(frequent)
+    rest = sparse[~np.isin(sparse, frequent)]
+    if rest.size:
+        image = Image.fromarray(_unpacked(rest)[None]).quantize(128, method=Image.Quantize.MEDIANCUT)
+        between = np.frombuffer(bytes(image.getpalette() or b""), np.uint8).reshape(-1, 3)
+        palette = np.concatenate([palette, between])[:256]
+
+    seen = np.zeros(1 << 24, bool)
+    seen[packed] = True
+    present = np.flatnonzero(seen)
+    index = np.zeros(1 << 24, np.uint8)
+    entries = palette.astype(np.float32)
+    for some in np.array_split(present, 1 + len(present) // 20_000):
+        away = np.sum(entries**2, axis=1) - 2 * _unpacked(some).astype(np.float32) @ entries.T
+        index[some] = away.argmin(axis=1)
+    image = Image.fromarray(index[packed], mode="P")
+    image.putpalette(palette.tobytes())
+    return image
+
+
+def _unpacked(colours: np.ndarray) -> np.ndarray:
+    return np.stack([colours >> 16, colours >> 8 & 255, colours & 255], axis=-1).astype(np.uint8)
+
+
+def tidy(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK) -> None:
+    """Quiet axes: a light grid, two spines, labels in the page's sizes; ``x`` and ``y`` name quantity and unit."""
+    axes.set_title(title, fontsize=TITLE_PT, color=colour, loc="left", fontweight="bold", pad=7)
+    axes.set_xlabel(x, fontsize=TEXT_PT, color=SOFT)
+    axes.set_ylabel(y, fontsize=TEXT_PT, color=SOFT)
+    axes.tick_params(labelsize=SMALL_PT, colors=SOFT, length=3, width=0.7)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color("#b9c2cb")
+        spine.set_linewidth(0.8)
+    if grid:
+        axes.grid(True, color=RULE, linewidth=0.7)
+        axes.set_axisbelow(True)
+
+
+def bare(axes: Any, title: str = "", colour: str = INK) -> None:
+    """Axes of an image: a title and nothing else."""
+    tidy(axes, title, grid=False, colour=colour)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def legend(axes: Any, **options: Any) -> None:
+    """The legend of what the axes hold, in the page's type."""
+    axes.legend(**{"fontsize": SMALL_PT, "labelcolor": INK, "frameon": False, **options})
+
+
+def colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) -> None:
+    """A colour bar beside ``axes``, in the page's type."""
+    bar = drawing.colorbar(image, ax=axes, **{"shrink": 0.9, "aspect": 24, "pad": 0.02, **options})
+    bar.ax.tick_params(labelsize=SMALL_PT, colors=SOFT, length=3, width=0.7)
+    bar.set_label(label, fontsize=TEXT_PT, color=SOFT)
+    bar.outline.set_visible(False)
+
+
+def shrink(image: np.ndarray, width: int) -> np.ndarray:
+    """(h, w) float averaged over squares of whole pixels until it is at most ``width`` wide.
+
+    A square is NaN where fewer than half of its pixels are finite.
+    """
+    if image.ndim != 2:
+        raise InputError(f"an image of shape {image.shape} cannot be drawn as a map: (h, w) is needed")
+    factor = -(-image.shape[1] // width)
+    if factor <= 1:
+        return image
+    h, w = (-(-size // factor) for size in image.shape)
+    padded = np.full((h * factor, w * factor), np.nan, np.float32)
+    padded[: image.shape[0], : image.shape[1]] = image
+    finite = np.isfinite(padded)
+    share = cv2.resize(finite.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(np.where(finite, padded, np.float32(0)), (w, h), interpolation=cv2.INTER_AREA)
+    out = np.full((h, w), np.nan, np.float32)
+    np.divide(mean, share, out=out, where=share > 0.499)
+    return out
+
+
+def rounded_up(value: float) -> float:
+    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten; 1 for nothing finite above zero."""
+    if not (np.isfinite(value) and value > 0):
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(s for s in (1, 1.5, 2, 3, 4, 5, 6, 8, 10, 15) if s * power >= value * (1 - 1e-9)) * power)
+
+
+def percentile(values: np.ndarray, share: float) -> float:
+    """A percentile of the finite values; NaN where there is none."""
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, share)) if finite.size else float("nan")

@@ -1,0 +1,125 @@
+"""Shaded views of scans and of what they were merged to."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from slviewer.report.canvas import DENSITY, FULL, HALF, INK, TEXT_PT, bare, colour_bar, finish, legend, new_figure
+from slviewer.report.data import CloudView
+from slviewer.report.page import Figure
+from slviewer.report.shaded import render, view_rotation
+
+YAW_DEG, PITCH_DEG = 24.0, 18.0
+SCANS = ("#5b8fd0", "#e0a13c", "#63b28a", "#c8718f", "#8f83c9")
+CLAY = (0.80, 0.79, 0.77)
+MOST_POINTS = 450_000
+"""Points drawn of one cloud: more change nothing at the size of a page."""
+
+
+SQUARES, FINER = 14, 8
+"""Squares across a chequered view, and how much finer it is told which scans measured there."""
+
+
+def clouds(views: Sequence[CloudView]) -> Figure:
+    """The scans side by side, each coloured by its own depth."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
+    columns = min(len(views), 3)
+    rows = -(-len(views) // columns)
+    width = FULL // 3 if columns > 1 else 760
+    picture = (0.76 * width, 0.66 * width)
+    drawing = new_figure(columns * width, rows * round(picture[1] + 62))
+    axes = drawing.subplots(rows, columns, squeeze=False).ravel()
+    size = (round(DENSITY * picture[0]), round(DENSITY * picture[1]))
+    palette = ListedColormap(colormaps["YlGnBu_r"](np.linspace(0.18, 0.92, 256)))
+    for ax, view in zip(axes, views, strict=False):
+        points, normals, _ = _sampled(view)
+        z = points[:, 2]
+        near, far = (np.percentile(z, [1, 99]) if len(z) else (0.0, 1.0)) + np.array([-1e-3, 1e-3])
+        shades = palette(np.clip((z - near) / (far - near), 0, 1))[:, :3]
+        picture = render(points, normals, shades, size, view_rotation(YAW_DEG, PITCH_DEG))
+        bare(ax, view.name)
+        ax.imshow(picture)
+        ax.set_xlabel(_counted(view), fontsize=TEXT_PT, color=INK, loc="left")
+        colour_bar(drawing, ScalarMappable(Normalize(near, far), palette), ax, "z, mm", shrink=0.7, aspect=20)
+    for ax in axes[len(views) :]:
+        ax.set_axis_off()
+    return finish(
+        drawing,
+        "Each scan as measured, seen from above and aside, lit by its own surface normals and coloured by depth.",
+        "Shaded views of " + ", ".join(f"{view.name} ({_counted(view)})" for view in views),
+    )
+
+
+def merged_cloud(view: CloudView) -> Figure:
+    """The merged cloud: lit as one surface, and coloured by the scan that each point comes from."""
+    points, normals, source = _sampled(view)
+    size = (2 * HALF - 40, 2 * HALF - 240)
+    rotation = view_rotation(YAW_DEG, PITCH_DEG)
+    drawing = new_figure(FULL, HALF - 40)
+    left, right = drawing.subplots(1, 2)
+    bare(left, "as one surface")
+    left.imshow(render(points, normals, np.broadcast_to(CLAY, points.shape), size, rotation))
+    left.set_xlabel(_counted(view), fontsize=TEXT_PT, color=INK, loc="left")
+    bare(right, "by scan, in turns")
+    palette = np.array([_rgb(colour) for colour in SCANS])
+    shown = _mosaic(points, source) if len(points) else np.arange(0)
+    points, normals, source = points[shown], normals[shown], source[shown]
+    right.imshow(render(points, normals, palette[source % len(SCANS)], size, rotation))
+    for i, name in enumerate(view.names):
+        right.plot([], [], "s", color=SCANS[i % len(SCANS)], markersize=8, label=name)
+    legend(right, loc="upper left", bbox_to_anchor=(0, 0), ncols=max(len(view.names), 1), handletextpad=0.2)
+    return finish(
+        drawing,
+        "The merged cloud in the reference scan's frame. Right: each square shows the points of one scan alone, so "
+        "that a step where squares meet would be a misalignment.",
+        f"Shaded views of the merged cloud, {_counted(view)}, as one surface and coloured by scan",
+    )
+
+
+def _sampled(view: CloudView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals and source (n,) of at most MOST_POINTS measured points, evenly thinned."""
+    from slviewer.reconstruction.reconstruct import normals as grid_normals
+
+    points, normals = view.points, view.normals
+    if points.ndim == 3:
+        step = max(1, int(np.ceil(np.sqrt(np.isfinite(points[..., 2]).sum() / MOST_POINTS))))
+        points = np.ascontiguousarray(points[::step, ::step], np.float32)
+        normals = grid_normals(points) if normals is None else normals[::step, ::step]
+        points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
+        source = np.zeros(len(points), np.intp)
+    else:
+        step = max(1, -(-len(points) // MOST_POINTS))
+        points = points[::step]
+        normals = np.full(points.shape, np.nan) if normals is None else normals[::step]
+        source = np.zeros(len(points), np.intp) if view.source is None else view.source[::step].astype(np.intp)
+    known = np.isfinite(points).all(axis=1)
+    return points[known], normals[known], source[known]
+
+
+def _mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Indices of the points that a chequered view shows: in each square of x and y those of one scan alone.
+
+    The scans take turns from square to square, among those that measured there (told in finer squares).
+    """
+    low, high = np.percentile(points[:, :2], [0.5, 99.5], axis=0)
+    fine = float(np.max(high - low)) / (SQUARES * FINER)
+    at = np.clip(((points[:, :2] - low) / fine).astype(np.intp), 0, SQUARES * FINER + FINER)
+    place = at[:, 1] * (at[:, 0].max() + 1) + at[:, 0]
+    scans = int(source.max()) + 1
+    present = np.zeros((int(place.max()) + 1, scans), bool)
+    present[place, source] = True
+    turn = (at // FINER).sum(axis=1) % np.maximum(present[place].sum(axis=1), 1)
+    rank = np.cumsum(present, axis=1) - 1  # the how-manieth of the scans that are present each one is
+    return np.flatnonzero(rank[place, source] == turn)
+
+
+def _counted(view: CloudView) -> str:
+    count = int(np.isfinite(view.points[..., 2]).sum())
+    return f"{count:,} points" + (f"; {view.note}" if view.note else "")
+
+
+def _rgb(colour: str) -> tuple[float, ...]:
+    return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))

@@ -1,0 +1,62 @@
+"""The Letter's picture of one pixel: z over phase, x and y over z, and what the fits leave over."""
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.report.canvas import FULL, INK, MODELS, SOFT, finish, legend, new_figure, tidy
+from slviewer.report.data import PixelCurve
+from slviewer.report.page import Figure
+
+DATA = "#c2502e"
+
+
+def pixel_curves(curve: PixelCurve) -> Figure:
+    """The rational function and the two lines of one camera pixel with their data, residuals in um below."""
+    n = len(curve.phase)
+    if any(np.shape(v) != (n,) for v in (curve.z, curve.x, curve.y)) or np.shape(curve.coefficients) != (5,):
+        raise InputError(
+            f"pixel {curve.pixel} has {n} phases, and depths {np.shape(curve.z)}, x {np.shape(curve.x)}, "
+            f"y {np.shape(curve.y)} with coefficients {np.shape(curve.coefficients)}: (n,) each and (5,) are needed"
+        )
+    known = np.isfinite([curve.phase, curve.z, curve.x, curve.y]).all(axis=0)
+    phase, z, x, y = (np.asarray(v, float)[known] for v in (curve.phase, curve.z, curve.x, curve.y))
+    c0, c1, c2, c3, c4 = curve.coefficients
+
+    def depth(at: np.ndarray) -> np.ndarray:
+        return (c0 + c1 * at) / (1 + c2 * at)
+
+    panels = (
+        ("z over phase (eq. 9)", "absolute phase, rad", "z", phase, z, depth),
+        ("x over z (eq. 10)", "z, mm", "x", z, x, lambda at: c3 * at),
+        ("y over z (eq. 11)", "z, mm", "y", z, y, lambda at: c4 * at),
+    )
+    drawing = new_figure(FULL, 400)
+    grid = drawing.add_gridspec(2, 3, height_ratios=(3, 1.15))
+    for i, ((title, along, name, at, value, fitted), rms) in enumerate(zip(panels, curve.rms_mm, strict=True)):
+        upper = drawing.add_subplot(grid[0, i])
+        lower = drawing.add_subplot(grid[1, i], sharex=upper)
+        tidy(upper, title, "", f"{name}, mm")
+        tidy(lower, "", along, f"{name} - fit, µm")
+        upper.tick_params(labelbottom=False)
+        if at.size:
+            margin = 0.06 * (np.ptp(at) or 1.0)
+            line = np.linspace(at.min() - margin, at.max() + margin, 200)
+            upper.plot(line, fitted(line), color=MODELS["pixelwise"], linewidth=1.5, label="fit")
+            upper.plot(at, value, "o", color=DATA, markersize=4.2, markeredgewidth=0, alpha=0.85, label="target poses")
+            residuals = 1e3 * (value - fitted(at))
+            lower.vlines(at, 0, residuals, color=DATA, linewidth=0.9, alpha=0.6)
+            lower.plot(at, residuals, "o", color=DATA, markersize=3.4, markeredgewidth=0)
+            reach = 1.25 * max(float(np.abs(residuals).max()), 1.0)
+            lower.set_ylim(-reach, reach)
+            legend(upper, loc="best", title=f"RMS {1e3 * rms:.0f} µm", title_fontsize=8.6, alignment="left")
+            upper.get_legend().get_title().set_color(INK)
+        lower.axhline(0, color=SOFT, linewidth=0.8)
+    u, v = curve.pixel
+    said = ", ".join(f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True))
+    return finish(
+        drawing,
+        f"What camera pixel ({u}, {v}) learnt from {at.size} target poses: z as a rational function of the absolute "
+        f"phase of axis {curve.axis}, x and y as lines through the camera's centre. Below: what the fits leave over "
+        f"(RMS {said}).",
+        f"Curves of z over phase, x over z and y over z at camera pixel ({u}, {v}) with data and residuals; RMS {said}",
+    )

@@ -1,0 +1,183 @@
+"""Pictures of what is known of each camera pixel: RMS of its fit, error of its point."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.report.canvas import (
+    DENSITY,
+    EMPTY,
+    FULL,
+    INK,
+    SOFT,
+    TITLE_PT,
+    bare,
+    colour_bar,
+    finish,
+    legend,
+    model_colour,
+    new_figure,
+    percentile,
+    rounded_up,
+    shrink,
+    tidy,
+)
+from slviewer.report.page import Figure
+
+TITLE_PX = 34
+BINS = 121
+
+
+def rms_maps(rms_mm: np.ndarray, axis: str = "") -> Figure:
+    """The RMS of each pixel's fit (3, h, w) mm in z, x, y; grey where a pixel was not fitted."""
+    if rms_mm.ndim != 3 or rms_mm.shape[0] != 3:
+        raise InputError(f"RMS maps of shape {rms_mm.shape} cannot be drawn: (3, h, w) in z, x, y is needed")
+    _, h, w = rms_mm.shape
+    drawing = new_figure(FULL, round(FULL / 3 * 0.84 * h / w) + TITLE_PX + 16)
+    medians = [percentile(rms, 50) for rms in rms_mm]
+    for axes, name, rms, median in zip(drawing.subplots(1, 3), "zxy", rms_mm, medians, strict=True):
+        top = rounded_up(percentile(rms, 99))
+        bare(axes, f"{name}: median {median:.3f} mm")
+        image = axes.imshow(
+            _shown(rms, FULL // 3), cmap=_map("viridis", 100), vmin=0, vmax=top, aspect="equal", interpolation="nearest"
+        )
+        colour_bar(drawing, image, axes, "RMS of the fit, mm", extend="max")
+    named = f" along axis {axis}" if axis else ""
+    return finish(
+        drawing,
+        f"RMS of each camera pixel's fit over the target poses{named}, in z, x and y. Each colour scale ends at the "
+        "99th percentile; grey pixels saw the board too rarely to be fitted.",
+        "Three maps of the fit's RMS in z, x and y; medians "
+        + ", ".join(f"{name} {median:.3f} mm" for name, median in zip("zxy", medians, strict=True)),
+    )
+
+
+def error_maps(
+    title: str,
+    maps: Mapping[str, np.ndarray],
+    rms_mm: Mapping[str, float],
+    floor_mm: float = float("nan"),
+    *,
+    limit_mm: float | None = None,
+    width: int = FULL,
+    sign: str = "red is towards the camera",
+) -> Figure:
+    """Signed errors (h, w) mm of each model on one colour scale, cropped to the data, and their histograms.
+
+    ``limit_mm`` ends the scale on either side (by default where 99 % of all errors lie within). A narrow figure has
+    the histogram below the maps.
+    """
+    if not maps or len({m.shape for m in maps.values()}) != 1:
+        raise InputError(f"the error maps of '{title}' differ in size, or there are none: give each model's, one size")
+    rows, columns = _box(list(maps.values()))
+    cropped = {model: errors[rows, columns] for model, errors in maps.items()}
+    limit = limit_mm or error_limit(list(cropped.values()))
+    h, w = next(iter(cropped.values())).shape
+    drawing, axes, histogram, map_width = _layout(width, len(maps), h / w)
+    drawing.suptitle(title, x=0.004, ha="left", fontsize=TITLE_PT + 1.5, color=INK, fontweight="bold")
+    image = None
+    for ax, (model, errors) in zip(axes, cropped.items(), strict=True):
+        bare(ax, f"{model}: RMS {rms_mm[model]:.3f} mm", model_colour(model))
+        image = ax.imshow(
+            _shown(errors, map_width),
+            cmap=_map("RdBu_r", 101),
+            vmin=-limit,
+            vmax=limit,
+            aspect="equal",
+            interpolation="nearest",
+        )
+    colour_bar(drawing, image, axes, "error, mm", extend="both")
+    _histogram(histogram, cropped, rms_mm, floor_mm, limit)
+    said = ", ".join(f"{model} {rms_mm[model]:.3f} mm" for model in maps)
+    return finish(
+        drawing,
+        f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus the RMS"
+        f"{_floor_words(floor_mm)}.",
+        f"Error maps and histograms of {title}; RMS {said}",
+    )
+
+
+def error_limit(maps: list[np.ndarray]) -> float:
+    """Where a symmetric colour scale for all of ``maps`` ends, mm: 99 % of the errors lie within."""
+    samples = [m.ravel()[:: max(1, m.size // 300_000)] for m in maps]
+    return rounded_up(percentile(np.abs(np.concatenate(samples)), 99))
+
+
+def _layout(width: int, count: int, aspect: float) -> tuple[Any, Any, Any, int]:
+    """Figure, the maps' axes, the histogram's, and the width of one map in CSS px."""
+    if width < 800:
+        map_width = int((width - 70) / count)
+        map_height = int(map_width * min(aspect, 1.4))
+        drawing = new_figure(width, map_height + 2 * TITLE_PX + 120)
+        grid = drawing.add_gridspec(2, count, height_ratios=(map_height, 120))
+        return (
+            drawing,
+            [drawing.add_subplot(grid[0, i]) for i in range(count)],
+            drawing.add_subplot(grid[1, :]),
+            map_width,
+        )
+    map_width = int((width - 90) / (count + 1.1))
+    map_height = int(np.clip(map_width * aspect, 200, 460))
+    drawing = new_figure(width, map_height + 2 * TITLE_PX + 8)
+    grid = drawing.add_gridspec(1, count + 1, width_ratios=(*(1.0,) * count, 1.1))
+    return (
+        drawing,
+        [drawing.add_subplot(grid[0, i]) for i in range(count)],
+        drawing.add_subplot(grid[0, count]),
+        map_width,
+    )
+
+
+def _histogram(
+    axes: Any, maps: Mapping[str, np.ndarray], rms_mm: Mapping[str, float], floor_mm: float, limit: float
+) -> None:
+    reach = 1.25 * limit
+    edges = np.linspace(-reach, reach, BINS)
+    centres = (edges[1:] + edges[:-1]) / 2
+    tidy(axes, "", "error, mm", "share of points")
+    for model, errors in maps.items():
+        finite = errors[np.isfinite(errors)]
+        counts, _ = np.histogram(finite, BINS - 1, (-reach, reach))
+        density = counts / max(finite.size, 1) / (edges[1] - edges[0])
+        colour = model_colour(model)
+        axes.fill_between(centres, density, color=colour, alpha=0.22, linewidth=0)
+        axes.plot(centres, density, color=colour, linewidth=1.4, label=model)
+        for side in (-1, 1):
+            axes.axvline(side * rms_mm[model], color=colour, linewidth=1.1, linestyle=(0, (4, 2)))
+    if np.isfinite(floor_mm) and floor_mm > 0:
+        noise = np.exp(-0.5 * (centres / floor_mm) ** 2) / (floor_mm * np.sqrt(2 * np.pi))
+        axes.plot(centres, noise, color=SOFT, linewidth=1.1, linestyle=":", label="noise alone")
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(bottom=0)
+    axes.set_yticks([])
+    legend(axes, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.3, ncols=4, columnspacing=1.1)
+
+
+def _box(maps: list[np.ndarray]) -> tuple[slice, slice]:
+    """Rows and columns around the finite pixels of any map, with a small margin; everything where there is none."""
+    finite = np.logical_or.reduce([np.isfinite(m) for m in maps])
+    if not finite.any():
+        return slice(None), slice(None)
+    spans = []
+    for along in (1, 0):
+        hit = np.nonzero(finite.any(axis=along))[0]
+        margin = max(2, (hit[-1] - hit[0]) // 50)
+        spans.append(slice(max(hit[0] - margin, 0), hit[-1] + margin + 1))
+    return spans[0], spans[1]
+
+
+def _shown(image: np.ndarray, width: int) -> np.ma.MaskedArray:
+    """As fine as it will be drawn, invalid pixels masked."""
+    return np.ma.masked_invalid(shrink(image, DENSITY * width))
+
+
+def _map(name: str, levels: int) -> Any:
+    from matplotlib import colormaps
+
+    return colormaps[name].resampled(levels).with_extremes(bad=EMPTY)
+
+
+def _floor_words(floor_mm: float) -> str:
+    return f"; dotted: noise alone ({floor_mm:.3f} mm)" if np.isfinite(floor_mm) else ""

@@ -1,0 +1,306 @@
+"""Any session as the sections of a page: what was captured, how it was calibrated, and what that measures."""
+
+import numpy as np
+
+from slviewer.report.clouds import clouds, merged_cloud
+from slviewer.report.data import CalibrationView, DeviceParameters, SessionData, VerificationView
+from slviewer.report.maps import error_maps, rms_maps
+from slviewer.report.page import Cell, Column, Headline, Item, Mark, Notice, Section, Table
+from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
+from slviewer.report.tables import (
+    UNKNOWN,
+    better_worse,
+    incidence_text,
+    merge_table,
+    models_of,
+    number,
+    spacing_table,
+    verdict,
+)
+
+WORST = 2.0
+"""A pose whose reprojection error exceeds the RMS over the poses this many times is marked."""
+SET_ASIDE_PERCENT = 2.0
+"""More points set aside than this, and the RMS does not speak for the shape."""
+
+
+def session_title(data: SessionData) -> tuple[str, str]:
+    """The page's title and the sentence below it."""
+    poses = sum(row.state == "used" for row in data.captures)
+    scans = sum(row.role == "scan" for row in data.captures)
+    return data.name, (
+        f"{_counted(len(data.captures), 'capture')}: {_counted(poses, 'target pose')} used to calibrate, "
+        f"{_counted(scans, 'scan')}."
+    )
+
+
+def session_headlines(data: SessionData) -> list[Headline]:
+    """Poses used, reprojection error, fit, and the best flatness that was proven."""
+    headlines = []
+    calibration = data.calibration
+    if calibration is not None:
+        used = sum(row.state == "used" for row in data.captures)
+        wanted = sum(row.role == "calibration" for row in data.captures)
+        near, far = calibration.depth_range_mm
+        headlines.append(Headline(f"{used} of {wanted}", "target poses used", f"boards at {near:.0f} to {far:.0f} mm"))
+        rms = calibration.reprojection_rms_px
+        if rms:
+            headlines.append(
+                Headline(
+                    f"{rms.get('camera', np.nan):.3f} / {rms.get('projector', np.nan):.3f} px",
+                    "reprojection RMS, camera / projector",
+                    f"both devices together {rms['stereo']:.3f} px" if "stereo" in rms else "",
+                )
+            )
+    if data.pixel_fits:
+        best = min((float(np.nanmedian(fit.rms_mm[0])), fit.axis) for fit in data.pixel_fits)
+        headlines.append(
+            Headline(f"{best[0]:.3f} mm", "pixel-wise fit, RMS in z", f"median over the pixels, axis {best[1]}")
+        )
+    planes = [v for v in data.verifications if v.shape == "plane"]
+    if planes:
+        means = {
+            m: float(np.nanmean([v.rms_mm.get(m, np.nan) for v in planes]))
+            for m in models_of([v.rms_mm for v in planes])
+        }
+        model = min(means, key=lambda m: means[m])
+        others = ", ".join(f"{m} {value:.3f} mm" for m, value in means.items() if m != model)
+        headlines.append(
+            Headline(
+                f"{means[model]:.3f} mm",
+                f"mean plane RMS, {model}",
+                others and f"against {others}",
+                "better" if others else "",
+            )
+        )
+    return headlines
+
+
+def session_sections(data: SessionData) -> list[Section]:
+    """Captures, then whatever of calibration, proofs and clouds the session holds."""
+    sections = [_captures(data)]
+    if data.calibration is not None:
+        sections += [_reprojection(data.calibration), _parameters(data.calibration)]
+    if data.pixel_fits:
+        sections.append(_pixel_fits(data))
+    if data.verifications or data.spacings:
+        sections.append(_verifications(data))
+    if data.clouds or data.merged is not None:
+        sections.append(_clouds(data))
+    return sections
+
+
+def _captures(data: SessionData) -> Section:
+    marks: dict[str, Mark] = {"used": "better", "left out": "worse", "excluded": "worse"}
+    columns = [Column("capture", align="left"), Column("role", align="left"), Column("state", align="left")]
+    columns += [
+        Column("camera", "px"),
+        Column("projector", "px"),
+        Column("frames"),
+        Column("period", "px", align="left"),
+    ]
+    columns += [Column("made", align="left"), Column("why not used", align="left")]
+    rows: list[list[str | Cell]] = [
+        [
+            row.name,
+            row.role,
+            Cell(row.state, marks.get(row.state, "")),
+            f"{row.camera[0]}x{row.camera[1]}",
+            f"{row.projector[0]}x{row.projector[1]}",
+            str(row.frames),
+            ", ".join(f"{axis} {period:g}" for axis, period in row.periods_px.items()),
+            row.made,
+            row.why,
+        ]
+        for row in data.captures
+    ]
+    filled = [i for i, _ in enumerate(columns) if i < 7 or any(row[i] for row in rows)]
+    table = Table([columns[i] for i in filled], [[row[i] for i in filled] for row in rows], "Captures of the session")
+    unused = [row for row in data.captures if row.state in ("left out", "excluded")]
+    items: list[Item] = [Notice(warning) for warning in data.warnings]
+    items += [Notice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
+    return Section(
+        "Captures", "" if data.captures else "The session holds no captures yet.", [*items, table] if rows else items
+    )
+
+
+def _reprojection(calibration: CalibrationView) -> Section:
+    rms = calibration.reprojection_rms_px
+    items: list[Item] = []
+    if calibration.pose_rms_px:
+        items.append(pose_bars(calibration.pose_rms_px))
+    residuals = calibration.residuals
+    if residuals:
+        worst = max(residuals, key=lambda name: max(calibration.pose_rms_px.get(name, (0.0, 0.0))))
+        shown = residuals[worst]
+        items += [
+            residual_arrows(f"camera, {worst} (the worst pose)", shown.pixels, shown.camera, calibration.camera.size),
+            residual_arrows(f"projector, {worst}", shown.projector_pixels, shown.projector, calibration.projector.size),
+            coverage("camera", calibration.camera.size, [r.pixels for r in residuals.values()]),
+            coverage("projector", calibration.projector.size, [r.projector_pixels for r in residuals.values()]),
+        ]
+    if calibration.pose_rms_px:
+        items.append(_pose_table(calibration))
+    aside = calibration.features_set_aside
+    text = [
+        "How far the target's features lie from where the calibration predicts them, in px: "
+        + ", ".join(f"{device} {value:.3f}" for device, value in rms.items())
+        + f". Target: {calibration.target}."
+        if rms
+        else "This calibration was made elsewhere, and says nothing of its reprojection error."
+    ]
+    if aside:
+        text.append(f"{_counted(aside, 'feature')} beyond 6 robust sigma {'were' if aside > 1 else 'was'} set aside.")
+    return Section("Reprojection", text, items)
+
+
+def _pose_table(calibration: CalibrationView) -> Table:
+    typical = np.sqrt(np.nanmean(np.square(list(calibration.pose_rms_px.values())), axis=0))
+    columns = [
+        Column("pose", align="left"),
+        Column("camera", "px"),
+        Column("projector", "px"),
+        Column("", align="left"),
+    ]
+    rows: list[list[str | Cell]] = []
+    for name, values in calibration.pose_rms_px.items():
+        high = [value > WORST * usual for value, usual in zip(values, typical, strict=True)]
+        shown = [Cell(f"{v:.3f}", "worse") if h else number(v) for v, h in zip(values, high, strict=True)]
+        rows.append([name, *shown, Cell("look at this pose", "worse") if any(high) else ""])
+    if not any(row[3] for row in rows):
+        columns, rows = columns[:3], [row[:3] for row in rows]
+    return Table(columns, rows, "Reprojection RMS of each pose")
+
+
+def _parameters(calibration: CalibrationView) -> Section:
+    def lens(device: DeviceParameters) -> list[str]:
+        K, D, sigma = device.K, device.D, device.focal_sigma_px
+        spread = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
+        return [
+            f"{device.size[0]} x {device.size[1]}",
+            *(f"{K[i, i]:.2f}{spread}" for i in (0, 1)),
+            *(f"{K[i, 2]:.2f}" for i in (0, 1)),
+            *(f"{value:.5f}".replace("-", "−") for value in D[:5]),
+        ]
+
+    names = ["size", "focal length fx", "focal length fy", "principal point cx", "principal point cy"]
+    names += ["radial k1", "radial k2", "tangential p1", "tangential p2", "radial k3"]
+    units = ["px"] * 5 + [""] * 5
+    rows = list(zip(names, units, lens(calibration.camera), lens(calibration.projector), strict=True))
+    columns = [Column("parameter", align="left"), Column("unit", align="centre"), Column("camera"), Column("projector")]
+    t = np.asarray(calibration.t, float).ravel()
+    angle = np.degrees(np.arccos(np.clip((np.trace(calibration.R) - 1) / 2, -1, 1)))
+    axes = np.degrees(np.arccos(np.clip(calibration.R[2, 2], -1, 1)))
+    rig = [
+        ["baseline (distance of the two devices)", f"{np.linalg.norm(t):.2f} mm"],
+        ["t, camera to projector (x, y, z)", " / ".join(f"{v:.2f}" for v in t).replace("-", "−") + " mm"],
+        ["angle between the optical axes", f"{axes:.2f}°"],
+        ["rotation, camera to projector", f"{angle:.2f}°"],
+        ["depths of the boards", "{:.0f} to {:.0f} mm".format(*calibration.depth_range_mm)],
+    ]
+    return Section(
+        "Parameters",
+        "Pinhole and Brown distortion of both devices, and where the projector stands in the camera's frame.",
+        [
+            Table(columns, rows, "Lenses", ["± is one standard deviation, from the lens's own calibration."]),
+            Table([Column("quantity", align="left"), Column("value")], rig, "Rig"),
+        ],
+    )
+
+
+def _pixel_fits(data: SessionData) -> Section:
+    columns = [Column("axis", align="left"), Column("pixels fitted", "%"), Column("poses a pixel, median")]
+    columns += [Column(f"RMS in {name}", "mm") for name in "zxy"]
+    rows: list[list[str | Cell]] = []
+    for fit in data.pixel_fits:
+        fitted = np.isfinite(fit.rms_mm[0])
+        medians = [float(np.median(rms[fitted])) if fitted.any() else np.nan for rms in fit.rms_mm]
+        poses = float(np.median(fit.poses[fitted])) if fitted.any() else np.nan
+        rows.append([fit.axis, number(100 * fitted.mean(), 1), number(poses, 0), *(number(m) for m in medians)])
+    table = Table(columns, rows, "Fits by captured axis (median over the pixels)")
+    return Section(
+        "Pixel-wise model",
+        "Each camera pixel's own rational function from phase to depth, and lines from depth to x and y.",
+        [table, *(rms_maps(fit.rms_mm, fit.axis) for fit in data.pixel_fits)],
+    )
+
+
+def _verifications(data: SessionData) -> Section:
+    items: list[Item] = []
+    for shape, caption in (
+        ("plane", "Planes: RMS distance from the best plane"),
+        ("sphere", "Spheres: RMS and radius"),
+    ):
+        found = [v for v in data.verifications if v.shape == shape]
+        if found:
+            items.append(_verification_table(found, caption))
+    if data.spacings:
+        items.append(spacing_table(data.spacings, "Distances between the centres of spheres"))
+    for v in data.verifications:
+        if v.maps is not None:
+            sign = "red is outwards" if v.shape == "sphere" else "red is towards the camera"
+            items.append(error_maps(v.maps.title, v.maps.maps, v.maps.rms_mm, v.maps.noise_floor_mm, sign=sign))
+    return Section(
+        "Verification",
+        "Known shapes, measured by each model. Every RMS stands beside its noise floor: what the capture's noise alone "
+        "would give.",
+        items,
+    )
+
+
+def _verification_table(found: list[VerificationView], caption: str) -> Table:
+    models = models_of([v.rms_mm for v in found])
+    sphere = found[0].shape == "sphere"
+    columns = [
+        Column("capture", align="left"),
+        Column("model", align="left"),
+        Column("RMS", "mm"),
+        Column("floor", "mm"),
+    ]
+    columns += [Column("against " + models[0], align="left")] if len(models) > 1 else []
+    columns += [Column("radius", "mm"), Column("error", "mm")] if sphere else []
+    columns += [
+        Column("R1 / R2 / R3", "%", align="centre"),
+        Column("points"),
+        Column("set aside", "%"),
+        Column("coverage", "%"),
+    ]
+    rows: list[list[str | Cell]] = []
+    for v in found:
+        for i, model in enumerate(m for m in models if m in v.rms_mm):
+            rms, rival = v.rms_mm[model], v.rms_mm.get(models[0], np.nan)
+            mark = better_worse(rms, rival) if model != models[0] else ""
+            text = number(rms)
+            row: list[str | Cell] = [v.name if not i else "", model]
+            row += [Cell(text, mark) if isinstance(text, str) else text, number(v.noise_floor_mm.get(model, np.nan))]
+            if len(models) > 1:
+                row.append(verdict(rms, rival) if model != models[0] else "")
+            if sphere:
+                radius = v.radius_mm.get(model, np.nan)
+                row += [number(radius), number(radius - v.true_radius_mm, signed=True)]
+            aside = 100 * v.set_aside.get(model, 0) / max(v.points, 1)
+            share = f"{aside:.1f}"
+            row += [incidence_text(v.incidence) if not i else "", f"{v.points:,}" if not i else ""]
+            row.append(Cell(share, "worse") if aside > SET_ASIDE_PERCENT else share)
+            row.append(number(100 * v.coverage[model], 1) if model in v.coverage else UNKNOWN)
+            rows.append(row)
+    notes = [
+        "Set aside: points beyond 5 robust sigma, above 2 % the RMS does not speak for the shape. Coverage: measured "
+        "pixels of those lit and modulated."
+    ]
+    return Table(columns, rows, caption, notes)
+
+
+def _clouds(data: SessionData) -> Section:
+    items: list[Item] = []
+    if data.pairs:
+        items.append(merge_table(data.pairs, "Alignment of the scans by point-to-plane ICP"))
+    if data.clouds:
+        items.append(clouds(data.clouds))
+    if data.merged is not None:
+        items.append(merged_cloud(data.merged))
+    return Section("Scans", "", items)
+
+
+def _counted(count: int, word: str) -> str:
+    return f"{count} {word}{'s' * (count != 1)}"

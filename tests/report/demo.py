@@ -1,0 +1,225 @@
+"""Made-up results that look like real ones: bent planes, noisy spheres, a hilly object seen from three places."""
+
+import numpy as np
+
+from slviewer.report.data import (
+    CalibrationView,
+    CaptureRow,
+    CloudView,
+    DeviceParameters,
+    ErrorMaps,
+    MergePair,
+    PixelCurve,
+    PixelFitView,
+    PlaneRow,
+    PoseResiduals,
+    ReproductionData,
+    SessionData,
+    SpacingRow,
+    SphereRow,
+    VerificationView,
+)
+
+MODELS = ("stereo", "pixelwise")
+INCIDENCE = ((100, 0), (91.2, 8.8), (0, 100), (0, 100), (0, 47.6), (0, 0.7), (0, 0), (0, 0), (2.1, 97.9), (0, 87))
+LETTER = {
+    "stereo": (0.188, 0.237, 0.144, 0.127, 0.172, 0.205, 0.270, 0.214, 0.138, 0.146),
+    "pixelwise": (0.068, 0.066, 0.070, 0.056, 0.091, 0.104, 0.163, 0.118, 0.053, 0.076),
+}
+OURS = {
+    "stereo": (0.134, 0.156, 0.198, 0.222, 0.293, 0.372, 0.456, 0.41, 0.21, 0.25),
+    "pixelwise": (0.219, 0.149, 0.076, 0.079, 0.121, 0.189, 0.333, 0.41, 0.08, 0.088),
+}
+MIDDLES = (440, 475, 580, 610, 695, 740, 790, 770, 550, 655)
+
+
+def grid(width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Image coordinates from -1 to 1 along the width."""
+    height = width * 3 // 4
+    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
+    return (2 * u - width) / width, (2 * v - height) / width
+
+
+def error_map(width: int, rms: float, noise: float, seed: int, round_: bool = False) -> np.ndarray:
+    u, v = grid(width)
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.uniform(2, 5, 3)
+    bend = np.sin(a * u + b * v) + 0.7 * np.cos(b * u - c * v) + 0.5 * u * v
+    bend *= np.sqrt(max(rms**2 - noise**2, 0.0)) / bend.std()
+    errors = (bend + noise * rng.standard_normal(u.shape)).astype(np.float32)
+    outside = u**2 + v**2 > 0.3 if round_ else (np.abs(u + 0.1 * v) > 0.75) | (np.abs(v - 0.08 * u) > 0.6)
+    errors[outside] = np.nan
+    return errors
+
+
+def error_maps(title: str, width: int, rms: dict[str, float], seed: int, round_: bool = False) -> ErrorMaps:
+    maps = {m: error_map(width, r, 0.036, seed + i, round_) for i, (m, r) in enumerate(rms.items())}
+    return ErrorMaps(title, maps, rms, 0.036)
+
+
+def cloud(width: int, shift: float) -> np.ndarray:
+    """(h, w, 3): a shell-like hill at about ``shift`` mm, with a spiral groove and holes."""
+    u, v = grid(width)
+    u, v = u * 1.35 * shift / 600, v * 1.35 * shift / 600
+    radius, angle = np.hypot(u, v), np.arctan2(v, u)
+    groove = 9 * np.cos(5 * np.log(radius + 0.04) - angle) * np.exp(-radius) + 2.2 * np.cos(26 * angle) * radius
+    z = shift - 75 * np.sqrt(np.clip(0.85 - radius**2, 0, None)) - groove
+    rng = np.random.default_rng(int(shift))
+    z = (z + 0.05 * rng.standard_normal(z.shape)).astype(np.float32)
+    z[(radius > 0.85) | (np.hypot(u - 0.3, v + 0.2) < 0.03)] = np.nan
+    return np.stack([u * 130, v * 130, z], axis=-1).astype(np.float32)
+
+
+def pixel_curve() -> PixelCurve:
+    rng = np.random.default_rng(3)
+    z = np.sort(rng.uniform(505, 695, 25))
+    c = np.array([900.0, -1.2, 0.004, 0.11, -0.05])
+    phase = (c[0] - z) / (z * c[2] - c[1])
+    noise = 0.03 * rng.standard_normal((3, 25))
+    curve = PixelCurve((500, 500), "x", phase, z + noise[0], c[3] * z + 0.2 * noise[1], c[4] * z + 0.2 * noise[2], c,
+                       np.array([0.03, 0.006, 0.006]))  # fmt: skip
+    curve.z[4] = np.nan
+    return curve
+
+
+def rms_maps(width: int) -> np.ndarray:
+    u, v = grid(width)
+    rng = np.random.default_rng(5)
+    z = 0.03 + 0.04 * (u**2 + v**2) + 0.006 * np.abs(rng.standard_normal(u.shape))
+    maps = np.stack([z, 0.2 * z, 0.15 * z]).astype(np.float32)
+    maps[:, np.abs(u) > 0.95] = np.nan
+    return maps
+
+
+def outlines() -> dict[str, np.ndarray]:
+    out = {}
+    for i, middle in enumerate(MIDDLES):
+        tilt = np.radians((-1) ** i * (4 + 2.5 * i))
+        corners = np.array([[-110, -85, 0], [110, -85, 0], [110, 85, 0], [-110, 85, 0]], float)
+        if i in (1, 4, 6):
+            corners = corners[:, [0, 1, 2]] @ np.array(
+                [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
+            )
+        else:
+            corners = corners @ np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+        out[f"plane_{i + 1:02d}"] = corners + [10, -5, middle]
+    return out
+
+
+def plane_rows() -> list[PlaneRow]:
+    rows = []
+    for i, (r1, r2) in enumerate(INCIDENCE):
+        share = {"R1": float(r1), "R2": float(r2), "R3": 100.0 - r1 - r2}
+        rms = {m: OURS[m][i] for m in MODELS}
+        letter = {m: LETTER[m][i] for m in MODELS}
+        rows.append(PlaneRow(f"plane_{i + 1:02d}", share, rms, dict.fromkeys(MODELS, 0.036), share, letter))
+    return rows
+
+
+def sphere_rows() -> list[SphereRow]:
+    radii = ((97.94, 98.11), (98.1, 98.05), (98.2, 98.04), (98.25, 98.02), (98.31, 97.9), (98.39, 97.8))
+    rms = ((0.109, 0.08), (0.096, 0.074), (0.086, 0.062), (0.076, 0.056), (0.092, 0.076), (0.085, 0.085))
+    letter = ((98.44, 98.01), (98.28, 98.0), (98.27, 98.08), (98.2, 98.06), (98.25, 98.15), (98.1, 98.06))
+    return [
+        SphereRow(
+            f"sphere_{i + 1}",
+            f"R{i // 2 + 1}",
+            98.03,
+            dict(zip(MODELS, rms[i], strict=True)),
+            dict.fromkeys(MODELS, 0.04),
+            dict(zip(MODELS, radii[i], strict=True)),
+            dict(zip(MODELS, rms[i], strict=True)),
+            dict(zip(MODELS, letter[i], strict=True)),
+        )
+        for i in range(6)
+    ]
+
+
+def reproduction_data(width: int = 1600) -> ReproductionData:
+    clouds = [cloud(width, shift) for shift in (450, 590, 740)]
+    merged = np.concatenate(
+        [c.reshape(-1, 3) + np.array([0, 0, 590 - s], np.float32) for c, s in zip(clouds, (450, 590, 740), strict=True)]
+    )
+    source = np.repeat(np.arange(3, dtype=np.uint8), [c.size // 3 for c in clouds])
+    known = np.isfinite(merged[:, 2])
+    from slviewer.reconstruction.reconstruct import normals
+
+    facing = np.concatenate([normals(c).reshape(-1, 3) for c in clouds])
+    spheres = sphere_rows()
+    return ReproductionData(
+        camera=(width, width * 3 // 4),
+        projector=(912, 1140),
+        quick=width < 1600,
+        seed=0,
+        poses=25,
+        depth_range_mm=(500.0, 700.0),
+        reprojection_rms_px={"camera": 0.041, "projector": 0.065, "stereo": 0.054},
+        letter_reprojection_rms_px={"camera": 0.253, "projector": 0.141},
+        fit_rms_mm={"z": 0.041, "x": 0.008, "y": 0.006},
+        planes=plane_rows(),
+        spheres=spheres,
+        spacings=[SpacingRow("sphere_1 to sphere_2", 120.0, {"stereo": 120.57, "pixelwise": 119.8}),
+                  SpacingRow("pair", 150.0, {"stereo": 150.31, "pixelwise": 150.2})],  # fmt: skip
+        pairs=[MergePair("object_r1", "object_r3", 0.21, 0.84, 0.26), MergePair("object_r2", "object_r3", 0.12, 0.9, 0.25)],
+        pixel_curve=pixel_curve(),
+        rms_maps_mm=rms_maps(width),
+        plane_maps=[error_maps(f"plane_{i:02d}", width, {m: OURS[m][i - 1] for m in MODELS}, i) for i in (1, 3, 8)],
+        sphere_maps=[error_maps(row.name, width, dict(row.rms_mm), 20 + i, True) for i, row in enumerate(spheres)],
+        plane_outlines=outlines(),
+        clouds=[CloudView(f"object_r{i + 1}", c, note=f"R{i + 1}") for i, c in enumerate(clouds)],
+        merged=CloudView("merged", merged[known], facing[known], source[known], ("object_r1", "object_r2", "object_r3")),
+        letter_points={"R1": 1642179, "R2": 1476327, "R3": 1034094},
+    )  # fmt: skip
+
+
+def session_data(width: int = 1600) -> SessionData:
+    rng = np.random.default_rng(7)
+    height = width * 3 // 4
+    names = [f"pose_{i:02d}" for i in range(1, 26) if i not in (9, 17)]
+    rms = {name: tuple(0.04 * rng.uniform(0.7, 1.4, 2)) for name in names}
+    rms["pose_14"] = (0.17, 0.21)
+    residuals = {}
+    for name in names:
+        a = rng.uniform(-0.3, 0.3)
+        v, u = np.mgrid[0:16, 0:21].reshape(2, -1) * 0.03 * width
+        turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+        pixels = np.stack([u, v], axis=1) @ turn + rng.uniform(0.05, 0.25, 2) * [width, height]
+        noise = [rms[name][i] / np.sqrt(2) * rng.standard_normal(pixels.shape) for i in (0, 1)]
+        noise[0][3] = np.nan
+        residuals[name] = PoseResiduals(pixels, noise[0], pixels * [0.5, 0.8], noise[1])
+    captures = [
+        CaptureRow(n, "calibration", "used", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0}) for n in names
+    ]
+    captures += [
+        CaptureRow("pose_09", "calibration", "left out", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0},
+                   "12 of 336 circles found: lower the exposure, or move the board so that all of it is in view"),
+        CaptureRow("pose_17", "calibration", "excluded", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0},
+                   "the board slipped"),
+        CaptureRow("vase <b>blue</b>", "scan", "scan", (width, height), (912, 1140), 26, {"x": 18.0}),
+    ]  # fmt: skip
+    K = np.array([[3510.2, 0, 801.3], [0, 3509.8, 598.2], [0, 0, 1]])
+    D = np.array([-0.0812, 0.113, 0.0003, -0.0002, -0.04])
+    a = np.radians(14.0)
+    R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    planes = [
+        VerificationView(
+            row.name, "plane", row.incidence, 812_345, {"stereo": 1200, "pixelwise": 24000 if i else 900},
+            {"stereo": 0.993, "pixelwise": 0.981}, row.rms_mm, row.noise_floor_mm,
+            maps=error_maps(row.name, width, dict(row.rms_mm), i),
+        )
+        for i, row in enumerate(plane_rows()[:3:2])
+    ]  # fmt: skip
+    return SessionData(
+        name="Vase <script>alert(1)</script>",
+        captures=captures,
+        calibration=CalibrationView(
+            DeviceParameters(K, D, (width, height), 1.2),
+            DeviceParameters(K * [[0.4], [0.8], [1]], -D, (912, 1140), 2.1),
+            R, np.array([-178.2, 0.4, 21.3]), "circles:21x16:9", (498.0, 703.0),
+            {"camera": 0.041, "projector": 0.062, "stereo": 0.053}, rms, residuals, 3,
+        ),
+        pixel_fits=[PixelFitView("x", rms_maps(width), np.full((height, width), 17, np.uint16))],
+        verifications=planes,
+        clouds=[CloudView("vase <b>blue</b>", cloud(width, 590))],
+        warnings=["the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"],
+    )  # fmt: skip
