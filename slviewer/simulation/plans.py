@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.simulation.boards import BoardScene, Pose, Shape, blank_board, printed_board
+from slviewer.simulation.boards import FLAT, BoardScene, Pose, Shape, blank_board, printed_board
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene, Spheres, sphere
@@ -13,9 +13,6 @@ from slviewer.target.board import Board
 
 R1_R2_MM, R2_R3_MM = 500.0, 700.0
 """Where the Letter's depth ranges meet: R1 in front of the calibrated depths, R2 inside, R3 behind."""
-
-BOARD_SHAPE = Shape(bow_x_mm=0.12, bow_y_mm=-0.07, twist_mm=0.05, misplaced_mm=0.01)
-"""The default target: flat and well printed as such plates are, not perfect."""
 
 _LEFT_FREE_PX = 12.0  # between the outermost circles' rims and the image's edge, at full resolution
 
@@ -51,16 +48,18 @@ _OBJECTS = {
 }
 
 
-def letter_plan(rig: SimulatedRig, board: Board | None = None, poses: int = 25) -> dict[str, Scene]:
+def letter_plan(
+    rig: SimulatedRig, board: Board | None = None, poses: int = 25, shape: Shape = FLAT
+) -> dict[str, Scene]:
     """Every capture of the preset by name: pose_01 ..., plane_01 ... plane_10, sphere_1 ... sphere_6, object_r1 ... r3.
 
-    `board` defaults to the Letter's circles:21x16:9; its plate is bowed and twisted by a tenth of a millimetre or so,
-    its circles are misplaced by hundredths. The rig's seed draws the target poses and the misplacement.
+    `board` defaults to the Letter's circles:21x16:9, and `shape` to a flat plate with its circles in place. The rig's
+    seed draws the target poses and the misplacement.
     """
     board = board or Board.parse("circles:21x16:9")
     scenes: dict[str, Scene] = {}
     for i, pose in enumerate(target_poses(rig, board, poses), 1):
-        scenes[f"pose_{i:02d}"] = printed_board(board, pose, BOARD_SHAPE, rig.seed)
+        scenes[f"pose_{i:02d}"] = printed_board(board, pose, shape, rig.seed)
     return scenes | planes() | spheres() | objects()
 
 

@@ -192,7 +192,7 @@ def _spacings(session: Path, spheres: Mapping[str, Comparison]) -> dict[str, tup
     found = {}
     for i, a in enumerate(names):
         for b in names[i + 1 :]:
-            known = float(np.linalg.norm(np.subtract(truth[a]["centre"], truth[b]["centre"])))
+            known = float(np.linalg.norm(np.subtract(truth[a]["centres"][0], truth[b]["centres"][0])))
             measured = {m: float(np.linalg.norm(_centre(spheres[a], m) - _centre(spheres[b], m))) for m in MODELS}
             found[f"{a} - {b}"] = (known, measured)
     return found

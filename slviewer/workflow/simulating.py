@@ -5,19 +5,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.importers.imported import ImportedCapture
 from slviewer.session.store import Session
-from slviewer.simulation.boards import BoardScene
-from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
-from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.simulation.scenes import Scene, Spheres
+from slviewer.simulation.rig import letter
+from slviewer.simulation.scenes import Scene
+from slviewer.simulation.truth import rig_record, scene_record
 from slviewer.target.board import Board
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 
@@ -50,7 +47,7 @@ def simulate(
     plan = letter_plan(rig, board, poses)
     both = p18(rig.projector.size)
     only_x = one_axis(both, "x")
-    truth: dict[str, Any] = {"preset": preset, "scale": scale, "seed": seed, "target": TARGET, "rig": rig_truth(rig)}
+    truth: dict[str, Any] = {"preset": preset, "scale": scale, "seed": seed, "target": TARGET, "rig": rig_record(rig)}
 
     def rendered(poses_or_scans: dict[str, Scene], sequence: PatternSequence) -> Iterator[ImportedCapture]:
         for name, scene in poses_or_scans.items():
@@ -65,7 +62,7 @@ def simulate(
         saved = store.save_captures(rendered(groups["pose"], both), "calibration", board=board)
         saved += store.save_captures(rendered(scans, only_x), "scan")
         for kind, scenes in groups.items():
-            truth[f"{kind}s"] = {name: scene_truth(scene) for name, scene in scenes.items()}
+            truth[f"{kind}s"] = {name: scene_record(scene) for name, scene in scenes.items()}
         (store.folder / TRUTH).write_text(json.dumps({**truth, "complete": True}, indent=1) + "\n")
     progress(1.0, "simulated")
     return [capture.name for capture in saved]
@@ -76,24 +73,3 @@ def one_axis(sequence: PatternSequence, axis: Axis) -> PatternSequence:
     frames = [f for f in sequence.frames if f.axis == axis]
     texture = [f for f in sequence.frames if f.kind == "texture"][:1]
     return PatternSequence(sequence.projector, (*frames, *texture), sequence.phase_sign, sequence.gray_origin_px)
-
-
-def scene_truth(scene: Scene) -> dict[str, Any]:
-    """Where a scene stands, mm in the camera's frame, JSON-able."""
-    if isinstance(scene, Spheres):
-        centre = scene.centres[0].tolist() if len(scene.centres) == 1 else scene.centres.tolist()
-        return {"centre": centre, "radius_mm": scene.radius_mm}
-    if isinstance(scene, BoardScene | MeshScene):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = scene.pose.R, scene.pose.t
-        return {"T_camera_scene": T.tolist()}
-    raise InputError(f"nothing is known of where a {type(scene).__name__} stands: add it to scene_truth")
-
-
-def rig_truth(rig: SimulatedRig) -> dict[str, Any]:
-    """The rig's arrangement and lenses, JSON-able."""
-    lenses = {
-        name: {"size": list(lens.size), "focal_px": list(lens.focal_px), "brown": list(lens.brown)}
-        for name, lens in (("camera", rig.camera), ("projector", rig.projector))
-    }
-    return {"R": rig.R.tolist(), "t": rig.t.tolist(), **lenses}
