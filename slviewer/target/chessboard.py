@@ -16,23 +16,28 @@ def detect_chessboard(board: Board, image: BoardImage) -> np.ndarray:
 
     A board whose columns + rows are odd is numbered so that its top-left square is dark.
     """
-    largest = None
-    grid = _quick(board, image.grey)
-    if grid is None:
-        largest = _largest(image.grey)
-        grid = _matching(board, largest)
-    if grid is None:
-        grid = _classic(board, image.grey)
-    if grid is None:
-        raise DetectionError(_not_found(board, largest, image.grey))
+    doubt: DetectionError | None = None
+    for find in (_quick, _from_largest, _classic):
+        grid = find(board, image.grey)
+        if grid is not None:
+            try:
+                return _verified(board, image, grid)
+            except DetectionError as error:
+                doubt = doubt or error
+    raise DetectionError(_not_found(board, image.grey)) if doubt is None or _larger(board, image.grey) else doubt
+
+
+def _verified(board: Board, image: BoardImage, grid: np.ndarray) -> np.ndarray:
+    """(n, 2) px, refined and numbered, of a grid (rows, columns, 2) that may run any way; raises DetectionError."""
     # the finders' own order may be mirrored; all that is kept of it is what lies beside what
     if _turn(grid) < 0:
         grid = grid[:, ::-1]
     pixels = refine_corners(image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm)
     check_grid(board, pixels, np.arange(len(pixels)), "corners")
     grid = pixels.reshape(grid.shape)
+    first_is_dark = _first_is_dark(image.deep, grid)
     _refuse_larger(board, image.deep, grid)
-    numberings = _numberings(np.arange(len(pixels)).reshape(grid.shape[:2]), _first_is_dark(image.deep, grid))
+    numberings = _numberings(np.arange(len(pixels)).reshape(grid.shape[:2]), first_is_dark)
     return np.asarray(pixels[upright(board, pixels, numberings)])
 
 
@@ -62,11 +67,17 @@ def _largest(grey: np.ndarray) -> np.ndarray | None:
     return _in_full(corners, factor).reshape(*cells.shape[:2], 2) if found else None
 
 
-def _matching(board: Board, largest: np.ndarray | None) -> np.ndarray | None:
-    """The largest grid, laid along the board's rows, if it has the board's size."""
+def _from_largest(board: Board, grey: np.ndarray) -> np.ndarray | None:
+    """(rows, columns, 2) px: the largest grid, laid along the board's rows, if it has the board's size."""
+    largest = _largest(grey)
     if largest is None or sorted(largest.shape[:2]) != sorted(board.features):
         return None
     return largest if largest.shape[0] == board.rows else largest.transpose(1, 0, 2)
+
+
+def _larger(board: Board, grey: np.ndarray) -> bool:
+    largest = _largest(grey)
+    return largest is not None and largest[..., 0].size > len(board.points)
 
 
 def _classic(board: Board, grey: np.ndarray) -> np.ndarray | None:
@@ -87,8 +98,9 @@ def _turn(grid: np.ndarray) -> float:
     return float(a * d - b * c)
 
 
-def _not_found(board: Board, largest: np.ndarray | None, grey: np.ndarray) -> str:
+def _not_found(board: Board, grey: np.ndarray) -> str:
     """What the operator reads: the largest chessboard that can be seen, if any, and what to do."""
+    largest = _largest(grey)
     if largest is None:
         return f"no chessboard found where {board} has {len(board.points)} corners: {advice(grey)}"
     rows, columns = largest.shape[:2]

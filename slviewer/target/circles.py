@@ -12,6 +12,7 @@ from slviewer.target.centroid import refine_centres
 from slviewer.target.images import SEARCH_PX, BoardImage, advice, resized
 from slviewer.target.lattice import Lattice, grow_lattices, lay_pattern
 from slviewer.target.numbering import check_grid, upright
+from slviewer.target.planar import fit_homography, jacobians
 
 GOOD_PART = 1 / 3
 """Share of the board's circles in one lattice that no clutter has."""
@@ -32,15 +33,17 @@ class _Seen:
         return len(self.lattice.nodes)
 
 
-def detect_circles(board: Board, image: BoardImage) -> np.ndarray:
-    """(n, 2) float64 px of every circle of the board; raises DetectionError with how many were seen."""
+def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float]:
+    """((n, 2) float64 px of every circle, their radius in mm); raises DetectionError with how many were seen."""
     most: _Seen | None = None
     for seen in _attempts(board, image.grey):
         numberings = lay_pattern(board, seen.lattice)
         if numberings:
             _refuse_larger(board, seen.lattice, numberings)
             _refuse_squares(board, seen.blobs.chosen(numberings[0]))
-            return _centres(board, image, seen.blobs, numberings)
+            blobs = seen.blobs.chosen(upright(board, seen.blobs.centres, numberings))
+            pixels = _centres(board, image, blobs)
+            return pixels, _radius(board, blobs)
         if most is None or len(seen) > len(most):
             most = seen
     raise DetectionError(_not_found(board, image, most))
@@ -87,9 +90,8 @@ def _refuse_squares(board: Board, blobs: Blobs) -> None:
         raise DetectionError(f"a grid of squares found where {board} has circles: check the board's kind")
 
 
-def _centres(board: Board, image: BoardImage, blobs: Blobs, numberings: list[np.ndarray]) -> np.ndarray:
-    order = upright(board, blobs.centres, numberings)
-    pixels = refine_centres(image.deep, blobs.chosen(order))
+def _centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:
+    pixels = refine_centres(image.deep, blobs)
     lost = np.isnan(pixels).any(1)
     if lost.any():
         raise DetectionError(
@@ -98,6 +100,13 @@ def _centres(board: Board, image: BoardImage, blobs: Blobs, numberings: list[np.
         )
     check_grid(board, pixels, np.arange(len(pixels)), "circles")
     return pixels
+
+
+def _radius(board: Board, blobs: Blobs) -> float:
+    """mm, by the areas of the blobs and how large a square millimetre is where they lie."""
+    points = board.points[:, :2]
+    scale = np.linalg.det(jacobians(fit_homography(points, blobs.centres), points))
+    return float(np.sqrt(np.median(blobs.areas / scale) / np.pi))
 
 
 def _not_found(board: Board, image: BoardImage, most: _Seen | None) -> str:

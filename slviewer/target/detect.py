@@ -19,11 +19,13 @@ class Detection:
     """``pixels`` (n, 2) float64 px, and ``ids`` (n,) int: which of ``board.points`` each one is.
 
     All of them in order for grids of circles and chessboards, those that were seen for ChArUco. A circle's pixel is the
-    centroid of its image, not the image of its centre.
+    centroid of its image, which perspective and distortion move away from the image of its centre (some hundredths of
+    a pixel; it grows with the square of the radius): ``radius_mm``, 0 for corners, is there to correct that.
     """
 
     pixels: np.ndarray
     ids: np.ndarray
+    radius_mm: float = 0.0
 
 
 def detect(board: Board, image: np.ndarray) -> Detection:
@@ -37,8 +39,11 @@ def detect(board: Board, image: np.ndarray) -> Detection:
     if board.kind == "charuco":
         pixels, ids = detect_charuco(board, board_image)
         return Detection(pixels, ids)
-    find = detect_chessboard if board.kind == "chessboard" else detect_circles
-    return Detection(find(board, board_image), np.arange(len(board.points)))
+    ids = np.arange(len(board.points))
+    if board.kind == "chessboard":
+        return Detection(detect_chessboard(board, board_image), ids)
+    pixels, radius = detect_circles(board, board_image)
+    return Detection(pixels, ids, radius)
 
 
 def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> np.ndarray:
