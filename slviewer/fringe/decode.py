@@ -9,6 +9,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.reference import dark_sigmas, decode_reference, found_levels, lowest_coordinate, phase_shift
 from slviewer.fringe.reference_spikes import border_rad, cell_rad, is_plain
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.threshold import MIDDLE, fringe_mean
 
 __all__ = ["decode", "decode_reference", "texture"]
 
@@ -63,6 +64,7 @@ def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.n
         limits.EDGE,
         limits.WEAK_BIT,
         limits.WEAKER,
+        fringe_mean(found, stack) if is_plain(found) else MIDDLE,
         limits.UNDECIDED_BIT,
     )
     kernels.decode_coded(

@@ -30,12 +30,13 @@ class Scale(NamedTuple):
 
 
 class CodeRules(NamedTuple):
-    """How Gray bits are read; see `limits`."""
+    """How Gray bits are read; see `limits`, and `threshold` for ``mean``."""
 
     origin_turns: float
     edge: float
     weak: float
     weaker: float
+    mean: float
     undecided: float
 
 
@@ -121,13 +122,14 @@ def bit_height(stack, frames, inverses, bit, row, x, threshold):
 
 
 @numba.njit(inline="always")
-def code_row(stack, frames, inverses, row, threshold, code, least):
-    """Binary code of one row's Gray bits, and the smallest distance of a bit from its threshold."""
+def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom):
+    """One row's binary code, the least distance of a bit from its threshold, and the highest and lowest bit."""
     width = stack.shape[2]
     digit = np.zeros(width, np.int32)
     for x in range(width):
         code[x] = 0
         least[x] = np.float32(np.inf)
+        top[x] = bottom[x] = np.float32(0)
     for b in range(len(frames)):
         frame = stack[frames[b], row]
         if len(inverses):
@@ -137,17 +139,21 @@ def code_row(stack, frames, inverses, row, threshold, code, least):
                 digit[x] ^= np.int32(height > 0)
                 code[x] = 2 * code[x] + digit[x]
                 least[x] = min(least[x], abs(height))
+                top[x] = max(top[x], height)
+                bottom[x] = min(bottom[x], height)
         else:
             for x in range(width):
                 height = np.float32(frame[x]) - threshold[x]
                 digit[x] ^= np.int32(height > 0)
                 code[x] = 2 * code[x] + digit[x]
                 least[x] = min(least[x], abs(height))
+                top[x] = max(top[x], height)
+                bottom[x] = min(bottom[x], height)
 
 
 @numba.njit
-def misread(stack, frames, inverses, row, x, threshold, modulation, code, part, rules):
-    """+1 or -1 where the bit near its threshold and the phase disagree about the side of a code edge, else 0."""
+def misread(stack, frames, inverses, row, x, threshold, contrast, code, part, rules):
+    """+1 or -1 where the bit nearest the middle and the phase disagree about the side of a code edge, else 0."""
     last = len(frames) - 1
     zeros, ones = 0, 0
     while zeros <= last and not (code >> zeros) & 1:
@@ -156,11 +162,12 @@ def misread(stack, frames, inverses, row, x, threshold, modulation, code, part, 
         ones += 1
     # Codes 0 and 2^bits - 1 have no lower and no upper edge.
     lower, upper = np.float32(np.inf), np.float32(np.inf)
+    middle = (np.float32(0.5) - np.float32(rules.mean)) * contrast
     if zeros <= last:
-        lower = abs(bit_height(stack, frames, inverses, last - zeros, row, x, threshold))
+        lower = abs(bit_height(stack, frames, inverses, last - zeros, row, x, threshold) - middle)
     if ones <= last:
-        upper = abs(bit_height(stack, frames, inverses, last - ones, row, x, threshold))
-    weak, weaker = np.float32(rules.weak) * modulation, np.float32(rules.weaker)
+        upper = abs(bit_height(stack, frames, inverses, last - ones, row, x, threshold) - middle)
+    weak, weaker = np.float32(rules.weak / 2) * contrast, np.float32(rules.weaker)
     if part < np.float32(0.5):
         return 1 if upper < weak and upper < weaker * lower else 0
     return -1 if lower < weak and lower < weaker * upper else 0
@@ -191,11 +198,14 @@ def decode_coded(
     for row in numba.prange(height):
         peak, least = np.empty(width, np.float32), np.empty(width, np.float32)
         code, doubtful = np.empty(width, np.int32), np.empty(width, np.bool_)
+        top, bottom, contrast = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
         psi, B, A = wrapped[row], modulation[row], background[row]
         shift_row(stack, shift, cosines, sines, row, psi, B, A, peak)
-        code_row(stack, gray, inverse, row, A, code, least)
+        code_row(stack, gray, inverse, row, A, code, least, top, bottom)
         origin, undecided = np.float32(rules.origin_turns), np.float32(rules.undecided)
-        edge, far_edge, weak = np.float32(rules.edge), np.float32(1 - rules.edge), np.float32(rules.weak)
+        edge, far_edge = np.float32(rules.edge), np.float32(1 - rules.edge)
+        mean, over = np.float32(rules.mean), np.float32(1) - np.float32(rules.mean)
+        reach = np.float32(abs(0.5 - rules.mean) + rules.weak / 2)
         if complementary >= 0:
             extra = stack[complementary, row]
             for x in range(width):
@@ -223,10 +233,13 @@ def decode_coded(
                 reason[row, x] = verdict(dark, clipped, unclear)
                 absolute = np.float32(psi[x] + TWO_PI * (code[x] - whole))
                 phase[row, x] = np.float32(np.nan) if dark | clipped | unclear else absolute
-                doubtful[x] = beside & (least[x] < weak * B[x])
+                contrast[x] = max(np.divide(top[x], over), np.divide(-bottom[x], mean))
+                doubtful[x] = beside & (least[x] < reach * contrast[x])
             for x in range(width):  # the few pixels on a blurred edge
                 if doubtful[x] and reason[row, x] == VALID:
                     turns = psi[x] * PER_TURN - origin
                     whole = np.floor(turns)
-                    order = code[x] + misread(stack, gray, inverse, row, x, A[x], B[x], code[x], turns - whole, rules)
+                    order = code[x] + misread(
+                        stack, gray, inverse, row, x, A[x], contrast[x], code[x], turns - whole, rules
+                    )
                     phase[row, x] = np.float32(psi[x] + TWO_PI * (order - whole))

@@ -5,16 +5,16 @@ DARK_LEVELS = 3.0
 DARK_SIGMAS = 4.0
 """Modulation in standard deviations of a grey level, below which a pixel is DARK: a Gray bit, whose amplitude is at
 least the modulation, would flip in 1 pixel of 30,000 at this limit, and in 1 of 160 at 2.5."""
-LEVEL_SIGMA = 0.175
+LEVEL_SIGMA = 0.15
 """Multi-frequency: standard deviation, in periods, of the step from one level to the next, above which a pixel is DARK:
-at this limit the misfit that is refused below hides a wrong order in 1 pixel of 30,000."""
+at this limit the misfit that is refused below hides a wrong order in 1 pixel of 15,000."""
 DARK_BITS = 3
 """Gray code alone: undecided bits that make a pixel DARK; it sees white light, scattered, but no stripes."""
 
 EDGE = 0.15
 """Part of a period on either side of a code edge within which a blurred bit may be read as its neighbour's."""
 WEAK_BIT = 0.35
-"""A bit closer to its threshold than this part of the modulation may have been misread at its edge."""
+"""A bit closer to the middle of black and white than this part of their half difference lies on a blurred edge."""
 WEAKER = 0.5
 """... and only if it is closer by this factor than the bit of the cell's other edge."""
 UNDECIDED_BIT = 0.15
@@ -24,7 +24,7 @@ GRAY_UNDECIDED_SIGMAS = 2.0
 GRAY_UNDECIDED_PART = 0.05
 """... or within this part of the contrast: interreflected light alone makes such differences."""
 
-LEVEL_MISFIT = 0.3
+LEVEL_MISFIT = 0.4
 """Multi-frequency: largest distance, in periods, between a coordinate and the one that the longer period predicts."""
 
 OUTSIDE_PX = 0.5

@@ -24,16 +24,16 @@ def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[floa
     the constancy of Gray + inverse. Sampled from a few rows of the image.
     """
     if layout.steps >= 4:
-        levels, variances, freedom = _from_phase(_sample(stack, layout.shifts[-1].indices), white)
+        levels, variances, freedom = _from_phase(sample(stack, layout.shifts[-1].indices), white)
     elif len(layout.inverse) >= 2:
-        levels, variances, freedom = _from_inverses(_sample(stack, layout.gray), _sample(stack, layout.inverse), white)
+        levels, variances, freedom = _from_inverses(sample(stack, layout.gray), sample(stack, layout.inverse), white)
     else:
         frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
-        levels, variances, freedom = _from_differences(_sample(stack, tuple(i for i in frames if i is not None)), white)
+        levels, variances, freedom = _from_differences(sample(stack, tuple(i for i in frames if i is not None)), white)
     return _fit_line(*_binned(levels, variances, freedom))
 
 
-def _sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
+def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
     """(n, rows, blocks, BLOCK) float32 of evenly spread rows; all pixels of a row that fill whole blocks."""
     height, width = stack.shape[1:]
     rows = np.unique(np.linspace(0, height - 1, min(ROWS, height)).round().astype(int))

@@ -9,6 +9,7 @@ from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference_spikes import settle
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.threshold import fringe_mean
 
 TWO_PI = 2 * np.pi
 
@@ -94,10 +95,13 @@ def _order(
     code = np.zeros(wrapped.shape, np.int32)
     bit = np.zeros(wrapped.shape, np.int32)
     least = np.full(wrapped.shape, np.inf, np.float32)
+    top, bottom = np.zeros_like(wrapped), np.zeros_like(wrapped)
     for height in heights:
         bit ^= height > 0  # the binary digit is the parity of all Gray bits so far
         code = 2 * code + bit
         np.minimum(least, np.abs(height), out=least)
+        np.maximum(top, height, out=top)
+        np.minimum(bottom, height, out=bottom)
     turns = wrapped * np.float32(1 / TWO_PI) - np.float32(found.gray_origin_px / found.period_px)
     whole = np.floor(turns)
     part = turns - whole  # of a period, since the code edge
@@ -110,25 +114,30 @@ def _order(
         order = np.where(middle, half >> 1, ((half + 1) >> 1) - (part >= 0.75))
         inconsistent = np.where(middle, least, np.abs(last)) < undecided
     else:
-        order = code + _misread(code, heights, part, modulation)
+        mean = np.float32(fringe_mean(found, stack))
+        contrast = np.maximum(top / (1 - mean), -bottom / mean)
+        order = code + _misread(code, heights, part, contrast, (np.float32(0.5) - mean) * contrast)
         inner = (part >= np.float32(limits.EDGE)) & (part < np.float32(1 - limits.EDGE))
         inconsistent = inner & (least < undecided)
     return order - whole, inconsistent
 
 
-def _misread(code: np.ndarray, heights: list[np.ndarray], part: np.ndarray, modulation: np.ndarray) -> np.ndarray:
+def _misread(
+    code: np.ndarray, heights: list[np.ndarray], part: np.ndarray, contrast: np.ndarray, middle: np.ndarray
+) -> np.ndarray:
     """+1 or -1 where a plain Gray code was read from the wrong side of its edge.
 
-    The bit that lies near its threshold tells which edge the pixel is at; the phase tells on which side of it.
+    The bit that lies near the ``middle`` of black and white tells which edge the pixel is at; the phase tells on which
+    side of it. ``contrast`` is white less black.
     """
     lower, upper = (np.full(code.shape, np.inf, np.float32) for _ in range(2))
     for from_least, height in enumerate(reversed(heights)):
         # From k - 1 to k the Gray bit changes whose number, from the least, is the count of trailing zeros of k; from k
         # to k + 1 that of its trailing ones.
         low_bits = code & ((2 << from_least) - 1)
-        lower = np.where(low_bits == 1 << from_least, np.abs(height), lower)
-        upper = np.where(low_bits == (1 << from_least) - 1, np.abs(height), upper)
-    weak, weaker = np.float32(limits.WEAK_BIT) * modulation, np.float32(limits.WEAKER)
+        lower = np.where(low_bits == 1 << from_least, np.abs(height - middle), lower)
+        upper = np.where(low_bits == (1 << from_least) - 1, np.abs(height - middle), upper)
+    weak, weaker = np.float32(limits.WEAK_BIT / 2) * contrast, np.float32(limits.WEAKER)
     ahead = (part < np.float32(limits.EDGE)) & (upper < weak) & (upper < weaker * lower)
     behind = (part >= np.float32(1 - limits.EDGE)) & (lower < weak) & (lower < weaker * upper)
     return ahead.astype(np.int32) - behind.astype(np.int32)
