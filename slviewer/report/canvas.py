@@ -43,16 +43,21 @@ def new_figure(width: int, height: int) -> Any:
     return Drawing(figsize=(width / 100, height / 100), dpi=100 * DENSITY, facecolor="white", layout="constrained")
 
 
-def finish(drawing: Any, caption: str, alt: str) -> Figure:
-    """Draw, and make it a report's figure: a PNG of 256 colours, less than half the size of full colour."""
+def finish(drawing: Any, caption: str, alt: str, *, shaded: bool = False) -> Figure:
+    """Draw, and make it a report's figure: a PNG of 256 colours, less than half the size of full colour.
+
+    ``shaded`` pictures, which would show bands in 256 colours, keep 64 levels a channel.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
 
     with _drawing:
         canvas = FigureCanvasAgg(drawing)
         canvas.draw()
         rgb = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
     buffer = io.BytesIO()
-    _indexed(rgb).save(buffer, format="PNG", compress_level=7)
+    image = Image.fromarray(rgb & 0xFC | rgb >> 6) if shaded else _indexed(rgb)
+    image.save(buffer, format="PNG", compress_level=7)
     return Figure(buffer.getvalue(), caption, alt, rgb.shape[1] // DENSITY)
 
 
@@ -118,7 +123,8 @@ def bare(axes: Any, title: str = "", colour: str = INK) -> None:
 
 def legend(axes: Any, **options: Any) -> None:
     """The legend of what the axes hold, in the page's type."""
-    axes.legend(**{"fontsize": SMALL_PT, "labelcolor": INK, "frameon": False, **options})
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(**{"fontsize": SMALL_PT, "labelcolor": INK, "frameon": False, **options})
 
 
 def colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) -> None:

@@ -29,10 +29,10 @@ def clouds(views: Sequence[CloudView]) -> Figure:
     columns = min(len(views), 3)
     rows = -(-len(views) // columns)
     width = FULL // 3 if columns > 1 else 760
-    picture = (0.76 * width, 0.66 * width)
-    drawing = new_figure(columns * width, rows * round(picture[1] + 62))
+    across, down = round(0.76 * width), round(0.66 * width)
+    drawing = new_figure(columns * width, rows * (down + 62))
     axes = drawing.subplots(rows, columns, squeeze=False).ravel()
-    size = (round(DENSITY * picture[0]), round(DENSITY * picture[1]))
+    size = (DENSITY * across, DENSITY * down)
     palette = ListedColormap(colormaps["YlGnBu_r"](np.linspace(0.18, 0.92, 256)))
     for ax, view in zip(axes, views, strict=False):
         points, normals, _ = _sampled(view)
@@ -50,6 +50,7 @@ def clouds(views: Sequence[CloudView]) -> Figure:
         drawing,
         "Each scan as measured, seen from above and aside, lit by its own surface normals and coloured by depth.",
         "Shaded views of " + ", ".join(f"{view.name} ({_counted(view)})" for view in views),
+        shaded=True,
     )
 
 
@@ -76,6 +77,7 @@ def merged_cloud(view: CloudView) -> Figure:
         "The merged cloud in the reference scan's frame. Right: each square shows the points of one scan alone, so "
         "that a step where squares meet would be a misalignment.",
         f"Shaded views of the merged cloud, {_counted(view)}, as one surface and coloured by scan",
+        shaded=True,
     )
 
 

@@ -39,7 +39,7 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "") -> Figure:
     medians = [percentile(rms, 50) for rms in rms_mm]
     for axes, name, rms, median in zip(drawing.subplots(1, 3), "zxy", rms_mm, medians, strict=True):
         top = rounded_up(percentile(rms, 99))
-        bare(axes, f"{name}: median {median:.3f} mm")
+        bare(axes, f"{name}: {_median(median)}")
         image = axes.imshow(
             _shown(rms, FULL // 3), cmap=_map("viridis", 100), vmin=0, vmax=top, aspect="equal", interpolation="nearest"
         )
@@ -49,8 +49,8 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "") -> Figure:
         drawing,
         f"RMS of each camera pixel's fit over the target poses{named}, in z, x and y. Each colour scale ends at the "
         "99th percentile; grey pixels saw the board too rarely to be fitted.",
-        "Three maps of the fit's RMS in z, x and y; medians "
-        + ", ".join(f"{name} {median:.3f} mm" for name, median in zip("zxy", medians, strict=True)),
+        "Three maps of the fit's RMS in z, x and y; "
+        + ", ".join(f"{name} {_median(median)}" for name, median in zip("zxy", medians, strict=True)),
     )
 
 
@@ -177,6 +177,10 @@ def _map(name: str, levels: int) -> Any:
     from matplotlib import colormaps
 
     return colormaps[name].resampled(levels).with_extremes(bad=EMPTY)
+
+
+def _median(value: float) -> str:
+    return f"median {value:.3f} mm" if np.isfinite(value) else "no pixel fitted"
 
 
 def _floor_words(floor_mm: float) -> str:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from slviewer.report.canvas import percentile
 from slviewer.report.clouds import clouds, merged_cloud
 from slviewer.report.data import CalibrationView, DeviceParameters, SessionData, VerificationView
 from slviewer.report.maps import error_maps, rms_maps
@@ -11,6 +12,7 @@ from slviewer.report.tables import (
     UNKNOWN,
     better_worse,
     incidence_text,
+    mean_of,
     merge_table,
     models_of,
     number,
@@ -52,33 +54,34 @@ def session_headlines(data: SessionData) -> list[Headline]:
                     f"both devices together {rms['stereo']:.3f} px" if "stereo" in rms else "",
                 )
             )
-    if data.pixel_fits:
-        best = min((float(np.nanmedian(fit.rms_mm[0])), fit.axis) for fit in data.pixel_fits)
+    fits = [(percentile(fit.rms_mm[0], 50), fit.axis) for fit in data.pixel_fits]
+    fits = [fit for fit in fits if np.isfinite(fit[0])]
+    if fits:
+        rms_z, axis = min(fits)
         headlines.append(
-            Headline(f"{best[0]:.3f} mm", "pixel-wise fit, RMS in z", f"median over the pixels, axis {best[1]}")
+            Headline(f"{rms_z:.3f} mm", "pixel-wise fit, RMS in z", f"median over the pixels, axis {axis}")
         )
+    return headlines + _proof(data)
+
+
+def _proof(data: SessionData) -> list[Headline]:
+    """The flattest model's mean plane RMS, beside its noise floor and the other models'."""
     planes = [v for v in data.verifications if v.shape == "plane"]
-    if planes:
-        means = {
-            m: float(np.nanmean([v.rms_mm.get(m, np.nan) for v in planes]))
-            for m in models_of([v.rms_mm for v in planes])
-        }
-        model = min(means, key=lambda m: means[m])
-        others = ", ".join(f"{m} {value:.3f} mm" for m, value in means.items() if m != model)
-        headlines.append(
-            Headline(
-                f"{means[model]:.3f} mm",
-                f"mean plane RMS, {model}",
-                others and f"against {others}",
-                "better" if others else "",
-            )
-        )
-    return headlines
+    means = {m: mean_of([v.rms_mm.get(m, np.nan) for v in planes]) for m in models_of([v.rms_mm for v in planes])}
+    means = {m: mean for m, mean in means.items() if np.isfinite(mean)}
+    if not means:
+        return []
+    model = min(means, key=lambda m: means[m])
+    floor = mean_of([v.noise_floor_mm.get(model, np.nan) for v in planes])
+    notes = [f"noise floor {floor:.3f} mm"] if np.isfinite(floor) else []
+    notes += [f"{other} {mean:.3f} mm" for other, mean in means.items() if other != model]
+    mark: Mark = "better" if len(means) > 1 else ""
+    return [Headline(f"{means[model]:.3f} mm", f"mean plane RMS, {model}", "; ".join(notes), mark)]
 
 
 def session_sections(data: SessionData) -> list[Section]:
-    """Captures, then whatever of calibration, proofs and clouds the session holds."""
-    sections = [_captures(data)]
+    """What to look at first, whatever of calibration, proofs and clouds the session holds, and its captures."""
+    sections = _notices(data)
     if data.calibration is not None:
         sections += [_reprojection(data.calibration), _parameters(data.calibration)]
     if data.pixel_fits:
@@ -87,7 +90,14 @@ def session_sections(data: SessionData) -> list[Section]:
         sections.append(_verifications(data))
     if data.clouds or data.merged is not None:
         sections.append(_clouds(data))
-    return sections
+    return [*sections, _captures(data)]
+
+
+def _notices(data: SessionData) -> list[Section]:
+    unused = [row for row in data.captures if row.state in ("left out", "excluded")]
+    items: list[Item] = [Notice(warning) for warning in data.warnings]
+    items += [Notice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
+    return [Section("To notice", "", items)] if items else []
 
 
 def _captures(data: SessionData) -> Section:
@@ -97,7 +107,7 @@ def _captures(data: SessionData) -> Section:
         Column("camera", "px"),
         Column("projector", "px"),
         Column("frames"),
-        Column("period", "px", align="left"),
+        Column("period", "px", align="centre"),
     ]
     columns += [Column("made", align="left"), Column("why not used", align="left")]
     rows: list[list[str | Cell]] = [
@@ -116,19 +126,14 @@ def _captures(data: SessionData) -> Section:
     ]
     filled = [i for i, _ in enumerate(columns) if i < 7 or any(row[i] for row in rows)]
     table = Table([columns[i] for i in filled], [[row[i] for i in filled] for row in rows], "Captures of the session")
-    unused = [row for row in data.captures if row.state in ("left out", "excluded")]
-    items: list[Item] = [Notice(warning) for warning in data.warnings]
-    items += [Notice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
-    return Section(
-        "Captures", "" if data.captures else "The session holds no captures yet.", [*items, table] if rows else items
-    )
+    return Section("Captures", "" if rows else "The session holds no captures yet.", [table] if rows else [])
 
 
 def _reprojection(calibration: CalibrationView) -> Section:
     rms = calibration.reprojection_rms_px
     items: list[Item] = []
     if calibration.pose_rms_px:
-        items.append(pose_bars(calibration.pose_rms_px))
+        items.append(pose_bars(calibration.pose_rms_px, calibration.reprojection_rms_px))
     residuals = calibration.residuals
     if residuals:
         worst = max(residuals, key=lambda name: max(calibration.pose_rms_px.get(name, (0.0, 0.0))))

@@ -22,7 +22,7 @@ def view_rotation(yaw_deg: float, pitch_deg: float) -> np.ndarray:
     """(3, 3) turning camera-frame points into the view's frame: the viewer steps aside by yaw and up by pitch."""
     a, b = np.radians([yaw_deg, pitch_deg])
     turn = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
-    tilt = np.array([[1, 0, 0], [0, np.cos(b), np.sin(b)], [0, -np.sin(b), np.cos(b)]])
+    tilt = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
     return tilt @ turn
 
 

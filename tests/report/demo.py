@@ -76,8 +76,16 @@ def pixel_curve() -> PixelCurve:
     c = np.array([900.0, -1.2, 0.004, 0.11, -0.05])
     phase = (c[0] - z) / (z * c[2] - c[1])
     noise = 0.03 * rng.standard_normal((3, 25))
-    curve = PixelCurve((500, 500), "x", phase, z + noise[0], c[3] * z + 0.2 * noise[1], c[4] * z + 0.2 * noise[2], c,
-                       np.array([0.03, 0.006, 0.006]))  # fmt: skip
+    curve = PixelCurve(
+        (500, 500),
+        "x",
+        phase,
+        z + noise[0],
+        c[3] * z + 0.2 * noise[1],
+        c[4] * z + 0.2 * noise[2],
+        c,
+        np.array([0.03, 0.006, 0.006]),
+    )
     curve.z[4] = np.nan
     return curve
 
@@ -102,7 +110,7 @@ def outlines() -> dict[str, np.ndarray]:
             )
         else:
             corners = corners @ np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
-        out[f"plane_{i + 1:02d}"] = corners + [10, -5, middle]
+        out[f"plane_{i + 1:02d}"] = corners + np.array([10, -5, middle])
     return out
 
 
@@ -158,18 +166,25 @@ def reproduction_data(width: int = 1600) -> ReproductionData:
         fit_rms_mm={"z": 0.041, "x": 0.008, "y": 0.006},
         planes=plane_rows(),
         spheres=spheres,
-        spacings=[SpacingRow("sphere_1 to sphere_2", 120.0, {"stereo": 120.57, "pixelwise": 119.8}),
-                  SpacingRow("pair", 150.0, {"stereo": 150.31, "pixelwise": 150.2})],  # fmt: skip
-        pairs=[MergePair("object_r1", "object_r3", 0.21, 0.84, 0.26), MergePair("object_r2", "object_r3", 0.12, 0.9, 0.25)],
+        spacings=[
+            SpacingRow("sphere_1 to sphere_2", 120.0, {"stereo": 120.57, "pixelwise": 119.8}),
+            SpacingRow("pair", 150.0, {"stereo": 150.31, "pixelwise": 150.2}),
+        ],
+        pairs=[
+            MergePair("object_r1", "object_r3", 0.21, 0.84, 0.26),
+            MergePair("object_r2", "object_r3", 0.12, 0.9, 0.25),
+        ],
         pixel_curve=pixel_curve(),
         rms_maps_mm=rms_maps(width),
         plane_maps=[error_maps(f"plane_{i:02d}", width, {m: OURS[m][i - 1] for m in MODELS}, i) for i in (1, 3, 8)],
         sphere_maps=[error_maps(row.name, width, dict(row.rms_mm), 20 + i, True) for i, row in enumerate(spheres)],
         plane_outlines=outlines(),
         clouds=[CloudView(f"object_r{i + 1}", c, note=f"R{i + 1}") for i, c in enumerate(clouds)],
-        merged=CloudView("merged", merged[known], facing[known], source[known], ("object_r1", "object_r2", "object_r3")),
+        merged=CloudView(
+            "merged", merged[known], facing[known], source[known], ("object_r1", "object_r2", "object_r3")
+        ),
         letter_points={"R1": 1642179, "R2": 1476327, "R3": 1034094},
-    )  # fmt: skip
+    )
 
 
 def session_data(width: int = 1600) -> SessionData:
@@ -191,35 +206,63 @@ def session_data(width: int = 1600) -> SessionData:
         CaptureRow(n, "calibration", "used", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0}) for n in names
     ]
     captures += [
-        CaptureRow("pose_09", "calibration", "left out", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0},
-                   "12 of 336 circles found: lower the exposure, or move the board so that all of it is in view"),
-        CaptureRow("pose_17", "calibration", "excluded", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0},
-                   "the board slipped"),
+        CaptureRow(
+            "pose_09",
+            "calibration",
+            "left out",
+            (width, height),
+            (912, 1140),
+            52,
+            {"x": 18.0, "y": 18.0},
+            "12 of 336 circles found: lower the exposure, or move the board so that all of it is in view",
+        ),
+        CaptureRow(
+            "pose_17",
+            "calibration",
+            "excluded",
+            (width, height),
+            (912, 1140),
+            52,
+            {"x": 18.0, "y": 18.0},
+            "the board slipped",
+        ),
         CaptureRow("vase <b>blue</b>", "scan", "scan", (width, height), (912, 1140), 26, {"x": 18.0}),
-    ]  # fmt: skip
+    ]
     K = np.array([[3510.2, 0, 801.3], [0, 3509.8, 598.2], [0, 0, 1]])
     D = np.array([-0.0812, 0.113, 0.0003, -0.0002, -0.04])
     a = np.radians(14.0)
     R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
     planes = [
         VerificationView(
-            row.name, "plane", row.incidence, 812_345, {"stereo": 1200, "pixelwise": 24000 if i else 900},
-            {"stereo": 0.993, "pixelwise": 0.981}, row.rms_mm, row.noise_floor_mm,
+            row.name,
+            "plane",
+            row.incidence,
+            812_345,
+            {"stereo": 1200, "pixelwise": 24000 if i else 900},
+            {"stereo": 0.993, "pixelwise": 0.981},
+            row.rms_mm,
+            row.noise_floor_mm,
             maps=error_maps(row.name, width, dict(row.rms_mm), i),
         )
         for i, row in enumerate(plane_rows()[:3:2])
-    ]  # fmt: skip
+    ]
     return SessionData(
         name="Vase <script>alert(1)</script>",
         captures=captures,
         calibration=CalibrationView(
             DeviceParameters(K, D, (width, height), 1.2),
             DeviceParameters(K * [[0.4], [0.8], [1]], -D, (912, 1140), 2.1),
-            R, np.array([-178.2, 0.4, 21.3]), "circles:21x16:9", (498.0, 703.0),
-            {"camera": 0.041, "projector": 0.062, "stereo": 0.053}, rms, residuals, 3,
+            R,
+            np.array([-178.2, 0.4, 21.3]),
+            "circles:21x16:9",
+            (498.0, 703.0),
+            {"camera": 0.041, "projector": 0.062, "stereo": 0.053},
+            rms,
+            residuals,
+            3,
         ),
         pixel_fits=[PixelFitView("x", rms_maps(width), np.full((height, width), 17, np.uint16))],
         verifications=planes,
         clouds=[CloudView("vase <b>blue</b>", cloud(width, 590))],
         warnings=["the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"],
-    )  # fmt: skip
+    )

@@ -1,0 +1,172 @@
+"""The figures: pictures of the right size, one scale where figures are compared, nothing invented where data lack."""
+
+import io
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+from demo import cloud, error_map, outlines, pixel_curve, rms_maps
+from PIL import Image
+
+from slviewer.errors import InputError
+from slviewer.report import maps
+from slviewer.report.bars import rms_bars
+from slviewer.report.canvas import DENSITY, FULL, MODELS, finish, new_figure, rounded_up, shrink
+from slviewer.report.clouds import clouds, merged_cloud
+from slviewer.report.curves import pixel_curves
+from slviewer.report.data import CloudView, PixelCurve
+from slviewer.report.page import Figure
+from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
+from slviewer.report.space import planes_in_space
+
+RMS = {"stereo": 0.2, "pixelwise": 0.08}
+
+
+def opened(figure: Figure) -> np.ndarray:
+    image = Image.open(io.BytesIO(figure.png))
+    assert image.format == "PNG" and image.width == DENSITY * figure.width
+    assert figure.alt and figure.caption
+    return np.asarray(image.convert("RGB"))
+
+
+def test_colours_stay_true_where_they_mean_something() -> None:
+    drawing = new_figure(300, 200)
+    axes = drawing.subplots()
+    axes.imshow(np.random.default_rng(0).uniform(size=(200, 200, 3)))  # thousands of colours that compete
+    drawing.text(0.1, 0.9, "■", fontsize=30, color=MODELS["stereo"])
+    image = opened(finish(drawing, "c", "a")).reshape(-1, 3)
+    assert (image == 255).all(axis=1).mean() > 0.1
+    orange = np.array([int(MODELS["stereo"][i : i + 2], 16) for i in (1, 3, 5)])
+    assert (np.abs(image.astype(int) - orange).max(axis=1) == 0).sum() > 100
+
+
+def test_figures_can_be_drawn_by_several_threads() -> None:
+    done: list[Figure] = []
+    threads = [threading.Thread(target=lambda: done.append(pixel_curves(pixel_curve()))) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len({figure.png for figure in done}) == 1 and len(done) == 2
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What the maps' figures hold before they become pixels."""
+    kept: list[Any] = []
+
+    def keep(drawing: Any, *words: str) -> Figure:
+        kept.append(drawing)
+        return finish(drawing, *words)
+
+    monkeypatch.setattr(maps, "finish", keep)
+    return kept
+
+
+@pytest.mark.parametrize("width", [FULL, 528])
+def test_error_maps_share_one_scale_centred_on_zero(drawn: list[Any], width: int) -> None:
+    small, large = error_map(200, 0.05, 0.02, 1), error_map(200, 0.5, 0.02, 2)
+    figure = maps.error_maps("pose 3", {"stereo": large, "pixelwise": small}, RMS, 0.036, width=width)
+    assert opened(figure).shape[1] == DENSITY * width
+    images = [image for axes in drawn[0].axes for image in axes.get_images()]
+    limits = {image.get_clim() for image in images}
+    assert len(images) == 2 and len(limits) == 1
+    low, high = limits.pop()
+    assert low == -high and 0.6 < high < 2.5
+
+
+def test_maps_are_cropped_to_the_data_and_grey_where_there_is_none(drawn: list[Any]) -> None:
+    errors = np.full((300, 400), np.nan, np.float32)
+    errors[100:200, 150:300] = 0.1
+    errors[140:150, 200:220] = np.nan
+    other = errors.copy()
+    other[:, 280:] = np.nan
+    image = opened(maps.error_maps("pose 3", {"stereo": errors, "pixelwise": other}, RMS))
+    shown = [image for axes in drawn[0].axes for image in axes.get_images()]
+    assert {s.get_array().shape for s in shown} == {(104, 154)}
+    assert shown[0].get_cmap().get_bad()[:3] == pytest.approx(np.array([0xD5, 0xD9, 0xDE]) / 255)
+    assert (image == [0xD5, 0xD9, 0xDE]).all(axis=2).sum() > 5000
+
+
+def test_one_limit_for_many_figures() -> None:
+    a, b = error_map(200, 0.05, 0.02, 1), error_map(200, 0.5, 0.02, 2)
+    assert maps.error_limit([a, b]) == maps.error_limit([b]) or maps.error_limit([a, b]) < maps.error_limit([b])
+    assert maps.error_limit([np.full((4, 4), np.nan)]) == 1.0
+
+
+def test_nothing_measured_is_drawn_as_nothing() -> None:
+    empty = np.full((60, 80), np.nan, np.float32)
+    opened(maps.error_maps("pose", {"stereo": empty}, {"stereo": float("nan")}))
+    opened(maps.rms_maps(np.full((3, 60, 80), np.nan)))
+    opened(clouds([CloudView("nothing", np.full((60, 80, 3), np.nan, np.float32))]))
+    opened(merged_cloud(CloudView("nothing", np.zeros((0, 3), np.float32))))
+
+
+def test_shrinking_keeps_means_and_holes() -> None:
+    image = np.random.default_rng(1).normal(size=(300, 401)).astype(np.float32)
+    image[:, :30] = np.nan
+    small = shrink(image, 101)
+    assert small.shape == (75, 101)
+    assert np.isnan(small[:, :7]).all() and np.isfinite(small[:, 8:100]).all()
+    assert small[10, 50] == pytest.approx(image[40:44, 200:204].mean(), abs=1e-6)
+    assert shrink(image, 401) is image
+    assert [rounded_up(v) for v in (0.011, 0.4, 7, 0.95, float("nan"))] == pytest.approx([0.015, 0.4, 8, 1, 1])
+
+
+def test_the_pixels_curve_and_its_residuals() -> None:
+    figure = pixel_curves(pixel_curve())
+    opened(figure)
+    assert "(500, 500)" in figure.caption and "24 target poses" in figure.caption and "30 µm" in figure.caption
+    nothing = np.full(3, np.nan)
+    opened(pixel_curves(PixelCurve((1, 2), "x", nothing, nothing, nothing, nothing, np.ones(5), np.ones(3))))
+
+
+def test_planes_are_named_by_what_differs() -> None:
+    figure = planes_in_space(outlines(), (500, 700))
+    opened(figure)
+    assert "10 planes" in figure.caption and "500 to 700 mm" in figure.caption
+    points = np.random.default_rng(0).uniform(-50, 50, (500, 3)) * [1, 1, 0] + [0, 0, 480]
+    points[0] = np.nan
+    opened(planes_in_space({"only": points}, (500, 700)))
+
+
+def test_reprojection_figures() -> None:
+    rng = np.random.default_rng(2)
+    pixels, residuals = rng.uniform(0, 400, (50, 2)), rng.normal(0, 0.1, (50, 2))
+    residuals[3] = np.nan
+    figure = residual_arrows("pose_03", pixels, residuals, (640, 480))
+    assert "49 features" in figure.alt
+    opened(figure)
+    worst = pose_bars({"a": (0.1, 0.2), "b": (0.1, np.nan), "c": (0.3, 0.1)}, {"camera": 0.1})
+    assert "worst pose is c" in worst.caption
+    square = np.array([[0, 0], [320, 0], [320, 479], [0, 479]], float)
+    assert "50 %" in coverage("camera", (640, 480), [square, square[:2]]).alt
+
+
+def test_clouds_are_counted() -> None:
+    points = cloud(160, 590)
+    count = f"{np.isfinite(points[..., 2]).sum():,} points"
+    figure = clouds([CloudView("scan <1>", points, note="R2")] * 4)
+    assert count in figure.alt and "R2" in figure.alt
+    opened(figure)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: maps.error_maps("t", {}, {}),
+        lambda: maps.error_maps("t", {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))}, RMS),
+        lambda: maps.rms_maps(rms_maps(40)[:2]),
+        lambda: planes_in_space({}, (500, 700)),
+        lambda: planes_in_space({"p": np.zeros((2, 3))}, (500, 700)),
+        lambda: residual_arrows("t", np.zeros((3, 2)), np.zeros((4, 2)), (10, 10)),
+        lambda: pose_bars({}, {}),
+        lambda: rms_bars([]),
+        lambda: shrink(np.zeros((2, 2, 3)), 1),
+        lambda: pixel_curves(PixelCurve((0, 0), "x", *(np.zeros(n) for n in (3, 4, 3, 3, 5, 3)))),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(draw: Any) -> None:
+    with pytest.raises(InputError):
+        draw()

@@ -1,0 +1,187 @@
+"""Whole reports from made-up results: what wins shows, what loses shows as plainly, and the Letter stands beside it."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from demo import MODELS, plane_rows, reproduction_data, session_data, sphere_rows
+
+from slviewer.report.data import PlaneRow, SpacingRow
+from slviewer.report.page import Cell, Figure, Notice, Section, Table, write_page
+from slviewer.report.reproduction import (
+    inside_ratio,
+    reproduction_headlines,
+    reproduction_sections,
+    reproduction_title,
+)
+from slviewer.report.session import session_headlines, session_sections, session_title
+from slviewer.report.tables import better_worse, number, plane_table, spacing_table, sphere_table, verdict
+
+WIDTH = 240
+
+
+def texts(section: Section) -> str:
+    words = [section.title, *section.paragraphs]
+    for item in section.items:
+        if isinstance(item, Table):
+            cells = [c for row in (*item.rows, *item.footer) for c in row]
+            words += [item.caption, *item.notes, *(c.text if isinstance(c, Cell) else c for c in cells)]
+        else:
+            words.append(item.text if isinstance(item, Notice) else item.caption)
+    return "\n".join(words)
+
+
+def by_title(table: Table, row: int) -> dict[tuple[str, str], str | Cell]:
+    return {(c.group, c.title): cell for c, cell in zip(table.columns, table.rows[row], strict=True)}
+
+
+@pytest.fixture(scope="module")
+def reproduction() -> list[Section]:
+    return reproduction_sections(reproduction_data(WIDTH))
+
+
+def test_the_reproduction_is_one_self_contained_file(tmp_path: Path, reproduction: list[Section]) -> None:
+    data = reproduction_data(WIDTH)
+    path = tmp_path / "report.html"
+    write_page(path, *reproduction_title(data), reproduction_headlines(data), reproduction)
+    page = path.read_text(encoding="utf-8")
+    assert "http" not in page.replace("http-equiv", "") and "<script" not in page
+    assert set(re.findall(r'src="([^:"]*):', page)) == {"data"}
+    assert len(page) < 6e6
+    assert "Quick run" in page and "nan" not in re.sub(r"base64,[^\"]*", "", page).lower()
+
+
+def test_every_experiment_shows_its_figures(reproduction: list[Section]) -> None:
+    figures = [sum(isinstance(item, Figure) for item in section.items) for section in reproduction]
+    # curves and RMS maps; bars, three poses and the planes in space; six spheres; three clouds and the merged one
+    assert figures == [2, 5, 6, 2]
+    alts = " ".join(item.alt for section in reproduction for item in section.items if isinstance(item, Figure))
+    for word in ("pixel (500, 500)", "plane_01", "plane_03", "plane_08", "sphere_6", "object_r3", "merged"):
+        assert word in alts
+
+
+def test_the_letters_own_figures_stand_beside_ours(reproduction: list[Section]) -> None:
+    words = "\n".join(texts(section) for section in reproduction)
+    for figure in ("0.253", "0.141", "0.237", "0.184", "0.087", "3.59 × better", "98.44", "0.26", "0.25", "1,642,179"):
+        assert figure in words or figure == "0.087"
+    assert "0.086" in words  # the mean of the Letter's ten rows, which it rounds to 0.087
+
+
+def test_where_pixelwise_loses_it_is_said(reproduction: list[Section]) -> None:
+    planes = reproduction[1]
+    assert any(isinstance(i, Notice) and i.kind == "warning" and "plane_01" in i.text for i in planes.items)
+    table = next(i for i in planes.items if isinstance(i, Table))
+    first, third = by_title(table, 0), by_title(table, 2)
+    assert first["pixelwise", "RMS"] == Cell("0.219", "worse") and first["stereo", "RMS"] == Cell("0.134", "better")
+    assert first["pixelwise", "against stereo"] == Cell("1.63 × worse", "worse")
+    assert third["pixelwise", "RMS"] == Cell("0.076", "better") and third["stereo", "RMS"] == "0.198"
+    assert third["pixelwise", "floor"] == Cell("0.036", "muted")
+    assert by_title(table, 7)["pixelwise", "against stereo"] == "equal"
+
+
+def test_the_ratio_counts_the_planes_inside() -> None:
+    ratio, count = inside_ratio(plane_rows())
+    inside = [2, 3, 8, 9]
+    ours = [np.mean([plane_rows()[i].rms_mm[m] for i in inside]) for m in MODELS]
+    assert count == 4 and ratio == pytest.approx(ours[0] / ours[1])
+    assert np.isnan(inside_ratio([])[0])
+
+
+def test_headlines_name_both_and_mark_the_loser() -> None:
+    data = reproduction_data(WIDTH)
+    assert [h.mark for h in reproduction_headlines(data)] == ["better"] * 4
+    assert "0.270 → 0.174 mm" in reproduction_headlines(data)[0].value
+    worse = dataclasses.replace(data, spacings=[SpacingRow("a", 100.0, {"stereo": 100.1, "pixelwise": 100.4})])
+    assert reproduction_headlines(worse)[3].mark == "worse"
+
+
+def test_an_empty_reproduction_still_makes_a_page() -> None:
+    data = dataclasses.replace(
+        reproduction_data(WIDTH),
+        planes=[],
+        spheres=[],
+        spacings=[],
+        pairs=[],
+        pixel_curve=None,
+        plane_maps=[],
+        sphere_maps=[],
+        plane_outlines={},
+        clouds=[],
+        merged=None,
+        letter_points={},
+        fit_rms_mm={},
+        reprojection_rms_px={},
+        poses_left_out={"pose_02": "board not found"},
+        notes=["something was odd"],
+    )
+    sections = reproduction_sections(data)
+    assert len(sections) == 4 and len(reproduction_headlines(data)) == 2
+    assert "pose_02 was left out: board not found" in texts(sections[0])
+
+
+def test_missing_values_are_dashes_not_winners() -> None:
+    nan = float("nan")
+    row = PlaneRow("p", {}, {"stereo": 0.1, "pixelwise": nan}, {"stereo": nan})
+    cells = by_title(plane_table([row], "t"), 0)
+    assert cells["", "R1 / R2 / R3"] == cells["pixelwise", "RMS"] == Cell("–", "muted")
+    assert cells["stereo", "RMS"] == "0.100" and cells["pixelwise", "against stereo"] == Cell("–", "muted")
+    assert ("the Letter's rig", "stereo") not in cells
+
+
+def test_verdicts() -> None:
+    assert verdict(0.1, 0.25) == Cell("2.50 × better", "better")
+    assert verdict(-0.25, 0.1) == Cell("2.50 × worse", "worse")
+    assert verdict(0.100, 0.101) == "equal" and better_worse(0.100, 0.101) == ""
+    assert number(-0.5, signed=True) == "−0.500" and number(0.5, 1, signed=True) == "+0.5"
+
+
+def test_spheres_are_judged_by_their_radius_and_spacing() -> None:
+    table = sphere_table(sphere_rows(), "t")
+    row = by_title(table, 0)
+    assert row["stereo", "error"] == "−0.090" and row["pixelwise", "error"] == Cell("+0.080", "better")
+    assert "True radius 98.03 mm" in table.notes[0]
+    spacing = by_title(spacing_table([SpacingRow("a to b", 150.0, {"stereo": 150.5, "pixelwise": 149.9})], "t"), 0)
+    assert spacing["pixelwise", "error"] == Cell("−0.100", "better")
+    assert spacing["pixelwise", "against stereo"] == Cell("5.00 × better", "better")
+
+
+def test_a_sessions_report(tmp_path: Path) -> None:
+    data = session_data(WIDTH)
+    sections = session_sections(data)
+    titles = [section.title for section in sections]
+    assert titles == [
+        "To notice", "Reprojection", "Parameters", "Pixel-wise model", "Verification", "Scans", "Captures"
+    ]  # fmt: skip
+    words = "\n".join(texts(section) for section in sections)
+    for word in (
+        "12 of 336 circles",
+        "the board slipped",
+        "exposure changed",
+        "pose_14",
+        "look at this pose",
+        "179.47 mm",
+    ):
+        assert word in words
+    path = tmp_path / "report.html"
+    write_page(path, *session_title(data), session_headlines(data), sections)
+    page = path.read_text(encoding="utf-8")
+    assert "&lt;script&gt;" in page and "<script" not in page and "<b>" not in page
+    assert set(re.findall(r'src="([^:"]*):', page)) == {"data"}
+
+
+def test_a_session_with_nothing_in_it() -> None:
+    data = dataclasses.replace(
+        session_data(WIDTH), captures=[], calibration=None, pixel_fits=(), verifications=(), clouds=(), warnings=()
+    )
+    (section,) = session_sections(data)
+    assert "no captures yet" in texts(section) and session_headlines(data) == []
+
+
+def test_a_calibration_made_elsewhere() -> None:
+    data = session_data(WIDTH)
+    assert data.calibration is not None
+    bare = dataclasses.replace(data.calibration, reprojection_rms_px={}, pose_rms_px={}, residuals={})
+    sections = session_sections(dataclasses.replace(data, calibration=bare, verifications=(), pixel_fits=(), clouds=()))
+    assert "made elsewhere" in texts(sections[1])
