@@ -54,10 +54,10 @@ def suspects(phase, row, per_cell, suspect):
 
 @numba.njit
 def votes(phase, row, x, rules):
-    """(valid, agree, whole, above, below) neighbours in the window; see `reference_spikes`."""
+    """(valid, agree, above, below) neighbours in the window; see `reference_spikes`."""
     height, width = phase.shape
     per_cell, nearly = np.float32(1 / rules.cell_rad), np.float32(rules.whole)
-    valid, agree, whole, above, below = 0, 0, 0, 0, 0
+    valid, agree, above, below = 0, 0, 0, 0
     for v in range(max(0, row - rules.window), min(height, row + rules.window + 1)):
         for u in range(max(0, x - rules.window), min(width, x + rules.window + 1)):
             cells = (phase[v, u] - phase[row, x]) * per_cell
@@ -68,10 +68,9 @@ def votes(phase, row, x, rules):
             if nearest == 0:
                 agree += 1
             elif abs(cells - nearest) < nearly:
-                whole += 1
                 above += nearest == 1
                 below += nearest == -1
-    return valid, agree, whole, above, below
+    return valid, agree, above, below
 
 
 @numba.njit
@@ -94,7 +93,7 @@ def repair(phase, rules, out):
         for x in range(width):
             if not suspect[x] or np.isnan(phase[row, x]) or not at_edge(phase[row, x], rules):
                 continue
-            valid, _, _, above, below = votes(phase, row, x, rules)
+            valid, _, above, below = votes(phase, row, x, rules)
             if valid >= rules.neighbours:
                 if above >= rules.majority * valid:
                     out[row, x] = phase[row, x] + np.float32(TWO_PI)
@@ -119,8 +118,7 @@ def settle(phase, reason, rules, out):
         for x in range(width):
             if not suspect[x] or np.isnan(own[x]):
                 continue
-            valid, agree, whole, _, _ = votes(phase, row, x, rules)
-            few = valid < rules.lonely_neighbours or agree < rules.lonely * valid
-            if few or (rules.plain and whole >= 0.5 * valid and at_edge(own[x], rules)):
+            valid, agree, _, _ = votes(phase, row, x, rules)
+            if valid < rules.lonely_neighbours or agree < rules.lonely * valid:
                 out[row, x] = np.nan
                 reason[row, x] = INCONSISTENT

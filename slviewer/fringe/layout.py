@@ -58,9 +58,8 @@ class Layout:
 def layout(sequence: PatternSequence, axis: Axis) -> Layout:
     """The layout of one axis. Raises InputError where its frames cannot give an absolute phase."""
     if axis not in sequence.axes:
-        raise InputError(
-            f"the frames carry no pattern along axis {axis}: there is {' and '.join(sequence.axes) or 'none'}"
-        )
+        there = f"use axis {sequence.axes[0]}" if sequence.axes else "phase steps or Gray bits are needed"
+        raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
     shifts = tuple(_shift(sequence, axis, period) for period in sequence.periods_px(axis))
     gray, inverse, complementary, white, black = (
         _by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")

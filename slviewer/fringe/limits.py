@@ -32,8 +32,9 @@ OUTSIDE_PX = 0.5
 
 WINDOW = 2
 """Half the side of the neighbourhood that decides about spikes: 5 x 5 pixels."""
-SPIKE_MAJORITY = 0.65
-"""Part of the neighbours that must agree on one whole period before a pixel at a code edge is moved by it."""
+SPIKE_MAJORITY = 0.75
+"""Part of the neighbours that must agree on one whole period before a pixel at a code edge is moved by it: more than
+the two thirds that see the corner of an object from outside."""
 SPIKE_NEIGHBOURS = 8
 """Valid neighbours that such a majority needs."""
 WHOLE_PERIOD = 0.25

@@ -23,15 +23,12 @@ def settle(found: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.nda
     neighbours on its own side, and is left as it is.
     """
     cell = cell_rad(found)
-    plain = is_plain(found)
-    if plain:
+    if is_plain(found):
         phase = _repaired(found, phase, cell)
     reason = reason.copy()
     v, u, votes = _votes(phase, cell)
     few = votes["valid"] < limits.LONELY_NEIGHBOURS
     lonely = votes["agree"] < limits.LONELY * votes["valid"]
-    if plain:
-        lonely |= _at_edge(found, phase[v, u]) & (votes["whole"] >= 0.5 * votes["valid"])
     wrong = few | lonely
     reason[v[wrong], u[wrong]] = Reason.INCONSISTENT
     low, high = border_rad(found)
@@ -75,7 +72,7 @@ def _at_edge(found: Layout, phase: np.ndarray) -> np.ndarray:
 def _votes(phase: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Pixels that differ from one of their four neighbours, and how their window votes.
 
-    ``valid`` neighbours; those that ``agree``; those a ``whole`` number of cells away; one cell ``above``, ``below``.
+    ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``.
     """
     margin = limits.WINDOW
     padded = np.pad(phase, margin, constant_values=np.nan)
@@ -87,14 +84,13 @@ def _votes(phase: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, dict
             near = padded[margin + dv : margin + dv + phase.shape[0], margin + du : margin + du + phase.shape[1]]
             suspect |= ~(np.abs(np.rint((near - centre) * per_cell)) < 0.5)
         v, u = np.nonzero(suspect & np.isfinite(phase))
-        votes = {word: np.zeros(len(v), np.int32) for word in ("valid", "agree", "whole", "above", "below")}
+        votes = {word: np.zeros(len(v), np.int32) for word in ("valid", "agree", "above", "below")}
         for dv, du in OFFSETS:
             cells = (padded[v + margin + dv, u + margin + du] - phase[v, u]) * per_cell
             nearest = np.rint(cells)
             whole = np.abs(cells - nearest) < np.float32(limits.WHOLE_PERIOD)
             votes["valid"] += np.isfinite(cells)
             votes["agree"] += nearest == 0
-            votes["whole"] += whole & (nearest != 0)
             votes["above"] += whole & (nearest == 1)
             votes["below"] += whole & (nearest == -1)
     return v, u, votes

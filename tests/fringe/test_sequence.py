@@ -1,0 +1,116 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slviewer.errors import InputError
+from slviewer.fringe.patterns import profile, render
+from slviewer.fringe.presets import PRESETS, complementary, gray, multifrequency, p18
+from slviewer.fringe.sequence import Frame, PatternSequence, parse_size
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_survives_its_description(name):
+    sequence = PRESETS[name]((912, 1140))
+    assert PatternSequence.from_dict(json.loads(json.dumps(sequence.to_dict()))) == sequence
+    assert sequence.axes == ("x", "y")
+
+
+def test_p18_is_laid_out_as_its_folders_are():
+    sequence = p18((912, 1140))
+    assert len(sequence.frames) == 2 * 26
+    assert [f.kind for f in sequence.frames[:26]] == ["phase"] * 18 + ["gray"] * 7 + ["texture"]
+    assert sequence.period_px("x") == 18 and sequence.extent("y") == 1140
+    assert sequence.select("y") == list(range(26, 51))
+    assert len(p18((3840, 2160)).find("gray", "x")) == 8
+
+
+def test_gray_is_laid_out_as_procam_calibration():
+    sequence = gray((1024, 768))
+    assert [(f.kind, f.bit) for f in sequence.frames[:4]] == [("gray", 0), ("inverse", 0), ("gray", 1), ("inverse", 1)]
+    assert len(sequence.frames) == 42
+    assert [f.kind for f in sequence.frames[-2:]] == ["white", "black"]
+    assert sequence.select("x") == [*range(20), 40, 41]
+    assert sequence.period_px("x") == 1
+
+
+def test_rendered_cosine_and_bits():
+    sequence = complementary((50, 30), 4, 16.0)
+    image = render(sequence, 1)
+    assert image.shape == (30, 50) and image.dtype == np.uint8 and (image == image[0]).all()
+    u = np.arange(50)
+    assert np.abs(image[0] - (127.5 + 127.5 * np.cos(2 * np.pi * (u / 16 + 1 / 4)))).max() <= 0.5 + 1e-9
+    bits = sequence.find("gray", "x") + sequence.find("complementary", "x")
+    code = np.zeros(50, int)
+    for i in bits:
+        code = 2 * code + ((code & 1) ^ (profile(sequence, i)[1] > 0))
+    np.testing.assert_array_equal(code, u // 8)  # half periods
+    y = sequence.find("gray", "y")[-1]
+    assert (render(sequence, y) == render(sequence, y)[:, :1]).all()
+    inverse = gray((50, 30))
+    assert (profile(inverse, 0)[1] ^ profile(inverse, 1)[1] == 255).all()
+    assert profile(inverse, len(inverse.frames) - 2)[0] is None
+    assert render(inverse, len(inverse.frames) - 1).max() == 0
+
+
+def _frames(sequence, *without):
+    return tuple(f for i, f in enumerate(sequence.frames) if i not in without)
+
+
+@pytest.mark.parametrize(
+    ("frames", "said"),
+    [
+        (_frames(p18((912, 1140)), 3), "phase step 3 of 18 is missing"),
+        (_frames(p18((912, 1140)), 24), "Gray bit 6 of 7 is missing"),
+        (_frames(p18((912, 1140)), 18, 20), "Gray bit 0, 2 of 7 is missing"),
+        (_frames(gray((64, 64)), 3), "inverse of Gray bit 1 of 6 is missing"),
+        ((*p18((912, 1140)).frames, p18((912, 1140)).frames[0]), "step 0 occurs more than once"),
+        (
+            (*_frames(p18((912, 1140)), 0), Frame("phase", "x", step=0, steps=17, period_px=18)),
+            "speak of 17, 18 phase steps",
+        ),
+    ],
+)
+def test_an_incomplete_sequence_is_refused(frames, said):
+    with pytest.raises(InputError, match=said):
+        PatternSequence((912, 1140), frames)
+
+
+def test_bits_may_or_may_not_count_the_complementary_one():
+    frames = complementary((576, 576), 4, 18.0).frames
+    for more in (0, 1):
+        said = tuple(replace(f, bits=f.bits + more) if f.kind == "gray" else f for f in frames)
+        assert len(PatternSequence((576, 576), said).find("gray", "x")) == 5
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"kind": "fringes"},
+        {"kind": "phase", "axis": "x", "step": 0, "steps": 2, "period_px": 18},
+        {"kind": "phase", "axis": "x", "step": 4, "steps": 4, "period_px": 18},
+        {"kind": "phase", "axis": "x", "step": 0, "steps": 4},
+        {"kind": "phase", "axis": "x", "step": "first", "steps": 4, "period_px": 18},
+        {"kind": "gray", "bit": 0, "bits": 3},
+        {"kind": "gray", "axis": "u", "bit": 0},
+        {"axis": "x"},
+        {"kind": "white", "colour": "red"},
+    ],
+)
+def test_a_frame_that_cannot_be_is_refused(data):
+    with pytest.raises(InputError):
+        Frame.from_dict(data)
+
+
+def test_sizes():
+    assert parse_size("912x1140") == parse_size([912, 1140]) == (912, 1140)
+    for bad in ("912", "912x", "0x4", "axb", None):
+        with pytest.raises(InputError, match="projector size"):
+            parse_size(bad)
+
+
+def test_multifrequency_covers_each_axis():
+    sequence = multifrequency((912, 1140))
+    assert sequence.periods_px("x")[0] >= 912 and sequence.periods_px("y")[0] >= 1140
+    assert sequence.period_px("x") == 16
