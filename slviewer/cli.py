@@ -365,29 +365,20 @@ def _union(commands: dict[str, Callable[..., Any]]) -> Any:
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
 
 
-def _import(
-    command: Annotated[
-        Any,
-        tyro.conf.OmitSubcommandPrefixes,
-    ],
-) -> Callable[[], None]:
+def _import(command: Any) -> Callable[[], None]:
     """Import captures or calibrations that other tools made."""
-    result: Callable[[], None] = command
-    return result
+    run: Callable[[], None] = command
+    return run
 
 
-_import.__annotations__["command"] = tyro.conf.OmitArgPrefixes[
-    tyro.conf.OmitSubcommandPrefixes[
-        _union(
-            {
-                "p18": _import_p18,
-                "procam-calibration": _import_procam_calibration,
-                "frames": _import_frames,
-                "opencv-calibration": _import_opencv_calibration,
-            }
-        )
-    ]
-]
+_import.__annotations__["command"] = _union(
+    {
+        "p18": _import_p18,
+        "procam-calibration": _import_procam_calibration,
+        "frames": _import_frames,
+        "opencv-calibration": _import_opencv_calibration,
+    }
+)
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "import": _import,
@@ -417,7 +408,12 @@ def main(arguments: list[str] | None = None) -> int:
             prog="slviewer",
             description="Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge.",
             args=arguments,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+            config=(
+                tyro.conf.OmitArgPrefixes,
+                tyro.conf.OmitSubcommandPrefixes,
+                tyro.conf.FlagCreatePairsOff,
+                tyro.conf.PositionalMetavarFromFieldName,
+            ),
         )
     except SystemExit as stop:
         return int(stop.code or 0)

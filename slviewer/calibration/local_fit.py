@@ -27,7 +27,7 @@ def local_values(field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radi
     return out
 
 
-@kernel(parallel=False)
+@kernel()
 def _local_fits(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
     height, width = field.shape
     basis = np.empty((1024, 6))
@@ -79,7 +79,7 @@ def _local_fits(field, weight, pixels, radius, out):  # type: ignore[no-untyped-
                 trace += A[p, p]
             for p in range(6):
                 A[p, p] += 1e-12 * trace
-            solution = np.linalg.solve(A, b)
+            solution[:] = np.linalg.solve(A, b)
             residual = np.empty(count)
             for k in range(count):
                 fitted = 0.0

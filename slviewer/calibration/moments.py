@@ -67,7 +67,7 @@ class RationalMoments:
         return rms
 
 
-@kernel(parallel=False)
+@kernel()
 def _add_linear(phase, z, v0, u0, phase_ref, z_ref, sums, poses, phase_min, phase_max):  # type: ignore[no-untyped-def]
     for i in range(phase.shape[0]):
         for j in range(phase.shape[1]):
@@ -92,7 +92,7 @@ def _add_linear(phase, z, v0, u0, phase_ref, z_ref, sums, poses, phase_min, phas
             phase_max[v0 + i, u0 + j] = max(phase_max[v0 + i, u0 + j], p)
 
 
-@kernel(parallel=False)
+@kernel()
 def _add_gauss_newton(phase, z, v0, u0, phase_ref, z_ref, coefficients, sums):  # type: ignore[no-untyped-def]
     for i in range(phase.shape[0]):
         for j in range(phase.shape[1]):
@@ -118,7 +118,7 @@ def _add_gauss_newton(phase, z, v0, u0, phase_ref, z_ref, coefficients, sums):  
             a[9] += r * r
 
 
-@kernel(parallel=False)
+@kernel()
 def _solve(sums, poses, min_poses, coefficients, condition, step):  # type: ignore[no-untyped-def]
     """Cholesky of the normalised 3x3 matrix; ``step`` adds to the coefficients and leaves the residual in sums[9]."""
     for v in range(sums.shape[0]):

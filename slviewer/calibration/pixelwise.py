@@ -249,7 +249,7 @@ def _pixel_fit(m: RationalMoments, c3: np.ndarray, c4: np.ndarray, rms_x: np.nda
     return PixelFit(c, rms, m.poses, m.phase_min, m.phase_max, m.condition)
 
 
-@kernel(parallel=False)
+@kernel()
 def _add_rays(points, v0, u0, sums):  # type: ignore[no-untyped-def]
     for i in range(points.shape[0]):
         for j in range(points.shape[1]):

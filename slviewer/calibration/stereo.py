@@ -198,7 +198,7 @@ class _Solution:
         for device, images, size in (("camera", cameras, used[0].size), ("projector", projectors, projector_size)):
             try:
                 _, K, D, _, _, deviations, _, _ = cv2.calibrateCameraExtended(
-                    objects, images, size, None, None, criteria=criteria
+                    objects, images, size, np.zeros((3, 3)), np.zeros(5), criteria=criteria
                 )
             except cv2.error as error:
                 raise CalibrationRejected(

@@ -66,11 +66,13 @@ def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
 
 def decoded(session: Session, names: Sequence[str]) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
     """Captures with their frames and phases, in order; the next one's frames are read while one is worked on."""
+    captures = [session.load_capture(name) for name in names]
+    if not captures:
+        return
     with ThreadPoolExecutor(1) as reader:
-        captures = [session.load_capture(name) for name in names]
-        waiting = [reader.submit(lambda c=captures[0]: c.stack())] if captures else []
+        ahead = reader.submit(captures[0].stack)
         for i, capture in enumerate(captures):
-            frames = waiting.pop().result()
+            frames = ahead.result()
             if i + 1 < len(captures):
-                waiting.append(reader.submit(lambda c=captures[i + 1]: c.stack()))
+                ahead = reader.submit(captures[i + 1].stack)
             yield capture, frames, decode_capture(capture, frames)

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from slviewer.cli import main
+from slviewer.session.exporters import write_calibration
 from slviewer.session.store import Session
 
 Run = Callable[..., tuple[int, str, str]]
@@ -113,6 +114,27 @@ def test_an_excluded_pose_is_left_out_and_named(calibrated: dict, session: Path,
         with Session.open(session, write=True) as store:
             store.include("pose_02")
         run("calibrate", session, "--target", "circles:21x16:9")
+
+
+def test_a_calibration_made_elsewhere_reconstructs_the_same(
+    calibrated: dict, session: Path, run: Run, tmp_path: Path
+) -> None:
+    stereo = calibrated["models"]["stereo"]
+    names = ["K_camera", "D_camera", "K_projector", "D_projector", "R", "T"]
+    write_calibration(tmp_path / "rig.yml", {f"my_{name}": np.array(stereo[name]) for name in names})
+    frames = Session.open(session).load_capture("object_r2").frames
+    with Session.create(tmp_path / "other") as other:
+        sequence = Session.open(session).load_capture("object_r2").sequence
+        other.save_capture("part", "scan", sequence, frames, source="test")
+    keys = [f"my_{name}" for name in names]
+    status, _, error = run("import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *keys)
+    assert (status, error) == (0, "")
+    assert run("reconstruct", tmp_path / "other", "part", "--grid", tmp_path / "other.npy")[0] == 0
+    assert run("reconstruct", session, "object_r2", "--model", "stereo", "--grid", tmp_path / "own.npy")[0] == 0
+    difference = np.abs(np.load(tmp_path / "other.npy") - np.load(tmp_path / "own.npy"))
+    assert np.nanmax(difference) < 1e-3 and np.isfinite(difference[..., 2]).sum() > 10_000
+    status, _, error = run("import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *names)
+    assert status == 1 and "my_K_camera" in error
 
 
 def test_patterns_come_back_as_the_columns_themselves(run: Run, tmp_path: Path) -> None:
