@@ -39,9 +39,9 @@ SPIKE_NEIGHBOURS = 8
 """Valid neighbours that such a majority needs."""
 WHOLE_PERIOD = 0.25
 """How far, in periods, a difference may be from a whole period to count as a misread edge and not as a depth step."""
-LONELY = 0.25
-"""A pixel that fewer of its neighbours agree with is INCONSISTENT: less than a corner of an object has, more than a
-line one pixel wide, in which light of two surfaces is mixed."""
+LONELY = 0.4
+"""A pixel that a smaller part of its neighbours agrees with is INCONSISTENT: less than a straight edge of an object has
+(0.58), more than a line two pixels wide (0.38), in which the lens mixes the light of two surfaces."""
 LONELY_NEIGHBOURS = 3
 """... and so is one with fewer valid neighbours than this: nothing vouches for it."""
 GRAY_CELL_PX = 16.0
