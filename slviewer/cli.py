@@ -271,7 +271,7 @@ def _simulate(
 @_deferred
 def _reproduce(
     quick: bool = False,
-    out: Path = Path("reproduction"),
+    out: Path | None = None,
     json: Path | None = None,
     seed: int = 0,
 ) -> None:
@@ -279,13 +279,14 @@ def _reproduce(
 
     Args:
         quick: Half resolution; its figures are its own.
-        out: Folder for the session and the report.
+        out: Folder for the session and the report; by default reproduction, or reproduction-quick.
         json: Write the figures to this file too.
         seed: Another seed is another rig of the same kind.
     """
     from slviewer.workflow import reproduce
 
-    result = reproduce(out, quick=quick, seed=seed, **_ui())
+    folder = out or Path("reproduction-quick" if quick else "reproduction")
+    result = reproduce(folder, quick=quick, seed=seed, **_ui())
     _write_json(json, result.to_json())
     print(result.text())
 

@@ -1,5 +1,7 @@
 """The Letter's experiments on the simulated rig, its figures remade, and its tables beside ours."""
 
+import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +15,6 @@ from slviewer.errors import InputError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
 from slviewer.evaluation.render import render
-from slviewer.evaluation.sphere import SphereResult
 from slviewer.evaluation.tables import rows
 from slviewer.session.store import Session, is_session
 from slviewer.workflow.calibrating import calibrate
@@ -21,7 +22,7 @@ from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.merging import Merge, merge
 from slviewer.workflow.models import load_observations
 from slviewer.workflow.simulating import TARGET, TRUTH, simulate
-from slviewer.workflow.verifying import verify
+from slviewer.workflow.verifying import Verification, verify
 
 MODELS = ("stereo", "pixelwise")
 QUICK_SCALE = 0.5
@@ -103,6 +104,7 @@ class Reproduction:
                 *pairs,
                 "",
                 f"Report: {self.report}",
+                f"Session: {self.report.parent / 'session'} ({_size_gb(self.report.parent / 'session'):.1f} GB)",
             ]
         )
 
@@ -140,7 +142,7 @@ def reproduce(
         progress=part(progress, 0.65, 0.75),
         warn=warn,
     ).captures
-    spheres = verify(
+    round_ones = verify(
         session,
         [n for n in names if n.startswith("sphere_")],
         "sphere",
@@ -149,7 +151,7 @@ def reproduce(
         radius=letter.SPHERE_RADIUS_MM,
         progress=part(progress, 0.75, 0.82),
         warn=warn,
-    ).captures
+    )
     merged = merge(
         session, OBJECTS, OBJECTS[-1], out / "merged.ply", model="pixelwise", progress=part(progress, 0.82, 0.9)
     )
@@ -158,8 +160,8 @@ def reproduce(
         stereo=found.stereo,
         pixelwise=found.pixelwise,
         planes=planes,
-        spheres=spheres,
-        spacings_mm=_spacings(session, spheres),
+        spheres=round_ones.captures,
+        spacings_mm=_spacings(session, round_ones),
         merged=merged,
         report=out / "report.html",
     )
@@ -171,39 +173,37 @@ def reproduce(
 
 
 def _simulated(session: Path, scale: float, seed: int, progress: Progress) -> None:
-    """The session of this scale and seed; refuses a folder that holds another one."""
+    """Fills the session, unless it holds this scale and seed already; refuses one that holds anything else."""
     if is_session(session):
-        import json
-
-        truth = session / TRUTH
-        made = json.loads(truth.read_text()) if truth.is_file() else {}
-        if (made.get("scale"), made.get("seed"), made.get("complete")) == (scale, seed, True):
+        made = _truth(session)
+        if (made.get("scale"), made.get("seed")) == (scale, seed):
             return
-        raise InputError(f"{session} holds another simulation: choose another folder with --out, or delete it")
+        with Session.open(session) as store:
+            if made or store.capture_names():
+                raise InputError(f"{session} holds another simulation: choose another folder with --out, or delete it")
+        shutil.rmtree(session)  # an interrupted run's, with nothing in it
     simulate(session, scale=scale, seed=seed, progress=progress)
 
 
-def _spacings(session: Path, spheres: Mapping[str, Comparison]) -> dict[str, tuple[float, dict[str, float]]]:
+def _truth(session: Path) -> dict[str, Any]:
+    path = session / TRUTH
+    truth: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    return truth
+
+
+def _spacings(session: Path, spheres: Verification) -> dict[str, tuple[float, Mapping[str, float]]]:
     """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the simulation's truth."""
-    import json
-
-    truth = json.loads((session / TRUTH).read_text())["spheres"]
-    names = list(spheres)
-    found = {}
-    for i, a in enumerate(names):
-        for b in names[i + 1 :]:
-            known = float(np.linalg.norm(np.subtract(truth[a]["centres"][0], truth[b]["centres"][0])))
-            measured = {m: float(np.linalg.norm(_centre(spheres[a], m) - _centre(spheres[b], m))) for m in MODELS}
-            found[f"{a} - {b}"] = (known, measured)
-    return found
-
-
-def _centre(comparison: Comparison, model: str) -> np.ndarray:
-    result = comparison.results[model]
-    assert isinstance(result, SphereResult)
-    return result.sphere.centre
+    centres = {name: np.array(record["centres"][0]) for name, record in _truth(session)["spheres"].items()}
+    return {
+        f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), found)
+        for (a, b), found in spheres.centre_distances_mm().items()
+    }
 
 
 def _shown(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The columns that fit a terminal; coverage and points set aside stand in the report."""
     return [{k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k} for row in table]
+
+
+def _size_gb(folder: Path) -> float:
+    return sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 1e9

@@ -63,7 +63,7 @@ def simulate(
         saved += store.save_captures(rendered(scans, only_x), "scan")
         for kind, scenes in groups.items():
             truth[f"{kind}s"] = {name: scene_record(scene) for name, scene in scenes.items()}
-        (store.folder / TRUTH).write_text(json.dumps({**truth, "complete": True}, indent=1) + "\n")
+        (store.folder / TRUTH).write_text(json.dumps(truth, indent=1) + "\n")
     progress(1.0, "simulated")
     return [capture.name for capture in saved]
 

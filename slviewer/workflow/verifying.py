@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,6 +10,8 @@ import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.render import render
+from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
 from slviewer.session.store import Session
 from slviewer.workflow.decoding import capture_texture, decoded
@@ -25,13 +28,36 @@ class Verification:
 
     captures: Mapping[str, Comparison]
 
+    def centre_distances_mm(self) -> dict[tuple[str, str], dict[str, float]]:
+        """{(capture, capture): {model: mm}}: distances between the spheres' centres; empty for planes."""
+        found = {}
+        for (a, one), (b, other) in combinations(self.captures.items(), 2):
+            distances = {
+                model: float(np.linalg.norm(result.sphere.centre - partner.sphere.centre))
+                for model, result in one.results.items()
+                if isinstance(result, SphereResult) and isinstance(partner := other.results[model], SphereResult)
+            }
+            if distances:
+                found[a, b] = distances
+        return found
+
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``verify --json``."""
-        return {"captures": {name: comparison.to_dict() for name, comparison in self.captures.items()}}
+        """The contract of ``verify --json``, and for spheres the distances between their centres."""
+        data: dict[str, Any] = {"captures": {name: comparison.to_dict() for name, comparison in self.captures.items()}}
+        if distances := self.centre_distances_mm():
+            data["centre_distances_mm"] = {f"{a} - {b}": found for (a, b), found in distances.items()}
+        return data
 
     def text(self) -> str:
         """For people."""
-        return "\n".join(f"{name}:\n{comparison.text()}" for name, comparison in self.captures.items())
+        blocks = [f"{name}:\n{comparison.text()}" for name, comparison in self.captures.items()]
+        if distances := self.centre_distances_mm():
+            table = [
+                {"centres": f"{a} - {b}"} | {f"{model} mm": mm for model, mm in found.items()}
+                for (a, b), found in distances.items()
+            ]
+            blocks.append(f"distances between the centres:\n{render(table)}")
+        return "\n".join(blocks)
 
 
 def verify(
