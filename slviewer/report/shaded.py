@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.jit import kernel
 
 SUPERSAMPLING = 1.5
-LIGHT = np.array([-0.45, -0.62, -0.64]) / np.linalg.norm([-0.45, -0.62, -0.64])
+LIGHT = np.array([-0.45, -0.36, -0.82]) / np.linalg.norm([-0.45, -0.36, -0.82])
 """Towards the light, in the view's frame (x right, y down, z away): from above, left of the viewer."""
 AMBIENT = 0.34
 OUTLINE = 0.9
