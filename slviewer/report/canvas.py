@@ -57,7 +57,7 @@ def finish(drawing: Any, caption: str, alt: str, *, shaded: bool = False) -> Fig
         rgb = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
     buffer = io.BytesIO()
     image = Image.fromarray(rgb & 0xFC | rgb >> 6) if shaded else _indexed(rgb)
-    image.save(buffer, format="PNG", compress_level=7)
+    image.save(buffer, format="PNG", compress_level=5)
     return Figure(buffer.getvalue(), caption, alt, rgb.shape[1] // DENSITY)
 
 

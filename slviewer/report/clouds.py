@@ -12,7 +12,7 @@ from slviewer.report.shaded import render, view_rotation
 YAW_DEG, PITCH_DEG = 24.0, 18.0
 SCANS = ("#5b8fd0", "#e0a13c", "#63b28a", "#c8718f", "#8f83c9")
 CLAY = (0.80, 0.79, 0.77)
-MOST_POINTS = 450_000
+MOST_POINTS = 300_000
 """Points drawn of one cloud: more change nothing at the size of a page."""
 
 

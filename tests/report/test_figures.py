@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from demo import cloud, error_map, outlines, pixel_curve, rms_maps
+from made_up import cloud, error_map, outlines, pixel_curve, rms_maps
 from PIL import Image
 
 from slviewer.errors import InputError

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from demo import MODELS, plane_rows, reproduction_data, session_data, sphere_rows
+from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_rows
 
 from slviewer.report.data import PlaneRow, SpacingRow
 from slviewer.report.page import Cell, Figure, Notice, Section, Table, write_page
