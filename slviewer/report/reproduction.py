@@ -204,8 +204,8 @@ def _duel(label: str, values: dict[str, float], note: str) -> Headline:
 
 
 def _arrow(values: dict[str, float]) -> str:
-    base, ours = ("–" if not np.isfinite(v) else f"{v:.3f}" for v in (values[BASE], values[OURS]))
-    return f"{base} → {ours} mm"
+    base, ours = (number(values[model]) for model in (BASE, OURS))
+    return f"{base if isinstance(base, str) else base.text} → {ours if isinstance(ours, str) else ours.text} mm"
 
 
 def _mm(value: float) -> str:

@@ -13,10 +13,10 @@ UNKNOWN = Cell("–", "muted")
 
 
 def number(value: float, digits: int = 3, signed: bool = False) -> str | Cell:
-    """A value with so many decimals; a dash where it is unknown."""
+    """A value with so many decimals, halves rounded up as people do; a dash where it is unknown."""
     if not np.isfinite(value):
         return UNKNOWN
-    return f"{value:{'+' if signed else ''}.{digits}f}".replace("-", "−")
+    return f"{value * (1 + 1e-9):{'+' if signed else ''}.{digits}f}".replace("-", "−")
 
 
 def better_worse(error: float, rival: float) -> Mark:
