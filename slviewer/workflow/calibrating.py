@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.observe import Observation, Smoothing, observe
+from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
-from slviewer.errors import CalibrationRejected, DetectionError, InputError
+from slviewer.errors import CalibrationRejected, InputError
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.target.detect import detect
-from slviewer.workflow.decoding import capture_texture, check_projector, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import save_observations, save_pixelwise, save_stereo
+from slviewer.workflow.models import save_pixelwise, save_stereo
+from slviewer.workflow.poses import judge_all
 
 
 @dataclass(frozen=True)
@@ -108,8 +107,11 @@ def calibrate(
             )
         left_out = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
         names = [name for name in names if name not in left_out]
+        if not names:
+            raise InputError("every target pose is excluded: include some again")
         reading = part(progress, 0, 0.6)
-        observations, projector = _observe_all(store, names, board, step_2, left_out, reading)
+        observations = _observe_all(store, names, board, step_2, left_out, reading)
+        projector = store.load_capture(names[0]).sequence.projector
         progress(0.6, "stereo calibration")
         stereo = calibrate_stereo(observations, projector, str(board), left_out)
         for name, why in stereo.left_out.items():
@@ -127,7 +129,6 @@ def calibrate(
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
-        save_observations(store, observations, store.input_hashes(*(o.name for o in observations)))
         save_stereo(store, stereo, inputs, settings)
         if pixelwise is not None:
             save_pixelwise(store, pixelwise, inputs, settings)
@@ -142,31 +143,12 @@ def _observe_all(
     smoothing: Smoothing,
     left_out: dict[str, str],
     progress: Progress,
-) -> tuple[list[Observation], tuple[int, int]]:
+) -> list[Observation]:
     observations: list[Observation] = []
-    size: tuple[int, int] | None = None
-    projector: tuple[int, int] | None = None
-    for i, (capture, frames, phases) in enumerate(decoded(store, names)):
-        progress(i / len(names), f"reading {capture.name}")
-        here = (frames.shape[2], frames.shape[1])
-        if size is None:
-            size, projector = here, capture.sequence.projector
-        elif here != size or capture.sequence.projector != projector:
-            raise InputError(
-                f"{capture.name} has a {here[0]}x{here[1]} camera and a {_wxh(capture.sequence.projector)} projector, "
-                f"the poses before it {size[0]}x{size[1]} and {_wxh(projector or (0, 0))}: "
-                "calibrate poses of one rig at one resolution"
-            )
-        check_projector(capture.name, capture.sequence, phases)
-        try:
-            found = detect(board, capture_texture(capture, frames))
-            observations.append(observe(capture.name, board, found, phases, smoothing))
-        except DetectionError as error:
-            left_out[capture.name] = str(error)
-    if size is None or projector is None:
-        raise InputError("every target pose is excluded: include some again")
-    return observations, projector
-
-
-def _wxh(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
+    for i, judged in enumerate(judge_all(store, names, board, smoothing), 1):
+        progress(i / len(names), f"read {judged.name}")
+        if judged.observation is None:
+            left_out[judged.name] = judged.refused
+        else:
+            observations.append(judged.observation)
+    return observations

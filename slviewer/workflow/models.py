@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
@@ -33,22 +32,6 @@ def save_pixelwise(
     """Replace the session's pixelwise calibration."""
     meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
     store.save_result("calibration/pixelwise", meta, model.to_arrays())
-
-
-def save_observations(store: Session, observations: Sequence[Observation], inputs: Mapping[str, str]) -> None:
-    """Keep what each pose said, so that curves and residuals can be shown without decoding again."""
-    arrays = {f"{o.name}/{key}": value for o in observations for key, value in o.to_arrays().items()}
-    store.save_result("calibration/poses", {"poses": [o.name for o in observations], "inputs": dict(inputs)}, arrays)
-
-
-def load_observations(store: Session) -> list[Observation]:
-    """The observations of the poses that the last calibration read."""
-    meta, arrays = store.load_result("calibration/poses")
-    keys = {name: [key for key in arrays if key.startswith(f"{name}/")] for name in meta["poses"]}
-    return [
-        Observation.from_arrays(name, {key.removeprefix(f"{name}/"): arrays[key] for key in found})
-        for name, found in keys.items()
-    ]
 
 
 def available(store: Session) -> tuple[str, ...]:

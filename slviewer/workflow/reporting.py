@@ -25,7 +25,8 @@ from slviewer.report.session import session_headlines, session_sections, session
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
-from slviewer.workflow.models import available, load_model, load_observations, load_residuals, load_stereo
+from slviewer.workflow.models import available, load_model, load_residuals, load_stereo
+from slviewer.workflow.poses import load_observations
 
 
 def report(session: Path | str, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> None:
@@ -45,7 +46,7 @@ def report(session: Path | str, out: Path | str, *, progress: Progress = unheard
 
 def _data(store: Session) -> SessionData:
     stereo = load_stereo(store) if "stereo" in available(store) else None
-    observations = {o.name: o for o in load_observations(store)} if stereo and stereo.poses else {}
+    observations = {o.name: o for o in load_observations(store, list(stereo.poses))} if stereo and stereo.poses else {}
     stale = [
         f"The {name} calibration was made from target poses that have since changed: run calibrate again."
         for name in available(store)

@@ -20,7 +20,7 @@ from slviewer.session.store import Session, is_session
 from slviewer.workflow.calibrating import calibrate
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.merging import Merge, merge
-from slviewer.workflow.models import load_observations
+from slviewer.workflow.poses import load_observations
 from slviewer.workflow.simulating import TARGET, TRUTH, simulate
 from slviewer.workflow.verifying import Verification, verify
 
@@ -132,7 +132,7 @@ def reproduce(
     assert found.pixelwise is not None
     with Session.open(session) as store:
         names = store.capture_names("scan")
-        observations = load_observations(store)
+        observations = load_observations(store, list(found.stereo.poses))
     planes = verify(
         session,
         [n for n in names if n.startswith("plane_")],
