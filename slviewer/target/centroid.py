@@ -10,7 +10,7 @@ RING_PX = 5.0
 """Width of the ring beyond the soft edge from which the paper's brightness is read."""
 CORE = 0.6
 """Share of a bright circle's radius that is surely free of its edge."""
-SMALLEST_RING = 12
+SMALLEST_RING = 8
 """Pixels that a plane through the ring needs."""
 
 
@@ -48,7 +48,7 @@ def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
 def _centroid(
     image: np.ndarray, centre: np.ndarray, covariance: np.ndarray, gap: float, inverted: bool
 ) -> tuple[float, float]:
-    soft = min(SOFT_PX, 0.35 * gap)
+    soft = min(SOFT_PX, 0.3 * gap)
     reach = 2 * np.sqrt(np.diag(covariance)) + min(SOFT_PX + RING_PX, gap - soft) + 1
     u0, v0 = np.maximum(np.floor(centre - reach), 0).astype(int)
     u1, v1 = np.minimum(np.ceil(centre + reach) + 1, image.shape[::-1]).astype(int)

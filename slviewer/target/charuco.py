@@ -36,6 +36,11 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndar
             best = pixels, np.ravel(ids).astype(int)
         if best is not None and len(best[1]) >= ENOUGH * len(board.points):
             break
+    if best is not None and len(best[1]) >= FEWEST:
+        pixels, ids = best
+        points = board.points[ids][:, :2]
+        pixels, good = refine_corners(image.deep, pixels, points, board.pitch_mm, board.marker_mm)
+        best = pixels[good], ids[good]
     seen = 0 if best is None else len(best[1])
     if best is None or seen < FEWEST:
         there = board.columns * board.rows // 2
@@ -43,7 +48,5 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndar
             f"{seen} of {len(board.points)} corners and {markers} of {there} markers of {board} found, and "
             f"a pose needs {FEWEST}: {advice(image.grey)}"
         )
-    pixels, ids = best
-    pixels = refine_corners(image.deep, pixels, board.points[ids][:, :2], board.pitch_mm, board.marker_mm)
-    check_grid(board, pixels, ids, "corners")
-    return pixels, ids
+    check_grid(board, *best, "corners")
+    return best

@@ -32,7 +32,12 @@ def _verified(board: Board, image: BoardImage, grid: np.ndarray) -> np.ndarray:
     # the finders' own order may be mirrored; all that is kept of it is what lies beside what
     if _turn(grid) < 0:
         grid = grid[:, ::-1]
-    pixels = refine_corners(image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm)
+    pixels, good = refine_corners(image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm)
+    if not good.all():
+        raise DetectionError(
+            f"{np.count_nonzero(~good)} of {len(good)} corners are covered or blurred beyond measuring: "
+            "uncover the board, focus the camera, and avoid reflections"
+        )
     check_grid(board, pixels, np.arange(len(pixels)), "corners")
     grid = pixels.reshape(grid.shape)
     first_is_dark = _first_is_dark(image.deep, grid)

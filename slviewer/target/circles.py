@@ -18,6 +18,10 @@ GOOD_PART = 1 / 3
 """Share of the board's circles in one lattice that no clutter has."""
 ROUND = 0.97
 """Roundness between that of squares, 0.955, and of circles well resolved, 0.985 and more on real photographs."""
+PARTLY_COVERED = 0.96
+"""Roundness below which a piece of a circle is missing."""
+WELL_SHAPED_PX = 60.0
+"""Area of a circle from which on its roundness can be judged."""
 RESOLVED_PX = 80.0
 """Area of a circle beyond which more pixels do not help to find it."""
 
@@ -40,8 +44,8 @@ def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float]:
         numberings = lay_pattern(board, seen.lattice)
         if numberings:
             _refuse_larger(board, seen.lattice, numberings)
-            _refuse_squares(board, seen.blobs.chosen(numberings[0]))
             blobs = seen.blobs.chosen(upright(board, seen.blobs.centres, numberings))
+            _refuse_misshapen(board, blobs)
             pixels = _centres(board, image, blobs)
             return pixels, _radius(board, blobs)
         if most is None or len(seen) > len(most):
@@ -50,7 +54,8 @@ def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float]:
 
 
 def _attempts(board: Board, grey: np.ndarray) -> Iterator[_Seen]:
-    """Lattices at the search resolution, then coarser, where noise averages out, then in the full image.
+    """Lattices at the search resolution, then coarser, where noise averages out, then in the full image; at last twice
+    as large, if circles of a few pixels have been seen.
 
     Once a good part of the board has been seen, its circles are known to be dark or bright, and to be large enough for
     the search resolution or not, and what remains to be tried is little.
@@ -58,8 +63,8 @@ def _attempts(board: Board, grey: np.ndarray) -> Iterator[_Seen]:
     first = min(1.0, SEARCH_PX / max(grey.shape))
     colours = [False, True]
     resolved = False
-    for factor in dict.fromkeys((first, first / 2, 1.0)):
-        if resolved and factor > first:
+    for factor in dict.fromkeys((first, first / 2, 1.0, 2.0)):
+        if (resolved and factor > first) or (len(colours) > 1 and factor > 1):
             return
         small = resized(grey, factor)
         scale = np.array(grey.shape[::-1]) / np.array(small.shape[::-1])
@@ -85,9 +90,16 @@ def _refuse_larger(board: Board, lattice: Lattice, numberings: list[np.ndarray])
         )
 
 
-def _refuse_squares(board: Board, blobs: Blobs) -> None:
-    if np.median(blobs.areas) > 100 and np.median(blobs.roundness) < ROUND:
+def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
+    large = blobs.areas > WELL_SHAPED_PX
+    if large.all() and np.median(blobs.roundness) < ROUND:
         raise DetectionError(f"a grid of squares found where {board} has circles: check the board's kind")
+    covered = np.count_nonzero(large & (blobs.roundness < PARTLY_COVERED))
+    if covered:
+        raise DetectionError(
+            f"{covered} of {len(blobs.areas)} circles are partly covered, or reflect: "
+            "uncover the board, and turn it away from the lights"
+        )
 
 
 def _centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:

@@ -46,8 +46,12 @@ def advice(grey: np.ndarray) -> str:
 
 
 def resized(image: np.ndarray, factor: float) -> np.ndarray:
-    """The image at ``factor`` <= 1 of its size, averaged."""
-    return cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
+    """The image at ``factor`` of its size: averaged if smaller, interpolated if larger."""
+    if factor == 1:
+        return image
+    return cv2.resize(
+        image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    )
 
 
 def evenly_lit(grey: np.ndarray) -> np.ndarray:

@@ -16,6 +16,8 @@ from slviewer.target.planar import fit_homography, jacobians, to_image
 
 MOST_OFF = 0.08
 """How far, in pitches, a feature may lie from the grid that all features together describe."""
+OUTLYING = 8.0
+"""The same in robust standard deviations; hand-held paper boards reach 6."""
 MOST_BENT = 0.6
 """How far, in pitches, a lens may bend the grid."""
 
@@ -54,7 +56,8 @@ def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> 
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
     smooth = terms @ np.linalg.lstsq(terms, left_over, rcond=None)[0]
     off = np.linalg.norm(left_over - smooth, axis=1)
-    wrong = off > np.maximum(MOST_OFF * pitch, 0.5)
+    sigma = 1.26 * float(np.median(off))  # of two coordinates, robustly
+    wrong = off > np.clip(OUTLYING * sigma, np.maximum(0.3, 0.01 * pitch), np.maximum(0.5, MOST_OFF * pitch))
     if wrong.any():
         worst = int(np.argmax(off / pitch))
         u, v = pixels[worst]

@@ -14,14 +14,17 @@ FARTHEST_PX = 11
 """Largest half width of a window; what lies farther tells about the lens rather than about the corner."""
 EDGE_SHARE = 0.4
 """How far, in squares, a corner's window follows the edges."""
+MISFIT = 0.15
+RELATIVE_MISFIT = 3.0
+"""A corner's grey levels may leave the model by this share of its contrast, or by this much more than most do."""
 ITERATIONS = 15
 SETTLED_PX = 1e-3
 
 
 def refine_corners(
     image: np.ndarray, pixels: np.ndarray, points: np.ndarray, pitch: float, marker: float = 0.0
-) -> np.ndarray:
-    """(n, 2) float64 px, each near its start or a wild value where no two edges cross.
+) -> tuple[np.ndarray, np.ndarray]:
+    """((n, 2) float64 px, (n,) bool whether the grey levels there are those of a corner).
 
     ``image`` (h, w) float32; ``pixels`` (n, 2) px good to a px or two; ``points`` (n, 2), ``pitch`` and the side of
     the ``marker`` inside bright squares in mm.
@@ -40,11 +43,15 @@ def refine_corners(
     board = np.abs(np.einsum("nij,nmj->nmi", np.linalg.inv(to_px), offset))
     free = 0.8 * (1 - marker / pitch) / 2 if marker else EDGE_SHARE
     weight = (inside & (board.max(2) < EDGE_SHARE) & (board.min(2) < free)).astype(float)
-    return pixels + _fit(offset, grey, weight, to_px)
+    moved, misfit = _fit(offset, grey, weight, to_px)
+    good = misfit < np.maximum(MISFIT, RELATIVE_MISFIT * np.median(misfit))
+    good &= np.linalg.norm(moved, axis=1) < reach
+    return pixels + moved, good
 
 
-def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.ndarray) -> np.ndarray:
-    """(n, 2) px from the start to the crossing, by damped Gauss-Newton on all corners at once.
+def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((n, 2) px from the start to the crossing, (n,) rms misfit over the contrast), by damped Gauss-Newton on all
+    corners at once.
 
     Unknowns of each corner: its place (2), the angles of the edges' normals (2), the blur's sigma, the plane of the
     light (3), kappa.
@@ -79,7 +86,8 @@ def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.nda
         J = np.where(better[:, None, None], trial_J, J)
         if settled:
             break
-    return q[:, :2]
+    misfit = np.sqrt(cost / np.maximum(weight.sum(1), 1))
+    return q[:, :2], misfit / np.maximum(np.abs(q[:, 5] * q[:, 8]), 1e-6)
 
 
 def _model(q: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

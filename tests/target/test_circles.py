@@ -136,6 +136,22 @@ def test_hidden_circles_are_counted_not_guessed(notation: str, hide: tuple[float
         detect(board, replace(SMALL, hide=hide, tilt=10).render(board))
 
 
+@pytest.mark.parametrize("notation", ["circles:9x7:20", "acircles:4x11:20"])
+def test_partly_covered_circles_are_refused(notation: str) -> None:
+    with pytest.raises(DetectionError, match=r"\d+ of \d+ circles are partly covered"):
+        board = Board.parse(notation)
+        detect(board, replace(SMALL, hide=(-30, -30, 190, -1.5), tilt=10).render(board))
+
+
+def test_a_stain_on_one_circle_is_refused() -> None:
+    view = replace(SMALL, tilt=20)
+    image = view.render(BOARD)
+    u, v = np.round(view.truth(BOARD)[30]).astype(int).tolist()
+    cv2.circle(image, (u + 9, v), 3, 40, -1, cv2.LINE_AA)
+    with pytest.raises(DetectionError, match="1 of 63 circles"):
+        detect(BOARD, image)
+
+
 def test_a_board_partly_out_of_view_is_refused() -> None:
     with pytest.raises(DetectionError, match="of 63 circles found"):
         detect(BOARD, replace(SMALL, shift=(70, 0)).render(BOARD))

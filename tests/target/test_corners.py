@@ -60,13 +60,24 @@ def test_hidden_corners_are_counted_not_guessed() -> None:
         detect(CHESSBOARD, replace(SMALL, hide=(-30, -30, 190, 10)).render(CHESSBOARD))
 
 
+def test_a_stain_on_one_corner_is_refused() -> None:
+    view = replace(SMALL, tilt=20)
+    image = view.render(CHESSBOARD)
+    u, v = np.round(view.truth(CHESSBOARD)[30]).astype(int).tolist()
+    image[v - 2 : v + 6, u - 2 : u + 6] = 60
+    with pytest.raises(DetectionError, match=r"^1 of 63 corners|^at 1 of 63 corners"):
+        detect(CHESSBOARD, image)
+
+
 def test_a_board_partly_out_of_view_is_refused() -> None:
     with pytest.raises(DetectionError, match="of 63 corners"):
         detect(CHESSBOARD, replace(SMALL, shift=(90, 0)).render(CHESSBOARD))
 
 
-@pytest.mark.parametrize("wrong", ["chessboard:8x7:20", "chessboard:9x6:20", "chessboard:7x5:20", "chessboard:6x7:20"])
-@pytest.mark.parametrize("tilt", [0, 25])
+@pytest.mark.parametrize(
+    ("wrong", "tilt"),
+    [("chessboard:8x7:20", 25), ("chessboard:9x6:20", 0), ("chessboard:7x5:20", 25), ("chessboard:6x7:20", 25)],
+)
 def test_a_larger_chessboard_than_stated_is_refused(wrong: str, tilt: float) -> None:
     with pytest.raises(DetectionError, match=r"check (its|the board's) columns and rows"):
         detect(Board.parse(wrong), replace(SMALL, tilt=tilt).render(CHESSBOARD))
