@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import save_pixelwise, save_stereo
+from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.poses import judge_all
 
 
@@ -82,7 +82,7 @@ class CalibrationResult:
 
 
 def calibrate(
-    session: Path | str,
+    session: SessionLike,
     target: str,
     *,
     models: Sequence[str] = ("stereo", "pixelwise"),
@@ -98,12 +98,12 @@ def calibrate(
     """
     board = Board.parse(target)
     step_2 = Smoothing(smoothing, degree)
-    with Session.open(session, write=True) as store:
+    with opened(session, write=True) as store:
         excluded = store.excluded()
         names = store.capture_names("calibration")
         if not names:
             raise InputError(
-                f"{session} holds no target poses: import some with --role calibration, or capture them first"
+                f"{store.folder} holds no target poses: import some with --role calibration, or capture them first"
             )
         left_out = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
         names = [name for name in names if name not in left_out]

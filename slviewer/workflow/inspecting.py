@@ -1,15 +1,13 @@
 """What a session holds, in words."""
 
-from pathlib import Path
-
 from slviewer.session.capture import Capture
-from slviewer.session.store import Session
 from slviewer.workflow.models import available, best, load_stereo
+from slviewer.workflow.opening import SessionLike, opened
 
 
-def inspect(session: Path | str) -> str:
+def inspect(session: SessionLike) -> str:
     """Captures with their role, size and sequence, calibrations with their quality, and what is stale."""
-    with Session.open(session) as store:
+    with opened(session) as store:
         excluded = store.excluded()
         captures = store.captures()
         lines = [f"{store.folder}: {len(captures)} capture{'s' * (len(captures) != 1)}"]

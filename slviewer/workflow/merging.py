@@ -11,10 +11,10 @@ from slviewer.reconstruction.ply import write_ply
 from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_phases
 from slviewer.registration.merge import Merged
 from slviewer.registration.merge import merge as merge_clouds
-from slviewer.session.store import Session
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import best, load_model, warn_if_stale
+from slviewer.workflow.opening import SessionLike, opened
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Merge:
 
 
 def merge(
-    session: Path | str,
+    session: SessionLike,
     captures: Sequence[str],
     reference: str,
     out: Path | str,
@@ -63,7 +63,7 @@ def merge(
     names = list(dict.fromkeys([*captures, reference]))
     if len(names) < 2:
         raise UsageError(f"only {reference} was named: name the scans to merge with it")
-    with Session.open(session) as store:
+    with opened(session) as store:
         fitted = load_model(store, model or best(store))
         warn_if_stale(store, warn)
         clouds = {}

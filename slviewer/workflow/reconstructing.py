@@ -20,6 +20,7 @@ from slviewer.target.detect import board_mask, detect
 from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, best, load_models, load_stereo, warn_if_stale
+from slviewer.workflow.opening import SessionLike, opened
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    session: Path | str,
+    session: SessionLike,
     capture: str,
     *,
     model: str | None = None,
@@ -59,7 +60,7 @@ def reconstruct(
 
     The PLY of a board pose holds the points inside the board's outline; a scan's holds every point.
     """
-    with Session.open(session) as store:
+    with opened(session) as store:
         name = model or best(store)
         warn_if_stale(store, warn)
         shot = store.load_capture(capture)

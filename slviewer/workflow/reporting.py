@@ -26,14 +26,15 @@ from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import available, load_model, load_residuals, load_stereo
+from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.poses import load_observations
 
 
-def report(session: Path | str, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> None:
+def report(session: SessionLike, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> None:
     """Write what a session holds and how well it is calibrated to ``out``."""
     if Path(out).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{out} is no HTML file: end its name in .html")
-    with Session.open(session) as store:
+    with opened(session) as store:
         progress(0.1, "reading the session")
         data = _data(store)
         for message in data.warnings:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -13,10 +12,10 @@ from slviewer.evaluation.compare import Comparison, compare
 from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
-from slviewer.session.store import Session
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import load_models, load_stereo, warn_if_stale
+from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.reconstructing import board_region, lit, reconstruct_models
 
 Shape = Literal["plane", "sphere"]
@@ -61,7 +60,7 @@ class Verification:
 
 
 def verify(
-    session: Path | str,
+    session: SessionLike,
     captures: Sequence[str],
     shape: Shape,
     *,
@@ -84,7 +83,7 @@ def verify(
     if radius is not None and not radius > 0:
         raise UsageError(f"a radius of {radius:g} mm is not possible: give a positive one")
     results: dict[str, Comparison] = {}
-    with Session.open(session) as store:
+    with opened(session) as store:
         chosen = load_models(store, models)
         warn_if_stale(store, warn)
         reach = depth_range or load_stereo(store).depth_range_mm
