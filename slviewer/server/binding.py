@@ -1,0 +1,67 @@
+"""The listening socket, bound before viser starts: a failure is an error, not another port and not a hang."""
+
+import errno
+import os
+import socket
+import threading
+
+from slviewer.errors import SlviewerError
+
+RESOLVE_SECONDS = 1.5
+"""A name server that does not answer must not keep the operator waiting."""
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A TCP socket listening at exactly this address; port 0 takes any free one.
+
+    Raises SlviewerError within two seconds where the port is taken or the address is not this machine's.
+    """
+    if not host or not 0 <= port <= 65535:
+        raise SlviewerError(f"{host or 'An empty host'}:{port} is no address to serve at: try 127.0.0.1 and port 8080.")
+    family, address = _resolve(host, port)
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        if os.name == "posix":  # elsewhere this option lets two programs share a port
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind(address)
+        # Two sockets may bind the same port as long as neither listens: only listening tells that it is ours.
+        sock.listen(128)
+    except (OSError, OverflowError) as error:
+        sock.close()
+        raise SlviewerError(_remedy(host, port, error)) from error
+    return sock
+
+
+def _resolve(host: str, port: int) -> tuple[int, tuple]:
+    found: list[tuple[int, tuple]] = []
+
+    def look_up() -> None:
+        try:
+            infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        except (OSError, UnicodeError):
+            return
+        found.extend((info[0], info[4]) for info in infos)
+
+    thread = threading.Thread(target=look_up, daemon=True)
+    thread.start()
+    thread.join(RESOLVE_SECONDS)
+    if not found:
+        raise SlviewerError(
+            f"No address was found for the host {host!r}: use 127.0.0.1 for this machine alone, "
+            "or an address of this machine to let others in."
+        )
+    return found[0]
+
+
+def _remedy(host: str, port: int, error: OSError | OverflowError) -> str:
+    number = getattr(error, "errno", None)
+    if number in (errno.EADDRINUSE, getattr(errno, "WSAEADDRINUSE", -1)):
+        return (
+            f"Port {port} at {host} is taken, perhaps by another slviewer: close that one, or choose another port "
+            "with --port (--port 0 takes any free one)."
+        )
+    if number in (errno.EACCES, errno.EPERM):
+        return f"This account may not open port {port}: choose a port above 1023 with --port."
+    if number == errno.EADDRNOTAVAIL:
+        return f"{host} is not an address of this machine: use 127.0.0.1, or one that it has."
+    return f"The address {host}:{port} can't be served ({error}): use 127.0.0.1 and another --port."

@@ -1,0 +1,131 @@
+"""Every request passes here: who asks, what for, and what they get."""
+
+import logging
+import re
+from collections.abc import Awaitable, Callable
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import parse_qsl
+
+from websockets.http11 import Request, Response
+
+from slviewer.server.access import Access, Refusal, Role
+from slviewer.server.connection import Connection
+from slviewer.server.downloads import PREFIX, Downloads
+from slviewer.server.responses import harden, page_policy, respond, viser_policy
+from slviewer.server.routes import Routes
+
+logger = logging.getLogger("slviewer.server")
+
+_PATH = re.compile(r"/|(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+")
+
+_ONWARD = """<!doctype html><meta charset="utf-8"><title>slviewer</title><script>location.replace(location.pathname)\
+</script><noscript><a href="{path}">Open slviewer</a></noscript>"""
+
+
+class Door:
+    """Answers a server's requests: viser's page, our own pages and files, and who may open a WebSocket."""
+
+    def __init__(
+        self, access: Access, routes: Routes, downloads: Downloads, scripts: tuple[str, ...], evaluate: bool
+    ) -> None:
+        self._access = access
+        self._routes = routes
+        self._downloads = downloads
+        self._scripts = scripts
+        self._evaluate = evaluate
+
+    async def answer(self, connection: Connection, request: Request, viser_page: Callable[..., Any]) -> Response | None:
+        """The answer, or None to open a WebSocket; `viser_page` is viser's own process_request."""
+        try:
+            return await self._answer(connection, request, viser_page)
+        except Refusal as refusal:
+            response = respond(refusal.status, refusal.sentence + "\n")
+        except Exception:
+            logger.exception("a request failed")
+            response = respond(HTTPStatus.INTERNAL_SERVER_ERROR, "slviewer failed here: its log says why.\n")
+        harden(response.headers)
+        return response
+
+    async def _answer(
+        self, connection: Connection, request: Request, viser_page: Callable[..., Any]
+    ) -> Response | None:
+        headers, access = request.headers, self._access
+        host = access.host(headers, connection.transport.get_extra_info("sockname")[0])
+        websocket = any(value.lower() == "websocket" for value in headers.get_all("Upgrade"))
+        access.check_origin(headers, host, websocket)
+        path, _, query = request.path.partition("?")
+        if not _PATH.fullmatch(path):  # "//elsewhere" as a place to go on to would lead there
+            raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
+        if "?" in request.path:
+            if websocket:
+                raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
+            return self._let_in(path, query, host, "cross-site" in headers.get_all("Sec-Fetch-Site"))
+        role = access.role(headers)
+        if websocket:
+            self._may_connect(path, role)
+            connection.role = role
+            return None
+        if path == "/":
+            response = viser_page(connection, request)
+            if isinstance(response, Awaitable):
+                response = await response
+            harden(response.headers, viser_policy(self._scripts, host, self._evaluate))
+            return response
+        if path.startswith(PREFIX):
+            return await self._download(connection, path)
+        return self._page(path, role, host)
+
+    def _let_in(self, path: str, query: str, host: str, from_another_site: bool) -> Response:
+        """Answer to the link with the token: a cookie, and the same address without it.
+
+        Any other parameter is refused: some make viser's page load messages, and so code, from elsewhere.
+        """
+        fields = parse_qsl(query, keep_blank_values=True)
+        if len(fields) != 1 or fields[0][0] != "token":
+            raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
+        role = self._access.role_of(fields[0][1])
+        if role is None:
+            raise Refusal(HTTPStatus.FORBIDDEN, "This link is not, or no longer, valid: open the one last printed.")
+        if from_another_site:
+            # A browser that was sent here by another site's link would send on no strict cookie: our own page must.
+            html = _ONWARD.format(path=path).encode()
+            response = respond(HTTPStatus.OK, html, "text/html; charset=utf-8")
+            harden(response.headers, page_policy(html, host))
+        else:
+            response = respond(HTTPStatus.SEE_OTHER)
+            response.headers["Location"] = path
+            harden(response.headers)
+        response.headers["Set-Cookie"] = self._access.set_cookie(role)
+        return response
+
+    def _may_connect(self, path: str, role: Role) -> None:
+        if path != "/":
+            endpoint = self._routes.endpoint_at(path)
+            if endpoint is None:
+                raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
+            _operator_only(endpoint.viewers, role)
+
+    def _page(self, path: str, role: Role, host: str) -> Response:
+        page = self._routes.page_at(path)
+        if page is None:
+            raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
+        _operator_only(page.viewers, role)
+        response = respond(HTTPStatus.OK, page.html, "text/html; charset=utf-8")
+        harden(response.headers, page_policy(page.html, host))
+        return response
+
+    async def _download(self, connection: Connection, path: str) -> Response:
+        opened = self._downloads.open(path)
+        if opened is None:
+            raise Refusal(HTTPStatus.NOT_FOUND, "This file is no longer offered: ask for it again in slviewer.")
+        headers, file = opened
+        harden(headers)
+        headers["Connection"] = "close"
+        with file:
+            return await connection.stream(headers, file)
+
+
+def _operator_only(viewers: bool, role: Role) -> None:
+    if role != "operator" and not viewers:
+        raise Refusal(HTTPStatus.FORBIDDEN, "This link only watches: the page is for the operator.")

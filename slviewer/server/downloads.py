@@ -1,0 +1,88 @@
+"""Files that the application offers, by names that cannot be guessed; nothing else is read from the disk."""
+
+import contextlib
+import os
+import secrets
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote
+
+from websockets.datastructures import Headers
+
+from slviewer.errors import InputError
+from slviewer.server.text import safe_name
+
+PREFIX = "/download/"
+
+
+@dataclass(frozen=True)
+class Offer:
+    """One file: where it lies, the folder that it must not leave, and the name under which it is saved."""
+
+    path: Path
+    within: Path
+    name: str
+
+
+class Downloads:
+    """What can be fetched right now."""
+
+    def __init__(self) -> None:
+        self._offers: dict[str, Offer] = {}
+
+    def offer(self, path: Path, *, within: Path, name: str | None = None) -> str:
+        """The address, on this server, at which this file is fetched until it is withdrawn.
+
+        `within` is the folder that it belongs to (the session's); InputError where the file is missing or, through
+        links or "..", lies elsewhere. It is read when it is fetched, so that the newest content arrives.
+        """
+        offer = Offer(Path(path), Path(within).resolve(), safe_name(name or Path(path).name, "download"))
+        _opened(offer).close()
+        key = secrets.token_urlsafe(16)
+        self._offers[key] = offer
+        return PREFIX + key
+
+    def withdraw(self, address: str) -> None:
+        """No longer offer what was offered at this address."""
+        self._offers.pop(address.removeprefix(PREFIX), None)
+
+    def clear(self) -> None:
+        """No longer offer anything (another session is opened)."""
+        self._offers.clear()
+
+    def open(self, address: str) -> tuple[Headers, BinaryIO] | None:
+        """The headers and the open file for an address; None where nothing is offered, or it is there no more."""
+        offer = self._offers.get(address.removeprefix(PREFIX))
+        if offer is None:
+            return None
+        try:
+            file = _opened(offer)
+        except InputError:
+            return None
+        ascii_name = offer.name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_")
+        size = os.fstat(file.fileno()).st_size
+        headers = Headers(
+            {
+                "Content-Type": "application/octet-stream",
+                "Content-Length": str(size),
+                "Content-Disposition": f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(offer.name)}",
+            }
+        )
+        return headers, file
+
+
+def _opened(offer: Offer) -> BinaryIO:
+    """The file, found to be a regular one inside its folder after it was opened, so that no link can change it."""
+    with contextlib.suppress(OSError, ValueError):
+        real = offer.path.resolve(strict=True)
+        if real.is_relative_to(offer.within):
+            flags = (
+                os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+            )
+            file = os.fdopen(os.open(real, flags), "rb")
+            if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                return file
+            file.close()
+    raise InputError(f"{offer.path.name} can't be offered for download: it is no file inside {offer.within.name}.")

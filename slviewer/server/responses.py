@@ -1,0 +1,60 @@
+"""HTTP answers, and the headers that every one of them carries."""
+
+import base64
+import hashlib
+import re
+from http import HTTPStatus
+
+from websockets.datastructures import Headers
+from websockets.http11 import Response
+
+_CLOSED = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+
+
+def respond(status: HTTPStatus, body: bytes | str = b"", content_type: str = "text/plain; charset=utf-8") -> Response:
+    """A whole answer, its length told."""
+    data = body.encode() if isinstance(body, str) else body
+    headers = Headers({"Content-Type": content_type, "Content-Length": str(len(data))})
+    return Response(status.value, status.phrase, headers, data)
+
+
+def harden(headers: Headers, policy: str = _CLOSED) -> None:
+    """Add what keeps an answer out of other sites' pages, of caches, and of histories (in place)."""
+    for name, value in {
+        "Content-Security-Policy": policy,
+        "X-Content-Type-Options": "nosniff",
+        "X-Frame-Options": "DENY",
+        "Referrer-Policy": "no-referrer",
+        "Cross-Origin-Opener-Policy": "same-origin",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Cache-Control": "no-store",
+    }.items():
+        headers[name] = value
+
+
+def page_policy(html: bytes, host: str) -> str:
+    """What a page of ours may do: run the scripts that stand in it, show pictures, talk to this server; no more."""
+    scripts = " ".join(script_hash(m) for m in re.findall(rb"<script[^>]*>(.*?)</script>", html, re.S)) or "'none'"
+    return (
+        f"{_CLOSED}; script-src {scripts}; style-src 'unsafe-inline'; img-src 'self' data: blob:; "
+        f"media-src data:; connect-src 'self' ws://{host} wss://{host}"
+    )
+
+
+def viser_policy(scripts: tuple[str, ...], host: str, evaluate: bool) -> str:
+    """The same for viser's page, which besides unpacks itself with WebAssembly and works in a blob worker.
+
+    Only viser's own scripts (given by their hashes) run, so that HTML in a label, a script or an event handler in it,
+    does nothing even where someone forgot to escape it. `evaluate` lets the server send JavaScript, as Plotly needs.
+    """
+    extra = " 'unsafe-eval'" if evaluate else ""
+    return (
+        f"{_CLOSED}; script-src {' '.join(scripts)} 'wasm-unsafe-eval'{extra}; style-src 'unsafe-inline'; "
+        "img-src 'self' data: blob:; media-src data: blob:; font-src data:; worker-src blob:; "
+        f"connect-src 'self' data: blob: ws://{host} wss://{host}"
+    )
+
+
+def script_hash(script: bytes) -> str:
+    """A script's name in a Content-Security-Policy."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}'"

@@ -1,0 +1,137 @@
+"""A viser server that only invited browsers reach, and that changes only what its page offers them to change."""
+
+import ipaddress
+import urllib.parse
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import viser
+from websockets.asyncio.server import ServerConnection
+from websockets.asyncio.server import serve as serve_websockets
+
+from slviewer.server import pins, viser_internals
+from slviewer.server.access import Access, Role
+from slviewer.server.binding import listen
+from slviewer.server.connection import Connection, quiet_logger
+from slviewer.server.door import Door
+from slviewer.server.downloads import Downloads
+from slviewer.server.gate import ViserGate
+from slviewer.server.routes import Routes
+from slviewer.server.uploads import Budget
+
+MESSAGE_LIMIT = 32 * 2**20
+"""Bytes of one message from a browser; the largest is a picture that the server asked it for."""
+
+
+@dataclass(frozen=True)
+class SafeServer:
+    """A running server: build the page with `viser`, add pages with `routes`, offer files with `downloads`."""
+
+    viser: viser.ViserServer
+    routes: Routes
+    downloads: Downloads
+    host: str
+    port: int
+    access: Access
+
+    @property
+    def url(self) -> str:
+        """The operator's link."""
+        return self.link("/")
+
+    @property
+    def view_url(self) -> str:
+        """The link for those who watch and change nothing."""
+        return self.link("/", "viewer")
+
+    def link(self, path: str, role: Role = "operator") -> str:
+        """The address of a page of this server with a token, to be opened once; keep it as a password is kept."""
+        token = self.access.token if role == "operator" else self.access.view_token
+        return f"http://{self._shown_host()}:{self.port}{path}?{urllib.parse.urlencode({'token': token})}"
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this machine can reach it. If not, tokens cross the network unencrypted."""
+        return ipaddress.ip_address(self._address()).is_loopback
+
+    def role(self, client_id: int) -> Role | None:
+        """Whether a client of viser operates or watches; None once it is gone."""
+        connection = viser_internals.connection_of(self.viser, client_id)
+        return None if connection is None else connection.role
+
+    def stop(self) -> None:
+        """End all connections, the server and its threads."""
+        viser_internals.stop(self.viser)
+
+    def _address(self) -> str:
+        return self.viser.get_host().partition("%")[0]
+
+    def _shown_host(self) -> str:
+        address = ipaddress.ip_address(self._address())
+        if address.is_unspecified:
+            return "127.0.0.1" if address.version == 4 else "[::1]"
+        return f"[{address}]" if address.version == 6 else str(address)
+
+
+def serve(
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    *,
+    token: str | None = None,
+    view_token: str | None = None,
+    label: str | None = None,
+    names: tuple[str, ...] = (),
+    upload_limit: int = 256 * 10**6,
+    evaluate: bool = False,
+) -> SafeServer:
+    """Start serving; port 0 takes any free one.
+
+    `names` are further host names (`name` or `name:port`) under which browsers reach this server. `upload_limit` bounds
+    the bytes of all unfinished uploads. `evaluate` lets the server send JavaScript to the page: only Plotly needs it.
+
+    Raises SlviewerError within two seconds where the address can't be served, and where viser is not the pinned one.
+    """
+    pins.check_version()
+    sock = listen(host, port)
+    address, port = sock.getsockname()[:2]
+    try:
+        access = Access(port, token, view_token, names)
+        routes, downloads = Routes(), Downloads()
+        door = Door(access, routes, downloads, pins.VISER_SCRIPTS, evaluate)
+        budget = Budget(upload_limit)
+        started: list[viser.ViserServer] = []
+
+        def serve_viser(viser_handler: Callable[..., Any], _host: str, _port: int, **options: Any) -> serve_websockets:
+            viser_page = options.pop("process_request")
+
+            async def handle(connection: ServerConnection) -> None:
+                assert isinstance(connection, Connection)
+                path = connection.request.path if connection.request else "/"
+                endpoint = routes.endpoint_at(path)
+                if endpoint is not None:
+                    await endpoint.handler(connection)
+                elif path == "/" and started and connection.role is not None:
+                    gate = connection.gate = ViserGate(started[0], connection, connection.role, budget)
+                    try:
+                        await viser_handler(connection)
+                    finally:
+                        gate.close()
+
+            options.update(
+                sock=sock,
+                process_request=lambda connection, request: door.answer(connection, request, viser_page),
+                create_connection=Connection,
+                max_size=MESSAGE_LIMIT,
+                server_header=None,
+                open_timeout=None,  # Connection limits the request alone
+                logger=quiet_logger(),
+            )
+            return serve_websockets(handle, **options)
+
+        server = viser_internals.start(serve_viser, address, port, label)
+        started.append(server)
+    except BaseException:
+        sock.close()
+        raise
+    return SafeServer(server, routes, downloads, host, port, access)

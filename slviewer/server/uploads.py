@@ -1,0 +1,79 @@
+"""Uploads of one client: within the size allowed, under a harmless name, in no parts but those announced."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from slviewer.server.text import safe_name
+from slviewer.server.values import Refused
+
+SMALLEST_PART = 4096
+"""Bytes; viser's page sends half a megabyte at a time. Smaller parts would cost more memory than they carry."""
+
+
+class Budget:
+    """How many bytes of unfinished uploads the server holds for all clients together (viser keeps them in memory)."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.used = 0
+
+
+@dataclass
+class _Transfer:
+    source: str
+    size: int
+    parts: int
+    received: int = 0
+    seen: set[int] = field(default_factory=set)
+
+
+class Uploads:
+    """The uploads that one client has under way."""
+
+    def __init__(self, budget: Budget, forget: Callable[[str], None]) -> None:
+        self._budget = budget
+        self._forget = forget
+        self._transfers: dict[str, _Transfer] = {}
+
+    def start(self, message: Any) -> Any:
+        """The announcement (a FileTransferStartUpload) with a safe file name; Refused where it asks for too much."""
+        size, parts = message.size_bytes, message.part_count
+        if size < 0 or not (parts == 0 if size == 0 else 1 <= parts <= size // SMALLEST_PART + 1):
+            raise Refused("an upload whose parts cannot make up its size")
+        if size > self._budget.limit - self._budget.used:
+            raise Refused(f"an upload of {size / 1e6:.0f} MB where {self._budget.limit / 1e6:.0f} MB are allowed")
+        if size:  # an empty file is complete with its announcement
+            self._budget.used += size
+            self._transfers[message.transfer_uuid] = _Transfer(message.source_component_uuid, size, parts)
+        return replace(message, filename=safe_name(message.filename))
+
+    def part(self, message: Any) -> None:
+        """Count one part (a FileTransferPart) in; Refused, and the upload forgotten, where it was not announced."""
+        transfer = self._transfers.get(message.transfer_uuid)
+        if transfer is None:
+            raise Refused("a part of no upload")
+        transfer.received += len(message.content)
+        fits = (
+            message.source_component_uuid == transfer.source
+            and 0 <= message.part_index < transfer.parts
+            and message.part_index not in transfer.seen
+            and transfer.received <= transfer.size
+        )
+        transfer.seen.add(message.part_index)
+        complete = len(transfer.seen) == transfer.parts
+        if not fits or (complete and transfer.received != transfer.size):
+            self._end(message.transfer_uuid)
+            self._forget(message.transfer_uuid)
+            raise Refused("a part that was not announced")
+        if complete:
+            self._end(message.transfer_uuid)
+
+    def close(self) -> None:
+        """The client is gone."""
+        for transfer in list(self._transfers):
+            self._end(transfer)
+            self._forget(transfer)
+
+    def _end(self, transfer: str) -> None:
+        self._budget.used -= self._transfers.pop(transfer).size

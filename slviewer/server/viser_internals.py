@@ -1,0 +1,274 @@
+"""Everything that this room knows about the inside of viser, for exactly the version that it was read from.
+
+viser 1.1.1 has no hook for access, so its WebSocket server is created by ours, and its messages are read on their way
+in. `pins.py` names the version; a test compares what is used here with what it was when this was written.
+"""
+
+import contextlib
+import dataclasses
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NoReturn
+
+import msgspec
+import rich
+import viser
+import websockets
+from viser import _gui_handles, _messages, _scene_handles
+from viser.infra import _infra
+
+from slviewer.errors import SlviewerError
+
+Message = _messages.Message
+
+CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
+
+FROM_CLIENTS: dict[str, type[Any]] = {
+    kind.__name__: kind
+    for kind in (
+        _messages.ViewerCameraMessage,
+        _messages.GuiUpdateMessage,
+        _messages.GuiButtonHoldMessage,
+        _messages.GuiFormSubmitMessage,
+        _messages.GuiFormDirtyMessage,
+        _messages.CommandTriggerMessage,
+        _messages.FileTransferStartUpload,
+        _messages.FileTransferPart,
+        _messages.TransformControlsUpdateMessage,
+        _messages.TransformControlsDragStartMessage,
+        _messages.TransformControlsDragEndMessage,
+        _messages.SceneNodeClickMessage,
+        _messages.SceneNodeDragMessage,
+        _messages.ScenePointerMessage,
+        _messages.GetRenderResponseMessage,
+        _messages.LocalStorageGetItemResponseMessage,
+    )
+}
+"""The messages that a client has reason to send; opening and closing a share tunnel is not among them."""
+
+_starting = threading.Lock()
+
+
+class _Websockets:
+    """Stands in for the websockets package inside viser while it starts, so that it serves with our function."""
+
+    def __init__(self, serve: Callable[..., Any]) -> None:
+        self.asyncio = SimpleNamespace(server=SimpleNamespace(serve=serve))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(websockets, name)
+
+
+def start(serve: Callable[..., Any], host: str, port: int, label: str | None) -> viser.ViserServer:
+    """viser's server, listening through `serve` (called as websockets' own); no share tunnel, nothing printed."""
+    with _starting, _silent():
+        _infra.websockets = _Websockets(serve)  # type: ignore[assignment]
+        try:
+            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        finally:
+            _infra.websockets = websockets
+    for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+        server._websock_server.unregister_handler(kind)
+    # A button that does nothing would be shown again by every later change of the theme.
+    themed = partial(server.gui.configure_theme, show_logo=False, show_share_button=False)
+    for owner, name, value in (
+        (server, "request_share_url", _no_tunnel),
+        (server.gui, "configure_theme", themed),
+    ):
+        setattr(owner, name, value)
+    themed()
+    return server
+
+
+def stop(server: viser.ViserServer) -> None:
+    """End viser's server and its threads, without a word."""
+    with _silent():
+        server.stop()
+
+
+def _no_tunnel(*_: Any, **__: Any) -> NoReturn:
+    raise SlviewerError("slviewer opens no tunnel to the internet: use --host, or ssh -L, to reach it from elsewhere.")
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """viser prints its own address, without the token, and its end: both only confuse the operator."""
+    printing = rich.print
+    rich.print = lambda *_, **__: None
+    try:
+        yield
+    finally:
+        rich.print = printing
+
+
+def decode(raw: bytes) -> Message | None:
+    """The message in these bytes with every field of its declared type; None if it is anything else."""
+    try:
+        fields = msgspec.msgpack.decode(raw)
+        kind = FROM_CLIENTS[fields.pop("type")]
+        if not fields.keys() <= {
+            field.name for field in dataclasses.fields(kind)
+        }:  # viser fails on a field that it does not know
+            return None
+        return msgspec.convert(fields, kind)
+    except (msgspec.MsgspecError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+
+
+def encode(message: Message) -> bytes:
+    """The bytes in which a client sends this message."""
+    return msgspec.msgpack.encode({"type": type(message).__name__, **vars(message)})
+
+
+def client_of(server: viser.ViserServer, connection: object) -> int | None:
+    """The number that viser gave to the client of this connection; None before and after."""
+    live = server._websock_server._live_connections
+    return next((number for number, one in list(live.items()) if one is connection), None)
+
+
+def connection_of(server: viser.ViserServer, client_id: int) -> Any:
+    """The connection of the client with this number, or None."""
+    return server._websock_server._live_connections.get(client_id)
+
+
+def gui_apis(server: viser.ViserServer, client_id: int) -> list[viser.GuiApi]:
+    """The GUI shared by all clients, and this client's own."""
+    client = server._connected_clients.get(client_id)
+    return [server.gui] if client is None else [server.gui, client.gui]
+
+
+def gui_input(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
+    """The input with this id that the client can see, or None."""
+    found = (api._gui_input_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
+    return next((handle for handle in found if handle is not None and shown(handle)), None)
+
+
+def gui_form(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
+    """The form with this id that the client can see, or None."""
+    found = (api._container_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
+    return next((box for box in found if isinstance(box, _gui_handles.GuiFormHandle) and shown(box)), None)
+
+
+def command(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
+    """The command with this id that is not disabled, or None."""
+    found = (api._command_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
+    return next((one for one in found if one is not None and not (one._impl.removed or one.disabled)), None)
+
+
+def shown(handle: Any) -> bool:
+    """Whether this element, and every folder, tab, panel or modal that holds it, exists and is visible."""
+    while True:
+        impl = handle._impl
+        if impl.removed or not impl.props.visible:
+            return False
+        if isinstance(handle, _gui_handles.PanelHandle) or impl.parent_container_id == "root":
+            return True
+        try:
+            box = impl.gui_api._resolve_container_handle(impl.parent_container_id)
+        except KeyError:
+            return False
+        if isinstance(box, _gui_handles.GuiModalHandle):
+            return not box.closed
+        if isinstance(box, _scene_handles.Gui3dContainerHandle):
+            return not box._impl.removed and box._impl.visible
+        if isinstance(box, _gui_handles.GuiTabHandle):
+            if box.removed:
+                return False
+            box = box._parent
+        handle = box
+
+
+def holds(handle: Any, frequency: float) -> bool:
+    """Whether this is a button that calls back at this frequency, in Hz, while it is held."""
+    return isinstance(handle, _gui_handles.GuiButtonHandle) and frequency in handle._button_impl.hold_cbs_from_freq
+
+
+def scene_api(server: viser.ViserServer, client_id: int, owner: str) -> Any:
+    """The scene that a message names by its owner: the shared one, or the client's own; None for anyone else's."""
+    if owner == "":
+        return server.scene
+    client = server._connected_clients.get(client_id)
+    return client.scene if client is not None and client.scene._owner_id == owner else None
+
+
+def gizmo(scene: Any, client_id: int, name: str) -> bool:
+    """Whether this gizmo is there to be moved, and someone listens to it; also while one removed is still held."""
+    if (client_id, name) in scene._active_transform_drag_handles:
+        return True
+    handle = scene._handle_from_transform_controls_name.get(name)
+    return handle is not None and bool(handle._impl_aux.update_cb) and _visible(scene, name)
+
+
+def node_clicks(scene: Any, name: str) -> bool:
+    """Whether someone listens to clicks on this node."""
+    handle = scene._handle_from_node_name.get(name)
+    return handle is not None and bool(handle._impl.click_cb) and _visible(scene, name)
+
+
+def node_drags(scene: Any, client_id: int, name: str) -> bool:
+    """Whether someone listens to this node being dragged; also while one removed is still held."""
+    if (client_id, name) in scene._active_drag_handles:
+        return True
+    handle = scene._handle_from_node_name.get(name)
+    return handle is not None and bool(handle._impl.drag_cb) and _visible(scene, name)
+
+
+def _visible(scene: Any, name: str) -> bool:
+    """Whether the node and all that it hangs from are visible."""
+    parts = name.split("/")
+    chain = ("/".join(parts[: n + 1]) for n in range(1, len(parts)))
+    handles = (scene._handle_from_node_name.get(one) for one in chain)
+    return all(handle is None or handle._impl.visible for handle in handles)
+
+
+def pointer_listens(server: viser.ViserServer, client_id: int, event: str) -> bool:
+    """Whether someone listens to this event of the pointer over the whole scene."""
+    client = server._connected_clients.get(client_id)
+    scenes = [server.scene] if client is None else [server.scene, client.scene]
+    return any(entry.event_type == event for scene in scenes for entry in scene._scene_pointer_cb)
+
+
+def awaited(server: viser.ViserServer, client_id: int, kind: type[Message]) -> bool:
+    """Whether the server asked this client a question that is answered by this kind of message."""
+    client = server._connected_clients.get(client_id)
+    return client is not None and bool(client._websock_connection._incoming_handlers.get(kind))
+
+
+def uploading(server: viser.ViserServer, client_id: int, transfer: str) -> bool:
+    """Whether an upload of this id is under way, from whomever."""
+    return any(transfer in api._current_file_upload_states for api in gui_apis(server, client_id))
+
+
+def forget_upload(server: viser.ViserServer, client_id: int, transfer: str) -> None:
+    """Let go of what was received of an upload."""
+    for api in gui_apis(server, client_id):
+        api._current_file_upload_states.pop(transfer, None)
+
+
+def send_value(server: viser.ViserServer, client_id: int, handle: Any) -> None:
+    """Show one client the value that an input really has."""
+    value = handle._impl.value
+    if isinstance(value, bool | int | float | str | tuple) and not handle._impl.is_button:
+        _send(server, client_id, _messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+
+
+def refuse_upload(server: viser.ViserServer, client_id: int, source: str, transfer: str, size: int) -> None:
+    """End the progress that a client shows for an upload, and its wait for more."""
+    _send(server, client_id, _messages.FileTransferPartAck(source, transfer, size, size))
+    _send(server, client_id, _messages.RemoveNotificationMessage(f"upload-{transfer}"))
+
+
+def notify(server: viser.ViserServer, client_id: int, title: str, body: str) -> None:
+    """Tell one client what went wrong."""
+    client = server._connected_clients.get(client_id)
+    if client is not None:
+        client.add_notification(title=title, body=body, color="red", auto_close_seconds=10.0)
+
+
+def _send(server: viser.ViserServer, client_id: int, message: Message) -> None:
+    client = server._connected_clients.get(client_id)
+    if client is not None:
+        client._websock_connection.queue_message(message)
