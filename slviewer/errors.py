@@ -28,6 +28,10 @@ class SessionError(SlviewerError):
     """A session folder that cannot be read or written."""
 
 
+class DeviceError(SlviewerError):
+    """A camera or projector that does not answer, was unplugged, or cannot do what was asked."""
+
+
 class CalibrationRejected(SlviewerError):
     """A calibration that was computed, or could not be, and must not be used."""
 
