@@ -1,0 +1,162 @@
+"""What a camera and a projector can be asked: as little as a structured-light rig needs.
+
+A device belongs to the thread that opened it. Every method raises `DeviceError` when the device does not answer, is not
+open or was unplugged; after that, `close` and `open` are the way back, and `close` never raises.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.sequence import PatternSequence
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """What an operator sets by hand: exposure time in ms, and gain as a factor on the grey levels (1 = none)."""
+
+    exposure_ms: float
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.exposure_ms < float("inf"):
+            raise InputError(f"an exposure of {self.exposure_ms:g} ms is impossible: give a time above 0")
+        if not 0 < self.gain < float("inf"):
+            raise InputError(f"a gain of {self.gain:g} is impossible: give a factor above 0, 1 for none")
+
+
+class Camera(Protocol):
+    """Takes single images on request; `name`, `size` and `dtype` can be read before it is open."""
+
+    @property
+    def name(self) -> str:
+        """What an operator calls it."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) px of its frames."""
+        ...
+
+    @property
+    def dtype(self) -> np.dtype:
+        """uint8 or uint16."""
+        ...
+
+    def open(self) -> None:
+        """Claim the device; opening it twice is an error, opening it again after `close` is not."""
+        ...
+
+    def close(self) -> None:
+        """Give it back; nothing happens when it is not open."""
+        ...
+
+    def grab(self, out: np.ndarray) -> None:
+        """Fill `out` (h, w) of `dtype` with a frame whose exposure began after the projector last said "shown"."""
+        ...
+
+    def settings(self) -> CameraSettings:
+        """What is set now, read from the device."""
+        ...
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set it, and return what the device really took: the nearest it can do."""
+        ...
+
+
+class Projector(Protocol):
+    """Shows one image until it is told to show another; `name` and `size` can be read before it is open."""
+
+    @property
+    def name(self) -> str:
+        """What an operator calls it."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) px."""
+        ...
+
+    def open(self) -> None:
+        """Claim the device; it shows dark."""
+        ...
+
+    def close(self) -> None:
+        """Give it back; nothing happens when it is not open."""
+        ...
+
+    def load(self, sequence: PatternSequence) -> None:
+        """Make ready to show any frame of `sequence` at once; replaces what was loaded, and shows nothing yet."""
+        ...
+
+    def show(self, index: int) -> None:
+        """Show frame `index` of the loaded sequence; returns when its light reaches the scene."""
+        ...
+
+    def show_level(self, grey: int | None) -> None:
+        """Show even light of grey level 0 ... 255, None for dark; returns when it is shown. Keeps what is loaded."""
+        ...
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A camera and a projector that look at the same place, under the name that the operator chose."""
+
+    name: str
+    camera: Camera
+    projector: Projector
+
+    @contextmanager
+    def opened(self) -> Iterator["Rig"]:
+        """Both devices open for the length of a `with`, and closed after it whatever happened."""
+        self.open()
+        try:
+            yield self
+        finally:
+            self.close()
+
+    def open(self) -> None:
+        """Open both devices, or neither. Raises DeviceError."""
+        self.projector.open()
+        try:
+            self.camera.open()
+        except BaseException:
+            self.projector.close()
+            raise
+
+    def close(self) -> None:
+        """Close both devices; never raises."""
+        self.camera.close()
+        self.projector.close()
+
+
+def check_frame(camera: Camera, out: np.ndarray) -> None:
+    """Raise InputError unless `out` is a writable (h, w) array that `camera.grab` can fill in place."""
+    width, height = camera.size
+    if out.shape != (height, width) or out.dtype != camera.dtype or not out.flags.writeable:
+        raise InputError(
+            f"camera {camera.name} fills frames of shape {(height, width)} {camera.dtype}, "
+            f"got {'' if out.flags.writeable else 'read-only '}{out.shape} {out.dtype}: make the array by its size"
+        )
+
+
+def check_index(projector: Projector, sequence: PatternSequence | None, index: int) -> PatternSequence:
+    """The loaded sequence, if frame `index` is in it. Raises DeviceError if none is loaded, else InputError."""
+    if sequence is None:
+        raise DeviceError(f"projector {projector.name} has no patterns: load a sequence before showing a frame")
+    if not 0 <= index < len(sequence.frames):
+        raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
+    return sequence
+
+
+def check_level(grey: int | None) -> int:
+    """The grey level 0 ... 255 to show, 0 for dark. Raises InputError."""
+    if grey is None:
+        return 0
+    if not 0 <= grey <= 255:
+        raise InputError(f"a grey level of {grey} cannot be projected: give 0 to 255, or None for dark")
+    return grey
