@@ -9,9 +9,10 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.evaluation.incidence import incidence
 from slviewer.evaluation.plane import PlaneResult, evaluate_plane
-from slviewer.evaluation.region import find_plane, find_sphere, measured_pixels
+from slviewer.evaluation.region import find_plane, find_sphere, measured_pixels, start_plane, start_sphere
 from slviewer.evaluation.render import Row, render
 from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
+from slviewer.geometry.shapes import Plane, Sphere
 from slviewer.reconstruction.cloud import Cloud
 
 Shape = Literal["plane", "sphere"]
@@ -95,21 +96,26 @@ def compare(
         raise InputError(f"The models' clouds have different sizes, {sizes}: reconstruct them from the same capture.")
 
     every, sigma_z = _union(clouds)
-    if region is None:
-        _, region = (
-            find_plane(every, sigma_z=sigma_z)
+    start: Plane | Sphere
+    if region is not None:
+        start = (
+            start_plane(every, region, sigma_z)
             if shape == "plane"
-            else find_sphere(every, sigma_z=sigma_z, radius=radius)
+            else start_sphere(every, region, sigma_z, radius=radius)
         )
+    elif shape == "plane":
+        start, region = find_plane(every, sigma_z=sigma_z)
+    else:
+        start, region = find_sphere(every, sigma_z=sigma_z, radius=radius)
     measured_pixels(every, region)  # says so if there is too little
     common = region & np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
     results: dict[str, PlaneResult | SphereResult] = {}
     for model, cloud in clouds.items():
         try:
             results[model] = (
-                evaluate_plane(cloud.points, common, cloud.sigma_z)
-                if shape == "plane"
-                else evaluate_sphere(cloud.points, common, cloud.sigma_z, radius)
+                evaluate_plane(cloud.points, common, cloud.sigma_z, start)
+                if isinstance(start, Plane)
+                else evaluate_sphere(cloud.points, common, cloud.sigma_z, radius, start)
             )
         except InputError as error:
             raise InputError(f"No {shape} could be fitted to the {model} cloud. {error}") from error

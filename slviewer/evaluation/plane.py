@@ -16,15 +16,17 @@ class PlaneResult(ShapeResult):
     plane: Plane
 
 
-def evaluate_plane(points: np.ndarray, mask: np.ndarray | None, sigma_z: np.ndarray | None = None) -> PlaneResult:
+def evaluate_plane(
+    points: np.ndarray, mask: np.ndarray | None, sigma_z: np.ndarray | None = None, start: Plane | None = None
+) -> PlaneResult:
     """The plane in a cloud ``(h, w, 3)`` mm, NaN where invalid, and the distances from it.
 
     ``mask`` ``(h, w)``: the pixels that show the plane; None: the largest flat patch is found. ``sigma_z`` ``(h, w)``
-    mm: the expected noise of z, for the noise floor.
+    mm: the expected noise of z, for the noise floor. ``start``: about where the plane lies, if that is known.
     """
     if mask is None:
         start, mask = find_plane(points, sigma_z=sigma_z)
-    else:
+    elif start is None:
         start = start_plane(points, mask, sigma_z)
     plane, result = measure(points, mask, sigma_z, start, fit_plane)
     return PlaneResult(**vars(result), plane=plane)

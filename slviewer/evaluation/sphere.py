@@ -23,17 +23,21 @@ class SphereResult(ShapeResult):
 
 
 def evaluate_sphere(
-    points: np.ndarray, mask: np.ndarray | None, sigma_z: np.ndarray | None = None, radius: float | None = None
+    points: np.ndarray,
+    mask: np.ndarray | None,
+    sigma_z: np.ndarray | None = None,
+    radius: float | None = None,
+    start: Sphere | None = None,
 ) -> SphereResult:
     """The sphere in a cloud ``(h, w, 3)`` mm, NaN where invalid, and the radial distances from it.
 
     ``mask`` ``(h, w)``: the pixels that show the sphere; None: the largest round patch is found. ``sigma_z`` ``(h, w)``
     mm: the expected noise of z. ``radius`` in mm, roughly, helps to find the sphere; the fitted radius stays free, as
-    in the Letter's Table 2.
+    in the Letter's Table 2. ``start``: about where the sphere lies, if that is known.
     """
     if mask is None:
         start, mask = find_sphere(points, sigma_z=sigma_z, radius=radius)
-    else:
+    elif start is None:
         start = start_sphere(points, mask, sigma_z, radius)
     sphere, result = measure(points, mask, sigma_z, start, fit_sphere)
     return SphereResult(**vars(result), sphere=sphere)

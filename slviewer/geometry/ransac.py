@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
 
-SAMPLE = 6000
+SAMPLE = 3000
 """Points that are looked at: the shape must be found, not measured yet."""
-HYPOTHESES = 800
+HYPOTHESES = 400
 POLISHED = 12
 """How many of the best hypotheses are refined by least squares before the best is chosen."""
 
