@@ -26,14 +26,11 @@ _ONWARD = """<!doctype html><meta charset="utf-8"><title>slviewer</title><script
 class Door:
     """Answers a server's requests: viser's page, our own pages and files, and who may open a WebSocket."""
 
-    def __init__(
-        self, access: Access, routes: Routes, downloads: Downloads, scripts: tuple[str, ...], evaluate: bool
-    ) -> None:
+    def __init__(self, access: Access, routes: Routes, downloads: Downloads, scripts: tuple[str, ...]) -> None:
         self._access = access
         self._routes = routes
         self._downloads = downloads
         self._scripts = scripts
-        self._evaluate = evaluate
 
     async def answer(self, connection: Connection, request: Request, viser_page: Callable[..., Any]) -> Response | None:
         """The answer, or None to open a WebSocket; `viser_page` is viser's own process_request."""
@@ -70,7 +67,7 @@ class Door:
             response = viser_page(connection, request)
             if isinstance(response, Awaitable):
                 response = await response
-            harden(response.headers, viser_policy(self._scripts, host, self._evaluate))
+            harden(response.headers, viser_policy(self._scripts, host))
             return response
         if path.startswith(PREFIX):
             return await self._download(connection, path)

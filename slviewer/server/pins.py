@@ -6,7 +6,10 @@ from slviewer.errors import SlviewerError
 
 VISER = "1.1.1"
 
-VISER_SCRIPTS = ("'sha256-LOADER'", "'sha256-APP'")
+VISER_SCRIPTS = (
+    "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='",
+    "'sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE='",
+)
 """The scripts that viser's page runs: the loader that stands in it, and the application that the loader unpacks."""
 
 

@@ -41,15 +41,15 @@ def page_policy(html: bytes, host: str) -> str:
     )
 
 
-def viser_policy(scripts: tuple[str, ...], host: str, evaluate: bool) -> str:
+def viser_policy(scripts: tuple[str, ...], host: str) -> str:
     """The same for viser's page, which besides unpacks itself with WebAssembly and works in a blob worker.
 
     Only viser's own scripts (given by their hashes) run, so that HTML in a label, a script or an event handler in it,
-    does nothing even where someone forgot to escape it. `evaluate` lets the server send JavaScript, as Plotly needs.
+    does nothing even where someone forgot to escape it. They may evaluate text: parts of them are compiled so, and
+    Plotly is sent as text.
     """
-    extra = " 'unsafe-eval'" if evaluate else ""
     return (
-        f"{_CLOSED}; script-src {' '.join(scripts)} 'wasm-unsafe-eval'{extra}; style-src 'unsafe-inline'; "
+        f"{_CLOSED}; script-src {' '.join(scripts)} 'unsafe-eval'; style-src 'unsafe-inline'; "
         "img-src 'self' data: blob:; media-src data: blob:; font-src data:; worker-src blob:; "
         f"connect-src 'self' data: blob: ws://{host} wss://{host}"
     )

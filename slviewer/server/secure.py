@@ -83,12 +83,11 @@ def serve(
     label: str | None = None,
     names: tuple[str, ...] = (),
     upload_limit: int = 256 * 10**6,
-    evaluate: bool = False,
 ) -> SafeServer:
     """Start serving; port 0 takes any free one.
 
     `names` are further host names (`name` or `name:port`) under which browsers reach this server. `upload_limit` bounds
-    the bytes of all unfinished uploads. `evaluate` lets the server send JavaScript to the page: only Plotly needs it.
+    the bytes of all unfinished uploads.
 
     Raises SlviewerError within two seconds where the address can't be served, and where viser is not the pinned one.
     """
@@ -98,7 +97,7 @@ def serve(
     try:
         access = Access(port, token, view_token, names)
         routes, downloads = Routes(), Downloads()
-        door = Door(access, routes, downloads, pins.VISER_SCRIPTS, evaluate)
+        door = Door(access, routes, downloads, pins.VISER_SCRIPTS)
         budget = Budget(upload_limit)
         started: list[viser.ViserServer] = []
 

@@ -17,6 +17,8 @@ class Budget:
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.used = 0
+        self.names: set[str] = set()
+        """Of the transfers under way: viser keeps them in one place for all clients."""
 
 
 @dataclass
@@ -43,8 +45,11 @@ class Uploads:
             raise Refused("an upload whose parts cannot make up its size")
         if size > self._budget.limit - self._budget.used:
             raise Refused(f"an upload of {size / 1e6:.0f} MB where {self._budget.limit / 1e6:.0f} MB are allowed")
+        if message.transfer_uuid in self._budget.names:
+            raise Refused("an upload that is under way")
         if size:  # an empty file is complete with its announcement
             self._budget.used += size
+            self._budget.names.add(message.transfer_uuid)
             self._transfers[message.transfer_uuid] = _Transfer(message.source_component_uuid, size, parts)
         return replace(message, filename=safe_name(message.filename))
 
@@ -77,3 +82,4 @@ class Uploads:
 
     def _end(self, transfer: str) -> None:
         self._budget.used -= self._transfers.pop(transfer).size
+        self._budget.names.discard(transfer)

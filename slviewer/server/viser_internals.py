@@ -134,9 +134,9 @@ def connection_of(server: viser.ViserServer, client_id: int) -> Any:
     return server._websock_server._live_connections.get(client_id)
 
 
-def gui_apis(server: viser.ViserServer, client_id: int) -> list[viser.GuiApi]:
+def gui_apis(server: viser.ViserServer, client_id: int | None) -> list[viser.GuiApi]:
     """The GUI shared by all clients, and this client's own."""
-    client = server._connected_clients.get(client_id)
+    client = None if client_id is None else server._connected_clients.get(client_id)
     return [server.gui] if client is None else [server.gui, client.gui]
 
 
@@ -237,12 +237,7 @@ def awaited(server: viser.ViserServer, client_id: int, kind: type[Message]) -> b
     return client is not None and bool(client._websock_connection._incoming_handlers.get(kind))
 
 
-def uploading(server: viser.ViserServer, client_id: int, transfer: str) -> bool:
-    """Whether an upload of this id is under way, from whomever."""
-    return any(transfer in api._current_file_upload_states for api in gui_apis(server, client_id))
-
-
-def forget_upload(server: viser.ViserServer, client_id: int, transfer: str) -> None:
+def forget_upload(server: viser.ViserServer, client_id: int | None, transfer: str) -> None:
     """Let go of what was received of an upload."""
     for api in gui_apis(server, client_id):
         api._current_file_upload_states.pop(transfer, None)

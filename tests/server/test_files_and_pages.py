@@ -1,0 +1,208 @@
+"""Downloads, further pages and endpoints, and text that users typed."""
+
+import base64
+import hashlib
+import html
+import os
+import socket
+import time
+
+import pytest
+from conftest import Browser, until
+from websockets.exceptions import InvalidStatus
+
+from slviewer.errors import InputError
+from slviewer.server.connection import CHUNK
+from slviewer.server.text import escape, safe_name
+
+PAGE = "<!doctype html><title>projector</title><script>let a = 1</script>"
+
+
+def test_an_offered_file_arrives_whole(operator, watcher, stranger, tmp_path):
+    content = os.urandom(3 * CHUNK + 17)
+    (tmp_path / "cloud.ply").write_bytes(content)
+    downloads = operator.server.downloads
+    address = downloads.offer(tmp_path / "cloud.ply", within=tmp_path, name='scan "é".ply')
+    for browser in (operator, watcher):
+        answer = browser.get(address)
+        assert answer.status == 200 and answer.content == content
+        assert int(answer.headers["Content-Length"]) == len(content)
+        disposition = answer.headers["Content-Disposition"]
+        assert disposition.startswith("attachment; ") and "filename*=UTF-8''scan%20_%C3%A9_.ply" in disposition
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    assert stranger.get(address).status == 403
+    downloads.withdraw(address)
+    assert operator.get(address).status == 404
+
+
+def test_an_empty_file_is_a_file(operator, tmp_path):
+    (tmp_path / "empty.csv").touch()
+    answer = operator.get(operator.server.downloads.offer(tmp_path / "empty.csv", within=tmp_path))
+    assert answer.status == 200 and answer.content == b"" and answer.headers["Content-Length"] == "0"
+
+
+def test_no_file_outside_the_folder_is_offered(operator, tmp_path):
+    session, secret = tmp_path / "session", tmp_path / "secret.txt"
+    session.mkdir()
+    secret.write_text("secret")
+    (session / "link.txt").symlink_to(secret)
+    os.mkfifo(session / "pipe")
+    downloads = operator.server.downloads
+    for path in (
+        secret,
+        session / "link.txt",
+        session / ".." / "secret.txt",
+        session,
+        session / "none",
+        session / "pipe",
+    ):
+        with pytest.raises(InputError):
+            downloads.offer(path, within=session)
+
+
+def test_a_file_that_becomes_a_link_is_no_longer_sent(operator, tmp_path):
+    session, secret = tmp_path / "session", tmp_path / "secret.txt"
+    session.mkdir()
+    secret.write_text("secret")
+    (session / "a.txt").write_text("fine")
+    address = operator.server.downloads.offer(session / "a.txt", within=session)
+    (session / "a.txt").unlink()
+    (session / "a.txt").symlink_to(secret)
+    assert operator.get(address).status == 404
+    operator.server.downloads.clear()
+
+
+@pytest.mark.parametrize("path", ["/download", "/download/", "/download/x", "/download/../secret", "/download/x/y"])
+def test_addresses_that_were_not_offered_are_nothing(operator, path):
+    assert operator.get(path).status == 404
+
+
+def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(operator, tmp_path):
+    size = 64 * CHUNK
+    with (tmp_path / "large.bin").open("wb") as file:
+        file.truncate(size)
+    address = operator.server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
+    with socket.create_connection(("127.0.0.1", operator.server.port)) as slow:
+        slow.sendall(f"GET {address} HTTP/1.1\r\nHost: {operator.host}\r\nCookie: {operator.cookie}\r\n\r\n".encode())
+        assert slow.recv(100).startswith(b"HTTP/1.1 200")
+        start = time.monotonic()
+        assert operator.get("/").status == 200
+        assert hashlib.md5(operator.get(address).content).digest() == hashlib.md5(bytes(size)).digest()
+        assert time.monotonic() - start < 3
+    assert operator.get("/").status == 200  # the reader that left half-way did no harm
+
+
+def test_pages_and_endpoints_stand_beside_the_wizard(server, operator, watcher, stranger):
+    async def echo(connection) -> None:
+        async for message in connection:
+            await connection.send(f"{connection.role}: {message}")
+
+    server.routes.page("/projector", PAGE)
+    server.routes.websocket("/projector", echo)
+    server.routes.websocket("/watch", echo, viewers=True)
+    answer = operator.get("/projector")
+    assert answer.status == 200 and answer.content.decode() == PAGE
+    script = base64.b64encode(hashlib.sha256(b"let a = 1").digest()).decode()
+    assert f"script-src 'sha256-{script}';" in answer.headers["Content-Security-Policy"]
+    with operator.open("/projector") as socket_:
+        socket_.send("hello")
+        assert socket_.recv(2) == "operator: hello"
+    with watcher.open("/watch") as socket_:
+        socket_.send("hello")
+        assert socket_.recv(2) == "viewer: hello"
+    assert watcher.get("/projector").status == 403 and stranger.get("/projector").status == 403
+    for browser, origin in ((watcher, "own"), (stranger, "own"), (operator, "http://evil.example"), (operator, None)):
+        with pytest.raises(InvalidStatus):
+            browser.open("/projector", origin=origin)
+    link = server.link("/projector").partition(str(server.port))[2]
+    assert stranger.get(link).headers["Location"] == "/projector"
+    server.routes.remove("/projector")
+    assert operator.get("/projector").status == 404
+    for path in ("projector", "/", "/a/../b", "/download/x", "/a b"):
+        with pytest.raises(ValueError):
+            server.routes.page(path, PAGE)
+
+
+def test_a_failing_endpoint_takes_nothing_with_it(server, operator):
+    async def fail(connection) -> None:
+        raise RuntimeError("broken")
+
+    server.routes.websocket("/fail", fail)
+    socket_ = operator.open("/fail")
+    assert until(lambda: socket_.close_code == 1011)
+    assert operator.client().number >= 0
+
+
+NASTY = [
+    "<script>alert(1)</script>",
+    "<img src=x onerror=alert(1)>",
+    "[x](javascript:alert(1))",
+    "![x](http://evil.example/x.png)",
+    "{alert(1)}",
+    '" onmouseover="alert(1)',
+    "`code` **bold** _it_ # head | a | b | &lt;b&gt; \\<b>",
+    "1. list\n\n> quote\n\n    code",
+    "http://evil.example www.evil.example",
+    "\u202egpj.exe \x00\x1b[31m",
+]
+
+
+@pytest.mark.parametrize("text", NASTY)
+def test_typed_text_stays_text(text):
+    safe = escape(text)
+    assert (
+        not set(safe) & set("<>\"'`*_[](){}|!\\\n/:.~=")
+        and html.unescape(safe).split()
+        == "".join(c for c in text if c.isprintable() or c.isspace()).replace("\x00", "").split()
+    )
+
+
+def test_ordinary_names_stay_readable():
+    assert escape("Würfel 3") == "Würfel 3" and html.unescape(escape("a_b-1.ply (2)")) == "a_b-1.ply (2)"
+
+
+@pytest.mark.parametrize(
+    ("name", "safe"),
+    [
+        ("cloud.ply", "cloud.ply"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\Windows\\x.dll", "x.dll"),
+        ("..", "upload"),
+        ("", "upload"),
+        (".bashrc", "bashrc"),
+        ("a\x00\nb.txt", "ab.txt"),
+        ("con.txt", "_con.txt"),
+        ('a<b>:"|?*.yml', "a_b______.yml"),
+        ("Kalibrierung für Würfel.yml", "Kalibrierung für Würfel.yml"),
+        ("x/", "upload"),
+        ("\u202etxt.exe", "txt.exe"),
+    ],
+)
+def test_uploaded_names_are_plain_file_names(name, safe):
+    assert safe_name(name) == safe
+
+
+def test_long_names_are_cut_and_keep_their_suffix():
+    name = safe_name("漢" * 300 + ".ply")
+    assert name.endswith(".ply") and len(name.encode()) <= 200 and len(safe_name("a." + "b" * 500)) <= 120
+
+
+def test_the_server_stops_and_its_port_is_free_again(tmp_path):
+    from slviewer.server.secure import serve
+
+    with (tmp_path / "large.bin").open("wb") as file:
+        file.truncate(64 * CHUNK)
+    server = serve(port=0)
+    browser = Browser(server, server.access.token)
+    client = browser.client()
+    address = server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
+    with socket.create_connection(("127.0.0.1", server.port)) as slow:
+        slow.sendall(f"GET {address} HTTP/1.1\r\nHost: {browser.host}\r\nCookie: {browser.cookie}\r\n\r\n".encode())
+        slow.recv(100)
+        start = time.monotonic()
+        server.stop()
+        assert time.monotonic() - start < 3
+    client.thread.join(3)
+    assert not client.thread.is_alive()
+    again = serve(port=server.port)
+    again.stop()

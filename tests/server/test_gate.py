@@ -1,0 +1,428 @@
+"""What a client may change: every message that viser would obey and ours must not is sent to a live server."""
+
+import math
+import threading
+
+import msgspec
+import pytest
+from conftest import CAMERA, Browser, Client, until
+
+from slviewer.errors import SlviewerError
+
+
+@pytest.fixture
+def gui(server):
+    return server.viser.gui
+
+
+def settle(client: Client) -> None:
+    """Wait until all that the client sent before has been handled."""
+    gui = client.server.viser.gui
+    seen = threading.Event()
+    mark = gui.add_checkbox("settled", False)
+    mark.on_update(lambda _: seen.set())
+    client.set(mark, True)
+    assert seen.wait(5)
+    mark.remove()
+
+
+def test_the_operator_works(operator, gui):
+    got: list = []
+    slider = gui.add_slider("gain", 0.0, 10.0, 0.5, 5.0)
+    button = gui.add_button("Capture")
+    slider.on_update(lambda event: got.append((event.client_id, event.target.value)))
+    button.on_click(lambda _: got.append("click"))
+    client = operator.client()
+    assert until(lambda: any(m["type"] == "GuiSliderMessage" for m in client.received))
+    assert operator.server.role(client.number) == "operator"
+    client.set(slider, 7)
+    assert until(lambda: got == [(client.number, 7.0)]) and isinstance(slider.value, float)
+    client.set(button, True)
+    assert until(lambda: got[-1] == "click")
+    slider.value = 3.0
+    assert until(lambda: client.told(slider)[-1:] == [3.0])
+
+
+def test_two_browsers_show_the_same(operator, watcher, gui):
+    slider = gui.add_slider("gain", 0, 10, 1, 5)
+    first, second, third = operator.client(), operator.client(), watcher.client()
+    first.set(slider, 8)
+    assert until(lambda: second.told(slider) == [8] and third.told(slider) == [8])
+
+
+CASES = {
+    "slider": (
+        lambda g: g.add_slider("x", 0, 10, 1, 5),
+        [0, 10, 7],
+        [-1, 11, 2.5, math.nan, math.inf, "3", None, True, [3]],
+    ),
+    "number": (lambda g: g.add_number("x", 1.0, min=0.0, max=2.0), [0, 1.5], [-0.1, 2.1, math.nan, "1", 2**60, {}]),
+    "free number": (lambda g: g.add_number("x", 1), [-5, 2**40], [0.5, 2**60, -math.inf]),
+    "text": (
+        lambda g: g.add_text("x", "a"),
+        ["", "ß 漢 <b>", "x" * 20_000],
+        ["x" * 20_001, 5, b"a", None, "a\x00b", "a\nb"],
+    ),
+    "lines": (lambda g: g.add_text("x", "a", multiline=True), ["a\nb"], ["a\x1bb"]),
+    "checkbox": (lambda g: g.add_checkbox("x", False), [True], [1, "yes", None, 0.0]),
+    "dropdown": (lambda g: g.add_dropdown("x", ("a", "b")), ["b"], ["c", "", 0, None, ["a"]]),
+    "choice": (lambda g: g.add_button_group("x", ("a", "b")), ["b"], ["c", True]),
+    "vector2": (
+        lambda g: g.add_vector2("x", (0.0, 0.0), min=(-1.0, -1.0), max=(1.0, 1.0)),
+        [[1, 0.5]],
+        [[2, 0], [0], [0, "a"], 1],
+    ),
+    "vector3": (lambda g: g.add_vector3("x", (0.0, 0.0, 0.0)), [[9, 9, 9]], [[0, 0], [0, 0, math.nan], [0, 0, 0, 0]]),
+    "rgb": (lambda g: g.add_rgb("x", (1, 2, 3)), [[0, 255, 7]], [[0, 256, 0], [0, -1, 0], [0.5, 0, 0], "red"]),
+    "rgba": (lambda g: g.add_rgba("x", (1, 2, 3, 4)), [[0, 255, 7, 9]], [[0, 0, 0], [0, 0, 0, 300]]),
+    "range": (lambda g: g.add_multi_slider("x", 0, 9, 1, (2, 5)), [[0, 9]], [[5, 2], [-1, 5], [2, 10], [2]]),
+    "progress": (lambda g: g.add_progress_bar(5.0), [], [6, 7.0]),
+    "upload": (lambda g: g.add_upload_button("x"), [], ["a", {"name": "a", "content": b""}, True]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_values_stay_inside_the_range_and_the_options(operator, gui, case):
+    make, good, bad = CASES[case]
+    handle, calls = make(gui), []
+    client = operator.client()
+    handle._impl.update_cb.append(lambda event: calls.append(event.target.value))
+    before = handle.value
+    for value in bad:
+        client.set(handle, value)
+    settle(client)
+    assert handle.value == before and not calls
+    for count, value in enumerate(good, 1):
+        client.set(handle, value)
+        assert until(lambda count=count: len(calls) == count)
+        assert handle.value == (tuple(value) if isinstance(value, list) else value)
+
+
+def test_only_the_value_can_be_set(operator, gui):
+    slider = gui.add_slider("gain", 0, 10, 1, 5)
+    button = gui.add_button("Delete", disabled=True)
+    client = operator.client()
+    uuid = slider._impl.uuid
+    for updates in ({"max": 99}, {"disabled": False}, {"value": 6, "max": 99}, {"props": 1}, {"update_cb": []}, {}):
+        client.send("GuiUpdateMessage", uuid=uuid, updates=updates)
+    client.send("GuiUpdateMessage", uuid=button._impl.uuid, updates={"disabled": False})
+    client.send("GuiUpdateMessage", uuid="no such thing", updates={"value": 1})
+    settle(client)
+    assert (slider.value, slider.max, button.disabled) == (5, 10, True)
+
+
+def test_what_is_disabled_or_hidden_stays_as_it_is(operator, gui):
+    clicks: list = []
+    folder = gui.add_folder("folder", visible=False)
+    tabs = gui.add_tab_group(visible=False)
+    panel = gui.add_panel(visible=False)
+    with folder, gui.add_folder("inner"):
+        in_folder = gui.add_button("a")
+    with tabs.add_tab("tab"):
+        in_tab = gui.add_button("b")
+    with panel.add_tab("tab"):
+        in_panel = gui.add_button("c")
+    with gui.add_modal("modal") as modal:
+        in_modal = gui.add_button("d")
+    buttons = [gui.add_button("e", disabled=True), gui.add_button("f", visible=False), in_folder, in_tab, in_panel]
+    slider = gui.add_slider("gain", 0, 10, 1, 5, disabled=True)
+    for button in (*buttons, in_modal):
+        button.on_click(lambda event: clicks.append(event.target.label))
+    buttons[0].on_hold(lambda event: clicks.append("held"), callback_hz=10.0)
+    client = operator.client()
+    for button in buttons:
+        client.set(button, True)
+    client.send("GuiButtonHoldMessage", uuid=buttons[0]._impl.uuid, frequency=10.0)
+    client.set(slider, 6)
+    settle(client)
+    assert clicks == [] and slider.value == 5
+    assert until(lambda: client.told(slider) == [5]), "the page is shown the true value again"
+
+    buttons[0].disabled = False
+    for shown in (buttons[1], folder, tabs, panel):
+        shown.visible = True
+    for button in (*buttons, in_modal):
+        client.set(button, True)
+    client.send("GuiButtonHoldMessage", uuid=buttons[0]._impl.uuid, frequency=10.0)
+    client.send("GuiButtonHoldMessage", uuid=buttons[0]._impl.uuid, frequency=1000.0)
+    assert until(lambda: sorted(clicks) == ["a", "b", "c", "d", "e", "f", "held"])
+    modal.close()
+    client.set(in_modal, True)
+    settle(client)
+    assert clicks.count("d") == 1
+
+
+def test_a_watcher_sees_all_and_changes_nothing(server, operator, watcher, gui):
+    calls: list = []
+    slider = gui.add_slider("gain", 0, 10, 1, 5)
+    button, upload = gui.add_button("Capture"), gui.add_upload_button("Open")
+    command = gui.add_command("Capture")
+    gizmo = server.viser.scene.add_transform_controls("/board")
+    for register in (slider.on_update, button.on_click, upload.on_upload, command.on_trigger, gizmo.on_update):
+        register(lambda event: calls.append(event))
+    server.viser.scene.on_click()(lambda event: calls.append(event))
+    client = watcher.client()
+    assert server.role(client.number) == "viewer"
+    assert until(lambda: {"GuiSliderMessage", "TransformControlsMessage"} <= {m["type"] for m in client.received})
+    client.set(slider, 7)
+    client.set(button, True)
+    client.send("CommandTriggerMessage", uuid=command._impl.uuid)
+    client.send("TransformControlsUpdateMessage", name="/board", wxyz=[1, 0, 0, 0], position=[1, 1, 1], owner="")
+    client.send("ScenePointerMessage", **POINTER)
+    client.send("FileTransferStartUpload", **announced(upload, 0, 0))
+    client.send("GuiFormDirtyMessage", uuid="x")
+    client.send("ViewerCameraMessage", **{**CAMERA, "position": [7, 7, 7]})
+    assert until(lambda: server.viser.get_clients()[client.number].camera.position.tolist() == [7, 7, 7])
+    assert slider.value == 5 and calls == [] and gizmo.position.tolist() == [0, 0, 0]
+    assert until(lambda: client.told(slider) == [5])
+    both = operator.client()
+    both.set(slider, 9)
+    assert until(lambda: client.told(slider)[-1] == 9) and len(calls) == 1
+
+
+POINTER = {
+    "event_type": "click",
+    "ray_origin": [0, 0, 0],
+    "ray_direction": [0, 0, 1],
+    "screen_pos": [[0.5, 0.5]],
+    "modifier": None,
+}
+
+
+def test_commands_and_forms_answer_only_where_they_are(operator, gui):
+    calls: list = []
+    command, off = gui.add_command("Capture"), gui.add_command("Delete", disabled=True)
+    form, hidden = gui.add_form("form"), gui.add_form("hidden", visible=False)
+    for one in (command, off):
+        one.on_trigger(lambda event: calls.append(event.target.label))
+    for one in (form, hidden):
+        one.on_submit(lambda event: calls.append(event.target.label))
+    client = operator.client()
+    for uuid in ("x", off._impl.uuid, command._impl.uuid):
+        client.send("CommandTriggerMessage", uuid=uuid)
+    stored = len(operator.server.viser._websock_server._broadcast_buffer.message_from_id)
+    for uuid in ("x", "y", hidden._impl.uuid):
+        client.send("GuiFormSubmitMessage", uuid=uuid)
+        client.send("GuiFormDirtyMessage", uuid=uuid)
+    assert len(operator.server.viser._websock_server._broadcast_buffer.message_from_id) == stored
+    client.send("GuiFormSubmitMessage", uuid=form._impl.uuid)
+    assert until(lambda: len(calls) == 2)
+    settle(client)
+    assert sorted(calls) == ["Capture", "form"]
+
+
+def test_the_scene_answers_only_where_someone_listens(server, operator):
+    scene, calls = server.viser.scene, []
+    heard, deaf, hidden = (scene.add_transform_controls(name) for name in ("/heard", "/deaf", "/hidden"))
+    ball, plain = scene.add_icosphere("/ball", 1.0), scene.add_icosphere("/plain", 1.0)
+    for one in (heard, hidden):
+        one.on_update(lambda event: calls.append((event.target.name, event.phase)))
+    hidden.visible = False
+    ball.on_click(lambda event: calls.append("ball"))
+    client = operator.client()
+    pose = {"wxyz": [1, 0, 0, 0], "position": [1, 2, 3]}
+    click = {key: POINTER[key] for key in ("ray_origin", "ray_direction", "modifier")}
+    for name in ("/heard", "/deaf", "/hidden", "/none", ""):
+        client.send("TransformControlsUpdateMessage", name=name, **pose, owner="")
+    for owner in ("1", "999", "x"):
+        client.send("TransformControlsUpdateMessage", name="/heard", **pose, owner=owner)
+    for wxyz in ([0, 0, 0, 0], [math.nan, 0, 0, 1], [1, 0, 0], "abcd"):
+        client.send("TransformControlsUpdateMessage", name="/heard", wxyz=wxyz, position=[9, 9, 9], owner="")
+    for name in ("/ball", "/plain", "/none"):
+        node = {"name": name, "instance_index": None, "screen_pos": [0.1, 0.1], "owner": ""}
+        client.send("SceneNodeClickMessage", **node, **click)
+    client.send("ScenePointerMessage", **POINTER)
+    settle(client)
+    assert until(lambda: set(calls) == {("/heard", "update"), "ball"} and len(calls) == 2), calls
+    assert heard.position.tolist() == [1, 2, 3]
+    assert deaf.position.tolist() == hidden.position.tolist() == plain.position.tolist() == [0, 0, 0]
+
+    scene.on_click()(lambda event: calls.append("scene"))
+    client.send("ScenePointerMessage", **{**POINTER, "event_type": "rect-select"})
+    client.send("ScenePointerMessage", **{**POINTER, "ray_origin": None})
+    client.send("ScenePointerMessage", **{**POINTER, "screen_pos": []})
+    client.send("ScenePointerMessage", **POINTER)
+    assert until(lambda: "scene" in calls)
+    settle(client)
+    assert calls.count("scene") == 1
+
+
+def test_a_drag_of_a_removed_gizmo_still_ends(server, operator):
+    calls: list = []
+    gizmo = server.viser.scene.add_transform_controls("/board")
+    gizmo.on_update(lambda event: calls.append(event.phase))
+    client = operator.client()
+    client.send("TransformControlsDragStartMessage", name="/board", owner="")
+    assert until(lambda: calls == ["start"])
+    gizmo.remove()
+    client.send("TransformControlsDragEndMessage", name="/board", owner="")
+    assert until(lambda: calls == ["start", "end"])
+
+
+def test_no_client_opens_a_tunnel(server, operator, gui):
+    client = operator.client()
+    client.send("ShareUrlRequest")
+    client.send("ShareUrlDisconnect")
+    settle(client)
+    assert server.viser._share_tunnel is None
+    with pytest.raises(SlviewerError):
+        server.viser.request_share_url()
+    gui.configure_theme(dark_mode=True)
+    assert until(lambda: [m for m in client.received if m["type"] == "ThemeConfigurationMessage"][-1]["dark_mode"])
+    assert not any(m["show_share_button"] for m in client.received if m["type"] == "ThemeConfigurationMessage")
+
+
+def test_messages_of_the_server_are_none_of_a_client(server, operator, gui):
+    other = operator.client()
+    client = operator.client()
+    for kind, fields in (
+        ("RunJavascriptMessage", {"source": "alert(1)"}),
+        ("ResetGuiMessage", {}),
+        ("GetRenderResponseMessage", {"payload": b"x" * 100, "render_uuid": "x"}),
+        ("LocalStorageGetItemResponseMessage", {"value": "x", "error": None, "request_uuid": "x"}),
+        ("NoSuchMessage", {}),
+    ):
+        client.send(kind, **fields)
+    settle(client)
+    assert not any(m["type"] in ("RunJavascriptMessage", "ResetGuiMessage") for m in other.received)
+
+
+def test_garbage_hurts_nobody(server, operator, gui, capsys):
+    slider = gui.add_slider("gain", 0, 10, 1, 5)
+    client = operator.client()
+    client.socket.send("text")
+    client.socket.send(b"")
+    client.socket.send(b"\xff" * 50)
+    for thing in ([], 5, "x", {"type": 5}, {"type": ["GuiUpdateMessage"]}, {"uuid": "x"}, {1: 2}):
+        client.socket.send(msgspec.msgpack.encode(thing))
+    client.socket.send(b"\x91" * 100_000)
+    client.send("GuiUpdateMessage", uuid=["a"], updates={"value": 1})
+    client.send("GuiUpdateMessage", uuid=slider._impl.uuid, updates=[1])
+    client.send("GuiUpdateMessage", uuid=slider._impl.uuid, updates={"value": 1}, excluded_self_client=3)
+    client.send("ViewerCameraMessage", **{**CAMERA, "position": [math.nan, 0, 0]})
+    client.send("ViewerCameraMessage", **{**CAMERA, "image_width": -5})
+    client.send("ViewerCameraMessage", **{**CAMERA, "fov": "wide"})
+    settle(client)
+    assert slider.value == 5 and server.viser.get_clients()[client.number].camera.image_width == 1280
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_render_that_the_server_asked_for_arrives(server, operator):
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    client = operator.client()
+    picture = io.BytesIO()
+    Image.fromarray(np.full((4, 6, 3), 200, np.uint8)).save(picture, "PNG")
+    answers: list = []
+    handle = server.viser.get_clients()[client.number]
+    asking = threading.Thread(target=lambda: answers.append(handle.get_render(4, 6, transport_format="png", timeout=5)))
+    asking.start()
+    asked = lambda: [m for m in client.received if m["type"] == "GetRenderRequestMessage"]  # noqa: E731
+    assert until(asked)
+    client.send("GetRenderResponseMessage", payload=picture.getvalue(), render_uuid=asked()[0]["render_uuid"])
+    asking.join(5)
+    assert answers and answers[0].shape[:2] == (4, 6)
+
+
+def announced(button, size: int, parts: int, name: str = "a.txt", transfer: str = "t") -> dict:
+    return {
+        "source_component_uuid": button._impl.uuid,
+        "transfer_uuid": transfer,
+        "filename": name,
+        "mime_type": "",
+        "size_bytes": size,
+        "part_count": parts,
+    }
+
+
+def part(button, index: int, content: bytes, transfer: str = "t") -> dict:
+    return {
+        "source_component_uuid": button._impl.uuid,
+        "transfer_uuid": transfer,
+        "part_index": index,
+        "content": content,
+    }
+
+
+class TestUploads:
+    @pytest.fixture
+    def button(self, gui):
+        button = gui.add_upload_button("Open")
+        button.on_upload(lambda event: files.append((event.target.value.name, event.target.value.content)))
+        files: list = []
+        button.__dict__["files"] = files
+        return button
+
+    def under_way(self, browser: Browser) -> int:
+        return len(browser.server.viser.gui._current_file_upload_states)
+
+    def test_a_file_arrives_under_a_harmless_name(self, operator, button):
+        client, content = operator.client(), bytes(range(256)) * 32
+        client.send("FileTransferStartUpload", **announced(button, 8192, 2, "../../.ssh/authorized keys\x00.pub"))
+        client.send("FileTransferPart", **part(button, 0, content[:5000]))
+        client.send("FileTransferPart", **part(button, 1, content[5000:]))
+        assert until(lambda: button.files == [("authorized keys.pub", content)])
+        client.send("FileTransferStartUpload", **announced(button, 0, 0, "..\\..\\empty.yml"))
+        assert until(lambda: button.files[-1] == ("empty.yml", b""))
+        assert self.under_way(operator) == 0
+
+    def test_what_is_too_large_is_refused_with_a_word(self, operator, button):
+        client = operator.client()
+        client.send("FileTransferStartUpload", **announced(button, 3_000_001, 6))
+        assert until(lambda: any("Not uploaded" in str(m) for m in client.received))
+        assert until(lambda: any(m["type"] == "FileTransferPartAck" for m in client.received))
+        client.send("FileTransferPart", **part(button, 0, b"x" * 500_000))
+        settle(client)
+        assert self.under_way(operator) == 0 and not button.files
+
+    def test_several_at_once_share_the_limit(self, operator, button):
+        first, second = operator.client(), operator.client()
+        first.send("FileTransferStartUpload", **announced(button, 2_000_000, 4, transfer="a"))
+        settle(first)
+        second.send("FileTransferStartUpload", **announced(button, 2_000_000, 4, transfer="b"))
+        settle(second)
+        assert self.under_way(operator) == 1
+        first.socket.close()
+        assert until(lambda: self.under_way(operator) == 0)
+        second.send("FileTransferStartUpload", **announced(button, 2_000_000, 4, transfer="c"))
+        settle(second)
+        assert self.under_way(operator) == 1
+
+    @pytest.mark.parametrize(("size", "parts"), [(-1, 0), (10, 0), (0, 1), (10, 10_000_000), (5000, 3), (2**62, 1)])
+    def test_announcements_that_cannot_be_are_refused(self, operator, button, size, parts):
+        client = operator.client()
+        client.send("FileTransferStartUpload", **announced(button, size, parts))
+        settle(client)
+        assert self.under_way(operator) == 0 and not button.files
+
+    def test_parts_that_were_not_announced_end_the_upload(self, operator, button):
+        client = operator.client()
+        for bad in ([(0, b"x" * 8193)], [(5, b"x")], [(0, b"x" * 10), (0, b"x" * 10)], [(0, b"x"), (1, b"x")]):
+            client.send("FileTransferStartUpload", **announced(button, 8192, 2))
+            for index, content in bad:
+                client.send("FileTransferPart", **part(button, index, content))
+            settle(client)
+            assert self.under_way(operator) == 0 and not button.files
+
+    def test_nobody_meddles_with_anothers_upload(self, operator, button):
+        first, second = operator.client(), operator.client()
+        first.send("FileTransferStartUpload", **announced(button, 8192, 2))
+        first.send("FileTransferPart", **part(button, 0, b"a" * 4096))
+        settle(first)
+        second.send("FileTransferPart", **part(button, 1, b"b" * 4096))
+        second.send("FileTransferStartUpload", **announced(button, 4096, 1, "other.txt"))
+        settle(second)
+        first.send("FileTransferPart", **part(button, 1, b"a" * 4096))
+        assert until(lambda: button.files == [("a.txt", b"a" * 8192)])
+
+    def test_only_an_upload_button_takes_files(self, operator, gui, button):
+        slider = gui.add_slider("gain", 0, 10, 1, 5)
+        button.disabled = True
+        client = operator.client()
+        for target in (slider, button):
+            client.send("FileTransferStartUpload", **announced(target, 0, 0))
+        settle(client)
+        assert slider.value == 5 and not button.files
