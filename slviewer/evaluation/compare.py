@@ -9,7 +9,14 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.evaluation.incidence import incidence
 from slviewer.evaluation.plane import PlaneResult, evaluate_plane
-from slviewer.evaluation.region import find_plane, find_sphere, measured_pixels, start_plane, start_sphere
+from slviewer.evaluation.region import (
+    LEAST_PIXELS,
+    find_plane,
+    find_sphere,
+    measured_pixels,
+    start_plane,
+    start_sphere,
+)
 from slviewer.evaluation.render import Row, render
 from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.geometry.shapes import Plane, Sphere
@@ -83,9 +90,9 @@ def compare(
     """Fit the shape to every model's cloud of one capture, over the pixels that all of them measure.
 
     ``lit`` ``(h, w)`` bool: what a perfect decoder could measure (``PhaseMap.lit``). ``region`` ``(h, w)`` bool: the
-    pixels that show the shape, such as a board's outline; None: it is found in the first model's cloud, completed by
-    the others'. ``depth_range`` in mm bounds R2. ``radius`` in mm, roughly, helps to find a sphere; the fitted one is
-    free all the same.
+    pixels that show the shape, such as a board's outline; None: the shape is looked for where every model measures, and
+    its region grown in the first model's cloud, completed by the others'. ``depth_range`` in mm bounds R2. ``radius``
+    in mm, roughly, helps to find a sphere; the fitted one is free all the same.
 
     Raises ``InputError`` where clouds differ in size, the shape is not found, or the models share too few pixels.
     """
@@ -96,19 +103,25 @@ def compare(
         raise InputError(f"The models' clouds have different sizes, {sizes}: reconstruct them from the same capture.")
 
     every, sigma_z = _union(clouds)
-    start: Plane | Sphere
-    if region is not None:
-        start = (
-            start_plane(every, region, sigma_z)
-            if shape == "plane"
-            else start_sphere(every, region, sigma_z, radius=radius)
+    shared = np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
+    if len(clouds) > 1 and region is None and np.count_nonzero(shared) < LEAST_PIXELS:
+        raise InputError(
+            f"{' and '.join(clouds)} share {np.count_nonzero(shared)} measured pixels: name one model, or place the "
+            "shape where the board poses were."
         )
-    elif shape == "plane":
-        start, region = find_plane(every, sigma_z=sigma_z)
+    # A wall behind the shape may hold more pixels, in a model that measures everywhere.
+    searched = region if region is not None else shared
+    start: Plane | Sphere
+    if shape == "plane":
+        start = start_plane(every, searched, sigma_z)
+        if region is None:
+            start, region = find_plane(every, sigma_z=sigma_z, start=start)
     else:
-        start, region = find_sphere(every, sigma_z=sigma_z, radius=radius)
+        start = start_sphere(every, searched, sigma_z, radius=radius)
+        if region is None:
+            start, region = find_sphere(every, sigma_z=sigma_z, radius=radius, start=start)
     measured_pixels(every, region)  # says so if there is too little
-    common = region & np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
+    common = region & shared
     results: dict[str, PlaneResult | SphereResult] = {}
     for model, cloud in clouds.items():
         try:

@@ -25,19 +25,23 @@ _SAMPLE = 40_000
 
 
 def find_plane(
-    points: np.ndarray, mask: np.ndarray | None = None, sigma_z: np.ndarray | None = None
+    points: np.ndarray,
+    mask: np.ndarray | None = None,
+    sigma_z: np.ndarray | None = None,
+    start: Plane | None = None,
 ) -> tuple[Plane, np.ndarray]:
     """The plane that holds most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
 
     ``mask`` leaves only some pixels to search in; ``sigma_z`` ``(h, w)`` mm is the expected noise. The region is one
     patch without its outermost two pixels; isolated pixels and small holes inside it belong to it, whether something
-    was measured there or not. The plane is a start for fits, not a result. Raises ``InputError`` where no plane fills a
-    patch.
+    was measured there or not. A roughly known plane to ``start`` from spares the search. The plane that comes back is a
+    start for fits, not a result. Raises ``InputError`` where no plane fills a patch.
     """
     measured = measured_pixels(points, mask)
     noise = _typical(sigma_z, measured)
     reach = max(PATCH_TOLERANCE_MM, 6.0 * noise)
-    return _grow(points, measured, start_plane(points, measured, sigma_z), fit_plane, lambda shape: reach, "flat")
+    first = start or start_plane(points, measured, sigma_z)
+    return _grow(points, measured, first, fit_plane, lambda shape: reach, "flat")
 
 
 def find_sphere(
@@ -45,6 +49,7 @@ def find_sphere(
     mask: np.ndarray | None = None,
     sigma_z: np.ndarray | None = None,
     radius: float | None = None,
+    start: Sphere | None = None,
 ) -> tuple[Sphere, np.ndarray]:
     """The sphere that holds most pixels, and its region, as ``find_plane``; ``radius`` in mm narrows the search."""
     measured = measured_pixels(points, mask)
@@ -53,7 +58,8 @@ def find_sphere(
     def reach(shape: Sphere) -> float:
         return max(min(PATCH_TOLERANCE_MM, SPHERE_TOLERANCE * shape.radius), 6.0 * noise)
 
-    return _grow(points, measured, start_sphere(points, measured, sigma_z, radius), fit_sphere, reach, "round")
+    first = start or start_sphere(points, measured, sigma_z, radius)
+    return _grow(points, measured, first, fit_sphere, reach, "round")
 
 
 def find_spheres(

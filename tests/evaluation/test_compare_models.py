@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from planted import board_before_a_wall, cloud, plane_depth, sphere_depth
+from planted import board_before_a_wall, cloud, plane_depth, rectangle, sphere_depth
 
 from slviewer.errors import InputError
 from slviewer.evaluation import letter
@@ -47,6 +47,22 @@ def test_every_model_is_measured_over_the_common_pixels(two: tuple[dict[str, Clo
     assert result.warnings == []
 
 
+def test_a_larger_wall_that_one_model_alone_measures_is_not_the_shape() -> None:
+    board = rectangle((130, 280), (80, 230))
+    everywhere = cloud(np.where(board, plane_depth(), plane_depth(900.0, (0.0, 0.1))), 0.05)
+    near = everywhere.copy()
+    near[~rectangle((140, 270), (90, 220))] = np.nan
+    for order in (1, -1):
+        clouds = dict(
+            list({"stereo": seen(everywhere, "stereo"), "pixelwise": seen(near, "pixelwise")}.items())[::order]
+        )
+        result = compare("plane", clouds, board)
+        assert not result.region[~board].any()
+        assert result.region.sum() > 0.9 * board.sum()
+        assert result.results["stereo"].points == result.results["pixelwise"].points == 130 * 130
+        assert 0.04 < result.results["stereo"].rms_mm < 0.055
+
+
 def test_a_given_region_is_taken_as_it_is() -> None:
     points, board = board_before_a_wall()
     points[40:60, 60:90] = np.nan
@@ -71,6 +87,8 @@ def test_models_without_common_pixels_are_refused() -> None:
     right[:, :180] = np.nan
     with pytest.raises(InputError, match="left"):
         compare("plane", {"left": seen(left, "left"), "right": seen(right, "right")}, region=board)
+    with pytest.raises(InputError, match="left and right share 0 measured pixels"):
+        compare("plane", {"left": seen(left, "left"), "right": seen(right, "right")})
     with pytest.raises(InputError, match="different sizes"):
         compare("plane", {"left": seen(left, "left"), "right": seen(right[:100], "right")})
     with pytest.raises(InputError, match="at least one"):
