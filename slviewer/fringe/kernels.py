@@ -107,9 +107,9 @@ def is_clipped(modulation, background, peak, scale):
 
 @numba.njit(inline="always")
 def verdict(dark, clipped, inconsistent):
-    """The first reason that applies."""
-    lit = SATURATED if clipped else (INCONSISTENT if inconsistent else VALID)
-    return DARK if dark else lit
+    """The first reason that applies: what is clipped in all its frames has no modulation, yet is not dark."""
+    unclipped = DARK if dark else (INCONSISTENT if inconsistent else VALID)
+    return SATURATED if clipped else unclipped
 
 
 @numba.njit(inline="always")

@@ -37,7 +37,7 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
         dark = np.zeros(phase.shape, bool)
     dark |= weakest < dark_limit(background, noise, white, dark_sigmas(found))
     reason = np.select(
-        [dark, saturated, inconsistent], [Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT], Reason.VALID
+        [saturated, dark, inconsistent], [Reason.SATURATED, Reason.DARK, Reason.INCONSISTENT], Reason.VALID
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
     phase, reason = settle(found, phase, reason)

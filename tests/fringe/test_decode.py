@@ -5,7 +5,7 @@ import pytest
 from fringe_scene import capture, coverage, slope, wrong
 
 from slviewer.errors import InputError
-from slviewer.fringe.decode import decode, texture
+from slviewer.fringe.decode import decode, decode_reference, texture
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
 from slviewer.fringe.sequence import Frame, PatternSequence
@@ -113,6 +113,16 @@ def test_clipped_pixels_are_saturated_and_noise_at_white_is_not(dtype, times):
     assert np.isnan(phase.phase[:, :76]).all() and np.isfinite(phase.wrapped).all()
 
 
+@pytest.mark.parametrize("decoder", [decode, decode_reference])
+def test_what_is_clipped_in_every_frame_is_saturated_not_dark(decoder):
+    truth, sequence = slope(), SEQUENCES["p18"]
+    ambient = np.full(truth.shape, 20.0)
+    ambient[10:30, 40:70] = 400.0  # a reflection that leaves no modulation
+    phase = decoder(sequence, capture(sequence, truth, ambient=ambient, read=2.0), "x")
+    assert (phase.reason[12:28, 42:68] == Reason.SATURATED).all()
+    assert phase.mask[35:, 5:-5].mean() > 0.99
+
+
 def test_shadow_is_dark_and_the_lit_part_is_kept_to_its_border():
     truth, sequence = slope(), SEQUENCES["p18"]
     gain = np.full(truth.shape, 150.0)
@@ -206,7 +216,8 @@ def test_tiny_black_and_white_images_end_masked(name, shape):
     sequence = SEQUENCES[name]
     for level in (0, 128, 255):
         phase = decode(sequence, np.full((len(sequence.frames), *shape), level, np.uint8), "x")
-        assert (phase.reason == Reason.DARK).all() and np.isnan(phase.phase).all()
+        clipped = level == 255 and sequence.periods_px("x")
+        assert (phase.reason == (Reason.SATURATED if clipped else Reason.DARK)).all() and np.isnan(phase.phase).all()
         assert phase.noise[0] >= 0 and phase.noise[1] >= 0
 
 
