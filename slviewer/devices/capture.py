@@ -21,16 +21,15 @@ def capture(
     DeviceError, with the frame at which it happened; whatever is raised, `out` then holds no capture and the rig can be
     used again once its device answers. The projector is left showing the last frame.
     """
-    check_projector(rig, sequence)
+    rig.projector.load(sequence)
     n, (width, height) = len(sequence.frames), rig.camera.size
     if out is None:
         out = np.empty((n, height, width), rig.camera.dtype)
     if out.shape != (n, height, width) or out.dtype != rig.camera.dtype:
         raise InputError(
-            f"the {n} frames of camera {rig.camera.name} need {(n, height, width)} {rig.camera.dtype}, "
+            f"the {n} frames of {rig.camera.name} need {(n, height, width)} {rig.camera.dtype}, "
             f"got {out.shape} {out.dtype}: make the array by the camera's size"
         )
-    rig.projector.load(sequence)
     if progress is not None:
         progress(0, n)
     for k in range(n):
@@ -42,15 +41,3 @@ def capture(
         if progress is not None:
             progress(k + 1, n)
     return out
-
-
-def check_projector(rig: Rig, sequence: PatternSequence) -> None:
-    """Raise InputError unless `sequence` has frames, and the size of the rig's projector."""
-    if not sequence.frames:
-        raise InputError("the pattern sequence has no frames: choose one that has")
-    if tuple(sequence.projector) != tuple(rig.projector.size):
-        (w, h), (columns, rows) = sequence.projector, rig.projector.size
-        raise InputError(
-            f"the patterns are {w}x{h} px and projector {rig.projector.name} has {columns}x{rows}: "
-            "make them for this projector"
-        )

@@ -17,15 +17,18 @@ from slviewer.fringe.sequence import PatternSequence
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What an operator sets by hand: exposure time in ms, and gain as a factor on the grey levels (1 = none)."""
+    """Exposure time in ms, and gain as a factor on the grey levels (1 = none).
 
-    exposure_ms: float
-    gain: float = 1.0
+    None: read from a device, it cannot tell; given to `Camera.apply`, it stays as it is.
+    """
+
+    exposure_ms: float | None = None
+    gain: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.exposure_ms < float("inf"):
+        if self.exposure_ms is not None and not 0 < self.exposure_ms < float("inf"):
             raise InputError(f"an exposure of {self.exposure_ms:g} ms is impossible: give a time above 0")
-        if not 0 < self.gain < float("inf"):
+        if self.gain is not None and not 0 < self.gain < float("inf"):
             raise InputError(f"a gain of {self.gain:g} is impossible: give a factor above 0, 1 for none")
 
 
@@ -34,7 +37,7 @@ class Camera(Protocol):
 
     @property
     def name(self) -> str:
-        """What an operator calls it."""
+        """What an operator calls it, fit to begin a sentence with, such as "the simulated camera"."""
         ...
 
     @property
@@ -73,7 +76,7 @@ class Projector(Protocol):
 
     @property
     def name(self) -> str:
-        """What an operator calls it."""
+        """What an operator calls it, fit to begin a sentence with."""
         ...
 
     @property
@@ -90,7 +93,10 @@ class Projector(Protocol):
         ...
 
     def load(self, sequence: PatternSequence) -> None:
-        """Make ready to show any frame of `sequence` at once; replaces what was loaded, and shows nothing yet."""
+        """Make ready to show any frame of `sequence` at once; replaces what was loaded, and shows nothing yet.
+
+        Raises InputError for patterns that are not of the projector's size.
+        """
         ...
 
     def show(self, index: int) -> None:
@@ -135,19 +141,32 @@ class Rig:
 
 
 def check_frame(camera: Camera, out: np.ndarray) -> None:
-    """Raise InputError unless `out` is a writable (h, w) array that `camera.grab` can fill in place."""
+    """Raise InputError unless `out` is a contiguous, writable (h, w) array that `camera.grab` can fill in place."""
     width, height = camera.size
-    if out.shape != (height, width) or out.dtype != camera.dtype or not out.flags.writeable:
+    if out.shape != (height, width) or out.dtype != camera.dtype:
         raise InputError(
-            f"camera {camera.name} fills frames of shape {(height, width)} {camera.dtype}, "
-            f"got {'' if out.flags.writeable else 'read-only '}{out.shape} {out.dtype}: make the array by its size"
+            f"{camera.name} fills frames of shape {(height, width)} {camera.dtype}, got {out.shape} {out.dtype}: "
+            "make the array by its size"
+        )
+    if not (out.flags.c_contiguous and out.flags.writeable):
+        raise InputError(f"{camera.name} fills frames row by row: give a contiguous array that can be written")
+
+
+def check_sequence(projector: Projector, sequence: PatternSequence) -> None:
+    """Raise InputError unless `sequence` has frames, and the projector's size."""
+    if not sequence.frames:
+        raise InputError("the pattern sequence has no frames: choose one that has")
+    if tuple(sequence.projector) != tuple(projector.size):
+        (w, h), (columns, rows) = sequence.projector, projector.size
+        raise InputError(
+            f"the patterns are {w}x{h} px and {projector.name} has {columns}x{rows}: make them for this projector"
         )
 
 
 def check_index(projector: Projector, sequence: PatternSequence | None, index: int) -> PatternSequence:
     """The loaded sequence, if frame `index` is in it. Raises DeviceError if none is loaded, else InputError."""
     if sequence is None:
-        raise DeviceError(f"projector {projector.name} has no patterns: load a sequence before showing a frame")
+        raise DeviceError(f"{projector.name} has no patterns: load a sequence before showing a frame")
     if not 0 <= index < len(sequence.frames):
         raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
     return sequence

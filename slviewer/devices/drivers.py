@@ -1,0 +1,62 @@
+"""Drivers by name: every file of this folder that holds a `DRIVER` is one."""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.util import find_spec
+
+import slviewer.devices
+from slviewer.devices.protocols import Camera, Projector, Rig
+from slviewer.errors import DeviceError, InputError
+
+
+@dataclass(frozen=True)
+class Driver:
+    """One way to reach devices; its factories take what that driver needs, and import vendor packages when called.
+
+    `what`: in a few words, what it drives. `packages`: how to install each package that must be importable, such as
+    ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, whole rigs (where both
+    devices share something), or several of these.
+    """
+
+    name: str
+    what: str
+    needs: str = ""
+    packages: Mapping[str, str] = field(default_factory=dict)
+    camera: Callable[..., Camera] | None = None
+    projector: Callable[..., Projector] | None = None
+    rig: Callable[..., Rig] | None = None
+
+    @property
+    def missing(self) -> str:
+        """What is missing on this machine and how to install it, in words; empty if the driver can be used."""
+        return "; ".join(
+            f"the package {package} is missing: {remedy}"
+            for package, remedy in self.packages.items()
+            if find_spec(package) is None
+        )
+
+
+@cache
+def drivers() -> dict[str, Driver]:
+    """All drivers by name, usable here or not."""
+    modules = (module.name for module in pkgutil.iter_modules(slviewer.devices.__path__))
+    found = (getattr(importlib.import_module(f"slviewer.devices.{name}"), "DRIVER", None) for name in modules)
+    return {driver.name: driver for driver in found if isinstance(driver, Driver)}
+
+
+def available() -> list[Driver]:
+    """All drivers, those that can be used here first; `needs` and `missing` say what the others want."""
+    return sorted(drivers().values(), key=lambda driver: (bool(driver.missing), driver.name))
+
+
+def driver(name: str) -> Driver:
+    """The driver called `name`. Raises InputError if there is none, DeviceError if it lacks a package."""
+    if name not in drivers():
+        raise InputError(f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}")
+    found = drivers()[name]
+    if found.missing:
+        raise DeviceError(f"the driver {name} cannot be used here, {found.missing}")
+    return found

@@ -1,0 +1,131 @@
+"""A recorded capture as camera and projector: the frame that is shown is the frame that was recorded."""
+
+import numpy as np
+
+from slviewer.devices.drivers import Driver
+from slviewer.devices.opening import Openable
+from slviewer.devices.protocols import CameraSettings, Rig, check_frame, check_index, check_level
+from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.decode import texture
+from slviewer.fringe.sequence import PatternSequence
+
+
+class Recording:
+    """Frames (n, h, w), uint8 or uint16, and the sequence that was projected; `play` puts another in its place."""
+
+    def __init__(self, frames: np.ndarray, sequence: PatternSequence) -> None:
+        _check(frames, sequence)
+        self.played = (frames, sequence)
+        self.seen: np.ndarray | None = None  # (h, w) that belongs to what the projector shows; None: was not recorded
+
+    def play(self, frames: np.ndarray, sequence: PatternSequence) -> None:
+        """Play another capture of the same rig, from any thread; a capture that is running ends with the old one."""
+        _check(frames, sequence)
+        before, projector = self.played[0], self.played[1].projector
+        if frames.shape[1:] != before.shape[1:] or frames.dtype != before.dtype or sequence.projector != projector:
+            raise InputError(
+                f"the recording holds frames of {before.shape[1:]} {before.dtype} for a projector of {projector}, got "
+                f"{frames.shape[1:]} {frames.dtype} and {sequence.projector}: replay captures of one rig together"
+            )
+        self.played = (frames, sequence)
+
+
+class ReplayCamera(Openable):
+    """Sees the recorded frames. Its settings are unknown and stay as they were: what was recorded was recorded."""
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__("the replay camera")
+        self._recording = recording
+        height, width = recording.played[0].shape[1:]
+        self.size, self.dtype = (width, height), recording.played[0].dtype
+
+    def grab(self, out: np.ndarray) -> None:
+        """The recorded frame of the pattern shown; under even light of any level, the recorded texture."""
+        self.check_open()
+        check_frame(self, out)
+        if self._recording.seen is None:
+            raise DeviceError("the recording holds no dark frame: show a pattern or light")
+        out[:] = self._recording.seen
+
+    def settings(self) -> CameraSettings:
+        """Nothing known."""
+        self.check_open()
+        return CameraSettings()
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Nothing set."""
+        return self.settings()
+
+
+class ReplayProjector(Openable):
+    """Shows what was shown then, and refuses anything else."""
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__("the replay projector")
+        self._recording = recording
+        self._loaded: tuple[np.ndarray, PatternSequence] | None = None
+        self.size = recording.played[1].projector
+
+    def open(self) -> None:
+        """Ready, dark, nothing loaded."""
+        super().open()
+        self._loaded = None
+        self.show_level(None)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """Accept the recorded sequence. Raises DeviceError for any other."""
+        self.check_open()
+        played = self._recording.played
+        if sequence != played[1]:
+            raise DeviceError(
+                f"the recording answers only to the patterns it was made with, {_described(played[1])}, "
+                f"and was asked for {_described(sequence)}: capture with its own sequence"
+            )
+        self._loaded = played
+
+    def show(self, index: int) -> None:
+        """Let the camera see that frame."""
+        self.check_open()
+        frames, sequence = self._loaded or (None, None)
+        check_index(self, sequence, index)
+        assert frames is not None
+        self._recording.seen = frames[index]
+
+    def show_level(self, grey: int | None) -> None:
+        """Even light as far as the recording has it: its texture, or its dark frame."""
+        self.check_open()
+        frames, sequence = self._recording.played
+        if check_level(grey):
+            self._recording.seen = texture(sequence, frames)
+        else:
+            dark = [i for i, frame in enumerate(sequence.frames) if frame.kind == "black"]
+            self._recording.seen = frames[dark[0]] if dark else None
+
+
+def replay(frames: np.ndarray, sequence: PatternSequence) -> Rig:
+    """The rig that took `frames` (n, h, w) of `sequence`; they are not copied. Raises InputError if they don't fit."""
+    return replayed(Recording(frames, sequence))
+
+
+def replayed(recording: Recording) -> Rig:
+    """The rig of a recording whose owner will `play` more captures on it."""
+    return Rig("replay", ReplayCamera(recording), ReplayProjector(recording))
+
+
+DRIVER = Driver("replay", "a recorded capture, played back", needs="frames and their pattern sequence", rig=replay)
+
+
+def _check(frames: np.ndarray, sequence: PatternSequence) -> None:
+    if frames.ndim != 3 or frames.dtype not in (np.uint8, np.uint16) or len(frames) != len(sequence.frames):
+        raise InputError(
+            f"{len(sequence.frames)} frames (n, h, w) of uint8 or uint16 are needed for this sequence, "
+            f"got {frames.shape} {frames.dtype}: give one image a pattern"
+        )
+
+
+def _described(sequence: PatternSequence) -> str:
+    width, height = sequence.projector
+    kinds = sorted({frame.kind for frame in sequence.frames})
+    periods = sorted({frame.period_px for frame in sequence.frames if frame.kind == "phase"})
+    listed = [*kinds, *(f"period {period:g} px" for period in periods)]
+    return f"{len(sequence.frames)} frames of {width}x{height} px ({', '.join(listed)})"

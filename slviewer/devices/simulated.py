@@ -1,0 +1,143 @@
+"""The simulated rig as one more pair of drivers: it sees what stands in its `SimulatedWorld`."""
+
+import cv2
+import numpy as np
+
+from slviewer.devices.drivers import Driver
+from slviewer.devices.opening import Openable
+from slviewer.devices.protocols import CameraSettings, Rig, check_frame, check_index, check_level, check_sequence
+from slviewer.devices.world import Shown, SimulatedWorld
+from slviewer.errors import InputError
+from slviewer.fringe.patterns import profile
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.target.board import Board
+
+AUTO = CameraSettings(exposure_ms=1.0, gain=1.0)
+"""At 1 ms the brightest half percent of the lit scene reach the sensor's `peak_level` in white light, near or far."""
+
+_EXPOSURES_MS = (0.01, 100.0)
+_GAINS = (1.0, 16.0)
+_WHITE = 0.85  # albedo of the plate for which the camera is exposed while the projector lights nothing
+
+
+class SimulatedCamera(Openable):
+    """8-bit frames with the rig's noise; light grows with the exposure, and is cut off at 255."""
+
+    dtype = np.dtype(np.uint8)
+
+    def __init__(self, world: SimulatedWorld) -> None:
+        super().__init__("the simulated camera")
+        self.size = world.rig.camera.size
+        self.world = world
+        self._settings = AUTO
+        self._seen: tuple[Shown | None, int] = (None, 0)
+
+    def grab(self, out: np.ndarray) -> None:
+        """What the projector shows on what stands there now; every frame has noise of its own."""
+        self.check_open()
+        check_frame(self, out)
+        shown = self.world.shown
+        grabs = self._seen[1] + 1 if self._seen[0] is shown else 0
+        self._seen = (shown, grabs)
+        keys = np.random.default_rng([*shown.seed, grabs]).integers(0, 2**32, 2, dtype=np.uint32)
+        renderer = self.world.renderer(shown.preview)
+        width, height = renderer.rig.camera.size
+        frame = out if (width, height) == self.size else np.empty((height, width), np.uint8)
+        assert self._settings.exposure_ms is not None and self._settings.gain is not None
+        exposure = _auto_exposure(renderer) * self._settings.exposure_ms
+        renderer.frame(shown.pattern, keys, frame, lamp=shown.lamp, exposure=exposure, gain=self._settings.gain)
+        if frame is not out:
+            cv2.resize(frame, self.size, dst=out, interpolation=cv2.INTER_LINEAR)
+
+    def settings(self) -> CameraSettings:
+        """What is set."""
+        self.check_open()
+        return self._settings
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set it within 0.01 ... 100 ms and 1 ... 16 times."""
+        self.check_open()
+        exposure, gain = (
+            before if wanted is None else min(max(wanted, low), high)
+            for wanted, before, (low, high) in (
+                (settings.exposure_ms, self._settings.exposure_ms, _EXPOSURES_MS),
+                (settings.gain, self._settings.gain, _GAINS),
+            )
+        )
+        self._settings = CameraSettings(exposure, gain)
+        return self._settings
+
+
+class SimulatedProjector(Openable):
+    """Throws patterns into the world. The same captures in the same order have the same noise, previews or not."""
+
+    def __init__(self, world: SimulatedWorld) -> None:
+        super().__init__("the simulated projector")
+        self.size = world.rig.projector.size
+        self.world = world
+        self._sequence: PatternSequence | None = None
+        self._profiles: list[tuple[Axis | None, np.ndarray]] = []
+        self._loads, self._shows = 0, 0
+
+    def open(self) -> None:
+        """Ready, dark, nothing loaded."""
+        super().open()
+        self._sequence = None
+        self.show_level(None)
+
+    def close(self) -> None:
+        """Dark, and no longer ready."""
+        if self._open:
+            self.show_level(None)
+        super().close()
+
+    def load(self, sequence: PatternSequence) -> None:
+        """Compute all its patterns. Raises InputError for those that cannot be made, or not for this projector."""
+        self.check_open()
+        check_sequence(self, sequence)
+        self._profiles = [profile(sequence, k) for k in range(len(sequence.frames))]
+        self._sequence = sequence
+        self._loads, self._shows = self._loads + 1, 0
+
+    def show(self, index: int) -> None:
+        """Show one of them."""
+        self.check_open()
+        check_index(self, self._sequence, index)
+        self._show(self._profiles[index], preview=False)
+
+    def show_level(self, grey: int | None) -> None:
+        """Even light, for previews."""
+        self.check_open()
+        self._show((None, np.full(self.size[0], check_level(grey), np.uint8)), preview=True)
+
+    def _show(self, pattern: tuple[Axis | None, np.ndarray], preview: bool) -> None:
+        self._shows += 1
+        rig = self.world.rig
+        seed = (rig.seed, self._loads, self._shows, 0xDE)
+        lamp = 1 + rig.light.flicker * float(np.random.default_rng(seed).standard_normal())
+        self.world.shown = Shown(pattern, lamp, seed, preview)
+
+
+def simulated_rig(world: SimulatedWorld) -> Rig:
+    """The camera and projector that look into `world`."""
+    return Rig("simulated", SimulatedCamera(world), SimulatedProjector(world))
+
+
+def preset_rig(preset: str = "letter", scale: float = 1.0, seed: int = 0, board: str = "circles:21x16:9") -> Rig:
+    """A preset's rig before a board, such as "circles:21x16:9"; the camera's size is the preset's times `scale`."""
+    if preset != "letter":
+        raise InputError(f"no rig preset is called {preset!r}: use letter")
+    return simulated_rig(SimulatedWorld(letter(scale, seed), Board.parse(board)))
+
+
+DRIVER = Driver("simulated", "a rig that exists in numbers only, with known truth", rig=preset_rig)
+
+
+def _auto_exposure(renderer: Renderer) -> float:
+    """Grey levels of full white light on an albedo of 1; for a white plate in focus where nothing is lit."""
+    if renderer.truth().mask.any():
+        return renderer.exposure
+    sensor, light = renderer.rig.sensor, renderer.rig.light
+    return (sensor.peak_level - sensor.dark_level) / (_WHITE * (1 + light.ambient))

@@ -1,0 +1,153 @@
+"""What stands before the simulated rig, and the light that its projector throws on it."""
+
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+from slviewer.simulation.boards import FLAT, BoardScene, Pose, Shape, blank_board, printed_board
+from slviewer.simulation.mesh import MeshScene, demo_object
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig
+from slviewer.simulation.scenes import Scene, Spheres, sphere
+from slviewer.target.board import Board
+
+Thing = Literal["board", "plane", "sphere", "object"]
+"""The printed target, the blank plate, the Letter's sphere, the demo object."""
+
+_FIRST_PLACES_MM: dict[Thing, float] = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0}
+_SETTLED_S = 0.3  # a thing that has not been moved for so long is rendered in full by a preview too
+_DRAFT_SCALE = 0.25  # of a preview while things move: the geometry of 400x300 rays instead of 1600x1200
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What the projector shows: pattern as `fringe.profile` gives it, the lamp's relative light, the noise's seed.
+
+    Under even light, `preview`, a moving scene may be drawn as a draft.
+    """
+
+    pattern: tuple[Axis | None, np.ndarray]
+    lamp: float
+    seed: tuple[int, ...]
+    preview: bool
+
+
+class SimulatedWorld:
+    """One rig's surroundings, shared by its camera and its projector. Things may be moved from any thread.
+
+    One thing stands there at a time, and each keeps its place while another does. A pose is T_camera_thing: the board's
+    origin is its first feature, the plane's its middle, the sphere's its centre, the object's its own.
+    """
+
+    def __init__(self, rig: SimulatedRig, board: Board | None = None, shape: Shape = FLAT) -> None:
+        self.rig = rig
+        self.shown = Shown((None, np.zeros(rig.projector.size[0], np.uint8)), 1.0, (rig.seed,), True)
+        self._draft_rig = replace(rig, camera=replace(rig.camera, scale=min(rig.camera.scale, _DRAFT_SCALE)))
+        self._lock = threading.RLock()
+        self._things: dict[Thing, Scene] = {
+            "plane": blank_board(_facing("plane")),
+            "sphere": sphere((0.0, 0.0, _FIRST_PLACES_MM["sphere"])),
+        }
+        self._standing: Thing = "board"
+        self._moved = time.monotonic()
+        self._renderers: dict[bool, Renderer] = {}
+        self.print_board(board or Board.parse("circles:21x16:9"), shape)
+
+    @property
+    def standing(self) -> Thing:
+        """What stands before the rig."""
+        return self._standing
+
+    @property
+    def scene(self) -> Scene:
+        """The same for a `Renderer`, whose truth is this world's truth."""
+        with self._lock:
+            return self._things[self._standing]
+
+    @property
+    def board(self) -> Board:
+        """What is printed on the board."""
+        board = self._board().board
+        assert board is not None
+        return board
+
+    @property
+    def shape(self) -> Shape:
+        """How far the board is from flat, and its features from their places."""
+        return self._board().shape
+
+    @property
+    def pose(self) -> Pose:
+        """Where the thing that stands there is; a sphere's is not turned."""
+        return _pose(self.scene)
+
+    def print_board(self, board: Board, shape: Shape = FLAT) -> None:
+        """Take another board, its middle on the camera's axis; it does not replace what stands before the rig.
+
+        Raises InputError for ChArUco boards, which the simulation does not print.
+        """
+        middle = (board.points.min(0) + board.points.max(0)) / 2
+        pose = Pose(np.eye(3), np.array([0, 0, _FIRST_PLACES_MM["board"]]) - middle)
+        self._put("board", printed_board(board, pose, shape, self.rig.seed))
+
+    def place_board(self, pose: Pose) -> None:
+        """Let the board stand at T_camera_board, in place of whatever stood there."""
+        self.place("board", pose)
+
+    def place(self, thing: Thing, pose: Pose | None = None) -> None:
+        """Let `thing` stand at T_camera_thing, in place of whatever stood there; None: where it stood before."""
+        if thing not in get_args(Thing):
+            raise InputError(f"the simulated world has no {thing!r}: use one of {', '.join(get_args(Thing))}")
+        if pose is not None and not (np.isfinite(pose.R).all() and np.isfinite(pose.t).all()):
+            raise InputError("a pose with numbers that are not finite places nothing: give a turn and mm")
+        with self._lock:
+            scene = self._things[thing] if thing in self._things else demo_object(_facing(thing))
+            if pose is not None:
+                scene = _placed(scene, pose)
+            self._standing = thing
+            self._put(thing, scene)
+
+    def renderer(self, preview: bool) -> Renderer:
+        """Of what stands there now: in full, or a draft for a preview while things move, (h, w) at a smaller scale."""
+        with self._lock:
+            draft = preview and time.monotonic() - self._moved < _SETTLED_S
+            draft = draft and self._draft_rig.camera.scale < self.rig.camera.scale
+            if draft not in self._renderers:
+                self._renderers[draft] = Renderer(self._draft_rig if draft else self.rig, self._things[self._standing])
+            return self._renderers[draft]
+
+    def _put(self, thing: Thing, scene: Scene) -> None:
+        with self._lock:
+            self._things[thing] = scene
+            if thing == self._standing:
+                self._moved = time.monotonic()
+                self._renderers.clear()
+
+    def _board(self) -> BoardScene:
+        with self._lock:
+            scene = self._things["board"]
+        assert isinstance(scene, BoardScene)
+        return scene
+
+
+def _pose(scene: Scene) -> Pose:
+    if isinstance(scene, Spheres):
+        return Pose(np.eye(3), scene.centres[0])
+    assert isinstance(scene, BoardScene | MeshScene)
+    return scene.pose
+
+
+def _placed(scene: Scene, pose: Pose) -> Scene:
+    if isinstance(scene, Spheres):
+        return replace(scene, centres=pose.t[None].astype(float))
+    assert isinstance(scene, BoardScene | MeshScene)
+    return replace(scene, pose=pose)
+
+
+def _facing(thing: Thing) -> Pose:
+    return Pose(np.eye(3), np.array([0.0, 0.0, _FIRST_PLACES_MM[thing]]))
