@@ -59,6 +59,7 @@ class Renderer:
     def __init__(self, rig: SimulatedRig, scene: Scene) -> None:
         self.rig = rig
         self.scene = scene
+        self._lights: dict[float, tuple[np.ndarray, np.ndarray]] = {}
 
     def truth(self) -> Truth:
         """What a perfect instrument would measure."""
@@ -71,7 +72,7 @@ class Renderer:
 
         `progress(done, n)` is called after each frame, and may raise to stop.
         """
-        rig, maps = self.rig, self._maps
+        rig = self.rig
         if tuple(sequence.projector) != rig.projector.size:
             raise InputError(
                 f"the patterns are {sequence.projector[0]}x{sequence.projector[1]} px and the simulated projector has "
@@ -80,28 +81,57 @@ class Renderer:
         rng = np.random.default_rng([rig.seed, seed, 0xF0])
         keys = rng.integers(0, 2**32, (len(sequence.frames), 2), dtype=np.uint32)
         lamp = 1 + rig.light.flicker * rng.standard_normal(len(sequence.frames))
-        exposure = self.exposure
-        gain = (exposure * (1 - rig.light.black) * maps.gain).astype(np.float32)
-        stray = exposure * (rig.light.black * maps.gain + maps.stray)
-        for direction in (0, 1):
-            stray = correlate1d(stray, self._taps, axis=direction)
-        stray = np.ascontiguousarray(stray[self._frame], np.float32)
-        sensor = rig.sensor
-        noise = np.array([sensor.dark_level, sensor.read_variance, sensor.shot_variance])
         width, height = rig.camera.size
         stack = np.empty((len(sequence.frames), height, width), np.uint8)
         for k in range(len(stack)):
-            varies, grey_levels = profile(sequence, k)
-            # Rows and columns are blurred alike in space, hence by different numbers of pixels.
-            sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
-            pattern = blurred_profile((grey_levels / 255.0) ** rig.light.gamma, sigmas)
-            expose(
-                maps.coordinates[varies or "x"], maps.level, gain, np.float32(lamp[k]) * pattern.table, pattern.offset,
-                OVERSAMPLING, self._taps, stray, noise, NORMAL_QUANTILES, keys[k], stack[k],
-            )  # fmt: skip
+            self.frame(profile(sequence, k), keys[k], stack[k], lamp=lamp[k])
             if progress is not None:
                 progress(k + 1, len(stack))
         return stack
+
+    def frame(
+        self,
+        pattern: tuple[Axis | None, np.ndarray],
+        keys: np.ndarray,
+        out: np.ndarray,
+        *,
+        lamp: float = 1.0,
+        exposure: float | None = None,
+        gain: float = 1.0,
+    ) -> None:
+        """Fill `out` (h, w) uint8 with one frame of `pattern`, the axis and grey levels that `fringe.profile` gives.
+
+        `keys` (2,) uint32 decide the noise, `lamp` is the relative light of this frame, `exposure` replaces the
+        renderer's own, and `gain` multiplies the signal and its noise before they become 8 bits.
+        """
+        rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
+        width, height = rig.camera.size
+        if out.shape != (height, width) or out.dtype != np.uint8:
+            raise InputError(f"a frame needs an array of shape {(height, width)} uint8, got {out.shape} {out.dtype}")
+        lit, stray = self._light((self.exposure if exposure is None else exposure) * gain)
+        # Rows and columns are blurred alike in space, hence by different numbers of pixels.
+        sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
+        light = blurred_profile((grey_levels / 255.0) ** rig.light.gamma, sigmas)
+        sensor = rig.sensor
+        noise = np.array([sensor.dark_level, gain**2 * sensor.read_variance, gain * sensor.shot_variance])
+        expose(
+            maps.coordinates[varies or "x"], maps.level, lit, np.float32(lamp) * light.table, light.offset,
+            OVERSAMPLING, self._taps, stray, noise, NORMAL_QUANTILES, keys, out,
+        )  # fmt: skip
+
+    def _light(self, exposure: float) -> tuple[np.ndarray, np.ndarray]:
+        """Grey levels: of full white light as `_Maps.gain`, and of all that no pattern changes, blurred, (h, w)."""
+        if exposure not in self._lights:
+            maps, black = self._maps, self.rig.light.black
+            stray = exposure * (black * maps.gain + maps.stray)
+            for direction in (0, 1):
+                stray = correlate1d(stray, self._taps, axis=direction)
+            self._lights.clear()  # an exposure is kept for many frames
+            self._lights[exposure] = (
+                (exposure * (1 - black) * maps.gain).astype(np.float32),
+                np.ascontiguousarray(stray[self._frame], np.float32),
+            )
+        return self._lights[exposure]
 
     @cached_property
     def exposure(self) -> float:
