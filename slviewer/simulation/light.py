@@ -1,6 +1,7 @@
 """What the projector throws on a surface: profiles blurred by its optics, tabulated for the frame kernel."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -41,15 +42,21 @@ def blurred_profile(values: np.ndarray, sigmas: np.ndarray) -> Profile:
 
     Beyond its ends the profile continues with its end values: `window` darkens what lies outside the projector.
     """
-    reach = int(np.ceil(4.5 * sigmas.max())) + 1
+    weights, reach = _weights(tuple(sigmas.tolist()))
+    windows = sliding_window_view(np.pad(values.astype(np.float32), reach + _MARGIN, mode="edge"), 2 * reach + 1)
+    table = np.tensordot(windows, weights, 1)  # (px, within, sigma)
+    return Profile(np.ascontiguousarray(table.reshape(-1, len(sigmas)).T), _MARGIN * OVERSAMPLING)
+
+
+@lru_cache(8)
+def _weights(sigmas: tuple[float, ...]) -> tuple[np.ndarray, int]:
+    """(2 reach + 1, OVERSAMPLING, LEVELS) float32: what each projector px adds at each place within one; and reach."""
+    reach = int(np.ceil(4.5 * max(sigmas))) + 1
     around = np.arange(-reach, reach + 1)[:, None, None]
     within = (np.arange(OVERSAMPLING) / OVERSAMPLING)[:, None]
     # A box pixel seen from `within` is a difference of two Gaussian integrals.
-    right, left = (ndtr((around + edge - within) / sigmas) for edge in (0.5, -0.5))
-    weights = (right - left) / (right - left).sum(0)
-    windows = sliding_window_view(np.pad(values, reach + _MARGIN, mode="edge"), 2 * reach + 1)
-    table = np.tensordot(windows, weights, 1)  # (px, within, sigma)
-    return Profile(np.ascontiguousarray(table.reshape(-1, len(sigmas)).T, np.float32), _MARGIN * OVERSAMPLING)
+    right, left = (ndtr((around + edge - within) / np.array(sigmas)) for edge in (0.5, -0.5))
+    return ((right - left) / (right - left).sum(0)).astype(np.float32), reach
 
 
 def window(coordinate: np.ndarray, extent: int, blur_px: np.ndarray) -> np.ndarray:

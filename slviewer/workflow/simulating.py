@@ -1,9 +1,13 @@
 """A session filled by the simulated rig, with the truth in a file of its own."""
 
 import json
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
@@ -49,12 +53,19 @@ def simulate(
     only_x = one_axis(both, "x")
     truth: dict[str, Any] = {"preset": preset, "scale": scale, "seed": seed, "target": TARGET, "rig": rig_record(rig)}
 
-    def rendered(poses_or_scans: dict[str, Scene], sequence: PatternSequence) -> Iterator[ImportedCapture]:
-        for name, scene in poses_or_scans.items():
-            i = list(plan).index(name)
-            progress(i / len(plan), f"rendering {name}")
-            frames = Renderer(rig, scene).capture(sequence, seed=i)
-            yield ImportedCapture(name, sequence, frames, None, f"simulated: {preset}, scale {scale:g}, seed {seed}")
+    def rendered(scenes: dict[str, Scene], sequence: PatternSequence) -> Iterator[ImportedCapture]:
+        """One capture after another; the next one is rendered while one is saved."""
+        source = f"simulated: {preset}, scale {scale:g}, seed {seed}"
+        numbers = {name: i for i, name in enumerate(plan)}
+        with ThreadPoolExecutor(1) as renderer:
+            waiting = deque[Future[np.ndarray]]()
+            ahead = iter(scenes.items())
+            for name in scenes:
+                while len(waiting) < 2 and (following := next(ahead, None)):
+                    work = Renderer(rig, following[1]).capture
+                    waiting.append(renderer.submit(work, sequence, numbers[following[0]]))
+                progress(numbers[name] / len(plan), f"rendering {name}")
+                yield ImportedCapture(name, sequence, waiting.popleft().result(), None, source)
 
     with Session.create(session) as store:
         groups = {kind: {n: s for n, s in plan.items() if n.startswith(f"{kind}_")} for kind in KINDS}
