@@ -69,6 +69,10 @@ class Door:
                 response = await response
             harden(response.headers, viser_policy(self._scripts, host))
             return response
+        if path == "/favicon.ico":  # browsers ask by themselves, and would report that there is none
+            response = respond(HTTPStatus.NO_CONTENT)
+            harden(response.headers)
+            return response
         if path.startswith(PREFIX):
             return await self._download(connection, path)
         return self._page(path, role, host)

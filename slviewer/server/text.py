@@ -6,6 +6,9 @@ import unicodedata
 _INVISIBLE = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """Control characters, lone surrogates, and the marks that make text read in another order than it is written."""
 
+_LINK = re.compile(r"(?i)(?<=www)(?=\.)|(?<=http)(?=:)|(?<=https)(?=:)|(?=@)")
+"""Where viser's Markdown recognises an address, after it has read the entities."""
+
 _DEVICE_NAMES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
 
 
@@ -14,9 +17,9 @@ def escape(text: str) -> str:
 
     For viser's Markdown and HTML elements, also inside a quoted attribute; not between backticks, where Markdown
     shows entities as they are. Everything but letters and digits becomes a numeric entity, so that no Markdown or HTML
-    syntax can arise; white space becomes single spaces.
+    syntax can arise; white space becomes single spaces. An invisible joiner keeps addresses from becoming links.
     """
-    plain = _INVISIBLE.sub("", " ".join(str(text).split()))
+    plain = _LINK.sub("\u2060", _INVISIBLE.sub("", " ".join(str(text).split())))
     return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in plain)
 
 

@@ -1,5 +1,6 @@
 """Who is let in: every way past the door that viser leaves open is tried."""
 
+import contextlib
 import logging
 import socket
 import time
@@ -8,6 +9,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import SlviewerError, UsageError
+from slviewer.server import connection
 from slviewer.server.access import Access
 from slviewer.server.secure import serve
 
@@ -144,6 +146,30 @@ def test_other_methods_and_half_requests_end_without_noise(operator, caplog):
                 assert b"200 OK" not in raw.recv(1000)
         assert operator.get("/").status == 200
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def test_whoever_asks_for_nothing_is_let_go(server, monkeypatch):
+    monkeypatch.setattr(connection, "REQUEST_SECONDS", 0.1)
+    with socket.create_connection(("127.0.0.1", server.port)) as idle:
+        idle.sendall(b"GET / HTTP/1.1\r\n")
+        idle.settimeout(2)
+        with contextlib.suppress(ConnectionError):
+            assert idle.recv(100) == b""
+
+
+def test_an_ipv6_address_is_one_too():
+    try:
+        server = serve("::1", port=0)
+    except SlviewerError:
+        pytest.skip("this machine has no IPv6")
+    try:
+        assert server.loopback and server.url.startswith(f"http://[::1]:{server.port}/?token=")
+        with socket.create_connection(("::1", server.port)) as raw:
+            path = server.url.partition(f":{server.port}")[2]
+            raw.sendall(f"GET {path} HTTP/1.1\r\nHost: [::1]:{server.port}\r\n\r\n".encode())
+            assert raw.recv(100).startswith(b"HTTP/1.1 303")
+    finally:
+        server.stop()
 
 
 def test_a_taken_port_is_an_error_at_once(server):

@@ -1,17 +1,20 @@
 """Downloads, further pages and endpoints, and text that users typed."""
 
 import base64
+import contextlib
 import hashlib
 import html
 import os
+import re
 import socket
 import time
 
 import pytest
-from conftest import Browser, until
+from server_client import Browser, until
 from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import InputError
+from slviewer.server import connection
 from slviewer.server.connection import CHUNK
 from slviewer.server.text import escape, safe_name
 
@@ -92,6 +95,24 @@ def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(operator, t
     assert operator.get("/").status == 200  # the reader that left half-way did no harm
 
 
+def test_a_reader_who_takes_nothing_is_let_go(operator, tmp_path, monkeypatch):
+    monkeypatch.setattr(connection, "STALL_SECONDS", 0.2)
+    with (tmp_path / "large.bin").open("wb") as file:
+        file.truncate(64 * CHUNK)
+    address = operator.server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
+    with socket.create_connection(("127.0.0.1", operator.server.port)) as stalled:
+        stalled.sendall(
+            f"GET {address} HTTP/1.1\r\nHost: {operator.host}\r\nCookie: {operator.cookie}\r\n\r\n".encode()
+        )
+        time.sleep(0.6)
+        stalled.settimeout(2)
+        received = 0
+        with contextlib.suppress(ConnectionError):
+            while part := stalled.recv(CHUNK):
+                received += len(part)
+        assert received < 64 * CHUNK
+
+
 def test_pages_and_endpoints_stand_beside_the_wizard(server, operator, watcher, stranger):
     async def echo(connection) -> None:
         async for message in connection:
@@ -142,7 +163,7 @@ NASTY = [
     '" onmouseover="alert(1)',
     "`code` **bold** _it_ # head | a | b | &lt;b&gt; \\<b>",
     "1. list\n\n> quote\n\n    code",
-    "http://evil.example www.evil.example",
+    "http://evil.example HTTPS://evil.example www.evil.example me@evil.example",
     "\u202egpj.exe \x00\x1b[31m",
 ]
 
@@ -150,11 +171,11 @@ NASTY = [
 @pytest.mark.parametrize("text", NASTY)
 def test_typed_text_stays_text(text):
     safe = escape(text)
-    assert (
-        not set(safe) & set("<>\"'`*_[](){}|!\\\n/:.~=")
-        and html.unescape(safe).split()
-        == "".join(c for c in text if c.isprintable() or c.isspace()).replace("\x00", "").split()
-    )
+    assert not set(safe) & set("<>\"'`*_[](){}|!\\\n/:.~=@")
+    shown = html.unescape(safe)
+    assert not re.search(r"(?i)https?:|www\.|\w@", shown), "viser's Markdown would make a link of it"
+    typed = "".join(c for c in text if c.isprintable() or c.isspace())
+    assert shown.replace("\u2060", "").split() == typed.split()
 
 
 def test_ordinary_names_stay_readable():

@@ -5,25 +5,9 @@ import threading
 
 import msgspec
 import pytest
-from conftest import CAMERA, Browser, Client, until
+from server_client import CAMERA, announced, settle, until
 
 from slviewer.errors import SlviewerError
-
-
-@pytest.fixture
-def gui(server):
-    return server.viser.gui
-
-
-def settle(client: Client) -> None:
-    """Wait until all that the client sent before has been handled."""
-    gui = client.server.viser.gui
-    seen = threading.Event()
-    mark = gui.add_checkbox("settled", False)
-    mark.on_update(lambda _: seen.set())
-    client.set(mark, True)
-    assert seen.wait(5)
-    mark.remove()
 
 
 def test_the_operator_works(operator, gui):
@@ -325,104 +309,3 @@ def test_a_render_that_the_server_asked_for_arrives(server, operator):
     client.send("GetRenderResponseMessage", payload=picture.getvalue(), render_uuid=asked()[0]["render_uuid"])
     asking.join(5)
     assert answers and answers[0].shape[:2] == (4, 6)
-
-
-def announced(button, size: int, parts: int, name: str = "a.txt", transfer: str = "t") -> dict:
-    return {
-        "source_component_uuid": button._impl.uuid,
-        "transfer_uuid": transfer,
-        "filename": name,
-        "mime_type": "",
-        "size_bytes": size,
-        "part_count": parts,
-    }
-
-
-def part(button, index: int, content: bytes, transfer: str = "t") -> dict:
-    return {
-        "source_component_uuid": button._impl.uuid,
-        "transfer_uuid": transfer,
-        "part_index": index,
-        "content": content,
-    }
-
-
-class TestUploads:
-    @pytest.fixture
-    def button(self, gui):
-        button = gui.add_upload_button("Open")
-        button.on_upload(lambda event: files.append((event.target.value.name, event.target.value.content)))
-        files: list = []
-        button.__dict__["files"] = files
-        return button
-
-    def under_way(self, browser: Browser) -> int:
-        return len(browser.server.viser.gui._current_file_upload_states)
-
-    def test_a_file_arrives_under_a_harmless_name(self, operator, button):
-        client, content = operator.client(), bytes(range(256)) * 32
-        client.send("FileTransferStartUpload", **announced(button, 8192, 2, "../../.ssh/authorized keys\x00.pub"))
-        client.send("FileTransferPart", **part(button, 0, content[:5000]))
-        client.send("FileTransferPart", **part(button, 1, content[5000:]))
-        assert until(lambda: button.files == [("authorized keys.pub", content)])
-        client.send("FileTransferStartUpload", **announced(button, 0, 0, "..\\..\\empty.yml"))
-        assert until(lambda: button.files[-1] == ("empty.yml", b""))
-        assert self.under_way(operator) == 0
-
-    def test_what_is_too_large_is_refused_with_a_word(self, operator, button):
-        client = operator.client()
-        client.send("FileTransferStartUpload", **announced(button, 3_000_001, 6))
-        assert until(lambda: any("Not uploaded" in str(m) for m in client.received))
-        assert until(lambda: any(m["type"] == "FileTransferPartAck" for m in client.received))
-        client.send("FileTransferPart", **part(button, 0, b"x" * 500_000))
-        settle(client)
-        assert self.under_way(operator) == 0 and not button.files
-
-    def test_several_at_once_share_the_limit(self, operator, button):
-        first, second = operator.client(), operator.client()
-        first.send("FileTransferStartUpload", **announced(button, 2_000_000, 4, transfer="a"))
-        settle(first)
-        second.send("FileTransferStartUpload", **announced(button, 2_000_000, 4, transfer="b"))
-        settle(second)
-        assert self.under_way(operator) == 1
-        first.socket.close()
-        assert until(lambda: self.under_way(operator) == 0)
-        second.send("FileTransferStartUpload", **announced(button, 2_000_000, 4, transfer="c"))
-        settle(second)
-        assert self.under_way(operator) == 1
-
-    @pytest.mark.parametrize(("size", "parts"), [(-1, 0), (10, 0), (0, 1), (10, 10_000_000), (5000, 3), (2**62, 1)])
-    def test_announcements_that_cannot_be_are_refused(self, operator, button, size, parts):
-        client = operator.client()
-        client.send("FileTransferStartUpload", **announced(button, size, parts))
-        settle(client)
-        assert self.under_way(operator) == 0 and not button.files
-
-    def test_parts_that_were_not_announced_end_the_upload(self, operator, button):
-        client = operator.client()
-        for bad in ([(0, b"x" * 8193)], [(5, b"x")], [(0, b"x" * 10), (0, b"x" * 10)], [(0, b"x"), (1, b"x")]):
-            client.send("FileTransferStartUpload", **announced(button, 8192, 2))
-            for index, content in bad:
-                client.send("FileTransferPart", **part(button, index, content))
-            settle(client)
-            assert self.under_way(operator) == 0 and not button.files
-
-    def test_nobody_meddles_with_anothers_upload(self, operator, button):
-        first, second = operator.client(), operator.client()
-        first.send("FileTransferStartUpload", **announced(button, 8192, 2))
-        first.send("FileTransferPart", **part(button, 0, b"a" * 4096))
-        settle(first)
-        second.send("FileTransferPart", **part(button, 1, b"b" * 4096))
-        second.send("FileTransferStartUpload", **announced(button, 4096, 1, "other.txt"))
-        settle(second)
-        first.send("FileTransferPart", **part(button, 1, b"a" * 4096))
-        assert until(lambda: button.files == [("a.txt", b"a" * 8192)])
-
-    def test_only_an_upload_button_takes_files(self, operator, gui, button):
-        slider = gui.add_slider("gain", 0, 10, 1, 5)
-        button.disabled = True
-        client = operator.client()
-        for target in (slider, button):
-            client.send("FileTransferStartUpload", **announced(target, 0, 0))
-        settle(client)
-        assert slider.value == 5 and not button.files

@@ -1,0 +1,146 @@
+"""A client that speaks to the server as a browser does, or as one never would."""
+
+import contextlib
+import http.client
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import viser
+import zstandard
+from websockets.sync.client import ClientConnection, connect
+
+from slviewer.server.secure import SafeServer
+
+CAMERA = {
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [1, 2, 3.0],
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 100,
+    "image_height": 720,
+    "image_width": 1280,
+    "look_at": [0, 0, 0],
+    "up_direction": [0, 0, 1],
+}
+
+
+def until(condition: Callable[[], Any], seconds: float = 5.0) -> bool:
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+class Client:
+    """A WebSocket to viser, past the door."""
+
+    def __init__(self, server: SafeServer, connection: ClientConnection) -> None:
+        self.server = server
+        self.socket = connection
+        self.received: list[dict] = []
+        self.thread = threading.Thread(target=self._listen, daemon=True)
+        self.thread.start()
+        before = set(server.viser.get_clients())
+        self.send("ViewerCameraMessage", **CAMERA)
+        assert until(lambda: set(server.viser.get_clients()) - before), "the camera message made no client of it"
+        (self.number,) = set(server.viser.get_clients()) - before
+
+    def _listen(self) -> None:
+        with contextlib.suppress(Exception):
+            for raw in self.socket:
+                assert isinstance(raw, bytes)
+                size = int.from_bytes(raw[8:16], "little")
+                inner = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size], int.from_bytes(raw[:8], "little"))
+                self.received.extend(msgspec.msgpack.decode(inner)["messages"])
+
+    def send(self, kind: str, **fields: Any) -> None:
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def set(self, handle: Any, value: Any) -> None:
+        self.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
+
+    def told(self, handle: Any) -> list:
+        """The values of an input that the server sent since the client connected."""
+        updates = [m for m in self.received if m["type"] == "GuiUpdateMessage" and m["uuid"] == handle._impl.uuid]
+        return [m["updates"]["value"] for m in updates]
+
+
+class Browser:
+    """Requests to one server, with the cookie that a token gave."""
+
+    def __init__(self, server: SafeServer, token: str | None) -> None:
+        self.server = server
+        self.host = f"127.0.0.1:{server.port}"
+        self.cookie = f"slviewer_{server.port}={token}" if token else None
+        self.clients: list[Client] = []
+
+    def get(self, path: str, **headers: str) -> http.client.HTTPResponse:
+        """The answer, with its body in `.content`."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=5)
+        cookie = {"Cookie": self.cookie} if self.cookie else {}
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request("GET", path, headers={"Host": self.host, **cookie, **named})
+        response = connection.getresponse()
+        response.content = response.read()  # type: ignore[attr-defined]
+        connection.close()
+        return response
+
+    def open(self, path: str = "/", origin: str | None = "own", host: str | None = None) -> ClientConnection:
+        """A WebSocket; raises InvalidStatus where the server refuses it."""
+        headers = [("Cookie", self.cookie)] if self.cookie else []
+        if origin is not None:
+            headers.append(("Origin", f"http://{self.host}" if origin == "own" else origin))
+        uri = f"ws://{host or self.host}{path}"
+        return connect(
+            uri,
+            sock=socket.create_connection(("127.0.0.1", self.server.port), timeout=5),
+            additional_headers=headers,
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=2**26,
+        )
+
+    def client(self) -> Client:
+        client = Client(self.server, self.open())
+        self.clients.append(client)
+        return client
+
+    def close(self) -> None:
+        for client in self.clients:
+            client.socket.close()
+
+
+def settle(client: Client) -> None:
+    """Wait until all that the client sent before has been handled."""
+    gui = client.server.viser.gui
+    seen = threading.Event()
+    mark = gui.add_checkbox("settled", False)
+    mark.on_update(lambda _: seen.set())
+    client.set(mark, True)
+    assert seen.wait(5)
+    mark.remove()
+
+
+def announced(button, size: int, parts: int, name: str = "a.txt", transfer: str = "t") -> dict:
+    return {
+        "source_component_uuid": button._impl.uuid,
+        "transfer_uuid": transfer,
+        "filename": name,
+        "mime_type": "",
+        "size_bytes": size,
+        "part_count": parts,
+    }
+
+
+def part(button, index: int, content: bytes, transfer: str = "t") -> dict:
+    return {
+        "source_component_uuid": button._impl.uuid,
+        "transfer_uuid": transfer,
+        "part_index": index,
+        "content": content,
+    }
