@@ -14,7 +14,8 @@ from slviewer.server.access import Role
 
 REQUEST_SECONDS = 10
 STALL_SECONDS = 30
-CHUNK = 2**19
+CHUNK = 2**17
+"""Bytes; after the last chunk is written, a slow reader has ten seconds for it."""
 
 Gate = Callable[[Any], bytes | None]
 

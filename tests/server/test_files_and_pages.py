@@ -81,7 +81,7 @@ def test_addresses_that_were_not_offered_are_nothing(operator, path):
 
 
 def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(operator, tmp_path):
-    size = 64 * CHUNK
+    size = 512 * CHUNK
     with (tmp_path / "large.bin").open("wb") as file:
         file.truncate(size)
     address = operator.server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
@@ -98,7 +98,7 @@ def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(operator, t
 def test_a_reader_who_takes_nothing_is_let_go(operator, tmp_path, monkeypatch):
     monkeypatch.setattr(connection, "STALL_SECONDS", 0.2)
     with (tmp_path / "large.bin").open("wb") as file:
-        file.truncate(64 * CHUNK)
+        file.truncate(512 * CHUNK)
     address = operator.server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
     with socket.create_connection(("127.0.0.1", operator.server.port)) as stalled:
         stalled.sendall(
@@ -110,7 +110,7 @@ def test_a_reader_who_takes_nothing_is_let_go(operator, tmp_path, monkeypatch):
         with contextlib.suppress(ConnectionError):
             while part := stalled.recv(CHUNK):
                 received += len(part)
-        assert received < 64 * CHUNK
+        assert received < 512 * CHUNK
 
 
 def test_pages_and_endpoints_stand_beside_the_wizard(server, operator, watcher, stranger):
@@ -212,7 +212,7 @@ def test_the_server_stops_and_its_port_is_free_again(tmp_path):
     from slviewer.server.secure import serve
 
     with (tmp_path / "large.bin").open("wb") as file:
-        file.truncate(64 * CHUNK)
+        file.truncate(512 * CHUNK)
     server = serve(port=0)
     browser = Browser(server, server.access.token)
     client = browser.client()
