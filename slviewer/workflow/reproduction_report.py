@@ -1,9 +1,6 @@
 """The reproduction's results as what its report is drawn from."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,9 +21,7 @@ from slviewer.report.data import (
 from slviewer.report.page import write_page
 from slviewer.report.reproduction import reproduction_headlines, reproduction_sections, reproduction_title
 from slviewer.workflow.reporting import curve_at
-
-if TYPE_CHECKING:
-    from slviewer.workflow.reproducing import Reproduction
+from slviewer.workflow.reproduction import Reproduction
 
 SHOWN_PLANES = (1, 3, 8)
 """Those whose error maps the Letter shows."""
