@@ -2,7 +2,7 @@
 
 import contextlib
 import threading
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -32,6 +32,7 @@ class Session:
         self.folder = folder
         self._lock = lock
         self._decisions_lock = threading.Lock()
+        self._allow: Callable[[], None] | None = None
 
     # opening and closing
 
@@ -76,6 +77,16 @@ class Session:
         """Let the next writer in. Does nothing for a reader or when called again."""
         if self._lock is not None:
             self._lock.release()
+
+    def guarded(self, allow: Callable[[], None]) -> "Session":
+        """This session for one piece of work: `allow` is called before each save takes effect, and may raise to stop it.
+
+        So work that was given up can run on without ever changing the folder. Closing it closes this session too.
+        """
+        view = Session(self.folder, self._lock)
+        view._decisions_lock = self._decisions_lock
+        view._allow = allow
+        return view
 
     def __enter__(self) -> "Session":
         return self
@@ -175,6 +186,7 @@ class Session:
         size = sum(array.nbytes for array in checked.values())
         with atomic.staged_folder(target, size) as staged:
             write_result(staged, meta, checked)
+            self._require_writer()
         atomic.commit(staged, target)
 
     def load_result(
@@ -225,16 +237,24 @@ class Session:
     def exclude(self, name: str, why: str) -> None:
         """Leave a capture out of calibrations from now on, and remember why."""
         self.load_capture(name)
-        self._decide(lambda excluded: {**excluded, name: why})
+        self._decide("excluded", lambda excluded: {**(excluded or {}), name: why})
 
     def include(self, name: str) -> None:
         """Take a capture back in. Does nothing where it was not left out."""
-        self._decide(lambda excluded: {other: why for other, why in excluded.items() if other != name})
+        self._decide("excluded", lambda all: {other: why for other, why in (all or {}).items() if other != name})
 
     def excluded(self) -> dict[str, str]:
         """{capture: why} of the captures that the operator left out."""
+        return dict(self.decision("excluded") or {})
+
+    def decide(self, what: str, value: Any) -> None:
+        """Remember a decision, such as the rig or the target, as a plain value that JSON can hold."""
+        self._decide(what, lambda _: value)
+
+    def decision(self, what: str) -> Any:
+        """What was decided last; None where nothing was."""
         path = self.folder / "decisions.json"
-        return dict(atomic.read_json(path).get("excluded", {})) if path.exists() else {}
+        return atomic.read_json(path).get(what) if path.exists() else None
 
     @property
     def exports(self) -> Path:
@@ -266,6 +286,8 @@ class Session:
     def _require_writer(self) -> None:
         if self._lock is None or not self._lock.held:
             raise SessionError(f"{self.folder} is open for reading only: open it with write=True")
+        if self._allow is not None:
+            self._allow()
 
     def _stage(
         self,
@@ -317,7 +339,9 @@ class Session:
             found.append(str(read_meta(folder).get("hash")))
         return found
 
-    def _decide(self, change: Any) -> None:
+    def _decide(self, what: str, change: Callable[[Any], Any]) -> None:
         self._require_writer()
+        path = self.folder / "decisions.json"
         with self._decisions_lock:
-            atomic.replace_json(self.folder / "decisions.json", {"excluded": change(self.excluded())})
+            decisions = atomic.read_json(path) if path.exists() else {}
+            atomic.replace_json(path, {**decisions, what: change(decisions.get(what))})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zarr
 
-from slviewer.errors import InputError, SessionError
+from slviewer.errors import Cancelled, InputError, SessionError
 from slviewer.fringe.sequence import Frame
 from slviewer.session.importers.imported import ImportedCapture
 from slviewer.session.store import Session
@@ -220,6 +220,40 @@ def test_decisions_are_kept(session, sequence, frames):
     assert Session.open(session.folder).excluded() == {"a": "the board moved"}
     with pytest.raises(InputError):
         session.exclude("c", "there is none")
+
+
+def test_decisions_of_any_kind_stand_beside_each_other(session, sequence, frames):
+    session.save_capture("a", "calibration", sequence, frames, source="")
+    assert session.decision("target") is None
+    session.decide("target", "circles:21x16:9")
+    session.exclude("a", "blurred")
+    session.decide("rig", {"driver": "simulated", "scale": 0.5})
+    again = Session.open(session.folder)
+    assert again.decision("target") == "circles:21x16:9" and again.decision("rig")["scale"] == 0.5
+    assert again.excluded() == {"a": "blurred"}
+
+
+def test_work_that_was_given_up_saves_nothing(session, sequence, frames):
+    session.save_capture("a", "calibration", sequence, frames, source="")
+    given_up = []
+
+    def allow():
+        if given_up:
+            raise Cancelled("given up")
+
+    work = session.guarded(allow)
+    work.save_result("early", {}, {"x": np.ones(2)})
+    given_up.append(True)
+    for save in (
+        lambda: work.save_result("late", {}, {"x": np.ones(2)}),
+        lambda: work.decide("target", "other"),
+        lambda: work.trash_capture("a"),
+    ):
+        with pytest.raises(Cancelled):
+            save()
+    assert session.result_names() == ["early"] and session.capture_names() == ["a"]
+    session.save_result("mine", {}, {})
+    assert [p.name for p in (session.folder / "results").iterdir() if p.name.startswith(".")] == []
 
 
 def test_one_writer_and_any_number_of_readers(session, sequence, frames):
