@@ -104,6 +104,22 @@ def test_report_and_inspect(calibrated: dict, session: Path, run: Run, tmp_path:
     assert status == 0 and "44" not in text.splitlines()[0] and "calibration pixelwise: from 9 poses, fresh" in text
 
 
+def test_reproduce_remakes_the_letters_tables_and_figures(
+    session: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("slviewer.workflow.reproducing.QUICK_SCALE", 0.3)
+    out = session.parent  # whose session is what reproduce would simulate, but for fewer poses
+    status, text, _ = run("reproduce", "--quick", "--out", out, "--json", tmp_path / "figures.json")
+    assert status == 0
+    found = json.loads((tmp_path / "figures.json").read_text())
+    assert len(found["planes"]) == 10 and len(found["spheres"]) == 6
+    assert 1.3 < found["in_range_ratio"] < 10
+    assert 0.001 < found["spacing_rms_mm"]["pixelwise"] < 1.0
+    assert "0.184" in text and "0.087" in text and "2.13" in text  # the Letter's own means
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64") >= 14 and "http://" not in page.replace("http://www.w3.org", "")
+
+
 def test_an_excluded_pose_is_left_out_and_named(calibrated: dict, session: Path, run: Run) -> None:
     with Session.open(session, write=True) as store:
         store.exclude("pose_02", "blurred")
