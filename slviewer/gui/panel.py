@@ -1,0 +1,73 @@
+"""What a step's panel is, and what it is given: where to draw, whom to ask, and how to hear of failures."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import viser
+
+from slviewer.gui.scene import Scene
+from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a panel works with.
+
+    `gui` builds inputs, `scene` draws in 3D, `operator` takes requests. `offer(path)` gives the address at which a file
+    of the session is downloaded; `tell(level, text)` shows a notification in every browser; `escape(text)` makes text
+    that was typed or read harmless inside HTML and Markdown. `go(key)` brings another step to the front.
+    """
+
+    gui: viser.GuiApi
+    scene: Scene
+    operator: Any
+    offer: Callable[[Path], str]
+    tell: Callable[[Level, str], None]
+    escape: Callable[[str], str]
+    go: Callable[[str], None]
+    failed: Callable[[BaseException], None]
+
+    def safely(self, do: Callable[[], Any]) -> Callable[[Any], None]:
+        """A callback for viser that calls `do()`; whatever it raises becomes a notification in plain words.
+
+        ``button.on_click(stage.safely(lambda: stage.operator.calibrate()))``. `do` sends a request and returns: viser
+        runs callbacks in a small pool of threads, so one that computes would keep others waiting.
+        """
+
+        def callback(_event: Any) -> None:
+            try:
+                do()
+            except Exception as error:
+                self.failed(error)
+
+        return callback
+
+    def safely_with(self, do: Callable[[Any], Any]) -> Callable[[Any], None]:
+        """The same for a callback that needs viser's event, as those of gizmos and of the scene do."""
+
+        def callback(event: Any) -> None:
+            self.safely(lambda: do(event))(event)
+
+        return callback
+
+
+class Panel(Protocol):
+    """One step's controls. Every method is called by the drawing thread, and only handles that changed are touched."""
+
+    key: str
+
+    def __init__(self, stage: Stage) -> None: ...
+
+    def build(self) -> None:
+        """Make the handles; called once, inside the panel's own container."""
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Show this. Called whenever the snapshot changed while the panel is shown, and right after `shown(True)`."""
+
+    def draw_preview(self, preview: PreviewView) -> None:
+        """Show the latest frame; called while the panel is shown, ten times a second at most."""
+
+    def shown(self, visible: bool) -> None:
+        """The panel is brought to the front, or hidden: show or hide its layers of the scene."""

@@ -1,0 +1,259 @@
+"""The 3D view: named layers in the camera's frame, in mm, x to the right and y down as in the image.
+
+A layer is everything under one name ("poses", "scan", …): a panel fills its own, and shows or hides it as a whole. What
+is put under a name that exists replaces it. Every method may be called from any thread.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+import viser.transforms as tf
+
+Colour = tuple[int, int, int]
+
+CAMERA: Colour = (40, 120, 200)
+PROJECTOR: Colour = (235, 140, 30)
+GHOST: Colour = (20, 160, 220)
+
+SHOWN_POINTS = 150_000
+"""Points of one cloud that a browser is sent: software rendering still moves them, and the full cloud stays here."""
+_FRUSTUM_MM = 60.0
+
+
+class Scene:
+    """Draws into viser's scene."""
+
+    def __init__(self, api: viser.SceneApi) -> None:
+        self._api = api
+        self._layers: dict[str, Any] = {}
+        self._nodes: dict[tuple[str, str], list[Any]] = {}
+        self._pick: Callable[[Any], Any] | None = None
+        api.set_up_direction("-y")
+
+    # layers
+
+    def show(self, layer: str, visible: bool) -> None:
+        """Show or hide a layer and everything in it, now and when it is filled later."""
+        self._layer(layer).visible = visible
+
+    def remove(self, layer: str, name: str) -> None:
+        """Take one thing out of a layer; nothing happens where there is none."""
+        for node in self._nodes.pop((layer, name), []):
+            node.remove()
+
+    def clear(self, layer: str) -> None:
+        """Take everything out of a layer."""
+        for name in self.names(layer):
+            self.remove(layer, name)
+
+    def names(self, layer: str) -> list[str]:
+        """What stands in a layer."""
+        return [name for where, name in list(self._nodes) if where == layer]
+
+    # things
+
+    def device(
+        self, layer: str, name: str, K: np.ndarray, size: tuple[int, int], T_camera_device: np.ndarray, colour: Colour
+    ) -> None:
+        """A camera or a projector: the pyramid that it sees; K (3, 3) px, size (width, height) px, T (4, 4) mm."""
+        width, height = size
+        wxyz, position = _placed(T_camera_device)
+        handle = self._api.add_camera_frustum(
+            self._path(layer, name),
+            fov=float(2 * np.arctan2(height / 2, K[1, 1])),
+            # of the angles seen, not of the pixels: a projector's may be far from square
+            aspect=float((width / K[0, 0]) / (height / K[1, 1])),
+            scale=_FRUSTUM_MM,
+            color=colour,
+            wxyz=wxyz,
+            position=position,
+        )
+        self._set(layer, name, [handle])
+
+    def board(
+        self,
+        layer: str,
+        name: str,
+        T_camera_board: np.ndarray,
+        outline: np.ndarray,
+        colour: Colour,
+        *,
+        picture: np.ndarray | None = None,
+        label: str = "",
+        on_click: Callable[[Any], None] | None = None,
+        width_px: float = 2.0,
+    ) -> None:
+        """A board's outline (4, 3) mm at T_camera_board (4, 4), with a picture (h, w, 3) of it and its name, if given.
+
+        The outline's corners go from the board's first feature along its first row and back around, as
+        `Board.outline` gives them; the picture's rows run along the board's.
+        """
+        path = self._path(layer, name)
+        wxyz, position = _placed(T_camera_board)
+        nodes: list[Any] = [self._api.add_frame(path, show_axes=False, wxyz=wxyz, position=position)]
+        sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1).astype(np.float32)
+        nodes.append(
+            self._api.add_line_segments(f"{path}/outline", sides, colour, thickness=width_px, thickness_units="screen")
+        )
+        middle = outline.mean(axis=0)
+        if picture is not None:
+            # viser's image stands with its rows going up; the board's y goes down its rows
+            turned = tf.SO3.from_x_radians(np.pi).wxyz
+            size = np.ptp(outline, axis=0)
+            image = self._api.add_image(
+                f"{path}/picture", picture, float(size[0]), float(size[1]), wxyz=turned, position=middle
+            )
+            if on_click is not None:
+                image.on_click(on_click)
+            nodes.append(image)
+        if label:
+            nodes.append(
+                self._api.add_label(f"{path}/label", label, position=outline[0], anchor="bottom-left", depth_test=True)
+            )
+        self._set(layer, name, nodes)
+
+    def gizmo(
+        self,
+        layer: str,
+        name: str,
+        T: np.ndarray,
+        on_move: Callable[[np.ndarray], None],
+        on_end: Callable[[np.ndarray], None] | None = None,
+        *,
+        scale_mm: float = 90.0,
+        turns: bool = True,
+    ) -> None:
+        """A handle to drag and turn something with; both callbacks get T (4, 4) in the camera's frame."""
+        wxyz, position = _placed(T)
+        limits = ((-5000.0, 5000.0),) * 3
+        handle = self._api.add_transform_controls(
+            self._path(layer, name),
+            scale=scale_mm,
+            wxyz=wxyz,
+            position=position,
+            disable_rotations=not turns,
+            translation_limits=limits,  # type: ignore[arg-type]
+            depth_test=False,
+        )
+        handle.on_update(lambda event: on_move(_matrix(event.target)))
+        if on_end is not None:
+            handle.on_drag_end(lambda event: on_end(_matrix(event.target)))
+        self._set(layer, name, [handle])
+
+    def move(self, layer: str, name: str, T: np.ndarray) -> None:
+        """Bring something that is there already to T (4, 4), without telling its callbacks."""
+        nodes = self._nodes.get((layer, name))
+        if nodes:
+            nodes[0].wxyz, nodes[0].position = _placed(T)
+
+    def cloud(
+        self,
+        layer: str,
+        name: str,
+        points: np.ndarray,
+        colours: np.ndarray | Colour,
+        *,
+        size_mm: float = 0.0,
+    ) -> int:
+        """A cloud (…, 3) float32 mm with colours (…, 3) uint8 or one; NaN points are left out. Returns how many points
+        are shown: evenly thinned to SHOWN_POINTS, at full precision. `size_mm` of a point is by default what closes the
+        gaps between neighbours.
+        """
+        flat = np.asarray(points, np.float32).reshape(-1, 3)
+        index = np.flatnonzero(np.isfinite(flat).all(axis=1))
+        if len(index) > SHOWN_POINTS:
+            index = index[np.linspace(0, len(index) - 1, SHOWN_POINTS).astype(np.int64)]
+        shown = flat[index]
+        if isinstance(colours, np.ndarray) and colours.ndim > 1:
+            colours = np.ascontiguousarray(colours.reshape(-1, 3)[index])
+        if not len(shown):
+            self.remove(layer, name)
+            return 0
+        handle = self._api.add_point_cloud(
+            self._path(layer, name),
+            shown,
+            colours,
+            point_size=size_mm or _spacing(shown),
+            point_shape="square",
+            point_shading="flat",
+            precision="float32",
+        )
+        self._set(layer, name, [handle])
+        return len(shown)
+
+    def lines(self, layer: str, name: str, segments: np.ndarray, colour: Colour, *, width_px: float = 2.0) -> None:
+        """Segments (n, 2, 3) mm."""
+        handle = self._api.add_line_segments(
+            self._path(layer, name),
+            np.asarray(segments, np.float32),
+            colour,
+            thickness=width_px,
+            thickness_units="screen",
+        )
+        self._set(layer, name, [handle])
+
+    def mark(self, layer: str, name: str, point: np.ndarray, text: str, colour: Colour = (220, 40, 40)) -> None:
+        """A point (3,) mm with words beside it."""
+        path = self._path(layer, name)
+        ball = self._api.add_icosphere(path, radius=1.5, color=colour, position=np.asarray(point, float))
+        self._set(layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")])
+
+    def mesh(self, layer: str, name: str, vertices: np.ndarray, faces: np.ndarray, colour: Colour) -> None:
+        """A surface: vertices (n, 3) mm, faces (m, 3)."""
+        handle = self._api.add_mesh_simple(
+            self._path(layer, name),
+            np.asarray(vertices, np.float32),
+            np.asarray(faces, np.uint32),
+            color=colour,
+            side="double",
+        )
+        self._set(layer, name, [handle])
+
+    def on_pick(self, do: Callable[[np.ndarray, np.ndarray], None] | None) -> None:
+        """Call `do(origin, direction)`, (3,) each in the camera's frame, for a click into the scene; None: no longer.
+
+        The nearest point of an organised cloud to that ray is what was clicked on.
+        """
+        if self._pick is not None:
+            self._api.remove_click_callback(self._pick)
+            self._pick = None
+        if do is not None:
+
+            def pick(event: Any) -> None:
+                do(np.array(event.ray_origin), np.array(event.ray_direction))
+
+            self._pick = self._api.on_click()(pick)
+
+    def _layer(self, layer: str) -> Any:
+        if layer not in self._layers:
+            self._layers[layer] = self._api.add_frame(f"/{layer}", show_axes=False)
+        return self._layers[layer]
+
+    def _path(self, layer: str, name: str) -> str:
+        self._layer(layer)
+        # names are the operator's: a slash would make another layer
+        return f"/{layer}/{name.replace('/', '_')}"
+
+    def _set(self, layer: str, name: str, nodes: list[Any]) -> None:
+        self._nodes[layer, name] = nodes
+
+
+def _placed(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(wxyz, position) of T (4, 4)."""
+    return tf.SO3.from_matrix(T[:3, :3]).wxyz, T[:3, 3]
+
+
+def _matrix(handle: Any) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = tf.SO3(np.asarray(handle.wxyz, float)).as_matrix()
+    T[:3, 3] = handle.position
+    return T
+
+
+def _spacing(points: np.ndarray) -> float:
+    """About the distance between neighbours of a surface that was sampled evenly, in mm."""
+    low, high = np.percentile(points, [1, 99], axis=0)
+    sides = np.sort(high - low)
+    return float(np.clip(1.3 * np.sqrt(max(sides[1] * sides[2], 1e-6) / len(points)), 0.05, 20.0))

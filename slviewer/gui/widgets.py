@@ -1,0 +1,205 @@
+"""What several panels draw: sentences in colour, tables, pictures with a legend, colours for values.
+
+HTML takes viser's own colours, so that it is readable in its light and in its dark theme. Texts given to `cell`,
+`table` and `Words.say` are escaped here; a `Html` is taken as it is.
+"""
+
+import base64
+from collections.abc import Sequence
+from typing import Literal
+
+import cv2
+import numpy as np
+import viser
+
+from slviewer.server.text import escape
+
+PICTURE_PX = 720
+"""Width at which pictures are sent: viser shrinks a picture to its panel but never enlarges it."""
+
+Tone = Literal["plain", "dim", "info", "good", "warning", "error"]
+_TONES = {
+    "plain": "var(--mantine-color-text)",
+    "dim": "var(--mantine-color-dimmed)",
+    "info": "var(--mantine-color-blue-6)",
+    "good": "var(--mantine-color-green-7)",
+    "warning": "var(--mantine-color-orange-7)",
+    "error": "var(--mantine-color-red-7)",
+}
+_BOXES = {
+    "plain": "var(--mantine-color-gray-light)",
+    "dim": "transparent",
+    "info": "var(--mantine-color-blue-light)",
+    "good": "var(--mantine-color-green-light)",
+    "warning": "var(--mantine-color-orange-light)",
+    "error": "var(--mantine-color-red-light)",
+}
+
+
+class Html(str):
+    """Text that is HTML already, made by code from escaped parts."""
+
+
+def cell(text: object) -> Html:
+    """Any text as HTML that shows exactly it."""
+    return text if isinstance(text, Html) else Html(escape(str(text)))
+
+
+def toned(text: object, tone: Tone, *, bold: bool = False) -> Html:
+    """Text in a tone's colour."""
+    weight = ";font-weight:600" if bold else ""
+    return Html(f'<span style="color:{_TONES[tone]}{weight}">{cell(text)}</span>')
+
+
+def block(content: object) -> Html:
+    """HTML with the margins that viser gives its inputs."""
+    return Html(f'<div style="padding:0 0.75em 0.5em;font-size:0.875em;line-height:1.45">{cell(content)}</div>')
+
+
+def boxed(content: object, tone: Tone) -> Html:
+    """A box in a tone's colour, for a sentence that must not be overlooked."""
+    style = f"background:{_BOXES[tone]};border-left:3px solid {_TONES[tone]};border-radius:4px;padding:0.5em 0.7em"
+    return block(Html(f'<div style="{style}">{cell(content)}</div>'))
+
+
+def table(titles: Sequence[object], rows: Sequence[Sequence[object]]) -> Html:
+    """Rows below their titles: the first column to the left, the others, figures mostly, to the right."""
+
+    def line(tag: str, cells: Sequence[object], style: str) -> str:
+        sides = ["left"] + ["right"] * (len(cells) - 1)
+        return "".join(
+            f'<{tag} style="text-align:{side};padding:0.2em 0.4em;{style}">{cell(c)}</{tag}>'
+            for side, c in zip(sides, cells, strict=True)
+        )
+
+    head = line("th", titles, f"color:{_TONES['dim']};font-weight:600;vertical-align:bottom")
+    rule = "border-top:1px solid var(--mantine-color-default-border);font-variant-numeric:tabular-nums"
+    body = "".join(f"<tr>{line('td', row, rule)}</tr>" for row in rows)
+    return block(
+        Html(f'<div style="overflow-x:auto"><table style="width:100%;border-collapse:collapse">'
+             f"<tr>{head}</tr>{body}</table></div>")
+    )  # fmt: skip
+
+
+def link(address: str, text: str) -> Html:
+    """A link that downloads what is offered at this address of the server."""
+    style = (
+        "display:inline-block;padding:0.35em 0.9em;border-radius:4px;text-decoration:none;font-weight:600;"
+        "background:var(--mantine-primary-color-filled);color:#fff"
+    )
+    return Html(f'<a href="{cell(address)}" download style="{style}">{cell(text)}</a>')
+
+
+def thumbnail(jpeg: bytes, width_px: int = 72, alt: str = "") -> Html:
+    """A small picture inside HTML; an empty box where there is none yet."""
+    height = round(0.75 * width_px)
+    if not jpeg:
+        style = f"width:{width_px}px;height:{height}px;border-radius:4px;background:var(--mantine-color-gray-light)"
+        return Html(f'<div style="{style}"></div>')
+    data = base64.b64encode(jpeg).decode()
+    style = f"width:{width_px}px;height:{height}px;object-fit:cover;border-radius:4px;display:block"
+    return Html(f'<img alt="{cell(alt)}" src="data:image/jpeg;base64,{data}" style="{style}">')
+
+
+def meter(share: float, tone: Tone = "good") -> Html:
+    """A bar that is filled to `share`, 0 ... 1."""
+    width = 100 * min(max(share, 0.0), 1.0)
+    return Html(
+        '<div style="height:6px;border-radius:3px;background:var(--mantine-color-gray-light)">'
+        f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:{_TONES[tone]}"></div></div>'
+    )
+
+
+class Words:
+    """One piece of HTML in a panel, sent only when it changes, hidden while it is empty."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._handle = gui.add_html("", visible=False)
+        self._content = ""
+
+    def set(self, content: str) -> None:
+        """Show this HTML, as `block`, `boxed`, `table` and the like give it."""
+        if content != self._content:
+            self._content = content
+            self._handle.content = content
+            if self._handle.visible != bool(content):
+                self._handle.visible = bool(content)
+
+    def say(self, text: str, tone: Tone = "plain") -> None:
+        """Show a sentence, in a box where its tone asks for attention; nothing where it is empty."""
+        if not text:
+            self.set("")
+        elif tone in ("plain", "dim"):
+            self.set(block(toned(text, tone)))
+        else:
+            self.set(boxed(text, tone))
+
+
+class Picture:
+    """An image in a panel with a line of legend below, sent only when it changes."""
+
+    def __init__(self, gui: viser.GuiApi, label: str | None = None, *, width_px: int = PICTURE_PX) -> None:
+        self._width = width_px
+        empty = np.full((3 * width_px // 4, width_px, 3), 128, np.uint8)
+        self._image = gui.add_image(empty, label=label, format="jpeg", jpeg_quality=80, visible=False)
+        self._legend = Words(gui)
+
+    def set(self, image: np.ndarray, legend: str = "") -> None:
+        """Show (h, w) or (h, w, 3) uint8 RGB, scaled to the panel, and the legend (HTML, empty: none)."""
+        self._image.image = fitted(image, self._width)
+        if not self._image.visible:
+            self._image.visible = True
+        self._legend.set(legend)
+
+    def hide(self) -> None:
+        """Show nothing."""
+        if self._image.visible:
+            self._image.visible = False
+        self._legend.set("")
+
+
+def fitted(image: np.ndarray, width_px: int = PICTURE_PX) -> np.ndarray:
+    """(h, w) or (h, w, 3) uint8 as (h', width_px, 3) RGB, for `add_image`."""
+    if image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+    height, width = image.shape[:2]
+    how = cv2.INTER_AREA if width > width_px else cv2.INTER_LINEAR
+    return cv2.resize(image, (width_px, max(1, round(height * width_px / width))), interpolation=how)
+
+
+_STOPS = {
+    "value": ["440154", "3b528b", "21918c", "5ec962", "fde725"],  # matplotlib's viridis
+    "error": ["053061", "4393c3", "f7f7f7", "d6604d", "67001f"],  # its RdBu, reversed: blue below, red above
+}
+
+
+def colours(values: np.ndarray, low: float, high: float, scale: Literal["value", "error"] = "value") -> np.ndarray:
+    """(…, 3) uint8 RGB for values (…), spread over low ... high; middle grey where NaN."""
+    share = np.clip((np.asarray(values, float) - low) / max(high - low, 1e-12), 0, 1)
+    step = np.nan_to_num(share * 255).astype(np.uint8)
+    painted = _palette(scale)[step]
+    painted[~np.isfinite(share)] = 128
+    return painted
+
+
+def colour_bar(low: str, high: str, scale: Literal["value", "error"] = "value", title: str = "") -> Html:
+    """The legend of `colours`: its scale from `low` to `high`, both with their units."""
+    stops = ",".join(f"#{stop}" for stop in _STOPS[scale])
+    return block(
+        Html(
+            f'<div style="display:flex;gap:0.6em;align-items:center"><span>{cell(low)}</span>'
+            f'<div style="flex:1;height:10px;border-radius:3px;background:linear-gradient(90deg,{stops})"></div>'
+            f"<span>{cell(high)}</span></div>"
+            + (f'<div style="text-align:center">{cell(title)}</div>' if title else "")
+        )
+    )
+
+
+def _palette(scale: str) -> np.ndarray:
+    stops = np.array([[int(stop[k : k + 2], 16) for k in (0, 2, 4)] for stop in _STOPS[scale]], float)
+    at = np.linspace(0, len(stops) - 1, 256)
+    return (
+        np.stack([np.interp(at, np.arange(len(stops)), channel) for channel in stops.T], axis=1)
+        .round()
+        .astype(np.uint8)
+    )
