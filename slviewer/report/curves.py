@@ -3,15 +3,18 @@
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.report.canvas import FULL, INK, MODELS, SOFT, finish, legend, new_figure, tidy
+from slviewer.report.canvas import FULL, HALF, INK, MODELS, SOFT, finish, legend, new_figure, tidy
 from slviewer.report.data import PixelCurve
 from slviewer.report.page import Figure
 
 DATA = "#c2502e"
 
 
-def pixel_curves(curve: PixelCurve) -> Figure:
-    """The rational function and the two lines of one camera pixel with their data, residuals in um below."""
+def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
+    """The rational function and the two lines of one camera pixel with their data, residuals in um below.
+
+    A narrow figure has one curve a row, its residuals beside it.
+    """
     n = len(curve.phase)
     if any(np.shape(v) != (n,) for v in (curve.z, curve.x, curve.y)) or np.shape(curve.coefficients) != (5,):
         raise InputError(
@@ -30,14 +33,18 @@ def pixel_curves(curve: PixelCurve) -> Figure:
         ("x over z (eq. 10)", "z, mm", "x", z, x, lambda at: c3 * at),
         ("y over z (eq. 11)", "z, mm", "y", z, y, lambda at: c4 * at),
     )
-    drawing = new_figure(FULL, 400)
-    grid = drawing.add_gridspec(2, 3, height_ratios=(3, 1.15))
+    narrow = width <= HALF
+    drawing = new_figure(width, 540 if narrow else 400)
+    if narrow:
+        grid = drawing.add_gridspec(3, 2, width_ratios=(1.35, 1))
+    else:
+        grid = drawing.add_gridspec(2, 3, height_ratios=(3, 1.15))
     for i, ((title, along, name, at, value, fitted), rms) in enumerate(zip(panels, curve.rms_mm, strict=True)):
-        upper = drawing.add_subplot(grid[0, i])
-        lower = drawing.add_subplot(grid[1, i], sharex=upper)
-        tidy(upper, title, "", f"{name}, mm")
+        upper = drawing.add_subplot(grid[i, 0] if narrow else grid[0, i])
+        lower = drawing.add_subplot(grid[i, 1] if narrow else grid[1, i], sharex=upper)
+        tidy(upper, f"{title}: RMS {1e3 * rms:.0f} µm" if narrow else title, along if narrow else "", f"{name}, mm")
         tidy(lower, "", along, f"{name} - fit, µm")
-        upper.tick_params(labelbottom=False)
+        upper.tick_params(labelbottom=narrow)
         if at.size:
             margin = 0.06 * (np.ptp(at) or 1.0)
             line = np.linspace(at.min() - margin, at.max() + margin, 200)
@@ -48,15 +55,19 @@ def pixel_curves(curve: PixelCurve) -> Figure:
             lower.plot(at, residuals, "o", color=DATA, markersize=3.4, markeredgewidth=0)
             reach = 1.25 * max(float(np.abs(residuals).max()), 1.0)
             lower.set_ylim(-reach, reach)
-            legend(upper, loc="best", title=f"RMS {1e3 * rms:.0f} µm", title_fontsize=8.6, alignment="left")
-            upper.get_legend().get_title().set_color(INK)
+            if not narrow:
+                legend(upper, loc="best", title=f"RMS {1e3 * rms:.0f} µm", title_fontsize=8.6, alignment="left")
+                upper.get_legend().get_title().set_color(INK)
+            elif i == 0:
+                legend(upper, loc="best")
         lower.axhline(0, color=SOFT, linewidth=0.8)
     u, v = curve.pixel
     said = ", ".join(f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True))
     return finish(
         drawing,
         f"What camera pixel ({u}, {v}) learnt from {at.size} target poses: z as a rational function of the absolute "
-        f"phase of axis {curve.axis}, x and y as lines through the camera's centre. Below: what the fits leave over "
+        f"phase of axis {curve.axis}, x and y as lines through the camera's centre. "
+        f"{'Beside' if narrow else 'Below'}: what the fits leave over "
         f"(RMS {said}).",
         f"Curves of z over phase, x over z and y over z at camera pixel ({u}, {v}) with data and residuals; RMS {said}",
     )

@@ -10,6 +10,7 @@ from slviewer.report.canvas import (
     DENSITY,
     EMPTY,
     FULL,
+    HALF,
     INK,
     SOFT,
     TITLE_PT,
@@ -30,20 +31,36 @@ TITLE_PX = 34
 BINS = 121
 
 
-def rms_maps(rms_mm: np.ndarray, axis: str = "") -> Figure:
-    """The RMS of each pixel's fit (3, h, w) mm in z, x, y; grey where a pixel was not fitted."""
+def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure:
+    """The RMS of each pixel's fit (3, h, w) mm in z, x, y; grey where a pixel was not fitted.
+
+    A narrow figure has x and y below z.
+    """
     if rms_mm.ndim != 3 or rms_mm.shape[0] != 3:
         raise InputError(f"RMS maps of shape {rms_mm.shape} cannot be drawn: (3, h, w) in z, x, y is needed")
     _, h, w = rms_mm.shape
-    drawing = new_figure(FULL, round(FULL / 3 * 0.84 * h / w) + TITLE_PX + 16)
+    narrow = width <= HALF
+    if narrow:
+        upper, lower = (round(share * width * h / w) + TITLE_PX + 8 for share in (0.84, 0.37))
+        drawing = new_figure(width, upper + lower)
+        grid = drawing.add_gridspec(2, 2, height_ratios=(upper, lower))
+        places = [drawing.add_subplot(cell) for cell in (grid[0, :], grid[1, 0], grid[1, 1])]
+    else:
+        drawing = new_figure(width, round(width / 3 * 0.84 * h / w) + TITLE_PX + 16)
+        places = list(drawing.subplots(1, 3))
     medians = [percentile(rms, 50) for rms in rms_mm]
-    for axes, name, rms, median in zip(drawing.subplots(1, 3), "zxy", rms_mm, medians, strict=True):
+    for axes, name, rms, median in zip(places, "zxy", rms_mm, medians, strict=True):
         top = rounded_up(percentile(rms, 99))
         bare(axes, f"{name}: {_median(median)}")
         image = axes.imshow(
-            _shown(rms, FULL // 3), cmap=_map("viridis", 100), vmin=0, vmax=top, aspect="equal", interpolation="nearest"
+            _shown(rms, width if narrow else width // 3),
+            cmap=_map("viridis", 100),
+            vmin=0,
+            vmax=top,
+            aspect="equal",
+            interpolation="nearest",
         )
-        colour_bar(drawing, image, axes, "RMS of the fit, mm", extend="max")
+        colour_bar(drawing, image, axes, "" if narrow and name != "z" else "RMS of the fit, mm", extend="max")
     named = f" along axis {axis}" if axis else ""
     return finish(
         drawing,

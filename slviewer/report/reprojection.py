@@ -12,26 +12,29 @@ from slviewer.report.page import Figure
 CAMERA, PROJECTOR = "#3c6e9e", "#c98a1b"
 
 
-def pose_bars(pose_rms_px: Mapping[str, tuple[float, float]], rms_px: Mapping[str, float]) -> Figure:
+def pose_bars(
+    pose_rms_px: Mapping[str, tuple[float, float]], rms_px: Mapping[str, float], *, width: int = FULL
+) -> Figure:
     """Reprojection RMS of each pose, camera and projector side by side; ``rms_px``: the RMS over all features."""
     if not pose_rms_px:
         raise InputError("no pose was given: its reprojection error cannot be drawn")
     names = list(pose_rms_px)
     values = np.array([pose_rms_px[name] for name in names], float)
-    drawing = new_figure(FULL, 300)
+    narrow = width <= HALF
+    drawing = new_figure(width, 260 if narrow else 300)
     axes = drawing.subplots()
     tidy(axes, "", "", "reprojection RMS, px")
     axes.grid(False, axis="x")
     at = np.arange(len(names))
     for i, (device, colour) in enumerate((("camera", CAMERA), ("projector", PROJECTOR))):
         rms = rms_px.get(device, np.nan)
-        label = f"{device}, all poses {rms:.3f} px" if np.isfinite(rms) else device
+        label = f"{device}, {'all' if narrow else 'all poses'} {rms:.3f} px" if np.isfinite(rms) else device
         axes.bar(at + 0.4 * i - 0.2, values[:, i], 0.38, color=colour, label=label)
         if np.isfinite(rms):
             axes.axhline(rms, color=colour, linewidth=1, linestyle=(0, (4, 2)))
     axes.set_xticks(at, names, rotation=90 if len(names) > 12 else 0, fontsize=SMALL_PT)
     axes.set_xlim(-0.7, len(names) - 0.3)
-    legend(axes, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2)
+    legend(axes, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, columnspacing=1.2)
     worst = names[int(np.argmax(np.nan_to_num(values).max(axis=1)))]
     return finish(
         drawing,
