@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from slviewer.calibration.board_plane import BoardPlane
 from slviewer.calibration.local_fit import local_values
 from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
@@ -20,6 +21,9 @@ from slviewer.target.detect import Detection, board_mask
 
 SAMPLES = 30_000
 """Pixels that one smoothing fit takes; more change the result by less than the noise."""
+LEAST_CLEAR = 0.25
+"""Share of the bright pixels within half a pitch that must lie clear of contrast edges, or edges are approached."""
+AXES: tuple[Axis, ...] = ("x", "y")
 CELLS_PER_WIDTH = 14
 """Spline cells across the image: half the wavelength of the finest lens distortion worth keeping, and no finer."""
 
@@ -98,8 +102,7 @@ class Observation:
     def from_arrays(cls, name: str, arrays: Mapping[str, np.ndarray]) -> "Observation":
         """The inverse of ``to_arrays``."""
         surfaces: dict[Axis, Surface | Polynomial2D] = {}
-        axes: tuple[Axis, ...] = ("x", "y")
-        captured: list[Axis] = [axis for axis in axes if f"{axis}_trend" in arrays]
+        captured: list[Axis] = [axis for axis in AXES if f"{axis}_trend" in arrays]
         for axis in captured:
             u0, v0, u1, v1 = (float(edge) for edge in arrays[f"{axis}_extent"])
             trend = Polynomial2D(arrays[f"{axis}_trend"], (u0, v0, u1, v1))
@@ -138,23 +141,25 @@ def observe(
     pitch = pitch_px(board, detection)
     typical_pitch = float(np.median(pitch))
     box = _bounding_box(inside)
-    projector = np.full((len(detection.ids), 2), np.nan)
+    bright = {axis: bright_pixels(phase, inside, typical_pitch) for axis, phase in phases.items()}
+    projector = _projector_pixels(detection, phases, bright, pitch)
+    plane = BoardPlane.through(detection.pixels, projector, (width, height))
+    for axis in phases:
+        if plane:  # a hand before the board is none of it
+            u0, v0, u1, v1 = box
+            seen = phases[axis].coordinate[v0:v1, u0:u1]
+            bright[axis][v0:v1, u0:u1] &= plane.holds(seen, AXES.index(axis), (u0, v0))
+        if np.count_nonzero(bright[axis]) < 400:
+            raise DetectionError(
+                f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis} pattern: "
+                "light the whole board with the projector, and raise the exposure"
+            )
+    projector = _projector_pixels(detection, phases, bright, pitch)
     surfaces: dict[Axis, Surface | Polynomial2D] = {}
     supported = inside.copy()
     for axis, phase in phases.items():
-        bright = bright_pixels(phase, inside, typical_pitch)
-        if np.count_nonzero(bright) < 400:
-            raise DetectionError(
-                f"{name}: only {np.count_nonzero(bright)} pixels of the board carry a usable {axis} pattern: "
-                "light the whole board with the projector, and raise the exposure"
-            )
-        weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
-        weight /= weight.max()
-        projector[:, 0 if axis == "x" else 1] = local_values(
-            np.where(bright, phase.coordinate, 0.0), weight, detection.pixels, 0.8 * pitch
-        )
-        surfaces[axis] = _smooth(phase, weight, box, typical_pitch, smoothing)
-        supported &= _near(bright, reach=typical_pitch)
+        surfaces[axis] = _smooth(phase, _weight(phase, bright[axis]), box, typical_pitch, smoothing)
+        supported &= _near(bright[axis], reach=typical_pitch)
     u0, v0, u1, v1 = box
     return Observation(
         name=name,
@@ -185,7 +190,8 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
     """(h, w) bool: valid pixels of the board's bright parts, clear of the contrast edges.
 
     Across an edge the camera's PSF mixes a dark and a bright phase; dark parts carry little light. Bright means more
-    than half of the modulation found within a pitch.
+    than half of the modulation found within a pitch. How clear depends on what there is: between the squares and the
+    markers of a ChArUco board run strips of a few pixels.
     """
     modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
     shrink = max(1, int(pitch // 12))
@@ -194,11 +200,34 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
     crest = cv2.dilate(small, np.ones((reach, reach), np.uint8))
     crest = cv2.resize(crest, modulation.shape[::-1], interpolation=cv2.INTER_LINEAR)
     bright = (modulation > 0.5 * crest) & (modulation > 0)
-    margin = 2 * int(np.clip(pitch / 12, 1, 3)) + 1
     dark = cv2.morphologyEx(  # a lone pixel lost to noise is no edge
         (~bright).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
     )
-    return bright & (cv2.dilate(dark, np.ones((margin, margin), np.uint8)) == 0)
+    clear = np.zeros_like(bright)
+    window = (2 * int(pitch / 2) + 1,) * 2
+    around = cv2.blur(bright.astype(np.float32), window)
+    for margin in range(int(np.clip(pitch / 12, 1, 3)), 0, -1):
+        few = cv2.blur(clear.astype(np.float32), window) < LEAST_CLEAR * around
+        clear |= few & bright & (cv2.dilate(dark, np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)) == 0)
+    return clear
+
+
+def _projector_pixels(
+    detection: Detection, phases: Mapping[Axis, PhaseMap], bright: Mapping[Axis, np.ndarray], pitch: np.ndarray
+) -> np.ndarray:
+    """(n, 2) px: the projector coordinates of the features, NaN where one could not be read."""
+    projector = np.full((len(detection.ids), 2), np.nan)
+    for axis, phase in phases.items():
+        coordinate = np.where(bright[axis], phase.coordinate, 0.0)
+        weight = _weight(phase, bright[axis])
+        projector[:, AXES.index(axis)] = local_values(coordinate, weight, detection.pixels, 0.8 * pitch)
+    return projector
+
+
+def _weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
+    """(h, w): one over the phase's variance, of the bright pixels, the largest 1."""
+    weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
+    return np.asarray(weight / max(float(weight.max()), 1e-30))
 
 
 def _smooth(
