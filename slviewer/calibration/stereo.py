@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.observe import Observation
+from slviewer.calibration.soundness import check_enough, check_handedness, check_tilts
 from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
@@ -15,9 +16,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
 
-MIN_POSES = 3
 MIN_FEATURES = 12
-MIN_TILT_SPREAD_DEG = 4.0
 MAX_FOCAL_SIGMA = 0.05
 """Above this relative uncertainty the poses did not determine a focal length."""
 MAX_REPROJECTION_PX = 2.0
@@ -127,8 +126,9 @@ def calibrate_stereo(
         else:
             kept[observation.name] = usable
     used = [o for o in observations if o.name in kept]
-    _check_enough(used, left_out)
-    _check_tilts(used)
+    check_enough(used, left_out)
+    check_handedness(used)
+    check_tilts(used)
 
     for _ in range(4):
         solution = _Solution.fit(used, [kept[o.name] for o in used], projector_size)
@@ -143,37 +143,8 @@ def calibrate_stereo(
                     "was the board moved during the capture, or its grid shifted?"
                 )
                 used = [o for o in used if o.name != name]
-        _check_enough(used, left_out)
+        check_enough(used, left_out)
     return solution.model(used, kept, board, left_out)
-
-
-def _check_enough(used: Sequence[Observation], left_out: Mapping[str, str]) -> None:
-    if len(used) < MIN_POSES:
-        why = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
-        raise CalibrationRejected(
-            f"{len(used)} usable pose{'s' * (len(used) != 1)}, and at least {MIN_POSES} are needed: "
-            f"capture the board in more positions and tilts{why}"
-        )
-
-
-def _check_tilts(used: Sequence[Observation]) -> None:
-    """Parallel boards share their vanishing line and say nothing of the focal length."""
-    normals = []
-    for o in used:
-        width, height = o.size
-        H, _ = cv2.findHomography(o.points[:, :2], o.camera)
-        line = np.linalg.inv(H).T @ np.array([0.0, 0.0, 1.0])
-        f = 1.5 * width
-        nominal = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
-        normal = nominal.T @ line
-        normals.append(normal / np.linalg.norm(normal) * np.sign(normal[2] or 1))
-    cosines = np.clip(np.array(normals) @ np.array(normals).T, -1, 1)
-    spread = float(np.degrees(np.arccos(cosines.min())))
-    if spread < MIN_TILT_SPREAD_DEG:
-        raise CalibrationRejected(
-            f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees): "
-            "tilt the board by 15 to 30 degrees, in different directions"
-        )
 
 
 @dataclass(frozen=True)
@@ -228,6 +199,13 @@ class _Solution:
             flags=cv2.CALIB_USE_INTRINSIC_GUESS,
             criteria=criteria,
         )
+        for device, K in (("camera", K_c), ("projector", K_p)):
+            if not min(K[0, 0], K[1, 1]) > 0:
+                raise CalibrationRejected(
+                    f"the poses give the {device} focal lengths of {K[0, 0]:.0f}, {K[1, 1]:.0f} px, as no lens has: "
+                    "check the target's notation, the projector's size, the fringe period, and that x and y are not "
+                    "exchanged"
+                )
         return cls(
             Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size),
             Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size),

@@ -87,6 +87,21 @@ def test_parallel_poses_are_rejected() -> None:
         calibrate_stereo(poses, PROJECTOR)
 
 
+@pytest.mark.parametrize("turned", [[-1.0, 1.0], [1.0, -1.0]])
+def test_a_mirrored_projector_is_rejected_and_one_upside_down_is_not(turned: list[float]) -> None:
+    def projected(signs: np.ndarray) -> list:
+        middle = np.array(PROJECTOR) / 2 - 0.5
+        return [dataclasses.replace(o, projector=(o.projector - middle) * signs + middle) for o in observations(6)]
+
+    with pytest.raises(CalibrationRejected, match="mirror image"):
+        calibrate_stereo(projected(np.array(turned)), PROJECTOR)
+    exchanged = [dataclasses.replace(o, projector=o.projector[:, ::-1]) for o in observations(6)]
+    with pytest.raises(CalibrationRejected, match="exchange the x and y"):
+        calibrate_stereo(exchanged, PROJECTOR)
+    upside_down = calibrate_stereo(projected(np.array([-1.0, -1.0])), PROJECTOR)
+    assert upside_down.reprojection_rms_px["stereo"] < 0.03
+
+
 def test_exchanged_axes_are_rejected() -> None:
     poses = [dataclasses.replace(o, projector=o.projector[:, ::-1] * np.array([1.0, 0.3])) for o in observations()]
     for o in poses:

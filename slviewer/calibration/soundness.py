@@ -1,0 +1,59 @@
+"""What target poses must fulfil before a rig can be solved from them, each with its own reason to reject them."""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from slviewer.calibration.observe import Observation
+from slviewer.errors import CalibrationRejected
+
+MIN_POSES = 3
+MIN_TILT_SPREAD_DEG = 4.0
+
+
+def check_enough(used: Sequence[Observation], left_out: Mapping[str, str]) -> None:
+    """Three poses or more."""
+    if len(used) < MIN_POSES:
+        why = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
+        raise CalibrationRejected(
+            f"{len(used)} usable pose{'s' * (len(used) != 1)}, and at least {MIN_POSES} are needed: "
+            f"capture the board in more positions and tilts{why}"
+        )
+
+
+def check_tilts(used: Sequence[Observation]) -> None:
+    """Parallel boards share their vanishing line and say nothing of the focal length."""
+    normals = []
+    for o in used:
+        width, height = o.size
+        H, _ = cv2.findHomography(o.points[:, :2], o.camera)
+        line = np.linalg.inv(H).T @ np.array([0.0, 0.0, 1.0])
+        f = 1.5 * width
+        nominal = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
+        normal = nominal.T @ line
+        normals.append(normal / np.linalg.norm(normal) * np.sign(normal[2] or 1))
+    cosines = np.clip(np.array(normals) @ np.array(normals).T, -1, 1)
+    spread = float(np.degrees(np.arccos(cosines.min())))
+    if spread < MIN_TILT_SPREAD_DEG:
+        raise CalibrationRejected(
+            f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees): "
+            "tilt the board by 15 to 30 degrees, in different directions"
+        )
+
+
+def check_handedness(used: Sequence[Observation]) -> None:
+    """Camera and projector see the same side of a board: a mirror image in one of them is no view of it."""
+    mirrored = sum(_turn(o.points, o.camera) * _turn(o.points, o.projector) < 0 for o in used)
+    if mirrored > len(used) / 2:
+        raise CalibrationRejected(
+            f"in {mirrored} of {len(used)} poses the projector's coordinates are a mirror image of what the camera "
+            "sees: switch off the projector's rear or mirror mode, or exchange the x and y (V and H) patterns"
+        )
+
+
+def _turn(points: np.ndarray, pixels: np.ndarray) -> float:
+    """Positive where x turns into y the same way on the board and in the image."""
+    read = np.isfinite(pixels).all(1)
+    affine = np.column_stack([points[read, :2], np.ones(np.count_nonzero(read))])
+    return float(np.linalg.det(np.linalg.lstsq(affine, pixels[read], rcond=None)[0][:2]))
