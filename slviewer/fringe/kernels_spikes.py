@@ -89,7 +89,8 @@ def repair(phase, rules, out):
     for row in numba.prange(height):
         suspect = np.empty(width, np.bool_)
         suspects(phase, row, per_cell, suspect)
-        out[row] = phase[row]
+        for x in range(width):  # a slice would compile half as long again, for its shape check's message
+            out[row, x] = phase[row, x]
         for x in range(width):
             if not suspect[x] or np.isnan(phase[row, x]) or not at_edge(phase[row, x], rules):
                 continue

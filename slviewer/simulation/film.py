@@ -68,7 +68,8 @@ def expose(coordinate, level, gain, table, offset, per_px, taps, stray, noise, q
         light = np.empty(w, np.float32)
         bits = np.empty(w, np.uint32)
         for i in range(first, end):
-            light[:] = stray[i]
+            for j in range(w):
+                light[j] = stray[i, j]
             for tap in range(taps.size):
                 weight = taps[tap]
                 source = blurred[i - first + tap]
