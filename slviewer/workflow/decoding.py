@@ -13,8 +13,9 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
-MAX_OUTSIDE = 0.05
-"""Share of lit pixels whose code may lie outside the projector before the projector's size is doubted."""
+MAX_OUTSIDE = 0.01
+"""Share of readable pixels whose code may lie outside the projector before its size is doubted: of the right size there
+are a few along its border, and a corner of a wall beside the board may be all that tells a wrong one."""
 
 
 def decode_capture(capture: Capture, frames: np.ndarray | None = None) -> dict[Axis, PhaseMap]:
@@ -49,7 +50,7 @@ def check_projector(name: str, sequence: PatternSequence, phases: dict[Axis, Pha
             extent = width if axis == "x" else height
             what = "columns" if axis == "x" else "rows"
             raise InputError(
-                f"{name}: {100 * outside / (inside + outside):.0f} % of the {axis} codes lie outside the projector's "
+                f"{name}: {100 * outside / (inside + outside):.1f} % of the {axis} codes lie outside the projector's "
                 f"{extent} {what}: give the size of the projector that was used, instead of {width}x{height}"
             )
 
