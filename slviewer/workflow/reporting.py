@@ -94,6 +94,15 @@ def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping
     )
 
 
+def calibration_view(store: Session) -> CalibrationView:
+    """The session's stereo calibration as figures and tables show it, with every pose's residuals.
+
+    Raises InputError where there is none.
+    """
+    stereo = load_stereo(store)
+    return _calibration(store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))})
+
+
 def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str, Observation]) -> CalibrationView:
     residuals = {}
     for name, r in load_residuals(store).items():
