@@ -1,0 +1,61 @@
+"""Inputs whose options come and go with the session, and handles that are touched only where something changed."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import viser
+
+NOTHING = "–"
+
+
+def change(handle: Any, **values: Any) -> None:
+    """Set what differs, so that nothing is sent for nothing."""
+    for name, value in values.items():
+        if getattr(handle, name) != value:
+            setattr(handle, name, value)
+
+
+def titled(name: str, label: str) -> str:
+    """How a capture is called in a list: by its label, and by its name too where these differ."""
+    return name if label == name else f"{label} ({name})"
+
+
+class Choice:
+    """A dropdown of things that have a name and a text; `value` is the chosen one's name, empty where there is none."""
+
+    def __init__(self, gui: viser.GuiApi, label: str, hint: str | None = None) -> None:
+        self._handle: Any = gui.add_dropdown(label, (NOTHING,), hint=hint)
+        self._names: dict[str, str] = {}
+
+    def offer(self, things: Sequence[tuple[str, str]], preferred: str = "") -> None:
+        """Offer (name, text) pairs; what is chosen stays chosen while it is offered, else it becomes `preferred`, or
+        the first.
+        """
+        texts = tuple(text for _, text in things) or (NOTHING,)
+        chosen = self.value
+        names = {text: name for name, text in things}
+        self._names = names
+        if tuple(self._handle.options) != texts:
+            kept = next((text for text, name in names.items() if name == chosen), "")
+            wanted = next((text for text, name in names.items() if name == preferred), "")
+            self._handle.options = texts
+            self._handle.value = kept or wanted or texts[0]
+
+    @property
+    def value(self) -> str:
+        """The name of what is chosen."""
+        return self._names.get(self._handle.value, "")
+
+    def choose(self, name: str) -> None:
+        """Choose what is offered under `name`; nothing changes where it is not."""
+        text = next((text for text, each in self._names.items() if each == name), None)
+        if text is not None:
+            self._handle.value = text
+
+    def show(self, visible: bool) -> None:
+        """Show or hide it."""
+        change(self._handle, visible=visible)
+
+    def on_change(self, do: Callable[[Any], None]) -> None:
+        """Call `do(event)` whenever another thing is chosen, by whomever."""
+        self._handle.on_update(do)

@@ -1,0 +1,294 @@
+"""Calibrate: the models from the good poses, how well each pose agrees, and what every pixel learnt."""
+
+import threading
+from typing import Any
+
+import numpy as np
+import viser
+
+from slviewer.gui.inputs import Choice, change, titled
+from slviewer.gui.panel import Stage
+from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened, spread
+from slviewer.gui.widgets import Html, Words, block, boxed, cell, colours, table, toned
+from slviewer.report.curves import pixel_curves
+from slviewer.report.data import CalibrationView as Details
+from slviewer.report.data import DeviceParameters
+from slviewer.report.maps import rms_maps
+from slviewer.report.page import Figure
+from slviewer.report.reprojection import pose_bars, residual_arrows
+from slviewer.workflow.reporting import calibration_view
+from slviewer.workflow.wizard import looking
+from slviewer.workflow.wizard.snapshot import CalibrationView, PreviewView, SessionView, Snapshot
+
+LAYER = "calibrate"
+DEVICES = ("camera", "projector")
+
+
+class Panel:
+    """The fourth step."""
+
+    key = "calibrate"
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._painter = Painter(stage.failed)
+        self._lock = threading.RLock()
+        self._snapshot: Snapshot | None = None
+        self._visible = False
+        self._cloud: looking.ScanCloud | None = None
+        self._details: tuple[tuple[Any, ...], Details] | None = None
+
+    def build(self) -> None:
+        gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
+        self._calibrate = gui.add_button("Calibrate", icon=viser.Icon.TARGET)
+        self._calibrate.on_click(safely(lambda: operator.calibrate()))
+        self._summary = Words(gui)
+        with gui.add_folder("Reprojection error", visible=False) as self._poses_folder:
+            self._bars = Plot(gui)
+            self._pose = Choice(gui, "Pose")
+            self._pose_words = Words(gui)
+            self._exclude = gui.add_button("Exclude this pose", color="orange")
+            self._exclude.on_click(safely(self._toggle_pose))
+            self._device = gui.add_dropdown("Residual arrows of", DEVICES)
+            self._arrows = Plot(gui)
+        with gui.add_folder("Parameters", visible=False, expand_by_default=False) as self._parameters_folder:
+            self._parameters = Words(gui)
+        with gui.add_folder("Pixel-wise model", visible=False) as self._pixels_folder:
+            self._fits = Words(gui)
+            self._axis = Choice(gui, "Axis", "x: along the projector's columns; y: along its rows")
+            self._maps = Plot(gui)
+            self._column = gui.add_number("Pixel column u", 0, min=0, step=1)
+            self._row = gui.add_number("Pixel row v", 0, min=0, step=1)
+            self._over = Choice(gui, "Click on the cloud of", "Shows a cloud in 3D; click on it to choose a pixel")
+            self._curve_words = Words(gui)
+            self._curves = Plot(gui)
+        for choice in (self._pose, self._axis):
+            choice.on_change(safely(self._refresh))
+        for number in (self._device, self._column, self._row):
+            number.on_update(safely(self._refresh))
+        self._over.on_change(safely(self._show_cloud))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        with self._lock:
+            self._snapshot = snapshot
+            session = snapshot.session
+            calibration = session.calibration if session else None
+            step = snapshot.step(self.key)
+            busy = snapshot.job is not None and not snapshot.job.background
+            change(self._calibrate, disabled=busy or step.state == "blocked")
+            change(self._calibrate, label="Calibrate again" if calibration else "Calibrate")
+            shown = calibration is not None
+            for folder, visible in (
+                (self._poses_folder, shown and bool(calibration and calibration.poses)),
+                (self._parameters_folder, shown),
+                (self._pixels_folder, shown and bool(calibration and calibration.fit_rms_mm)),
+            ):
+                change(folder, visible=visible)
+            self._summary.set(_summary(calibration) if calibration else "")
+            if session is None or calibration is None:
+                return
+            names = [pose.name for pose in session.poses if pose.state in ("used", "excluded", "left out")]
+            self._pose.offer([(name, name) for name in names], worst(calibration))
+            self._axis.offer([(axis, axis) for axis in calibration.fit_rms_mm])
+            clouds = [(scan.name, titled(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"]
+            self._over.offer([("", "no cloud"), *clouds])
+            self._fits.set(_fits(calibration))
+            self._refresh()
+
+    def draw_preview(self, preview: PreviewView) -> None:
+        """This step needs no camera."""
+
+    def shown(self, visible: bool) -> None:
+        self._visible = visible
+        self._stage.scene.show(LAYER, visible)
+        self._stage.scene.on_pick(self._pick if visible else None)
+
+    # pictures
+
+    def _refresh(self) -> None:
+        """Ask for the pictures of what is chosen."""
+        with self._lock:
+            session = self._snapshot.session if self._snapshot else None
+            calibration = session.calibration if session else None
+            if session is None or calibration is None:
+                return
+            made = fingerprint(calibration)
+            operator = self._stage.operator
+            if calibration.poses:
+                self._painter.ask(
+                    "bars",
+                    made,
+                    lambda: pose_bars(calibration.pose_rms_px, calibration.reprojection_px, width=PLOT_PX),
+                    self._bars.set,
+                )
+            self._draw_pose(session, calibration)
+            self._painter.ask(
+                "parameters", made, lambda: _parameters(operator.calibration_details()), self._parameters.set
+            )
+            axis = self._axis.value
+            if axis not in calibration.fit_rms_mm:
+                return
+            self._painter.ask(
+                "maps",
+                (made, axis),
+                lambda: rms_maps(operator.pixel_fits()[axis].rms_mm, axis, width=PLOT_PX),
+                self._maps.set,
+            )
+            pixel = (int(self._column.value), int(self._row.value))
+            self._painter.ask(
+                "curves", (made, axis, pixel), lambda: (pixel, operator.pixel_curve(pixel, axis)), self._draw_curve
+            )
+
+    def _draw_pose(self, session: SessionView, calibration: CalibrationView) -> None:
+        name, device = self._pose.value, self._device.value
+        pose = next((pose for pose in session.poses if pose.name == name), None)
+        if pose is None:
+            return
+        excluded = pose.state == "excluded"
+        change(self._exclude, label=f"Include {name} again" if excluded else f"Exclude {name}")
+        rms = calibration.pose_rms_px.get(name)
+        if rms is None:
+            why = f": {pose.why}" if pose.why else ""
+            self._pose_words.say(f"{name} is not in this calibration ({pose.state}{why}).", "warning")
+            self._painter.forget("arrows")
+            self._arrows.hide()
+            return
+        said = f"{name}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
+        if excluded:
+            self._pose_words.say(f"{said} It is excluded now: calibrate again to do without it.", "warning")
+        else:
+            self._pose_words.say(said)
+        made = fingerprint(calibration)
+
+        def arrows() -> Figure:
+            details = self._detailed(made)
+            found, title = details.residuals[name], f"{name}, {device}"
+            if device == "camera":
+                return residual_arrows(title, found.pixels, found.camera, details.camera.size)
+            return residual_arrows(title, found.projector_pixels, found.projector, details.projector.size)
+
+        self._painter.ask("arrows", (made, name, device), arrows, self._arrows.set)
+
+    def _detailed(self, made: tuple[Any, ...]) -> Details:
+        """The calibration with its residuals, read once; on the painter's thread."""
+        if self._details is None or self._details[0] != made:
+            self._details = made, calibration_view(opened(self._stage.operator))
+        return self._details[1]
+
+    def _draw_curve(self, made: Any) -> None:
+        (u, v), curve = made
+        if curve is None:
+            self._curve_words.say(f"Pixel ({u}, {v}) saw the board too rarely to be fitted: choose another.", "warning")
+            self._curves.hide()
+            return
+        self._curve_words.say("")
+        self._curves.set(pixel_curves(curve, width=PLOT_PX))
+
+    # requests
+
+    def _toggle_pose(self) -> None:
+        name = self._pose.value
+        pose = self._snapshot.pose(name) if self._snapshot else None
+        if pose is None:
+            return
+        if pose.state == "excluded":
+            self._stage.operator.include(name)
+        else:
+            self._stage.operator.exclude(name)
+
+    def _show_cloud(self) -> None:
+        name = self._over.value
+        if not name:
+            self._painter.forget("cloud")
+            self._cloud = None
+            self._stage.scene.clear(LAYER)
+            return
+        operator = self._stage.operator
+        self._painter.ask("cloud", name, lambda: looking.scan_cloud(opened(operator), name), self._draw_cloud)
+
+    def _draw_cloud(self, cloud: looking.ScanCloud) -> None:
+        self._cloud = cloud
+        rows, columns = cloud.thinned(100_000)
+        z = cloud.points[rows, columns, 2]
+        self._stage.scene.cloud(LAYER, "cloud", cloud.points[rows, columns], colours(z, *spread(z)))
+        self._stage.scene.show(LAYER, self._visible)
+
+    def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        cloud = self._cloud
+        pixel = None if cloud is None else cloud.nearest(origin, direction)
+        if cloud is None or pixel is None:
+            return
+        u, v = pixel
+        change(self._column, value=u)
+        change(self._row, value=v)
+        self._stage.scene.mark(LAYER, "picked", cloud.points[v, u], f"pixel ({u}, {v})")
+
+
+def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:
+    """What pictures of a calibration depend on."""
+    return (
+        calibration.models,
+        calibration.K_camera.tobytes(),
+        calibration.K_projector.tobytes(),
+        calibration.t.tobytes(),
+    )
+
+
+def worst(calibration: CalibrationView) -> str:
+    """The pose that agrees least; empty where none is known."""
+    errors = calibration.pose_rms_px
+    return max(errors, key=lambda name: max(errors[name]), default="")
+
+
+def _summary(calibration: CalibrationView) -> Html:
+    rms = calibration.reprojection_px
+    rows: list[tuple[object, object]] = []
+    if rms:
+        rows.append(("reprojection RMS, camera", toned(f"{rms['camera']:.3f} px", "plain", bold=True)))
+        rows.append(("reprojection RMS, projector", toned(f"{rms['projector']:.3f} px", "plain", bold=True)))
+    rows.append(("poses used", f"{len(calibration.poses)} of {len(calibration.poses) + len(calibration.left_out)}"))
+    if calibration.depth_range_mm:
+        rows.append(("calibrated depths (R2)", "{:.0f} to {:.0f} mm".format(*calibration.depth_range_mm)))
+    rows.append(("baseline", f"{calibration.baseline_mm:.2f} mm"))
+    rows.append(("models", ", ".join(calibration.models)))
+    rows.append(("used for scans", calibration.best))
+    said = table(("Calibration", ""), rows)
+    if calibration.left_out:
+        why = "; ".join(f"{name}: {reason}" for name, reason in calibration.left_out.items())
+        said = Html(said + boxed(f"Left out: {why}", "warning"))
+    return said
+
+
+def _fits(calibration: CalibrationView) -> Html:
+    rows = [
+        (f"axis {axis}", *(f"{medians[name]:.3f} mm" for name in "zxy"))
+        for axis, medians in calibration.fit_rms_mm.items()
+    ]
+    return table(("Median RMS of the fits", "z", "x", "y"), rows)
+
+
+def _parameters(details: Details) -> Html:
+    def lens(device: DeviceParameters) -> list[str]:
+        K, D, sigma = device.K, device.D, device.focal_sigma_px
+        doubt = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
+        return [
+            f"{device.size[0]} x {device.size[1]} px",
+            *(f"{K[i, i]:.1f}{doubt} px" for i in (0, 1)),
+            *(f"{K[i, 2]:.1f} px" for i in (0, 1)),
+            *(f"{value:.5f}".replace("-", "−") for value in D[:5]),
+        ]
+
+    names = ["size", "focal length fx", "focal length fy", "centre cx", "centre cy", "k1", "k2", "p1", "p2", "k3"]
+    lenses = list(zip(names, lens(details.camera), lens(details.projector), strict=True))
+    t = np.asarray(details.t, float).ravel()
+    turned = np.degrees(np.arccos(np.clip((np.trace(details.R) - 1) / 2, -1, 1)))
+    axes = np.degrees(np.arccos(np.clip(details.R[2, 2], -1, 1)))
+    rig = [
+        ("baseline", f"{np.linalg.norm(t):.2f} mm"),
+        ("t, camera to projector", " / ".join(f"{value:.2f}" for value in t).replace("-", "−") + " mm"),
+        ("rotation", f"{turned:.2f}°"),
+        ("angle between the axes", f"{axes:.2f}°"),
+        ("target", details.target or "made elsewhere"),
+    ]
+    note = block(toned("± is one standard deviation.", "dim"))
+    return Html(table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig) + cell(note))

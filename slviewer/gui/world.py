@@ -1,0 +1,86 @@
+"""What stands before the simulated rig, where there is one: chosen, brought to a distance, and turned."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from slviewer.gui.inputs import change
+from slviewer.gui.panel import Stage
+from slviewer.gui.widgets import Words
+from slviewer.workflow.wizard.snapshot import Snapshot
+
+NEAREST_MM, FARTHEST_MM = 250.0, 1500.0
+_GIZMO = "thing"
+
+
+class Stand:
+    """A folder of a panel that offers `things` of the simulated world; with real devices it is not there."""
+
+    def __init__(self, stage: Stage, layer: str, things: Sequence[str]) -> None:
+        self._stage, self._layer, self._things = stage, layer, tuple(things)
+        self._T = np.eye(4)
+        self._standing = ""
+        gui = stage.gui
+        with gui.add_folder("Simulated rig", visible=False) as self._folder:
+            self._says = Words(gui)
+            self._thing = gui.add_dropdown("Before the rig", ("something else", *self._things))
+            self._distance = gui.add_number(
+                "Distance, mm", 600.0, min=NEAREST_MM, max=FARTHEST_MM, step=5.0, hint="or drag it in the 3D view"
+            )
+            self._turn = gui.add_number("Turned by, °", 0.0, min=-90.0, max=90.0, step=5.0)
+        self._thing.on_update(stage.safely_with(self._choose))
+        self._distance.on_update(stage.safely_with(self._bring))
+        self._turn.on_update(stage.safely_with(self._bring))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Show what stands there."""
+        world = snapshot.world
+        change(self._folder, visible=world is not None)
+        if world is None:
+            self._stage.scene.remove(self._layer, _GIZMO)
+            self._standing = ""
+            return
+        fits = world.standing in self._things
+        self._says.say(
+            "" if fits else f"The {world.standing} stands before the rig: choose what to capture instead.", "warning"
+        )
+        change(self._thing, value=world.standing if fits else "something else")
+        for number in (self._distance, self._turn):
+            change(number, disabled=not fits)
+        T = np.asarray(world.T_camera_thing, float)
+        if not fits:
+            self._stage.scene.remove(self._layer, _GIZMO)
+        elif self._standing != world.standing:
+            self._stage.scene.gizmo(self._layer, _GIZMO, T, lambda T: None, self._place)
+        elif not np.array_equal(T, self._T):
+            self._stage.scene.move(self._layer, _GIZMO, T)
+        self._standing, self._T = world.standing if fits else "", T
+        change(self._distance, value=round(float(np.clip(T[2, 3], NEAREST_MM, FARTHEST_MM)), 1))
+        change(self._turn, value=round(float(np.clip(_turn_deg(T), -90, 90)), 1))
+
+    def _place(self, T: np.ndarray) -> None:
+        self._stage.safely(lambda: self._stage.operator.place(self._standing, T))(None)
+
+    def _choose(self, event: Any) -> None:
+        if event.client_id is not None and self._thing.value in self._things:
+            self._stage.operator.place(self._thing.value)
+
+    def _bring(self, event: Any) -> None:
+        if event.client_id is None or not self._standing:  # not typed by anybody, but drawn
+            return
+        T = self._T.copy()
+        T[:3, 3] *= self._distance.value / T[2, 3]  # along the ray from the camera: what is in view stays in view
+        T[:3, :3] = _turned(np.radians(self._turn.value - _turn_deg(T))) @ T[:3, :3]
+        self._stage.operator.place(self._standing, T)
+
+
+def _turn_deg(T: np.ndarray) -> float:
+    """By how much a thing is turned about the vertical."""
+    return float(np.degrees(np.arctan2(T[0, 2], T[2, 2])))
+
+
+def _turned(angle: float) -> np.ndarray:
+    """(3, 3) about y by `angle` rad."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
