@@ -22,7 +22,9 @@ TILTS = ("facing", "top away", "right away", "bottom away", "left away")
 FACING_DEG = 8.0
 """Tilts below count as facing the camera."""
 GOAL = 2
-"""Poses that each cell, third and tilt should have."""
+"""Poses that each third and each tilt should have."""
+CELL_GOAL = 4
+"""Poses that each cell should have: a pixel-wise fit takes four at least."""
 NOMINAL_FOCAL = 1.5
 """In widths of the image, where nothing is known of the lens: between a phone's and a machine lens's."""
 
@@ -47,7 +49,8 @@ class Coverage:
     @property
     def share(self) -> float:
         """0 ... 1: how much of the goal is reached, the image, the depths and the tilts counting alike."""
-        return float(np.mean([np.minimum(n, GOAL).mean() / GOAL for n in (self.cells, self.depths, self.tilts)]))
+        goals = ((self.cells, CELL_GOAL), (self.depths, GOAL), (self.tilts, GOAL))
+        return float(np.mean([np.minimum(n, goal).mean() / goal for n, goal in goals]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +140,7 @@ def suggest(
     for T in _candidates(board, lens, have.range_mm, len(poses), lit):
         seen, third, tilt = _classify(board, lens, T, have.range_mm)
         lacks = (
-            (seen * np.maximum(GOAL - have.cells, 0)).sum() / (GOAL * ROWS * COLUMNS)
+            (seen * np.maximum(CELL_GOAL - have.cells, 0)).sum() / (CELL_GOAL * seen.size)
             + max(GOAL - have.depths[third], 0) / GOAL
             + max(GOAL - have.tilts[tilt], 0) / GOAL
         )

@@ -79,7 +79,7 @@ class Session:
             self._lock.release()
 
     def guarded(self, allow: Callable[[], None]) -> "Session":
-        """This session for one piece of work: `allow` is called before each save takes effect, and may raise to stop it.
+        """This session for one piece of work: `allow` is called before each save takes effect; it may raise to stop it.
 
         So work that was given up can run on without ever changing the folder. Closing it closes this session too.
         """

@@ -25,9 +25,11 @@ from slviewer.workflow.opening import SessionLike, opened
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A reconstructed capture, the file it went to, and for a board pose how flat each model measures the board."""
+    """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
+    measures the board."""
 
     cloud: Cloud
+    phases: Mapping[Axis, PhaseMap]
     ply: Path
     points: int
     board: Comparison | None = None
@@ -92,7 +94,7 @@ def reconstruct(
         if grid is not None:
             write_grid(Path(grid), cloud.points)
         progress(1.0, "reconstructed")
-    return Reconstruction(cloud, ply, int(np.count_nonzero(keep)), board)
+    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board)
 
 
 def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:

@@ -1,0 +1,284 @@
+"""The one thread that owns camera and projector: it shows, grabs, saves, and never computes.
+
+Between captures it grabs previews and hands on the latest one. A capture is saved by the request's own `save` before
+anything else happens, or it never existed. A fault ends the capture in which it happens, with a sentence; the devices
+are then closed and opened again, every `RETRY_S` until they answer, and the preview goes on.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slviewer.devices.capture import capture
+from slviewer.devices.protocols import CameraSettings, Rig
+from slviewer.errors import Cancelled, DeviceError, SlviewerError
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.workflow.wizard.notices import Notices, words_for
+from slviewer.workflow.wizard.snapshot import CaptureProgress, RigView
+
+RETRY_S = 2.0
+PREVIEWS_PER_S = 10.0
+LIGHTS = {"white": 255, "grey": 128, "dark": None}
+"""What the projector may show between captures, as grey levels; "pattern" is a sequence's first frame."""
+
+
+@dataclass(frozen=True)
+class CaptureRequest:
+    """`save(frames, settings)` must put the capture on disk, and is called on the acquisition thread; `saved` after it.
+
+    `frames` are this thread's own and overwritten by the next capture.
+    """
+
+    name: str
+    sequence: PatternSequence
+    save: Callable[[np.ndarray, CameraSettings], None]
+    saved: Callable[[], None]
+
+
+class Acquisition:
+    """The devices and what is asked of them. Every method may be called from any thread, and returns at once.
+
+    `offer(frame)` is given every preview (h, w), a fresh array each, and must return at once too.
+    """
+
+    def __init__(self, notices: Notices, changed: Callable[[], None], offer: Callable[[np.ndarray], None]) -> None:
+        self._notices, self._changed, self._offer = notices, changed, offer
+        self._condition = threading.Condition()
+        self._requests: deque[CaptureRequest] = deque()
+        self._wanted: Rig | None = None
+        self._settings: CameraSettings | None = None
+        self._light: tuple[str, PatternSequence | None] = ("white", None)
+        self._view = RigView()
+        self._cancel = False
+        self._closing = False
+        self._thread: threading.Thread | None = None
+        # the thread's own:
+        self._rig: Rig | None = None
+        self._is_open = False
+        self._next_try = 0.0
+        self._applied: CameraSettings | None = None
+        self._lit: tuple[str, PatternSequence | None] | None = None
+        self._buffer: np.ndarray | None = None
+
+    def use(self, rig: Rig | None, settings: CameraSettings | None = None) -> None:
+        """Take another rig, with these settings (its own where None), and close the one before; None: no rig."""
+        with self._condition:
+            self._wanted, self._settings = rig, settings
+            self._requests.clear()
+            self._view = RigView(light=self._light[0])
+            if rig is not None:
+                self._view = replace(
+                    self._view, state="opening", name=rig.name, camera=rig.camera.size, projector=rig.projector.size
+                )
+            if self._thread is None and rig is not None:
+                self._thread = threading.Thread(target=self._serve, name="slviewer acquisition", daemon=True)
+                self._thread.start()
+            self._condition.notify_all()
+        self._changed()
+
+    def apply(self, settings: CameraSettings) -> None:
+        """Set exposure and gain before the next frame; the view then says what the camera really took."""
+        with self._condition:
+            self._settings = settings
+            self._condition.notify_all()
+
+    def shine(self, light: str, pattern: PatternSequence | None = None) -> None:
+        """Show one of LIGHTS between captures, or the first frame of `pattern`."""
+        with self._condition:
+            self._light = (light, None if light in LIGHTS else pattern)
+            self._view = replace(self._view, light=light)
+            self._condition.notify_all()
+        self._changed()
+
+    def capture(self, request: CaptureRequest) -> None:
+        """Queue a capture. Raises DeviceError where no rig is open."""
+        with self._condition:
+            if self._view.state != "open":
+                why = self._view.fault or "choose a rig first, and wait until its preview runs"
+                raise DeviceError(f"{request.name} cannot be captured: {why}")
+            self._requests.append(request)
+            self._condition.notify_all()
+
+    def cancel(self) -> None:
+        """Stop the capture that runs, and forget those that wait."""
+        with self._condition:
+            self._requests.clear()
+            self._cancel = self._view.capture is not None
+
+    @property
+    def idle(self) -> bool:
+        """Whether no capture runs or waits."""
+        with self._condition:
+            return not self._requests and self._view.capture is None
+
+    def names(self) -> list[str]:
+        """Captures that run or wait."""
+        with self._condition:
+            running = [] if self._view.capture is None else [self._view.capture.name]
+            return running + [request.name for request in self._requests]
+
+    def view(self) -> RigView:
+        """The devices as they are now."""
+        with self._condition:
+            capture = self._view.capture
+            if capture is None:
+                return self._view
+            return replace(self._view, capture=replace(capture, waiting=len(self._requests)))
+
+    def close(self) -> None:
+        """End a running capture, close the devices and join the thread."""
+        with self._condition:
+            self._closing, self._cancel = True, True
+            self._requests.clear()
+            self._condition.notify_all()
+        if self._thread is not None:
+            self._thread.join(5.0)
+
+    # on the thread
+
+    def _serve(self) -> None:
+        preview = 0.0
+        while True:
+            with self._condition:
+                if self._closing:
+                    break
+                request = None
+                if self._is_open and self._rig is self._wanted and self._requests:
+                    request = self._requests.popleft()
+                    self._cancel = False
+                    n = len(request.sequence.frames)
+                    self._view = replace(self._view, capture=CaptureProgress(request.name, 0, n, 0))
+                wanted = self._wanted
+            try:
+                if self._rig is not wanted:
+                    self._close_devices()
+                    self._rig, self._next_try = wanted, 0.0
+                elif request is not None:
+                    self._take(request)
+                    preview = 0.0
+                elif wanted is not None and not self._is_open:
+                    if time.monotonic() >= self._next_try:
+                        self._open_devices()
+                elif self._is_open and time.monotonic() >= preview:
+                    preview = time.monotonic() + 1 / PREVIEWS_PER_S
+                    self._preview()
+            except Exception as error:
+                self._lose(error)
+            self._sleep(preview)
+        self._close_devices()
+
+    def _sleep(self, preview: float) -> None:
+        with self._condition:
+            if self._closing or self._requests or self._rig is not self._wanted:
+                return
+            until = preview if self._is_open else self._next_try
+            pause = RETRY_S if self._rig is None else until - time.monotonic()
+            if pause > 0:
+                self._condition.wait(min(pause, RETRY_S))
+
+    def _open_devices(self) -> None:
+        assert self._rig is not None
+        self._next_try = time.monotonic() + RETRY_S
+        self._rig.open()
+        self._is_open, self._applied, self._lit = True, None, None
+        self._prepare()
+        back = self.view().fault
+        self._say(state="open", fault="")
+        if back:
+            self._notices.tell("good", "the rig answers again")
+
+    def _prepare(self) -> None:
+        """Light and settings as they were asked for last."""
+        assert self._rig is not None
+        with self._condition:
+            settings, light = self._settings, self._light
+        if self._applied is None or settings != self._applied:
+            taken = self._rig.camera.settings() if settings is None else self._rig.camera.apply(settings)
+            self._applied = settings
+            if settings is None:
+                with self._condition:
+                    self._applied = self._settings = taken
+            self._say(exposure_ms=taken.exposure_ms, gain=taken.gain)
+        if light != self._lit:
+            name, pattern = light
+            if pattern is None:
+                self._rig.projector.show_level(LIGHTS.get(name, 255))
+            else:
+                self._rig.projector.load(pattern)
+                self._rig.projector.show(0)
+            self._lit = light
+
+    def _preview(self) -> None:
+        assert self._rig is not None
+        self._prepare()
+        width, height = self._rig.camera.size
+        frame = np.empty((height, width), self._rig.camera.dtype)
+        self._rig.camera.grab(frame)
+        self._offer(frame)
+
+    def _take(self, request: CaptureRequest) -> None:
+        assert self._rig is not None
+        try:
+            self._prepare()
+            self._lit = None  # the capture leaves its last frame on the projector
+            frames = capture(self._rig, request.sequence, self._frames(request.sequence), self._count)
+            request.save(frames, self._rig.camera.settings())
+            request.saved()
+        except Cancelled:
+            self._notices.tell("info", f"{request.name}: cancelled, nothing is kept of it")
+            return
+        except DeviceError:
+            raise
+        except SlviewerError as error:  # the disk refused, or the patterns: the devices are well
+            self._notices.tell("error", f"{request.name}: {error}")
+            return
+        finally:
+            self._say(capture=None)
+
+    def _frames(self, sequence: PatternSequence) -> np.ndarray:
+        """One buffer for all captures of one size: page faults of a fresh one would cost the frame rate."""
+        assert self._rig is not None
+        width, height = self._rig.camera.size
+        shape, dtype = (len(sequence.frames), height, width), self._rig.camera.dtype
+        if self._buffer is None or self._buffer.shape != shape or self._buffer.dtype != dtype:
+            self._buffer = np.empty(shape, dtype)
+        return self._buffer
+
+    def _count(self, frame: int, frames: int) -> None:
+        if self._cancel:
+            raise Cancelled("cancelled")
+        with self._condition:
+            current = self._view.capture
+            if current is not None:
+                self._view = replace(self._view, capture=replace(current, frame=frame, frames=frames))
+        self._changed()
+
+    def _lose(self, error: Exception) -> None:
+        """Give the devices up until they open again."""
+        sentence = words_for("the rig", error)
+        self._close_devices()
+        with self._condition:
+            first = not self._view.fault
+            waiting = len(self._requests)
+            self._requests.clear()
+            if self._rig is self._wanted:
+                self._view = replace(self._view, state="lost", fault=sentence, capture=None)
+        if first:
+            also = f"; {waiting} captures that waited are not taken" if waiting else ""
+            self._notices.tell("error", sentence + also)
+        self._changed()
+
+    def _close_devices(self) -> None:
+        if self._rig is not None and self._is_open:
+            self._is_open = False
+            self._rig.close()
+
+    def _say(self, **changes: object) -> None:
+        with self._condition:
+            if self._rig is self._wanted:
+                self._view = replace(self._view, **changes)  # type: ignore[arg-type]
+        self._changed()

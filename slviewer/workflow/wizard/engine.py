@@ -1,0 +1,249 @@
+"""What the operator's requests work on: the session, the rig, the threads, and the snapshot made of them.
+
+Requests (`operator`) and captures (`taking`) reach in here; panels do not.
+"""
+
+import shutil
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.devices.protocols import CameraSettings
+from slviewer.errors import InputError, SessionError, SlviewerError
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.workflow.wizard import work
+from slviewer.workflow.wizard.acquisition import Acquisition
+from slviewer.workflow.wizard.diagnostics import LogKeeper
+from slviewer.workflow.wizard.jobs import Jobs, Reporter
+from slviewer.workflow.wizard.looking import thumbnail
+from slviewer.workflow.wizard.notices import Notices
+from slviewer.workflow.wizard.reading import Reader
+from slviewer.workflow.wizard.rigs import Bench, Choice, SetUp
+from slviewer.workflow.wizard.snapshot import PreviewView, RigView, SessionView, Snapshot, Space, WorldView
+from slviewer.workflow.wizard.steps import Brightness, Facts, views
+from slviewer.workflow.wizard.telling import Teller
+from slviewer.workflow.wizard.watching import HandsFree, Watch, Watcher
+
+SATURATED, DIM = 0.005, 0.35
+"""Share of saturated pixels, and brightness of the brightest ones, from which on the operator is told."""
+_PATIENCE = 20  # snapshots in a row that may find the session's files in the middle of a change
+
+
+class Engine:
+    """Everything behind the requests. `capture_now` is called, on the watcher's thread, when hands-free has decided."""
+
+    def __init__(self, set_up: SetUp, capture_now: Callable[[], object]) -> None:
+        self._set_up, self._capture_now = set_up, capture_now
+        self.lock = threading.RLock()
+        self.log = LogKeeper()
+        self.preview: PreviewView | None = None
+        self.preview_listeners: list[Callable[[PreviewView], None]] = []
+        self.hands_free: HandsFree | None = None
+        self.autopilot = ""
+        self.bench: Bench | None = None
+        self._choice: Choice | None = None
+        self._reader: Reader | None = None
+        self._session_view: SessionView | None = None
+        self._unreadable = 0
+        self._queued: set[tuple[str, str]] = set()
+        self._brightness: Brightness = ""
+        nothing = Facts(None, RigView(), None)
+        empty = Snapshot(0, None, RigView(), None, None, (), views(nothing), None, False, "")
+        self.teller = Teller(self._make_snapshot, empty)
+        self.notices = Notices(self.teller.changed)
+        self.jobs = Jobs(self.notices, self.teller.changed)
+        self.watcher = Watcher(self._seen)
+        self.acquisition = Acquisition(self.notices, self.teller.changed, self.watcher.offer)
+
+    # session and rig
+
+    @property
+    def session(self) -> Session | None:
+        reader = self._reader
+        return None if reader is None else reader.session
+
+    @property
+    def reader(self) -> Reader:
+        """Of the open session. Raises SessionError where none is open."""
+        reader = self._reader
+        if reader is None:
+            raise SessionError("no session is open: open one first, or make a new one")
+        return reader
+
+    @property
+    def store(self) -> Session:
+        """The open session. Raises SessionError where none is open."""
+        return self.reader.session
+
+    def open_session(self, path: Path | str) -> None:
+        """Open another session; jobs of the one before are cancelled."""
+        with self.lock:
+            if not self.acquisition.idle:
+                raise InputError("a capture is on its way: wait for it, or cancel it, before another session is opened")
+            before = self.session
+            if before is not None and Path(path).expanduser().absolute() == before.folder:
+                return
+            store = Session.open_or_create(path)
+            self.jobs.cancel_all()
+            self._reader, self._session_view, self._queued = Reader(store), None, set()
+            if before is not None:
+                before.close()
+            remembered = store.decision("rig")
+            if self._choice is not None:
+                store.decide("rig", dict(self._choice))
+            elif remembered:
+                self.use_rig(remembered)
+            self.board_changed()
+
+    def use_rig(self, choice: Choice) -> None:
+        """Use other devices from now on, with the exposure that the session remembers for them."""
+        with self.lock:
+            store = self.session
+            bench = self._set_up(choice, self._board())
+            exposure = store.decision("exposure") if store and store.decision("rig") == dict(choice) else None
+            self._choice, self.bench = dict(choice), bench
+            self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
+            if store is not None:
+                store.decide("rig", dict(choice))
+
+    def board_changed(self) -> None:
+        """Look for the board that is now the target, and judge the poses by it."""
+        self._watch()
+        self.queue_unfinished()
+
+    def space(self, frames: int | None = None) -> Space | None:
+        """Free space where the session is, and what so many frames need (those of the next capture where None)."""
+        store, rig = self.session, self.acquisition.view()
+        if store is None:
+            return None
+        needed = None
+        if frames is not None and rig.camera is not None and self.bench is not None:
+            needed = frames * rig.camera[0] * rig.camera[1] * self.bench.rig.camera.dtype.itemsize
+        return Space(shutil.disk_usage(store.folder).free, needed)
+
+    def close(self) -> None:
+        """Stop all threads, close the devices, let the session go."""
+        self.acquisition.close()
+        self.watcher.close()
+        self.jobs.close()
+        self.teller.close()
+        with self.lock:
+            if self.session is not None:
+                self.session.close()
+        self.log.close()
+
+    def _board(self) -> Board | None:
+        target = self._reader.target() if self._reader else ""
+        return Board.parse(target) if target else None
+
+    def _watch(self) -> None:
+        view = self._session_view
+        self.watcher.look_for(Watch(self._board(), view.lens if view else None))
+
+    # the background
+
+    def queue_unfinished(self) -> None:
+        """Judge poses and make thumbnails, in the background, of whatever lacks them."""
+        reader = self._reader
+        if reader is None:
+            return
+        target = reader.target()
+        for capture in reader.session.captures():
+            key = (capture.hash, target)
+            with self.lock:
+                if key in self._queued:
+                    continue
+                self._queued.add(key)
+            self.jobs.submit(
+                f"Looking at {capture.name}",
+                partial(self._finish, reader, capture),
+                lambda _: self.teller.changed(session=True),
+                failed=partial(self._judging_failed, reader, capture),
+                background=True,
+            )
+
+    def _finish(self, reader: Reader, capture: Capture, report: Reporter) -> None:
+        if capture.name not in reader.session.capture_names():
+            return  # deleted since
+        if not reader.has_thumbnail(capture):
+            reader.add_thumbnail(capture, thumbnail(capture))
+            self.teller.changed(session=True)
+        target = reader.target()
+        if reader.lacks_judgement(capture, target):
+            judged = work.judge_pose(reader.session, capture.name, Board.parse(target), report)
+            if judged.observation is None:
+                self.notices.tell("warning", f"{capture.name} cannot be used: {judged.refused}")
+
+    def _judging_failed(self, reader: Reader, capture: Capture, error: BaseException) -> None:
+        self.notices.fail(f"Looking at {capture.name}", error)
+        if isinstance(error, InputError):
+            reader.add_unreadable(capture, str(error))
+        self.teller.changed(session=True)
+
+    # previews
+
+    def _seen(self, view: PreviewView) -> None:
+        """A preview was looked at (on the watcher's thread)."""
+        hands_free = self.hands_free
+        if hands_free is not None and view.board is not None:
+            countdown = hands_free.countdown(view.board, busy=not self.acquisition.idle)
+            if countdown is not None and countdown <= 0:
+                hands_free.took(view.board)
+                self._capture_now()
+            else:
+                view = replace(view, countdown_s=countdown)
+        self.preview = view
+        brightness: Brightness = "saturated" if view.saturated > SATURATED else "dim" if view.brightest < DIM else ""
+        if self.acquisition.view().light != "white":
+            brightness = ""
+        if brightness != self._brightness:
+            self._brightness = brightness
+            self.teller.changed()
+        for listener in self.preview_listeners:
+            listener(view)
+
+    # snapshots
+
+    def _make_snapshot(self, version: int, session_changed: bool) -> Snapshot:
+        """(On the teller's thread.)"""
+        reader, bench, rig = self._reader, self.bench, self.acquisition.view()
+        if reader is not None and (session_changed or self._session_view is None):
+            self._read(reader, rig, bench)
+        session = self._session_view if reader is not None else None
+        space = self.space(reader.frames_of_a_pose(rig) if reader is not None else None)
+        rig = replace(rig, simulated=bench is not None and bench.world is not None)
+        world = None
+        if bench is not None and bench.world is not None:
+            T, pose = np.eye(4), bench.world.pose
+            T[:3, :3], T[:3, 3] = pose.R, pose.t
+            world = WorldView(bench.world.standing, T)
+        return Snapshot(
+            version=version,
+            session=session,
+            rig=rig,
+            world=world,
+            job=self.jobs.view(),
+            notices=self.notices.all(),
+            steps=views(Facts(session, rig, space, self._brightness)),
+            space=space,
+            hands_free=self.hands_free is not None,
+            autopilot=self.autopilot,
+        )
+
+    def _read(self, reader: Reader, rig: RigView, bench: Bench | None) -> None:
+        try:
+            self._session_view = reader.read(rig, bench.focal_px if bench else None)
+            self._unreadable = 0
+        except (SlviewerError, OSError) as error:  # files were being changed, most likely: read them once more
+            self._unreadable += 1
+            if self._unreadable < _PATIENCE:
+                self.teller.changed(session=True)
+            else:
+                self.notices.fail("Reading the session", error)
+        self._watch()

@@ -1,0 +1,399 @@
+"""What an operator can ask for, whichever face asks: every request returns at once, and never raises.
+
+A request that cannot be granted becomes a notice, and returns False. Devices are asked on the acquisition thread and
+computing is done by the worker, so that requests may come from any thread, a browser's callbacks too.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Concatenate, ParamSpec, TypeVar
+
+import numpy as np
+
+from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.world import Thing
+from slviewer.errors import InputError, SlviewerError
+from slviewer.fringe.presets import PRESETS
+from slviewer.session.store import Session
+from slviewer.simulation.boards import Pose
+from slviewer.target.board import Board
+from slviewer.workflow.calibrating import CalibrationResult
+from slviewer.workflow.merging import Merge
+from slviewer.workflow.verifying import Shape
+from slviewer.workflow.wizard import diagnostics, work
+from slviewer.workflow.wizard.acquisition import LIGHTS
+from slviewer.workflow.wizard.autopilot import Autopilot
+from slviewer.workflow.wizard.engine import Engine
+from slviewer.workflow.wizard.exporting import FORMATS, Kind, check_export, export_file
+from slviewer.workflow.wizard.jobs import Reporter
+from slviewer.workflow.wizard.rigs import Choice, SetUp, set_up
+from slviewer.workflow.wizard.snapshot import PreviewView, Snapshot
+from slviewer.workflow.wizard.taking import sequence_for_poses, take_pose, take_scan
+from slviewer.workflow.wizard.watching import HandsFree
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Request = Callable[Concatenate["Operator", P], bool]
+
+
+def _request(doing: str) -> Callable[[Callable[Concatenate["Operator", P], None]], Request[P]]:
+    """Turns what a request raises into a notice, and tells everybody that something changed."""
+
+    def decorate(function: Callable[Concatenate["Operator", P], None]) -> Request[P]:
+        @wraps(function)
+        def ask(self: "Operator", /, *args: P.args, **kwargs: P.kwargs) -> bool:
+            try:
+                function(self, *args, **kwargs)
+            except Exception as error:
+                self._engine.notices.fail(doing, error)
+                return False
+            finally:
+                self._engine.teller.changed(session=True)
+            return True
+
+        return ask
+
+    return decorate
+
+
+class Operator:
+    """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
+
+    def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:
+        """Opens `session`, made where it is missing, and `rig`, by default the one that the session remembers."""
+        self._engine = Engine(set_up, self.capture_pose)
+        self._autopilot: Autopilot | None = None
+        if rig is not None:
+            self.choose_rig(rig)
+        if session is not None:
+            self.open_session(session)
+
+    def __enter__(self) -> "Operator":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # looking
+
+    @property
+    def session(self) -> Session | None:
+        """The open session, for reading what `looking` offers; None where none is open."""
+        return self._engine.session
+
+    def snapshot(self) -> Snapshot:
+        """The latest snapshot."""
+        return self._engine.teller.latest
+
+    def preview(self) -> PreviewView | None:
+        """The latest preview; None until there is one."""
+        return self._engine.preview
+
+    def subscribe(
+        self, callback: Callable[[Snapshot], None], preview: Callable[[PreviewView], None] | None = None
+    ) -> Callable[[], None]:
+        """Call back with every new snapshot, and with every preview, each on one thread; returns how to stop.
+
+        Changes that come fast are told together. A callback must return soon.
+        """
+        engine = self._engine
+        stop = engine.teller.listen(callback)
+        with engine.lock:
+            if preview is not None:
+                engine.preview_listeners = [*engine.preview_listeners, preview]
+
+        def stop_both() -> None:
+            stop()
+            with engine.lock:
+                engine.preview_listeners = [each for each in engine.preview_listeners if each is not preview]
+
+        return stop_both
+
+    def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
+        """The first snapshot for which `condition` holds; None where it took longer."""
+        return self._engine.teller.wait_for(condition, timeout_s)
+
+    def settle(self, timeout_s: float = 60.0) -> Snapshot:
+        """The snapshot after all captures and jobs that were asked for. Raises SlviewerError where it took longer."""
+        engine = self._engine
+        # captures first: each asks for its jobs before it ends
+        if self.wait_for(lambda _: engine.acquisition.idle and engine.jobs.idle, timeout_s) is None:
+            raise SlviewerError(f"there is still work to be done after {timeout_s:g} s: cancel it, or wait longer")
+        return engine.teller.now()
+
+    # session and rig
+
+    @_request("Opening the session")
+    def open_session(self, path: Path | str) -> None:
+        """Open a session for writing, or make one; jobs of the one before are cancelled."""
+        self._engine.open_session(path)
+
+    @_request("Choosing the rig")
+    def choose_rig(self, choice: Choice) -> None:
+        """Use other devices from now on; `rigs` says what a choice is. The session remembers it."""
+        self._engine.use_rig(choice)
+
+    @_request("Setting the exposure")
+    def set_exposure(self, exposure_ms: float | None = None, gain: float | None = None) -> None:
+        """Set exposure time and gain; None leaves one as it is. The snapshot tells what the camera really took."""
+        now = self._engine.acquisition.view()
+        settings = CameraSettings(exposure_ms or now.exposure_ms, gain or now.gain)
+        self._engine.acquisition.apply(settings)
+        if self.session is not None:
+            self.session.decide("exposure", {"exposure_ms": settings.exposure_ms, "gain": settings.gain})
+
+    @_request("Changing the light")
+    def shine(self, light: str) -> None:
+        """What the projector shows between captures: "white", "grey", "dark", or "pattern" to focus by."""
+        if light not in (*LIGHTS, "pattern"):
+            raise InputError(f"there is no light {light!r}: choose {', '.join(LIGHTS)} or pattern")
+        self._engine.acquisition.shine(light, sequence_for_poses(self._engine) if light == "pattern" else None)
+
+    # target, patterns, world
+
+    @_request("Choosing the target")
+    def choose_target(self, notation: str) -> None:
+        """The board that will be held before the rig; poses that were captured are judged by it anew."""
+        board, engine = Board.parse(notation), self._engine
+        with engine.lock:
+            store, world = engine.store, engine.bench.world if engine.bench else None
+            if world is not None and board != world.board:
+                world.print_board(board)
+            store.decide("target", str(board))
+            engine.board_changed()
+
+    @_request("Choosing the patterns")
+    def choose_patterns(self, name: str) -> None:
+        """The pattern sequence of later captures."""
+        if name not in PRESETS:
+            raise InputError(f"no pattern sequence is called {name!r}: use {', '.join(PRESETS)}")
+        self._engine.store.decide("patterns", name)
+
+    @_request("Placing")
+    def place(self, thing: Thing, T_camera_thing: np.ndarray | None = None) -> None:
+        """Put "board", "plane", "sphere" or "object" before the simulated rig, at T_camera_thing or where it was."""
+        world = self._engine.bench.world if self._engine.bench else None
+        if world is None:
+            raise InputError("only the simulated rig's things can be placed: choose it in the step Rig")
+        T = None if T_camera_thing is None else np.asarray(T_camera_thing, float)
+        if T is not None and T.shape != (4, 4):
+            raise InputError(f"a pose of shape {T.shape} places nothing: give (4, 4)")
+        world.place(thing, None if T is None else Pose(T[:3, :3].copy(), T[:3, 3].copy()))
+
+    def place_board(self, T_camera_board: np.ndarray) -> bool:
+        """Put the simulated board there."""
+        return self.place("board", T_camera_board)
+
+    def place_at_suggestion(self) -> bool:
+        """Put the simulated board where the next pose is suggested."""
+        view = self._engine.teller.now().session
+        if view is None or view.suggestion is None:
+            self._engine.notices.tell("error", "no pose is suggested yet: choose a rig and a target first")
+            return False
+        return self.place("board", view.suggestion.T_camera_board)
+
+    # captures
+
+    @_request("Capturing the pose")
+    def capture_pose(self) -> None:
+        """Capture the board where it is; it is judged in the background."""
+        take_pose(self._engine)
+
+    @_request("Retaking the pose")
+    def retake_pose(self, name: str) -> None:
+        """Capture the board again in place of a pose; the old one goes to the trash once the new one is saved."""
+        take_pose(self._engine, name)
+
+    @_request("Capturing the scan")
+    def capture_scan(self, label: str = "") -> None:
+        """Capture an object and reconstruct it; `label` is the operator's name for it, any text."""
+        take_scan(self._engine, "scan", label, self.reconstruct)
+
+    @_request("Capturing the plane")
+    def capture_plane(self, label: str = "") -> None:
+        """Capture a flat board and compare the models on it."""
+        take_scan(self._engine, "plane", label, lambda name: self.verify([name], "plane"))
+
+    @_request("Capturing the sphere")
+    def capture_sphere(self, label: str = "") -> None:
+        """Capture a sphere and compare the models on it."""
+        take_scan(self._engine, "sphere", label, lambda name: self.verify([name], "sphere"))
+
+    @_request("Switching hands-free capture")
+    def set_hands_free(self, on: bool) -> None:
+        """Capture a pose by itself whenever the board is held still in a new place."""
+        self._engine.hands_free = HandsFree() if on else None
+
+    # poses and scans
+
+    @_request("Excluding the pose")
+    def exclude(self, name: str, why: str = "by hand") -> None:
+        """Leave a pose out of calibrations."""
+        self._engine.store.exclude(name, why)
+
+    @_request("Including the pose")
+    def include(self, name: str) -> None:
+        """Take a pose back in."""
+        self._engine.store.include(name)
+
+    @_request("Deleting")
+    def delete(self, name: str) -> None:
+        """Move a capture, and what was computed from it alone, to the session's trash."""
+        store = self._engine.store
+        store.trash_capture(name)
+        store.include(name)
+        for kind in ("poses", "clouds", "verify"):
+            if store.state_of(f"{kind}/{name}") != "absent":
+                store.trash_result(f"{kind}/{name}")
+
+    @_request("Renaming")
+    def rename(self, name: str, label: str) -> None:
+        """Give a capture a name for people, any text; its files keep theirs."""
+        store = self._engine.store
+        store.load_capture(name)
+        store.decide("names", {**(store.decision("names") or {}), name: label.strip() or name})
+
+    # computing
+
+    @_request("Calibrating")
+    def calibrate(self) -> None:
+        """Calibrate from the poses that are not excluded."""
+        store, target = self._engine.store, self._engine.reader.target()
+        if not target:
+            raise InputError("choose the target first")
+
+        def sentence(result: CalibrationResult) -> str:
+            rms = result.stereo.reprojection_rms_px["stereo"]
+            return f"calibrated from {len(result.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
+
+        self._submit("Calibrating", lambda r: work.make_calibration(store, target, r, self._warn), sentence)
+
+    @_request("Verifying")
+    def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
+        """Compare the models on captures of a plane or a sphere; `radius_mm`, roughly, helps to find a sphere."""
+        store = self._engine.store
+        chosen = [store.load_capture(name).name for name in names]
+
+        def sentence(rms: dict[str, dict[str, float]]) -> str:
+            measured = [
+                (name, ", ".join(f"{m} {mm:.3f} mm" for m, mm in models.items())) for name, models in rms.items()
+            ]
+            return "; ".join(f"{name}: RMS {figures}" for name, figures in measured)
+
+        self._submit("Verifying", lambda r: work.measure(store, chosen, shape, radius_mm, r, self._warn), sentence)
+
+    @_request("Reconstructing")
+    def reconstruct(self, name: str, model: str | None = None) -> None:
+        """Reconstruct a capture, by the best model unless one is named."""
+        store = self._engine.store
+        store.load_capture(name)
+        self._submit(
+            "Reconstructing",
+            lambda r: work.make_cloud(store, name, model, r, self._warn),
+            lambda points: f"{name}: {points} points",
+        )
+
+    @_request("Merging")
+    def merge(self, names: Sequence[str], reference: str) -> None:
+        """Register scans to a reference, and merge them; `undo_merge` takes it back."""
+        store = self._engine.store
+        chosen = [store.load_capture(name).name for name in names]
+
+        def sentence(found: Merge) -> str:
+            pairs = (
+                f"{name} RMS {pair.rms_mm:.3f} mm, overlap {100 * pair.overlap:.0f} %"
+                for name, pair in found.merged.pairs.items()
+            )
+            return f"merged on {reference}: {'; '.join(pairs)}"
+
+        self._submit("Merging", lambda r: work.merge_scans(store, chosen, reference, r, self._warn), sentence)
+
+    @_request("Undoing the merge")
+    def undo_merge(self) -> None:
+        """Move the current merge to the trash; the one before it is current again."""
+        view, store = self._engine.teller.now().session, self._engine.store
+        if view is None or view.merge is None:
+            raise InputError("there is no merge to take back")
+        store.trash_result(f"merge/{view.merge.name}")
+        (store.exports / f"merged_{view.merge.name}.ply").unlink(missing_ok=True)
+
+    @_request("Exporting")
+    def export(self, kind: Kind, name: str = "", file_format: str = "") -> None:
+        """Write a file into the session's exports; `exporting.FORMATS` lists kinds and formats, the first by default.
+
+        `name` is the scan of a cloud or a mesh; a merged mesh is the current merge's.
+        """
+        store, view = self._engine.store, self._engine.teller.now().session
+        check_export(kind, file_format or FORMATS.get(kind, ("",))[0])
+        chosen = file_format or FORMATS[kind][0]
+        if kind == "merged mesh":
+            if view is None or view.merge is None:
+                raise InputError("there is no merge yet: merge scans first")
+            name = view.merge.name
+        rows = view.verifications if view else ()
+        self._submit(
+            "Exporting",
+            lambda r: export_file(store, kind, name, chosen, rows, r, self._warn),
+            lambda file_name: f"{file_name} is ready to download",
+        )
+
+    def report(self) -> bool:
+        """Write the HTML report into the exports."""
+        return self.export("report")
+
+    @_request("Collecting diagnostics")
+    def diagnostic_bundle(self) -> None:
+        """Write a zip with versions, settings, logs and small previews, no frames, into the exports."""
+        engine = self._engine
+        store, snapshot = engine.store, engine.teller.now()
+        self._submit(
+            "Collecting diagnostics",
+            lambda r: diagnostics.write_bundle(store, snapshot, engine.preview, engine.log, r),
+            lambda file_name: f"{file_name} is ready to download",
+        )
+
+    # stopping
+
+    @_request("Cancelling")
+    def cancel(self) -> None:
+        """Cancel the capture that runs, else the job; autopilot lands too."""
+        if self._autopilot is not None:
+            self._autopilot.stop()
+        if not self._engine.acquisition.idle:
+            self._engine.acquisition.cancel()
+        else:
+            self._engine.jobs.cancel()
+
+    @_request("Starting autopilot")
+    def start_autopilot(self, poses: int = 10, pause_s: float = 0.5) -> None:
+        """Play the whole wizard on the simulated rig, with a pause before each act so that it can be watched."""
+        with self._engine.lock:
+            if self._autopilot is not None and self._autopilot.running:
+                raise InputError("autopilot is flying already")
+            self._autopilot = Autopilot(self, self._autopilot_says, poses=poses, pause_s=pause_s)
+            self._autopilot.start()
+
+    def close(self) -> None:
+        """Stop everything and let the session go; what was captured is saved already."""
+        if self._autopilot is not None:
+            self._autopilot.stop()
+        self._engine.close()
+
+    # inside
+
+    def _autopilot_says(self, act: str) -> None:
+        self._engine.autopilot = act
+        self._engine.teller.changed()
+
+    def _warn(self, text: str) -> None:
+        self._engine.notices.tell("warning", text)
+
+    def _submit(self, name: str, make: Callable[[Reporter], T], sentence: Callable[[T], str]) -> None:
+        """A job of the operator's; `sentence(result)` says how it ended."""
+
+        def done(result: T) -> None:
+            self._engine.notices.tell("good", sentence(result))
+            self._engine.teller.changed(session=True)
+
+        self._engine.jobs.submit(name, make, done)

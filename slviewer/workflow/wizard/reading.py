@@ -1,0 +1,367 @@
+"""What a session's files say, as the panels see it. Nothing is remembered but what would be read again the same."""
+
+import threading
+from collections.abc import Callable, Mapping
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.next_pose import outline_px
+from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.fringe.presets import PRESETS
+from slviewer.session.capture import Capture
+from slviewer.session.names import natural_key
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.workflow.models import available, best, load_model, load_stereo
+from slviewer.workflow.wizard.exporting import listed
+from slviewer.workflow.wizard.snapshot import (
+    CalibrationView,
+    CentreDistance,
+    MergeView,
+    PoseState,
+    PoseView,
+    RigView,
+    ScanView,
+    SessionView,
+    VerificationRow,
+)
+from slviewer.workflow.wizard.suggestion import Features, Plan, plan
+
+PATTERNS = "complementary"
+"""The sequence where the session names none: its codes forgive blurred edges, and it is shorter than the Letter's."""
+
+
+class Reader:
+    """Reads one session again and again, and keeps what is dear to read under its content hash."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self._kept: dict[Any, Any] = {}
+        self._lock = threading.Lock()
+        self._thumbnails: dict[str, bytes] = {}
+        self._unreadable: dict[tuple[str, str], str] = {}
+
+    def add_thumbnail(self, capture: Capture, jpeg: bytes) -> None:
+        """A small picture that was made of a capture."""
+        with self._lock:
+            self._thumbnails[capture.hash] = jpeg
+
+    def add_unreadable(self, capture: Capture, why: str) -> None:
+        """A pose whose judging failed, and why: it would fail again, and the session keeps no answer."""
+        with self._lock:
+            self._unreadable[capture.hash, self.target()] = why
+
+    def target(self) -> str:
+        """The board's notation: as decided, else that of the calibration or of the poses; empty where none says."""
+        decided = self.session.decision("target")
+        if decided:
+            return str(decided)
+        if "stereo" in available(self.session) and (board := load_stereo(self.session).board):
+            return board
+        return next((str(c.meta["board"]) for c in self.session.captures("calibration") if c.meta.get("board")), "")
+
+    def patterns(self) -> str:
+        """The name of the pattern sequence."""
+        return str(self.session.decision("patterns") or PATTERNS)
+
+    def has_thumbnail(self, capture: Capture) -> bool:
+        """Whether a small picture was made of it."""
+        return capture.hash in self._thumbnails
+
+    def lacks_judgement(self, capture: Capture, target: str) -> bool:
+        """Whether this is a pose that nobody has tried to read with this target."""
+        if capture.role != "calibration" or not target or (capture.hash, target) in self._unreadable:
+            return False
+        return self._judged(capture, target) is None
+
+    def frames_of_a_pose(self, rig: RigView) -> int | None:
+        """How many frames the next pose will have; None where no rig says."""
+        if rig.projector is None:
+            return None
+        patterns, projector = self.patterns(), rig.projector
+        return self._keep(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
+
+    def read(self, rig: RigView, focal_px: float | None) -> SessionView:
+        """The session now. `rig` tells sizes before there are poses; `focal_px` is its lens's nominal focal length."""
+        session, target = self.session, self.target()
+        captures = {capture.name: capture for capture in session.captures()}
+        stereo, calibration = self._calibration(captures)
+        labels = session.decision("names") or {}
+        hashes = {name: capture.hash for name, capture in captures.items()}
+        if calibration is not None:
+            for model in calibration.models:
+                name = f"calibration/{model}"
+                if self._fresh(name, hashes):
+                    hashes[name] = self._meta(name)["hash"]
+        poses, planned = self._poses(captures, target, stereo, calibration, rig, focal_px)
+        rows, distances = self._verifications(captures, labels, hashes)
+        merges = [name for name in self._results("merge/") if set(self._meta(name)["scans"]) <= set(captures)]
+        return SessionView(
+            folder=session.folder,
+            target=target,
+            patterns=self.patterns(),
+            poses=poses,
+            lens=None if planned is None else planned.lens,
+            coverage=None if planned is None else planned.coverage,
+            suggestion=None if planned is None else planned.suggestion,
+            calibration=calibration,
+            verifications=rows,
+            distances=distances,
+            scans=tuple(self._scan(c, labels, hashes) for c in captures.values() if c.role == "scan"),
+            merge=self._merge(merges[-1], hashes) if merges else None,
+            merges=len(merges),
+            exports=listed(session),
+        )
+
+    # poses
+
+    def _judged(self, capture: Capture, target: str) -> dict[str, Any] | None:
+        """The `meta` of what the session knows of a pose, if it is of these frames and this board."""
+        try:
+            meta = self._meta(f"poses/{capture.name}")
+        except InputError:
+            return None
+        return meta if meta["inputs"].get(capture.name) == capture.hash and meta["target"] == target else None
+
+    def _poses(
+        self,
+        captures: Mapping[str, Capture],
+        target: str,
+        stereo: StereoModel | None,
+        calibration: CalibrationView | None,
+        rig: RigView,
+        focal_px: float | None,
+    ) -> tuple[tuple[PoseView, ...], Plan | None]:
+        excluded = self.session.excluded()
+        used = self._meta("calibration/stereo").get("inputs", {}) if stereo is not None else {}
+        features: dict[str, Features] = {}
+        states: dict[str, tuple[PoseState, str]] = {}
+        for name, capture in captures.items():
+            if capture.role != "calibration":
+                continue
+            meta = self._judged(capture, target) if target else None
+            if meta is not None and not meta["refused"]:
+                features[name] = self._features(name, meta["hash"])
+            states[name] = self._state(capture, target, meta, excluded, used, calibration)
+        if not target:
+            return self._views(captures, states, {}, None, calibration, ""), None
+        first = next((c for c in captures.values() if c.role == "calibration"), None)
+        camera, projector = (first.size, first.sequence.projector) if first else (rig.camera, rig.projector)
+        planned = None
+        if camera is not None and projector is not None:
+            counted = {name: f for name, f in features.items() if states[name][0] not in ("excluded", "refused")}
+            refused = sum(state == "refused" for state, _ in states.values())
+            model = self._meta("calibration/stereo")["hash"] if stereo is not None else ""
+            poses = tuple((name, captures[name].hash) for name in counted)
+            board = Board.parse(target)
+            planned = self._keep(
+                ("plan", target, camera, projector, poses, model, focal_px, refused),
+                lambda: plan(board, camera, projector, counted, stereo, focal_px, refused),
+            )
+        return self._views(captures, states, features, planned, calibration, target), planned
+
+    def _state(
+        self,
+        capture: Capture,
+        target: str,
+        meta: Mapping[str, Any] | None,
+        excluded: Mapping[str, str],
+        used: Mapping[str, str],
+        calibration: CalibrationView | None,
+    ) -> tuple[PoseState, str]:
+        if capture.name in excluded:
+            return "excluded", excluded[capture.name]
+        if (capture.hash, target) in self._unreadable:
+            return "refused", self._unreadable[capture.hash, target]
+        if meta is None:
+            return "judging", ""
+        if meta["refused"]:
+            return "refused", str(meta["refused"])
+        if used.get(capture.name) == capture.hash:
+            return "used", ""
+        if calibration is not None and capture.name in calibration.left_out:
+            why = calibration.left_out[capture.name]
+            if not why.startswith("excluded by the operator"):  # it was included again since
+                return "left out", why
+        return "good", ""
+
+    def _views(
+        self,
+        captures: Mapping[str, Capture],
+        states: Mapping[str, tuple[PoseState, str]],
+        features: Mapping[str, Features],
+        planned: Plan | None,
+        calibration: CalibrationView | None,
+        target: str,
+    ) -> tuple[PoseView, ...]:
+        views = []
+        for name, (state, why) in states.items():
+            T = None if planned is None else planned.poses.get(name)
+            board_px = None
+            if planned is not None and T is not None:
+                board_px = outline_px(Board.parse(target), planned.lens, T)
+            views.append(
+                PoseView(
+                    name=name,
+                    state=state,
+                    why=why,
+                    created=str(captures[name].meta.get("created", "")),
+                    T_camera_board=T,
+                    calibrated=state == "used",
+                    board_px=board_px,
+                    rms_px=calibration.pose_rms_px.get(name) if calibration and state == "used" else None,
+                    thumbnail=self._thumbnails.get(captures[name].hash, b""),
+                )
+            )
+        return tuple(views)
+
+    def _features(self, name: str, content_hash: str) -> Features:
+        def load() -> Features:
+            arrays = self.session.load_result(f"poses/{name}", only=("points", "camera", "projector"))[1]
+            return Features(**arrays)
+
+        return self._keep(("features", content_hash), load)
+
+    # calibration
+
+    def _calibration(self, captures: Mapping[str, Capture]) -> tuple[StereoModel | None, CalibrationView | None]:
+        session = self.session
+        models = available(session)
+        if "stereo" not in models:
+            return None, None
+        meta = self._meta("calibration/stereo")
+        stereo: StereoModel = self._keep(("stereo", meta["hash"], tuple(captures)[:1]), lambda: load_stereo(session))
+        fit_rms: dict[str, Mapping[str, float]] = {}
+        if "pixelwise" in models:
+            key = ("pixelwise", self._meta("calibration/pixelwise")["hash"])
+            fit_rms = self._keep(key, lambda: _fit_rms(session))
+        rig = stereo.rig
+        return stereo, CalibrationView(
+            models=models,
+            best=best(session),
+            stale=self._stale(meta["inputs"], captures),
+            target=stereo.board,
+            poses=tuple(stereo.poses),
+            left_out=stereo.left_out,
+            reprojection_px=stereo.reprojection_rms_px,
+            pose_rms_px=stereo.pose_rms_px,
+            depth_range_mm=stereo.depth_range_mm,
+            baseline_mm=stereo.baseline_mm,
+            K_camera=rig.camera.K,
+            D_camera=rig.camera.D,
+            K_projector=rig.projector.K,
+            D_projector=rig.projector.D,
+            R=rig.R,
+            t=rig.t,
+            focal_sigma_px=stereo.focal_sigma_px,
+            fit_rms_mm=fit_rms,
+        )
+
+    def _stale(self, inputs: Mapping[str, str], captures: Mapping[str, Capture]) -> str:
+        excluded = self.session.excluded()
+        gone = [n for n, used in inputs.items() if n not in captures or captures[n].hash != used]
+        left = [n for n in inputs if n in excluded]
+        if gone:
+            return f"{_listed(gone)} {'was' if len(gone) == 1 else 'were'} retaken or deleted since: calibrate again"
+        if left:
+            return f"{_listed(left)} {'was' if len(left) == 1 else 'were'} excluded since: calibrate again"
+        return ""
+
+    # verifications, scans, merges
+
+    def _verifications(
+        self, captures: Mapping[str, Capture], labels: Mapping[str, str], hashes: Mapping[str, str]
+    ) -> tuple[tuple[VerificationRow, ...], tuple[CentreDistance, ...]]:
+        rows, centres = [], {}
+        for result in self._results("verify/"):
+            name, meta = result.removeprefix("verify/"), self._meta(result)
+            if name not in captures:
+                continue
+            stale = not self._fresh(result, hashes)
+            for model, figures in meta["models"].items():
+                rows.append(
+                    VerificationRow(
+                        capture=name,
+                        label=str(labels.get(name, name)),
+                        shape=meta["shape"],
+                        model=model,
+                        incidence=meta["incidence"],
+                        stale=stale,
+                        **figures,
+                    )
+                )
+            if not stale:
+                centres.update({(name, model): np.array(c) for model, c in meta["centres_mm"].items()})
+        distances = [
+            CentreDistance((a, b), model, float(np.linalg.norm(one - other)))
+            for ((a, model), one), ((b, same), other) in combinations(centres.items(), 2)
+            if model == same
+        ]
+        return tuple(rows), tuple(distances)
+
+    def _scan(self, capture: Capture, labels: Mapping[str, str], hashes: Mapping[str, str]) -> ScanView:
+        result = f"clouds/{capture.name}"
+        try:
+            meta = self._meta(result)
+        except InputError:
+            meta = None
+        depths = None if meta is None else (float(meta["depth_mm"][0]), float(meta["depth_mm"][1]))
+        return ScanView(
+            name=capture.name,
+            label=str(labels.get(capture.name, capture.name)),
+            purpose=capture.meta.get("settings", {}).get("purpose", "scan"),
+            created=str(capture.meta.get("created", "")),
+            cloud="absent" if meta is None else "fresh" if self._fresh(result, hashes) else "stale",
+            model="" if meta is None else meta["model"],
+            points=0 if meta is None else meta["points"],
+            depth_mm=depths,
+            noise_mm=None if meta is None else meta["noise_mm"],
+            thumbnail=self._thumbnails.get(capture.hash, b""),
+        )
+
+    def _merge(self, result: str, hashes: Mapping[str, str]) -> MergeView:
+        meta = self._meta(result)
+        return MergeView(
+            name=result.removeprefix("merge/"),
+            reference=meta["reference"],
+            scans=tuple(meta["scans"]),
+            points=meta["points"],
+            pairs={
+                name: (pair["rms_mm"], pair["overlap"], np.array(pair["T_reference_scan"]))
+                for name, pair in meta["pairs"].items()
+            },
+            stale=not self._fresh(result, hashes),
+        )
+
+    # files
+
+    def _results(self, prefix: str) -> list[str]:
+        return sorted((n for n in self.session.result_names() if n.startswith(prefix)), key=natural_key)
+
+    def _meta(self, result: str) -> dict[str, Any]:
+        return self.session.load_result(result, only=())[0]
+
+    def _fresh(self, result: str, hashes: Mapping[str, str]) -> bool:
+        """Whether every input is there with the hash it had, and is fresh itself."""
+        return all(hashes.get(name) == used for name, used in self._meta(result).get("inputs", {}).items())
+
+    def _keep(self, key: Any, make: Callable[[], Any]) -> Any:
+        if key not in self._kept:
+            if len(self._kept) > 500:
+                self._kept.clear()
+            self._kept[key] = make()
+        return self._kept[key]
+
+
+def _fit_rms(session: Session) -> dict[str, Mapping[str, float]]:
+    model = load_model(session, "pixelwise")
+    assert isinstance(model, PixelwiseModel)
+    return {axis: model.median_rms_mm(axis) for axis in model.axes}
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

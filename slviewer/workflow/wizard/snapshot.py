@@ -1,0 +1,291 @@
+"""All that a panel draws: frozen, plain values, taken at one moment."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from slviewer.calibration.next_pose import Coverage, Suggestion
+from slviewer.geometry.lens import Lens
+
+Level = Literal["info", "good", "warning", "error"]
+PoseState = Literal["judging", "good", "refused", "excluded", "used", "left out"]
+StepState = Literal["blocked", "ready", "done"]
+RigState = Literal["none", "opening", "open", "lost"]
+
+
+@dataclass(frozen=True)
+class Notice:
+    """One sentence for the operator; `number` counts up and never repeats."""
+
+    number: int
+    level: Level
+    text: str
+    time: datetime
+
+
+@dataclass(frozen=True)
+class JobView:
+    """What the worker does now: `share` 0 ... 1, `doing` in words, since how many seconds, and how many jobs wait."""
+
+    name: str
+    share: float
+    doing: str
+    seconds: float
+    can_cancel: bool
+    background: bool
+    waiting: int
+
+
+@dataclass(frozen=True)
+class CaptureProgress:
+    """A capture on its way: frames taken, of how many, and how many captures wait behind it."""
+
+    name: str
+    frame: int
+    frames: int
+    waiting: int
+
+
+@dataclass(frozen=True)
+class RigView:
+    """The devices: `camera` and `projector` sizes are (width, height) px; what a device does not tell is None."""
+
+    state: RigState = "none"
+    name: str = ""
+    simulated: bool = False
+    camera: tuple[int, int] | None = None
+    projector: tuple[int, int] | None = None
+    exposure_ms: float | None = None
+    gain: float | None = None
+    light: str = "white"  # what the projector shows between captures
+    fault: str = ""  # why it is lost, in a sentence
+    capture: CaptureProgress | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PoseView:
+    """One target pose. `T_camera_board` (4, 4) mm is calibrated where `calibrated`, else approximate, None if unknown;
+    `rms_px` is (camera, projector) reprojection; `thumbnail` a JPEG, empty until it is made; `board_px` (4, 2) the
+    board's outline in the camera's px.
+    """
+
+    name: str
+    state: PoseState
+    why: str
+    created: str
+    T_camera_board: np.ndarray | None
+    calibrated: bool
+    board_px: np.ndarray | None
+    rms_px: tuple[float, float] | None
+    thumbnail: bytes = field(repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationView:
+    """The session's calibration; `stale` says in a sentence what changed since, empty where nothing did.
+
+    `target` is empty for one made elsewhere.
+    `fit_rms_mm`: {axis: {z, x, y: median mm}} of the pixel-wise fit, empty where there is none.
+    """
+
+    models: tuple[str, ...]
+    best: str
+    stale: str
+    target: str
+    poses: tuple[str, ...]
+    left_out: Mapping[str, str]
+    reprojection_px: Mapping[str, float]
+    pose_rms_px: Mapping[str, tuple[float, float]]
+    depth_range_mm: tuple[float, float] | None
+    baseline_mm: float
+    K_camera: np.ndarray
+    D_camera: np.ndarray
+    K_projector: np.ndarray
+    D_projector: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+    focal_sigma_px: Mapping[str, float]
+    fit_rms_mm: Mapping[str, Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class VerificationRow:
+    """One capture of a plane or a sphere, measured by one model; what is not known is None."""
+
+    capture: str
+    label: str
+    shape: Literal["plane", "sphere"]
+    model: str
+    rms_mm: float
+    noise_floor_mm: float | None
+    radius_mm: float | None
+    points: int
+    set_aside: int
+    coverage: float | None
+    incidence: Mapping[str, float] | None  # percent in R1, R2, R3
+    stale: bool
+
+
+@dataclass(frozen=True)
+class CentreDistance:
+    """How far apart two spheres' centres are by one model."""
+
+    captures: tuple[str, str]
+    model: str
+    distance_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class ScanView:
+    """One capture that is no target pose. `cloud` says whether it is reconstructed: no, yes, or by an older
+    calibration; `label` is the operator's name for it.
+    """
+
+    name: str
+    label: str
+    purpose: Literal["scan", "plane", "sphere"]
+    created: str
+    cloud: Literal["absent", "fresh", "stale"]
+    model: str
+    points: int
+    depth_mm: tuple[float, float] | None
+    noise_mm: float | None
+    thumbnail: bytes = field(repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class MergeView:
+    """The current merge: `pairs` maps each scan but the reference to (RMS mm, overlap 0 ... 1, T_reference_scan)."""
+
+    name: str
+    reference: str
+    scans: tuple[str, ...]
+    points: int
+    pairs: Mapping[str, tuple[float, float, np.ndarray]]
+    stale: bool
+
+
+@dataclass(frozen=True)
+class ExportView:
+    """A file made for other programs."""
+
+    name: str
+    path: Path
+    bytes: int
+
+
+@dataclass(frozen=True)
+class StepView:
+    """One step: what to do now, in a sentence; `wrong`: what is wrong and how to mend it; `because`: why it waits."""
+
+    key: str
+    title: str
+    now: str
+    state: StepState
+    because: str
+    wrong: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Space:
+    """Free disk space, and what the next capture needs; None where no rig says."""
+
+    free_bytes: int
+    capture_bytes: int | None
+
+    @property
+    def enough(self) -> bool:
+        return self.capture_bytes is None or self.free_bytes > 2 * self.capture_bytes
+
+
+@dataclass(frozen=True, eq=False)
+class WorldView:
+    """The simulated world: what stands there, and its T_camera_thing (4, 4) mm."""
+
+    standing: Literal["board", "plane", "sphere", "object"]
+    T_camera_thing: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SessionView:
+    """What the session's files say."""
+
+    folder: Path
+    target: str  # notation of the board, empty until one is chosen
+    patterns: str  # name of the pattern sequence
+    poses: tuple[PoseView, ...] = ()
+    lens: Lens | None = None  # calibrated, or a guess to place boards with; None before sizes are known
+    coverage: Coverage | None = None
+    suggestion: Suggestion | None = None
+    calibration: CalibrationView | None = None
+    verifications: tuple[VerificationRow, ...] = ()
+    distances: tuple[CentreDistance, ...] = ()
+    scans: tuple[ScanView, ...] = ()
+    merge: MergeView | None = None
+    merges: int = 0  # how many undo can take back
+    exports: tuple[ExportView, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Everything at one moment; `version` grows with each change. `session` is None until one is open."""
+
+    version: int
+    session: SessionView | None
+    rig: RigView
+    world: WorldView | None  # None for real devices
+    job: JobView | None
+    notices: tuple[Notice, ...]
+    steps: tuple[StepView, ...]
+    space: Space | None
+    hands_free: bool
+    autopilot: str  # what it does now; empty where it rests
+
+    def step(self, key: str) -> StepView:
+        """The step called `key`."""
+        return next(step for step in self.steps if step.key == key)
+
+    def pose(self, name: str) -> PoseView | None:
+        """The pose called `name`, if there is one."""
+        poses = self.session.poses if self.session else ()
+        return next((pose for pose in poses if pose.name == name), None)
+
+    def scan(self, name: str) -> ScanView | None:
+        """The scan called `name`, if there is one."""
+        scans = self.session.scans if self.session else ()
+        return next((scan for scan in scans if scan.name == name), None)
+
+
+@dataclass(frozen=True, eq=False)
+class BoardSeen:
+    """The board in the preview: features (n, 2) and outline (4, 2), camera px; `still_s` since it moved last."""
+
+    pixels: np.ndarray
+    outline: np.ndarray
+    still_s: float
+    T_camera_board: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class PreviewView:
+    """The latest frame as a panel shows it, apart from the snapshot since it changes many times a second.
+
+    `image` (h, w) uint8 is `scale` times the camera's size. `histogram` (64,) are shares of the pixels by grey level.
+    `board` is None where none is seen or none is looked for, and `missing` then says why. `countdown_s`: seconds until
+    a hands-free capture, None where none is coming.
+    """
+
+    number: int
+    image: np.ndarray
+    scale: float
+    saturated: float
+    brightest: float  # 99.5th percentile, as a share of the camera's range
+    histogram: np.ndarray
+    board: BoardSeen | None
+    missing: str
+    countdown_s: float | None
+    frames_per_s: float

@@ -1,0 +1,99 @@
+"""Captures as the wizard takes them: what is projected, under which name it is saved, and what follows."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from slviewer.devices.protocols import CameraSettings
+from slviewer.errors import DeviceError, InputError, SessionError
+from slviewer.fringe.presets import PRESETS
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.session.atomic import megabytes
+from slviewer.workflow.simulating import one_axis
+from slviewer.workflow.wizard.acquisition import CaptureRequest
+from slviewer.workflow.wizard.engine import Engine
+
+Purpose = Literal["scan", "plane", "sphere"]
+
+
+def sequence_for_poses(engine: Engine) -> PatternSequence:
+    """Both axes of the session's pattern sequence, for the projector of the rig."""
+    projector = engine.acquisition.view().projector
+    if projector is None:
+        raise DeviceError("no rig is chosen: choose one in the step Rig")
+    return PRESETS[engine.reader.patterns()](projector)
+
+
+def take_pose(engine: Engine, name: str | None = None) -> None:
+    """Capture the target; `name`: in place of this pose, which goes to the trash once the new one is saved."""
+    store = engine.store
+    target = engine.reader.target()
+    if not target:
+        raise InputError("choose the target first: a pose is judged by it")
+    retake = name is not None
+    if name is not None and store.load_capture(name).role != "calibration":
+        raise InputError(f"{name} is no target pose: capture another scan instead")
+    sequence, name = sequence_for_poses(engine), name or _next_name(engine, "pose")
+    source = engine.acquisition.view().name
+
+    def save(frames: np.ndarray, camera: CameraSettings) -> None:
+        settings = {"purpose": "pose", "exposure_ms": camera.exposure_ms, "gain": camera.gain}
+        store.save_capture(
+            name, "calibration", sequence, frames, source=source, settings=settings, board=target, force=retake
+        )
+        if retake and name in store.excluded():
+            store.include(name)
+
+    _take(engine, name, sequence, save, lambda: None)
+
+
+def take_scan(engine: Engine, purpose: Purpose, label: str, follow: Callable[[str], object]) -> None:
+    """Capture anything but the target, and `follow(name)` once it is saved."""
+    store = engine.store
+    view = engine.teller.now().session
+    if view is None or view.calibration is None:
+        raise InputError("calibrate first: without a calibration a capture cannot be measured")
+    # half of the frames, of the axis along which the projector's picture moves more with depth
+    shift = np.abs(np.diag(view.calibration.K_projector)[:2] * view.calibration.t[:2])
+    sequence = one_axis(sequence_for_poses(engine), "x" if shift[0] >= shift[1] else "y")
+    name = _next_name(engine, purpose)
+    source = engine.acquisition.view().name
+
+    def save(frames: np.ndarray, camera: CameraSettings) -> None:
+        settings = {"purpose": purpose, "exposure_ms": camera.exposure_ms, "gain": camera.gain}
+        store.save_capture(name, "scan", sequence, frames, source=source, settings=settings)
+        if label.strip():
+            store.decide("names", {**(store.decision("names") or {}), name: label.strip()})
+
+    _take(engine, name, sequence, save, lambda: follow(name))
+
+
+def _take(
+    engine: Engine,
+    name: str,
+    sequence: PatternSequence,
+    save: Callable[[np.ndarray, CameraSettings], None],
+    follow: Callable[[], object],
+) -> None:
+    space = engine.space(len(sequence.frames))
+    if space is not None and not space.enough:
+        raise SessionError(
+            f"{name} needs {megabytes(space.capture_bytes or 0)} and {megabytes(space.free_bytes)} are free on "
+            f"{engine.store.folder}: free some space first"
+        )
+
+    def saved() -> None:
+        engine.queue_unfinished()
+        follow()
+        engine.teller.changed(session=True)
+
+    engine.acquisition.capture(CaptureRequest(name, sequence, save, saved))
+
+
+def _next_name(engine: Engine, kind: str) -> str:
+    """A name that no capture has, nor one that is still on its way."""
+    taken = [*engine.store.capture_names(), *engine.acquisition.names()]
+    numbers = [name.removeprefix(f"{kind}_") for name in taken if name.startswith(f"{kind}_")]
+    number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
+    return f"{kind}_{number:02d}"
