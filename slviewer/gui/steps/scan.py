@@ -1,0 +1,240 @@
+"""Scan: capture an object, look at its cloud, and ask any of its points."""
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from slviewer.gui.inputs import Choice, change, titled
+from slviewer.gui.panel import Stage
+from slviewer.gui.pictures import Painter, opened, spread
+from slviewer.gui.preview import drawn, legend, light_words
+from slviewer.gui.widgets import Html, Picture, Words, block, cell, colour_bar, colours, table, thumbnail, toned
+from slviewer.gui.world import Stand
+from slviewer.report.maps import error_limit
+from slviewer.workflow.wizard.looking import ScanCloud, scan_cloud
+from slviewer.workflow.wizard.snapshot import PreviewView, ScanView, Snapshot
+
+LAYER = "scan"
+COLOURS = ("texture", "depth", "modulation", "expected noise", "error")
+_STATES = {"absent": "not reconstructed yet", "fresh": "", "stale": "older calibration"}
+
+
+class Panel:
+    """The sixth step."""
+
+    key = "scan"
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._painter = Painter(stage.failed)
+        self._lock = threading.RLock()
+        self._snapshot: Snapshot | None = None
+        self._known: tuple[str, ...] = ()
+        self._cloud: ScanCloud | None = None
+        self._made: tuple[Any, ScanCloud] | None = None
+        self._visible = False
+
+    def build(self) -> None:
+        gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
+        with gui.add_folder("Capture", visible=False) as self._capture_folder:
+            self._picture = Picture(gui, "Live picture")
+            self._stand = Stand(self._stage, LAYER, ("object", "sphere", "plane"))
+            self._label = gui.add_text("Name of the scan, if you like", "")
+            self._capture = gui.add_button("Capture scan", icon=viser.Icon.CAMERA)
+            self._capture.on_click(safely(lambda: operator.capture_scan(self._label.value)))
+        self._gallery = Words(gui)
+        with gui.add_folder("Cloud", visible=False) as self._cloud_folder:
+            self._scan = Choice(gui, "Scan")
+            self._words = Words(gui)
+            self._model = Choice(gui, "Model")
+            self._reconstruct = gui.add_button("Reconstruct", icon=viser.Icon.CUBE)
+            self._reconstruct.on_click(safely(self._ask_cloud))
+            self._colour = gui.add_dropdown("Colour by", COLOURS)
+            self._legend = Words(gui)
+            self._point = Words(gui)
+            self._rename_to = gui.add_text("New name", "")
+            rename = gui.add_button("Rename scan", icon=viser.Icon.PENCIL, color="gray")
+            rename.on_click(safely(lambda: operator.rename(self._scan.value, self._rename_to.value)))
+            delete = gui.add_button(
+                "Delete scan", icon=viser.Icon.TRASH, color="red", hint="It goes to the session's trash"
+            )
+            delete.on_click(safely(lambda: operator.delete(self._scan.value)))
+        self._scan.on_change(safely(self._refresh))
+        self._colour.on_update(safely(self._refresh))
+
+    def draw(self, snapshot: Snapshot) -> None:
+        with self._lock:
+            self._snapshot = snapshot
+            session, ready = snapshot.session, snapshot.step(self.key).state != "blocked"
+            rig = snapshot.rig
+            change(self._capture_folder, visible=rig.state != "none")
+            change(self._capture, disabled=not ready or rig.state != "open" or rig.capture is not None)
+            self._stand.draw(snapshot)
+            scans = session.scans if session else ()
+            change(self._cloud_folder, visible=bool(scans))
+            self._gallery.set(gallery(scans, self._scan.value))
+            if session is None or not scans:
+                self._stage.scene.remove(LAYER, "cloud")
+                self._painter.forget("cloud")
+                return
+            ready_made = [scan.name for scan in scans if scan.cloud != "absent"]
+            self._scan.offer([(scan.name, titled(scan.name, scan.label)) for scan in scans], (ready_made or [""])[-1])
+            if new := [name for name in ready_made if name not in self._known]:
+                if self._known:  # just reconstructed: this is what the operator wants to see
+                    self._scan.choose(new[-1])
+                self._known = tuple(ready_made)
+            models = session.calibration.models if session.calibration else ()
+            self._model.offer(
+                [(model, model) for model in models], session.calibration.best if session.calibration else ""
+            )
+            self._refresh()
+
+    def draw_preview(self, preview: PreviewView) -> None:
+        self._picture.set(drawn(preview), legend(preview, light_words(preview)))
+
+    def shown(self, visible: bool) -> None:
+        self._visible = visible
+        self._stage.scene.show(LAYER, visible)
+        self._stage.scene.on_pick(self._pick if visible else None)
+
+    # drawing
+
+    def _refresh(self) -> None:
+        """Ask for the chosen cloud in the chosen colours."""
+        with self._lock:
+            scan = self._snapshot.scan(self._scan.value) if self._snapshot else None
+            if scan is None or self._snapshot is None:
+                return
+            busy = self._snapshot.job is not None and not self._snapshot.job.background
+            change(
+                self._reconstruct, disabled=busy, label="Reconstruct" if scan.cloud == "absent" else "Reconstruct again"
+            )
+            self._words.set(scan_words(scan))
+            self._gallery.set(gallery(self._snapshot.session.scans if self._snapshot.session else (), scan.name))
+            if scan.cloud == "absent":
+                self._painter.forget("cloud")
+                self._cloud = None
+                self._stage.scene.remove(LAYER, "cloud")
+                self._stage.scene.remove(LAYER, "picked")
+                self._legend.set("")
+                self._point.set("")
+                return
+            verified = (
+                tuple(row.rms_mm for row in self._snapshot.session.verifications if row.capture == scan.name)
+                if self._snapshot.session
+                else ()
+            )
+            key = (scan.name, scan.model, scan.points, scan.noise_mm, verified)
+            operator, colour = self._stage.operator, self._colour.value
+
+            def make() -> tuple[Any, ScanCloud, str]:
+                if self._made is None or self._made[0] != key:
+                    self._made = key, scan_cloud(opened(operator), scan.name)
+                return key, self._made[1], colour
+
+            self._painter.ask("cloud", (key, colour), make, self._draw_cloud)
+
+    def _draw_cloud(self, made: tuple[Any, ScanCloud, str]) -> None:
+        _, cloud, colour = made
+        fresh = cloud is not self._cloud
+        self._cloud = cloud
+        rows, columns = cloud.thinned(150_000)
+        painted, bar = painting(cloud, colour)
+        shown = self._stage.scene.cloud(LAYER, "cloud", cloud.points[rows, columns], painted[rows, columns])
+        self._stage.scene.show(LAYER, self._visible)
+        self._legend.set(
+            bar + block(toned(f"{shown:,} points drawn; the file holds all. Click on a point to ask it.", "dim"))
+        )
+        if fresh:
+            self._stage.scene.remove(LAYER, "picked")
+            self._point.set("")
+
+    def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        cloud = self._cloud
+        pixel = None if cloud is None else cloud.nearest(origin, direction)
+        if cloud is None or pixel is None:
+            return
+        u, v = pixel
+        self._point.set(point_words(cloud, u, v))
+        self._stage.scene.mark(LAYER, "picked", cloud.points[v, u], f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm")
+
+    def _ask_cloud(self) -> None:
+        self._stage.operator.reconstruct(self._scan.value, self._model.value or None)
+
+
+def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
+    """((h, w, 3) uint8, the legend as HTML) of a cloud in one of COLOURS."""
+    if colour == "error":
+        if not cloud.errors:
+            grey = np.full(cloud.points.shape, 150, np.uint8)
+            return grey, block(
+                toned("No error is known: measure this capture as a plane or a sphere first.", "warning")
+            )
+        model = cloud.model if cloud.model in cloud.errors else next(iter(cloud.errors))
+        limit = error_limit(list(cloud.errors.values()))
+        bar = colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", f"error by {model}")
+        return colours(cloud.errors[model], -limit, limit, "error"), bar
+    if colour == "texture":
+        texture = cloud.texture if cloud.texture.ndim == 3 else np.repeat(cloud.texture[..., None], 3, axis=2)
+        return texture, Html("")
+    valid = np.isfinite(cloud.points[..., 2])
+    values, unit, digits = {
+        "depth": (cloud.points[..., 2], "mm", 1),
+        "modulation": (cloud.modulation, "grey levels", 0),
+        "expected noise": (cloud.sigma_z, "mm", 3),
+    }[colour]
+    low, high = spread(np.where(valid, values, np.nan))
+    return colours(values, low, high), colour_bar(
+        f"{low:.{digits}f} {unit}", f"{high:.{digits}f} {unit}", "value", colour
+    )
+
+
+def point_words(cloud: ScanCloud, u: int, v: int) -> Html:
+    """All that is known of the point at pixel (u, v)."""
+    x, y, z = cloud.points[v, u]
+    rows: list[tuple[object, object]] = [
+        ("pixel (column, row)", f"({u}, {v})"),
+        ("x, y, z", f"{x:.3f}, {y:.3f}, {z:.3f} mm"),
+        (f"absolute phase, axis {cloud.axis}", f"{cloud.phase[v, u]:.3f} rad"),
+        ("modulation", f"{cloud.modulation[v, u]:.1f} grey levels"),
+        ("expected noise of z", f"{cloud.sigma_z[v, u]:.3f} mm"),
+    ]
+    rows += [(f"error, {model}", f"{errors[v, u]:.3f} mm") for model, errors in cloud.errors.items()]
+    return table(("Clicked point", ""), rows)
+
+
+def scan_words(scan: ScanView) -> Html:
+    """A scan's figures."""
+    if scan.cloud == "absent":
+        return block(toned("Captured, and not reconstructed yet.", "warning"))
+    rows: list[tuple[object, object]] = [("points", f"{scan.points:,}"), ("model", scan.model)]
+    if scan.depth_mm is not None:
+        rows.append(("depths", f"{scan.depth_mm[0]:.0f} to {scan.depth_mm[1]:.0f} mm"))
+    if scan.noise_mm is not None:
+        rows.append(("expected noise of z (median)", f"{scan.noise_mm:.3f} mm"))
+    said = table((titled(scan.name, scan.label), ""), rows)
+    if scan.cloud == "stale":
+        said = Html(said + block(toned("Made with an older calibration: reconstruct it again.", "warning")))
+    return said
+
+
+def gallery(scans: Sequence[ScanView], chosen: str) -> Html:
+    """Pictures of the scans with their names."""
+    if not scans:
+        return Html("")
+    cards = []
+    for scan in scans:
+        frame = "var(--mantine-primary-color-filled)" if scan.name == chosen else "transparent"
+        state = _STATES[scan.cloud] or f"{scan.points:,} points"
+        tone = "dim" if scan.cloud == "fresh" else "warning"
+        cards.append(
+            f'<div style="width:92px;border:2px solid {frame};border-radius:6px;padding:2px;font-size:0.8rem;'
+            f'line-height:1.25;overflow:hidden">{thumbnail(scan.thumbnail, 84, scan.label)}'
+            f'<div style="white-space:nowrap;overflow:hidden;text-overflow:ellipsis">{cell(scan.label)}</div>'
+            f"{toned(state, tone)}</div>"  # type: ignore[arg-type]
+        )
+    style = "display:flex;flex-wrap:wrap;gap:4px;max-height:260px;overflow-y:auto"
+    return block(Html(f'<div style="{style}">{"".join(cards)}</div>'))
