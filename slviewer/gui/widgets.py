@@ -5,8 +5,10 @@ HTML takes viser's own colours, so that it is readable in its light and in its d
 """
 
 import base64
+import io
+import wave
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -121,7 +123,7 @@ class Words:
         """Show this HTML, as `block`, `boxed`, `table` and the like give it."""
         if content != self._content:
             self._content = content
-            self._handle.content = content
+            self._handle.content = str(content)  # an Html would not be sent
             if self._handle.visible != bool(content):
                 self._handle.visible = bool(content)
 
@@ -156,6 +158,40 @@ class Picture:
         if self._image.visible:
             self._image.visible = False
         self._legend.set("")
+
+
+class Sound:
+    """Short tones in the browsers that show the page; they stay silent until someone has clicked in them."""
+
+    _TONES_HZ: ClassVar[dict[str, tuple[float, ...]]] = {
+        "tick": (880.0,),
+        "taken": (1320.0, 1760.0),
+        "good": (880.0, 1320.0),
+        "bad": (330.0, 220.0),
+    }
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._handle = gui.add_html("")
+        self._count = 0
+
+    def play(self, name: Literal["tick", "taken", "good", "bad"]) -> None:
+        """Play it once."""
+        self._count += 1
+        data = base64.b64encode(_wav(self._TONES_HZ[name])).decode()
+        self._handle.content = f'<audio autoplay data-n="{self._count}" src="data:audio/wav;base64,{data}"></audio>'
+
+
+def _wav(tones_hz: Sequence[float], rate: int = 8000, seconds: float = 0.12) -> bytes:
+    t = np.arange(int(rate * seconds)) / rate
+    swell = np.minimum(1, np.minimum(t, seconds - t) / 0.01)  # without it, tones click
+    samples = np.concatenate([swell * np.sin(2 * np.pi * f * t) for f in tones_hz])
+    file = io.BytesIO()
+    with wave.open(file, "wb") as out:
+        out.setnchannels(1)
+        out.setsampwidth(1)
+        out.setframerate(rate)
+        out.writeframes((128 + 90 * samples).astype(np.uint8).tobytes())
+    return file.getvalue()
 
 
 def fitted(image: np.ndarray, width_px: int = PICTURE_PX) -> np.ndarray:

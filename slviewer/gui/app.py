@@ -1,0 +1,194 @@
+"""Starting the wizard: the engine, the server, and one thread that draws."""
+
+import logging
+import signal
+import threading
+import time
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from slviewer.errors import SlviewerError, UsageError
+from slviewer.gui import shell as frame
+from slviewer.gui.panel import Stage
+from slviewer.gui.scene import Scene
+from slviewer.gui.shell import Shell
+from slviewer.server.secure import SafeServer, serve
+from slviewer.server.text import escape
+from slviewer.workflow.wizard.notices import words_for
+from slviewer.workflow.wizard.operator import Operator
+from slviewer.workflow.wizard.snapshot import Level
+
+log = logging.getLogger("slviewer.gui")
+
+DRAWN_PER_S = 10.0
+DEFAULT_SESSION = "slviewer-session"
+_BRAND = (25, 113, 194)
+
+
+class App:
+    """A running wizard: its engine, its server, and the thread that draws the newest snapshot."""
+
+    def __init__(self, operator: Operator, host: str = "127.0.0.1", port: int = 8080, **options: Any) -> None:
+        """Serve `operator`; `options` are those of `serve`. Raises SlviewerError where the address can't be served."""
+        self.operator = operator
+        self.server: SafeServer = serve(host, port, label="slviewer", **options)
+        try:
+            self._start()
+        except BaseException:
+            self.server.stop()
+            raise
+
+    def close(self) -> None:
+        """End drawing and serving; the operator is whoever's started it."""
+        self._closing = True
+        self._changed.set()
+        self._unsubscribe()
+        self._thread.join(5.0)
+        self.server.stop()
+
+    def _start(self) -> None:
+        page, operator = self.server.viser, self.operator
+        page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
+        page.initial_camera.position = (-350.0, -350.0, -500.0)
+        page.initial_camera.look_at = (0.0, 0.0, 450.0)
+        page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
+        self._closing = False
+        self._changed = threading.Event()
+        self._offers: dict[Path, str] = {}
+        self._stage = Stage(
+            page.gui, Scene(page.scene), operator, self._offer, self._tell, escape, self._go, self._failed
+        )
+        snapshot = operator.snapshot()
+        self._told = snapshot.notices[-1].number if snapshot.notices else 0
+        self.shell = Shell(page.gui, self._stage, snapshot.steps, operator.open_session)
+        page.on_client_connect(self._greet)
+        self._unsubscribe = operator.subscribe(self._wake, self._wake)
+        self._thread = threading.Thread(target=self._draw_forever, name="slviewer drawing", daemon=True)
+        self._thread.start()
+
+    # drawing
+
+    def _wake(self, _news: object) -> None:
+        self._changed.set()
+
+    def _draw_forever(self) -> None:
+        version, number = -1, -1
+        while not self._closing:
+            begun = time.monotonic()
+            self._changed.wait(1.0)
+            self._changed.clear()
+            if self._closing:
+                return
+            try:
+                version, number = self._draw(version, number)
+            except Exception as error:
+                version = -1
+                self._failed(error)
+                time.sleep(1.0)
+            time.sleep(max(0.0, 1 / DRAWN_PER_S - (time.monotonic() - begun)))
+
+    def _draw(self, version: int, number: int) -> tuple[int, int]:
+        snapshot, preview = self.operator.snapshot(), self.operator.preview()
+        if snapshot.version != version or self.shell.due:
+            with self.server.viser.atomic():
+                self.shell.draw(snapshot)
+            for notice in snapshot.notices:
+                if notice.number > self._told:
+                    self._told = notice.number
+                    self._tell(notice.level, notice.text)
+        if preview is not None and preview.number != number:
+            self.shell.draw_preview(preview)
+            number = preview.number
+        return snapshot.version, number
+
+    # what panels use
+
+    def _tell(self, level: Level, text: str) -> None:
+        for client in self.server.viser.get_clients().values():
+            frame.notify(client, level, text)
+
+    def _failed(self, error: BaseException) -> None:
+        self._tell("error", words_for("This", error))
+
+    def _go(self, key: str) -> None:
+        self.shell.go(key)
+        self._changed.set()
+
+    def _offer(self, path: Path) -> str:
+        if path not in self._offers:
+            session = self.operator.snapshot().session
+            folder = session.folder if session is not None else path.parent
+            self._offers[path] = self.server.downloads.offer(path, within=folder)
+        return self._offers[path]
+
+    def _greet(self, client: viser.ClientHandle) -> None:
+        if self.server.role(client.client_id) == "viewer":
+            frame.greet_viewer(client)
+
+
+def run(
+    session: Path | None = None,
+    rig: str = "",
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open_browser: bool = True,
+) -> None:
+    """Serve the wizard until Ctrl-C. `rig` as `rig_choice` reads it; empty: the session's, else the simulated one.
+
+    Raises SlviewerError where the session, the rig or the address cannot be used.
+    """
+    with Operator() as operator:
+        _granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
+        begun = operator.wait_for(lambda s: s.session is not None, 60.0)
+        if rig or begun is None or begun.rig.state == "none":
+            _granted(operator, operator.choose_rig(rig_choice(rig or "simulated")))
+        app = App(operator, host, port)
+        try:
+            print(f"slviewer is ready: {app.server.url}")
+            print(f"to watch only:     {app.server.view_url}", flush=True)
+            if not app.server.loopback:
+                print("Others on this network can read what is sent: use a network that you trust.", flush=True)
+            if open_browser:
+                _open(app.server.url)
+            _until_stopped()
+        except KeyboardInterrupt:
+            print("\nslviewer ends; the session is kept.")
+        finally:
+            app.close()
+
+
+def rig_choice(text: str) -> dict[str, Any]:
+    """What `Operator.choose_rig` takes: "simulated" (half resolution), "simulated:0.25", or a driver's name."""
+    name, _, scale = text.partition(":")
+    if name != "simulated":
+        return {"driver": text}
+    try:
+        return {"driver": name, "scale": float(scale or 0.5)}
+    except ValueError:
+        raise UsageError(f"{text!r} is no rig: write simulated, or simulated:0.25 for a quarter of the size") from None
+
+
+def _until_stopped() -> None:
+    """Wait for Ctrl-C, or for the request to end that a service manager sends."""
+    stopped = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stopped.set())
+    while not stopped.wait(1.0):  # in pieces: some systems deliver Ctrl-C only between waits
+        pass
+
+
+def _granted(operator: Operator, granted: bool) -> None:
+    """Raise what kept a request from being granted."""
+    if not granted:
+        failed = operator.wait_for(lambda s: any(n.level == "error" for n in s.notices), 2.0)
+        raise SlviewerError(failed.notices[-1].text if failed else "the wizard could not begin: its log says why")
+
+
+def _open(url: str) -> None:
+    try:
+        webbrowser.get()
+    except webbrowser.Error:
+        return
+    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()

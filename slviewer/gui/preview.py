@@ -1,0 +1,98 @@
+"""The live picture as the operator sees it: what is saturated, the board that is found, and where to hold it next."""
+
+import cv2
+import numpy as np
+
+from slviewer.gui.widgets import PICTURE_PX, Html, block, cell, fitted, toned
+from slviewer.target.board import Board
+from slviewer.workflow.wizard.snapshot import PreviewView
+
+_FOUND, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
+DIM = 0.35
+"""Share of the camera's range below which the brightest parts of an image are called dim."""
+
+
+def drawn(preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None) -> np.ndarray:
+    """(h, w, 3) uint8: the frame with saturated pixels marked, the found board's features joined row by row, and the
+    outline (4, 2), in camera px, of where to hold the board.
+    """
+    picture = fitted(preview.image)
+    clipped = preview.image >= 255
+    if clipped.any():
+        mask = cv2.resize(clipped.astype(np.uint8), picture.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        picture[mask > 0] = _CLIPPED
+    to_picture = preview.scale * PICTURE_PX / preview.image.shape[1]
+    if ghost_px is not None and np.isfinite(ghost_px).all():
+        _dashed(picture, ghost_px * to_picture)
+    if preview.board is not None:
+        _grid(picture, preview.board.pixels * to_picture, board)
+        corners = np.round(preview.board.outline * to_picture * 16).astype(np.int32)
+        cv2.polylines(picture, [corners], True, _FOUND, 2, cv2.LINE_AA, shift=4)
+    return picture
+
+
+def light_words(preview: PreviewView) -> Html:
+    """How bright the frame is, in words with a colour."""
+    if preview.saturated > 0.002:
+        share = 100 * preview.saturated
+        return toned(f"{share:.1f} % saturated, marked red: lower the exposure", "error", bold=True)
+    if preview.brightest < DIM:
+        return toned(f"Dim: the brightest parts reach {100 * preview.brightest:.0f} %. Raise the exposure", "warning")
+    return toned(f"Well exposed: the brightest parts reach {100 * preview.brightest:.0f} %", "good")
+
+
+def board_words(preview: PreviewView, board: Board | None) -> Html:
+    """Whether the board is seen, and why not."""
+    if board is None:
+        return toned("No board is chosen yet", "dim")
+    if preview.board is None:
+        return toned(preview.missing or "The board is not looked for yet", "warning")
+    seen, all_of_it = len(preview.board.pixels), len(board.points)
+    return toned(f"Board found: {seen} of {all_of_it} features", "good")
+
+
+def legend(preview: PreviewView, *words: Html) -> Html:
+    """Lines below the picture, the frame rate beside the first."""
+    rate = toned(f"{preview.frames_per_s:.0f} pictures/s", "dim")
+    first = f'<div style="display:flex;justify-content:space-between;gap:1em"><span>{words[0]}</span>{rate}</div>'
+    return block(Html(first + "".join(f"<div>{word}</div>" for word in words[1:])))
+
+
+def histogram_chart(preview: PreviewView) -> Html:
+    """Grey levels from dark to bright; bars that reach the right end are clipped light."""
+    shares = np.sqrt(preview.histogram / max(float(preview.histogram.max()), 1e-9))  # the few bright pixels matter most
+    bars = "".join(
+        f'<rect x="{4 * k}" y="{40 - 40 * share:.1f}" width="3.4" height="{40 * share:.1f}" '
+        f'fill="{"var(--mantine-color-red-6)" if k == len(shares) - 1 else "var(--mantine-color-blue-5)"}"/>'
+        for k, share in enumerate(shares)
+    )
+    axis = "".join(
+        f'<span style="color:var(--mantine-color-dimmed);font-size:0.75rem">{cell(text)}</span>'
+        for text in ("dark", "grey level", "saturated")
+    )
+    return block(
+        Html(
+            f'<svg viewBox="0 0 {4 * len(shares)} 40" preserveAspectRatio="none" '
+            f'style="width:100%;height:48px;display:block;border-bottom:1px solid var(--mantine-color-dimmed)">{bars}'
+            f'</svg><div style="display:flex;justify-content:space-between">{axis}</div>'
+        )
+    )
+
+
+def _grid(picture: np.ndarray, pixels: np.ndarray, board: Board | None) -> None:
+    at = np.round(pixels * 16).astype(np.int32)
+    if board is not None and len(pixels) == len(board.points):
+        columns = board.features[0]
+        for row in at.reshape(-1, columns, 2):
+            cv2.polylines(picture, [row], False, _FOUND, 1, cv2.LINE_AA, shift=4)
+    for point in at:
+        cv2.circle(picture, (int(point[0]), int(point[1])), 40, _FOUND, -1, cv2.LINE_AA, shift=4)
+
+
+def _dashed(picture: np.ndarray, corners: np.ndarray) -> None:
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        dashes = max(2, int(np.linalg.norm(end - start) / 14))
+        for k in range(dashes):
+            a, b = (start + (end - start) * (k + part) / dashes for part in (0.0, 0.6))
+            ends = [tuple(int(v) for v in np.round(p * 16)) for p in (a, b)]
+            cv2.line(picture, ends[0], ends[1], _GHOST, 3, cv2.LINE_AA, shift=4)
