@@ -20,6 +20,7 @@ GHOST: Colour = (20, 160, 220)
 SHOWN_POINTS = 150_000
 """Points of one cloud that a browser is sent: software rendering still moves them, and the full cloud stays here."""
 _FRUSTUM_MM = 60.0
+_FLOOR_MM = 260.0
 
 
 class Scene:
@@ -31,6 +32,18 @@ class Scene:
         self._nodes: dict[tuple[str, str], list[Any]] = {}
         self._pick: Callable[[Any], Any] | None = None
         api.set_up_direction("-y")
+        api.add_grid(
+            "/floor",
+            plane="xz",
+            position=(0.0, _FLOOR_MM, 500.0),
+            infinite_grid=True,
+            cell_size=50.0,
+            section_size=250.0,
+            cell_color=(225, 229, 233),
+            section_color=(190, 196, 202),
+            fade_distance=2500.0,
+            shadow_opacity=0.0,
+        )
 
     # layers
 
@@ -40,7 +53,7 @@ class Scene:
 
     def remove(self, layer: str, name: str) -> None:
         """Take one thing out of a layer; nothing happens where there is none."""
-        for node in self._nodes.pop((layer, name), []):
+        for node in reversed(self._nodes.pop((layer, name), [])):  # what hangs below a node first
             node.remove()
 
     def clear(self, layer: str) -> None:
@@ -66,6 +79,8 @@ class Scene:
             # of the angles seen, not of the pixels: a projector's may be far from square
             aspect=float((width / K[0, 0]) / (height / K[1, 1])),
             scale=_FRUSTUM_MM,
+            thickness=2.0,
+            thickness_units="screen",
             color=colour,
             wxyz=wxyz,
             position=position,
