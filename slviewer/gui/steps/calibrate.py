@@ -16,11 +16,12 @@ from slviewer.report.data import DeviceParameters
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
+from slviewer.target.board import Board
 from slviewer.workflow.reporting import calibration_view
 from slviewer.workflow.wizard import looking
 from slviewer.workflow.wizard.snapshot import CalibrationView, PreviewView, SessionView, Snapshot
 
-LAYER = "calibrate"
+LAYER, BOARDS = "calibrate", "calibrated boards"
 DEVICES = ("camera", "projector")
 
 
@@ -35,6 +36,8 @@ class Panel:
         self._lock = threading.RLock()
         self._snapshot: Snapshot | None = None
         self._visible = False
+        self._pixel_chosen = False
+        self._boards: tuple[Any, ...] = ()
         self._cloud: looking.ScanCloud | None = None
         self._details: tuple[tuple[Any, ...], Details] | None = None
 
@@ -49,7 +52,7 @@ class Panel:
             self._pose_words = Words(gui)
             self._exclude = gui.add_button("Exclude this pose", color="orange")
             self._exclude.on_click(safely(self._toggle_pose))
-            self._device = gui.add_dropdown("Residual arrows of", DEVICES)
+            self._device = gui.add_dropdown("Arrows of", DEVICES)
             self._arrows = Plot(gui)
         with gui.add_folder("Parameters", visible=False, expand_by_default=False) as self._parameters_folder:
             self._parameters = Words(gui)
@@ -59,7 +62,7 @@ class Panel:
             self._maps = Plot(gui)
             self._column = gui.add_number("Pixel column u", 0, min=0, step=1)
             self._row = gui.add_number("Pixel row v", 0, min=0, step=1)
-            self._over = Choice(gui, "Click on the cloud of", "Shows a cloud in 3D; click on it to choose a pixel")
+            self._over = Choice(gui, "Cloud to click", "Shows a cloud in 3D; click on it to choose a pixel")
             self._curve_words = Words(gui)
             self._curves = Plot(gui)
         for choice in (self._pose, self._axis):
@@ -93,6 +96,11 @@ class Panel:
             clouds = [(scan.name, titled(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"]
             self._over.offer([("", "no cloud"), *clouds])
             self._fits.set(_fits(calibration))
+            if not self._pixel_chosen:
+                self._pixel_chosen = True
+                u, v = np.round(calibration.K_camera[:2, 2]).astype(int)
+                change(self._column, value=max(int(u), 0))
+                change(self._row, value=max(int(v), 0))
             self._refresh()
 
     def draw_preview(self, preview: PreviewView) -> None:
@@ -100,7 +108,8 @@ class Panel:
 
     def shown(self, visible: bool) -> None:
         self._visible = visible
-        self._stage.scene.show(LAYER, visible)
+        for layer in (LAYER, BOARDS):
+            self._stage.scene.show(layer, visible)
         self._stage.scene.on_pick(self._pick if visible else None)
 
     # pictures
@@ -122,21 +131,23 @@ class Panel:
                     self._bars.set,
                 )
             self._draw_pose(session, calibration)
-            self._painter.ask(
-                "parameters", made, lambda: _parameters(operator.calibration_details()), self._parameters.set
-            )
-            axis = self._axis.value
+            self._draw_boards(session, calibration)
+            self._painter.ask("parameters", made, lambda: _parameters(self._detailed(made)), self._parameters.set)
+            axis: Any = self._axis.value
             if axis not in calibration.fit_rms_mm:
                 return
             self._painter.ask(
                 "maps",
                 (made, axis),
-                lambda: rms_maps(operator.pixel_fits()[axis].rms_mm, axis, width=PLOT_PX),
+                lambda: rms_maps(looking.pixel_fits(opened(operator))[axis].rms_mm, axis, width=PLOT_PX),
                 self._maps.set,
             )
             pixel = (int(self._column.value), int(self._row.value))
             self._painter.ask(
-                "curves", (made, axis, pixel), lambda: (pixel, operator.pixel_curve(pixel, axis)), self._draw_curve
+                "curves",
+                (made, axis, pixel),
+                lambda: (pixel, looking.pixel_curve(opened(operator), pixel, axis)),
+                self._draw_curve,
             )
 
     def _draw_pose(self, session: SessionView, calibration: CalibrationView) -> None:
@@ -168,6 +179,33 @@ class Panel:
             return residual_arrows(title, found.projector_pixels, found.projector, details.projector.size)
 
         self._painter.ask("arrows", (made, name, device), arrows, self._arrows.set)
+
+    def _draw_boards(self, session: SessionView, calibration: CalibrationView) -> None:
+        """The poses in 3D, from green to red by their reprojection error, the chosen one thick."""
+        scene, chosen = self._stage.scene, self._pose.value
+        shown = (
+            fingerprint(calibration),
+            chosen,
+            bool(self._over.value),
+            tuple((p.name, p.state) for p in session.poses),
+        )
+        if shown == self._boards:
+            return
+        self._boards = shown
+        scene.clear(BOARDS)
+        if self._over.value or not calibration.target:
+            return
+        outline = Board.parse(calibration.target).outline()
+        usual = np.sqrt(np.mean(np.square([max(rms) for rms in calibration.pose_rms_px.values()] or [1.0])))
+        for pose in session.poses:
+            if pose.T_camera_board is not None and pose.name in calibration.pose_rms_px:
+                share = float(np.clip(max(calibration.pose_rms_px[pose.name]) / usual - 0.5, 0, 1))
+                colour = (round(60 + 170 * share), round(170 - 110 * share), 70)
+                here = pose.name == chosen
+                label = pose.name if here else ""
+                width = 5.0 if here else 1.5
+                scene.board(BOARDS, pose.name, pose.T_camera_board, outline, colour, label=label, width_px=width)
+        scene.show(BOARDS, self._visible)
 
     def _detailed(self, made: tuple[Any, ...]) -> Details:
         """The calibration with its residuals, read once; on the painter's thread."""
@@ -202,7 +240,9 @@ class Panel:
             self._painter.forget("cloud")
             self._cloud = None
             self._stage.scene.clear(LAYER)
+            self._refresh()
             return
+        self._refresh()
         operator = self._stage.operator
         self._painter.ask("cloud", name, lambda: looking.scan_cloud(opened(operator), name), self._draw_cloud)
 

@@ -18,6 +18,8 @@ from slviewer.workflow.wizard.looking import ScanCloud, scan_cloud
 from slviewer.workflow.wizard.snapshot import PreviewView, ScanView, Snapshot
 
 LAYER = "scan"
+SMALL_PX = 380
+"""Width of the live picture: the cloud matters more here."""
 COLOURS = ("texture", "depth", "modulation", "expected noise", "error")
 _STATES = {"absent": "not reconstructed yet", "fresh": "", "stale": "older calibration"}
 
@@ -40,10 +42,10 @@ class Panel:
     def build(self) -> None:
         gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
         with gui.add_folder("Capture", visible=False) as self._capture_folder:
-            self._picture = Picture(gui, "Live picture")
-            self._stand = Stand(self._stage, LAYER, ("object", "sphere", "plane"))
-            self._label = gui.add_text("Name of the scan, if you like", "")
+            self._picture = Picture(gui, "Live picture", width_px=SMALL_PX)
             self._capture = gui.add_button("Capture scan", icon=viser.Icon.CAMERA)
+            self._label = gui.add_text("Name", "", hint="If you like; else it is numbered")
+            self._stand = Stand(self._stage, LAYER, ("object", "sphere", "plane"))
             self._capture.on_click(safely(lambda: operator.capture_scan(self._label.value)))
         self._gallery = Words(gui)
         with gui.add_folder("Cloud", visible=False) as self._cloud_folder:

@@ -27,6 +27,8 @@ from slviewer.workflow.wizard.snapshot import (
 )
 
 LAYER = "verify"
+SMALL_PX = 300
+"""Width of the live picture: here it only has to show that the plane or the sphere is in view."""
 TABLE = "verifications.csv"
 _SIGN = {"plane": "red is towards the camera", "sphere": "red is outwards"}
 
@@ -47,11 +49,11 @@ class Panel:
     def build(self) -> None:
         gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
         with gui.add_folder("Capture", visible=False) as self._capture_folder:
-            self._picture = Picture(gui, "Live picture")
-            self._stand = Stand(self._stage, LAYER, ("plane", "sphere"))
-            self._label = gui.add_text("Name, if you like", "")
+            self._picture = Picture(gui, "Live picture", width_px=SMALL_PX)
             self._plane = gui.add_button("Capture plane", icon=viser.Icon.SQUARE)
             self._sphere = gui.add_button("Capture sphere", icon=viser.Icon.SPHERE)
+            self._label = gui.add_text("Name", "", hint="If you like; else it is numbered")
+            self._stand = Stand(self._stage, LAYER, ("plane", "sphere"))
             self._plane.on_click(safely(lambda: operator.capture_plane(self._label.value)))
             self._sphere.on_click(safely(lambda: operator.capture_sphere(self._label.value)))
         with gui.add_folder("Recorded captures", visible=False) as self._recorded_folder:
