@@ -268,7 +268,9 @@ class Acquisition:
             if self._rig is self._wanted:
                 self._view = replace(self._view, state="lost", fault=sentence, capture=None)
         if first:
-            also = f"; {waiting} captures that waited are not taken" if waiting else ""
+            also = {0: "", 1: "; the capture that waited is not taken"}.get(
+                waiting, f"; the {waiting} captures that waited are not taken"
+            )
             self._notices.tell("error", sentence + also)
         self._changed()
 

@@ -165,10 +165,14 @@ def _surface(points: np.ndarray, normals: np.ndarray, report: Reporter) -> tuple
     known = np.isfinite(normals).all(1)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[known].astype(float)))
     cloud.normals = o3d.utility.Vector3dVector(normals[known].astype(float))
-    cell = float(np.ptp(np.percentile(points, [1, 99], axis=0), axis=0).max()) / _CELLS
-    cloud = cloud.voxel_down_sample(cell)
+    extent = float(np.ptp(np.percentile(points, [1, 99], axis=0), axis=0).max())
+    cloud = cloud.voxel_down_sample(extent / _CELLS)
+    # no finer than the points lie apart: the rest would be invented
+    spacing = float(np.median(np.asarray(cloud.compute_nearest_neighbor_distance())))
+    cell = max(extent / _CELLS, spacing)
     report(0.3, "a surface through the points")
-    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=9)
+    depth = int(np.ceil(np.log2(1.1 * extent / cell)))
+    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth)
     report(0.8, "cutting off what was not measured")
     skin = o3d.geometry.PointCloud(mesh.vertices)
     mesh.remove_vertices_by_mask(np.asarray(skin.compute_point_cloud_distance(cloud)) > 3 * cell)

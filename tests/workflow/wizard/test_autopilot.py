@@ -1,0 +1,130 @@
+"""The whole wizard, flown once on a small rig; then everything that can be looked at, exported and undone."""
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from slviewer.reconstruction.ply import read_ply
+from slviewer.workflow.wizard import looking
+from slviewer.workflow.wizard.autopilot import Autopilot
+from slviewer.workflow.wizard.operator import Operator
+from slviewer.workflow.wizard.snapshot import SessionView, Snapshot
+
+
+@pytest.fixture(scope="module")
+def acts() -> list[str]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def operator(tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
+    folder = tmp_path_factory.mktemp("flight") / "session"
+    with Operator(folder, {"driver": "simulated", "scale": 0.25, "seed": 0}) as operator:
+        Autopilot(operator, poses=8, before=acts.append).run()
+        yield operator
+
+
+def session_of(snapshot: Snapshot) -> SessionView:
+    assert snapshot.session is not None
+    return snapshot.session
+
+
+def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
+    snapshot = operator.snapshot()
+    session = session_of(snapshot)
+    assert [step.state for step in snapshot.steps] == ["done"] * 8
+    assert not [notice.text for notice in snapshot.notices if notice.level == "error"]
+    assert "Capturing pose 8 of 8" in acts and acts[-1] == "Writing the report"
+    assert {pose.state for pose in session.poses} == {"used"}
+    assert all(pose.rms_px and 0.01 < max(pose.rms_px) < 0.4 for pose in session.poses)
+    assert session.coverage is not None and session.coverage.share > 0.8
+    calibration = session.calibration
+    assert calibration is not None and calibration.best == "pixelwise" and abs(calibration.baseline_mm - 180) < 2
+    rows = {(row.capture, row.model): row for row in session.verifications}
+    assert rows["plane_01", "pixelwise"].rms_mm < rows["plane_01", "stereo"].rms_mm < 0.5
+    assert rows["plane_01", "pixelwise"].noise_floor_mm < rows["plane_01", "pixelwise"].rms_mm  # type: ignore[operator]
+    assert rows["sphere_01", "pixelwise"].radius_mm == pytest.approx(98, abs=0.5)
+    merge = session.merge
+    assert merge is not None and set(merge.pairs) == {"scan_01", "scan_02"} and merge.reference == "scan_03"
+    assert all(0.01 < rms < 0.5 and overlap > 0.5 for rms, overlap, _ in merge.pairs.values())
+    merged = read_ply(next(e.path for e in session.exports if e.name == "merged_1.ply"))
+    assert len(merged.points) == merge.points > 30_000
+    assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
+
+
+def test_panels_find_what_they_draw(operator: Operator) -> None:
+    store = operator.session
+    assert store is not None
+    cloud = looking.scan_cloud(store, "plane_01")
+    assert cloud.points.shape == (300, 400, 3) and set(cloud.errors) == {"stereo", "pixelwise"}
+    measured = np.isfinite(cloud.points).all(-1)
+    assert np.isfinite(cloud.phase[measured]).all() and cloud.modulation[measured].min() > 1
+    v, u = 150, 200
+    assert cloud.nearest(np.zeros(3), cloud.points[v, u]) == (u, v)
+    assert cloud.nearest(np.zeros(3), np.array([0, 1.0, 0])) is None
+    assert np.isfinite(cloud.points[cloud.thinned(2000)][..., 2]).sum() <= 2500
+    assert set(looking.error_histogram(store, "plane_01").counts) == {"stereo", "pixelwise"}
+    pixels, residuals = looking.residuals(store, "pose_03")
+    assert pixels.shape == (336, 2) and residuals.shape == (336, 4)
+    curve = looking.pixel_curve(store, (200, 150), "x")
+    assert curve is not None and len(curve.phase) >= 4
+    assert looking.pixel_fits(store)["x"].rms_mm.shape == (3, 300, 400)
+    assert looking.merged_cloud(store, "1").normals is not None
+
+
+def test_files_for_other_programs(operator: Operator) -> None:
+    assert operator.export("mesh", "scan_01", "stl") and operator.export("mesh", "scan_01", "glb")
+    assert operator.export("cloud", "scan_02") and operator.export("calibration") and operator.export("table")
+    assert operator.export("merged mesh") and operator.diagnostic_bundle()
+    session = session_of(operator.settle())
+    files = {export.name: export for export in session.exports}
+    assert all(export.bytes > 100 for export in files.values())
+    assert len(trimesh.load(files["scan_01_mesh.stl"].path).faces) > 10_000
+    assert "vertex" in read_head(files["merged_1_mesh.ply"].path)
+    surface = trimesh.load(files["merged_1_mesh.ply"].path)
+    cloud = read_ply(files["merged_1.ply"].path)
+    gaps = cKDTree(surface.vertices).query(cloud.points[::200])[0]
+    assert len(surface.faces) > 5_000 and np.median(gaps) < 0.5
+    table = files["verifications.csv"].path.read_text().splitlines()
+    assert len(table) == 5 and table[1].startswith("plane_01,A flat plate,plane,stereo,")
+    bundle = next(export for export in files.values() if export.name.startswith("diagnostics_"))
+    with zipfile.ZipFile(bundle.path) as inside:
+        names = inside.namelist()
+        assert {"versions.json", "state.json", "log.txt", "session/decisions.json"} <= set(names)
+        assert "previews/pose_01.jpg" in names and not [n for n in names if "frames" in n or n.endswith(".npy")]
+        assert b"calibrated from 8 poses" in inside.read("log.txt")
+    assert bundle.bytes < 1_000_000
+    assert not operator.export("mesh", "scan_01", "doc") and not operator.export("cloud", "../x")
+    assert not [path for path in (operator.session.folder / "exports").iterdir() if path.name.startswith(".")]  # type: ignore[union-attr]
+
+
+def read_head(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.read(300).decode("ascii", "replace")
+
+
+def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
+    assert operator.exclude("pose_02")
+    stale = operator.settle()
+    assert session_of(stale).calibration.stale.startswith("pose_02 was excluded")  # type: ignore[union-attr]
+    assert stale.step("calibrate").state == "ready" and stale.step("scan").state == "done"
+    assert operator.calibrate()
+    again = operator.settle()
+    session = session_of(again)
+    assert session.calibration is not None and session.calibration.stale == "" and len(session.calibration.poses) == 7
+    assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
+    assert session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
+    assert again.pose("pose_02").state == "excluded"  # type: ignore[union-attr]
+    assert operator.reconstruct("scan_01")
+    assert again.scan("scan_01") is not None and operator.settle().scan("scan_01").cloud == "fresh"  # type: ignore[union-attr]
+    assert operator.undo_merge()
+    undone = session_of(operator.settle())
+    assert undone.merge is None and "merged_1.ply" not in {export.name for export in undone.exports}
+    assert not operator.undo_merge()
+    assert operator.delete("scan_02")
+    assert operator.settle().scan("scan_02") is None
