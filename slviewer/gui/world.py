@@ -26,7 +26,12 @@ class Stand:
             self._says = Words(gui)
             self._thing = gui.add_dropdown("Before the rig", ("something else", *self._things))
             self._distance = gui.add_number(
-                "At, mm", 600.0, min=NEAREST_MM, max=FARTHEST_MM, step=5.0, hint="Distance from the camera; or drag it in the 3D view"
+                "At, mm",
+                600.0,
+                min=NEAREST_MM,
+                max=FARTHEST_MM,
+                step=5.0,
+                hint="Distance from the camera; or drag it in the 3D view",
             )
             self._turn = gui.add_number("Turned, °", 0.0, min=-90.0, max=90.0, step=5.0)
         self._thing.on_update(stage.safely_with(self._choose))

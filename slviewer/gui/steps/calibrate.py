@@ -9,6 +9,7 @@ import viser
 from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened, spread
+from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, colours, table, toned
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationView as Details
@@ -63,6 +64,7 @@ class Panel:
             self._column = gui.add_number("Pixel column u", 0, min=0, step=1)
             self._row = gui.add_number("Pixel row v", 0, min=0, step=1)
             self._over = Choice(gui, "Cloud to click", "Shows a cloud in 3D; click on it to choose a pixel")
+            bring_button(self._stage, lambda: self._cloud.points if self._cloud else None)
             self._curve_words = Words(gui)
             self._curves = Plot(gui)
         for choice in (self._pose, self._axis):

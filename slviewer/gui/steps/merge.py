@@ -10,6 +10,7 @@ from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
 from slviewer.gui.steps.verify import likely
+from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, block, cell, meter, table, toned
 from slviewer.workflow.wizard import looking
 from slviewer.workflow.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
@@ -32,6 +33,7 @@ class Panel:
         self._lock = threading.RLock()
         self._snapshot: Snapshot | None = None
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
+        self._points: np.ndarray | None = None
         self._visible = False
 
     def build(self) -> None:
@@ -48,6 +50,7 @@ class Panel:
         self._view.on_update(safely(self._refresh))
         self._reference.on_change(safely(self._refresh))
         self._legend = Words(gui)
+        bring_button(self._stage, lambda: self._points)
 
     def draw(self, snapshot: Snapshot) -> None:
         with self._lock:
@@ -151,6 +154,7 @@ class Panel:
         scene = self._stage.scene
         for name in set(scene.names(LAYER)) - {name for name, _, _ in things}:
             scene.remove(LAYER, name)
+        self._points = np.concatenate([points for _, points, _ in things]) if things else None
         words = []
         for name, points, colours in things:
             scene.cloud(LAYER, name, points, colours)

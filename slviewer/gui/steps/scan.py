@@ -11,6 +11,7 @@ from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened, spread
 from slviewer.gui.preview import drawn, legend, light_words
+from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Picture, Words, block, cell, colour_bar, colours, table, thumbnail, toned
 from slviewer.gui.world import Stand
 from slviewer.report.maps import error_limit
@@ -56,6 +57,7 @@ class Panel:
             self._reconstruct.on_click(safely(self._ask_cloud))
             self._colour = gui.add_dropdown("Colour by", COLOURS)
             self._legend = Words(gui)
+            bring_button(self._stage, lambda: self._cloud.points if self._cloud else None)
             self._point = Words(gui)
             self._rename_to = gui.add_text("New name", "")
             rename = gui.add_button("Rename scan", icon=viser.Icon.PENCIL, color="gray")

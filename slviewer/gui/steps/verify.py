@@ -11,6 +11,7 @@ from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened
 from slviewer.gui.preview import drawn, legend, light_words
+from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Picture, Words, block, cell, colour_bar, colours, link, table, toned
 from slviewer.gui.world import Stand
 from slviewer.report.maps import error_limit, error_maps
@@ -44,6 +45,7 @@ class Panel:
         self._lock = threading.RLock()
         self._snapshot: Snapshot | None = None
         self._measured: tuple[str, ...] = ()
+        self._points: np.ndarray | None = None
         self._visible = False
 
     def build(self) -> None:
@@ -56,6 +58,18 @@ class Panel:
             self._stand = Stand(self._stage, LAYER, ("plane", "sphere"))
             self._plane.on_click(safely(lambda: operator.capture_plane(self._label.value)))
             self._sphere.on_click(safely(lambda: operator.capture_sphere(self._label.value)))
+        with gui.add_folder("Result", visible=False) as self._result_folder:
+            self._result = Choice(gui, "Result of")
+            self._words = Words(gui)
+            self._maps = Plot(gui)
+            self._model = Choice(gui, "Colours in 3D", "By whose error the cloud is coloured")
+            self._legend = Words(gui)
+            bring_button(self._stage, lambda: self._points)
+        with gui.add_folder("All results", visible=False) as self._table_folder:
+            self._table = Words(gui)
+            self._write = gui.add_button("Write table as CSV", icon=viser.Icon.TABLE_EXPORT, color="gray")
+            self._write.on_click(safely(lambda: operator.export("table")))
+            self._file = Words(gui)
         with gui.add_folder("Recorded captures", visible=False) as self._recorded_folder:
             self._recorded = Choice(gui, "Capture")
             self._radius = gui.add_number(
@@ -69,17 +83,6 @@ class Panel:
             for shape in ("plane", "sphere"):
                 self._all[shape] = gui.add_button(f"Measure all {shape}s", color="gray", visible=False)
                 self._all[shape].on_click(safely(lambda shape=shape: self._measure_all(shape)))  # type: ignore[misc]
-        with gui.add_folder("Result", visible=False) as self._result_folder:
-            self._result = Choice(gui, "Result of")
-            self._words = Words(gui)
-            self._maps = Plot(gui)
-            self._model = Choice(gui, "Coloured in 3D by the error of")
-            self._legend = Words(gui)
-        with gui.add_folder("All results", visible=False) as self._table_folder:
-            self._table = Words(gui)
-            self._write = gui.add_button("Write table as CSV", icon=viser.Icon.TABLE_EXPORT, color="gray")
-            self._write.on_click(safely(lambda: operator.export("table")))
-            self._file = Words(gui)
         for choice in (self._result, self._model):
             choice.on_change(safely(self._refresh))
 
@@ -158,6 +161,7 @@ class Panel:
 
     def _draw_cloud(self, made: Any) -> None:
         cloud, model, shape = made
+        self._points = cloud.points
         limit = error_limit(list(cloud.errors.values()))
         rows, columns = cloud.thinned(120_000)
         painted = colours(cloud.errors[model][rows, columns], -limit, limit, "error")
