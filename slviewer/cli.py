@@ -361,6 +361,29 @@ def _bench(calibration: bool = False, scale: float = 1.0, json: Path | None = No
     print(result.text())
 
 
+@_deferred
+def _wizard(
+    session: Positional[Path | None] = None,
+    rig: str = "",
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    no_browser: bool = False,
+) -> None:
+    """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does the same.
+
+    Args:
+        session: Session folder, made if it does not exist; by default slviewer-session, here.
+        rig: simulated (half resolution), simulated:0.25 and the like, or a driver's name; by default the one that the
+            session remembers, else the simulated one.
+        host: Address to serve at; any other than the default lets others on the network try.
+        port: Port to serve at; 0 takes any free one.
+        no_browser: Print the address, and open no browser.
+    """
+    from slviewer.gui.app import run
+
+    run(session, rig, host, port, open_browser=not no_browser)
+
+
 def _union(commands: dict[str, Callable[..., Any]]) -> Any:
     choices = [Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)] for name, f in commands.items()]
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
@@ -382,6 +405,7 @@ _import.__annotations__["command"] = _union(
 )
 
 COMMANDS: dict[str, Callable[..., Any]] = {
+    "wizard": _wizard,
     "import": _import,
     "calibrate": _calibrate,
     "reconstruct": _reconstruct,
@@ -400,6 +424,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments:
+        arguments = ["wizard"]
     if arguments == ["--version"]:
         print(f"slviewer {__version__}")
         return 0

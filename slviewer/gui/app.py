@@ -52,8 +52,8 @@ class App:
     def _start(self) -> None:
         page, operator = self.server.viser, self.operator
         page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
-        page.initial_camera.position = (-350.0, -350.0, -500.0)
-        page.initial_camera.look_at = (0.0, 0.0, 450.0)
+        page.initial_camera.position = (-430.0, -310.0, -70.0)
+        page.initial_camera.look_at = (0.0, 0.0, 420.0)
         page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
         self._closing = False
         self._changed = threading.Event()

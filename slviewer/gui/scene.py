@@ -152,9 +152,13 @@ class Scene:
             translation_limits=limits,  # type: ignore[arg-type]
             depth_test=False,
         )
-        handle.on_update(lambda event: on_move(_matrix(event.target)))
-        if on_end is not None:
-            handle.on_drag_end(lambda event: on_end(_matrix(event.target)))
+
+        @handle.on_update
+        def _(event: Any) -> None:
+            on_move(_matrix(event.target))
+            if on_end is not None and event.phase == "end":
+                on_end(_matrix(event.target))
+
         self._set(layer, name, [handle])
 
     def move(self, layer: str, name: str, T: np.ndarray) -> None:

@@ -23,6 +23,7 @@ _ICONS = {
     "ready": viser.Icon.CIRCLE_DOTTED,
     "blocked": viser.Icon.LOCK,
 }
+_STEP_COLOURS = {"done": (211, 249, 216), "ready": (208, 235, 255), "blocked": (233, 236, 239)}
 _TITLES = {"info": "Note", "good": "Done", "warning": "Take care", "error": "This failed"}
 _COLOURS: dict[str, Any] = {"info": "blue", "good": "green", "warning": "orange", "error": "red"}
 _SECONDS = {"info": 5.0, "good": 5.0, "warning": 12.0, "error": 20.0}
@@ -38,9 +39,10 @@ class Shell:
     ) -> None:
         self._gui, self._stage = gui, stage
         self._devices = Devices(stage.scene)
-        self._panels = {step.key: _panel(step.key)(stage) for step in steps if _exists(step.key)}
+        self._panels = {step.key: _panel(step.key)(stage) for step in steps}
         self._drawn: Snapshot | None = None
         self._shown_key = ""
+        self._flown = ""
         self._wanted_key = next((s.key for s in steps if s.state != "done"), steps[0].key)
         gui.set_panel_label("slviewer")
         self._build_left(steps, ask_open)
@@ -77,6 +79,7 @@ class Shell:
             opens = gui.add_button("Open or make session", icon=viser.Icon.FOLDER_OPEN, color="gray")
             opens.on_click(stage.safely(lambda: ask_open(self._path.value)))
         with gui.add_folder("Messages", expand_by_default=True):
+            self._busy = Words(gui)
             self._latest = Words(gui)
 
     def _build_right(self) -> None:
@@ -103,9 +106,9 @@ class Shell:
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show this snapshot."""
+        self._follow(snapshot)
         key = self._wanted_key
-        turned = key != self._shown_key
-        if turned:
+        if key != self._shown_key:
             self._turn(key)
         self._draw_steps(snapshot)
         self._draw_heading(snapshot)
@@ -126,6 +129,13 @@ class Shell:
         """Whether another step was asked for since the last drawing."""
         return self._wanted_key != self._shown_key
 
+    def _follow(self, snapshot: Snapshot) -> None:
+        """Show the step that Autopilot is at, when it comes to another one."""
+        flown = flown_step(snapshot)
+        if flown != self._flown:
+            self._flown = flown
+            self.go(flown)
+
     def _turn(self, key: str) -> None:
         if self._shown_key:
             self._folders[self._shown_key].visible = False
@@ -139,8 +149,7 @@ class Shell:
             button = self._step_buttons[step.key]
             change(button, icon=_ICONS[step.state])
             here = step.key == self._shown_key
-            colour = None if here else {"done": "green", "ready": "gray", "blocked": "dark"}[step.state]
-            change(button, color=colour)
+            change(button, color=None if here else _STEP_COLOURS[step.state])
 
     def _draw_heading(self, snapshot: Snapshot) -> None:
         steps = list(snapshot.steps)
@@ -173,8 +182,6 @@ class Shell:
             says = f"{job.name}: {job.doing or 'begins'}{also} ({job.seconds:.0f} s)"
             parts.append(f"{cell(says)}{meter(job.share, 'info')}")
             can_cancel = can_cancel or job.can_cancel
-        elif job is not None:
-            parts.append(toned(f"In the background: {job.doing or job.name}", "dim"))
         self._job_says.set(
             block(Html("".join(f'<div style="margin-bottom:0.3em">{p}</div>' for p in parts))) if parts else ""
         )
@@ -198,7 +205,11 @@ class Shell:
         change(self._autopilot, label="Stop Autopilot" if snapshot.autopilot else "Autopilot")
         change(self._autopilot, color="red" if snapshot.autopilot else "teal")
         self._autopilot_says.set(boxed(snapshot.autopilot, "info") if snapshot.autopilot else "")
-        self._latest.set("".join(_notice(notice) for notice in reversed(snapshot.notices[-_KEPT:])))
+        latest = "".join(_notice(notice) for notice in reversed(snapshot.notices[-_KEPT:]))
+        job = snapshot.job
+        # here, since it comes and goes with every pose, and must not move what the operator is about to press
+        self._busy.say(f"{job.doing or job.name} …" if job is not None and job.background else "Idle", "dim")
+        self._latest.set(latest or block(toned("Nothing yet.", "dim")))
 
     # asking
 
@@ -213,6 +224,25 @@ class Shell:
             operator.cancel()
         else:
             operator.start_autopilot()
+
+
+def flown_step(snapshot: Snapshot) -> str:
+    """The step that Autopilot is at, told by what it has done so far; empty while it rests."""
+    session, world = snapshot.session, snapshot.world
+    if not snapshot.autopilot or session is None or world is None:
+        return ""
+    job = snapshot.job.name if snapshot.job is not None else ""
+    if not session.target:
+        return "target"
+    if job == "Calibrating":
+        return "calibrate"
+    if world.standing == "board":
+        return "poses" if session.calibration is None or session.calibration.stale else "calibrate"
+    if world.standing != "object":
+        return "verify"
+    if job.startswith("Export"):
+        return "export"
+    return "merge" if job.startswith("Merg") or session.merge is not None else "scan"
 
 
 def notify(client: viser.ClientHandle, level: str, text: str) -> None:
@@ -248,8 +278,3 @@ def _counted(n: int, what: str) -> str:
 def _notice(notice: Notice) -> str:
     time = toned(f"{notice.time:%H:%M}", "dim")
     return block(Html(f"{time} {toned(notice.text, _MARKS[notice.level])}"))  # type: ignore[arg-type]
-
-
-def _exists(key: str) -> bool:
-    import importlib.util
-    return importlib.util.find_spec(f"slviewer.gui.steps.{key}") is not None

@@ -9,9 +9,10 @@ from slviewer.gui.panel import Stage
 from slviewer.gui.preview import drawn as drawn_preview
 from slviewer.gui.preview import histogram_chart, legend, light_words
 from slviewer.gui.widgets import Html, Picture, Words, block, boxed, cell, toned
+from slviewer.simulation.rig import letter
 from slviewer.workflow.wizard.snapshot import PreviewView, RigView, Snapshot
 
-SIMULATED = {
+SIMULATED: dict[str, dict[str, Any]] = {
     "Simulated, half resolution": {"driver": "simulated", "scale": 0.5},
     "Simulated, full resolution": {"driver": "simulated", "scale": 1.0},
     "Simulated, quarter resolution": {"driver": "simulated", "scale": 0.25},
@@ -62,6 +63,7 @@ class Panel:
         if rig == self._drawn:
             return
         self._says.set(_described(rig))
+        change(self._choice, value=self._chosen(rig))
         open_now = rig.state == "open"
         for handle in (self._exposure, self._light):
             change(handle, disabled=not open_now)
@@ -85,6 +87,13 @@ class Panel:
 
     def shown(self, visible: bool) -> None:
         """Nothing of this step stands in the scene."""
+
+    def _chosen(self, rig: RigView) -> str:
+        """The choice that gave this rig, as far as it can be told."""
+        if rig.simulated and rig.camera is not None:
+            width, _ = letter().camera.size
+            return next((c for c, how in SIMULATED.items() if round(width * how["scale"]) == rig.camera[0]), _CHOOSE)
+        return next((c for c, how in self._choices.items() if how["driver"] == rig.name), _CHOOSE)
 
     def _choose(self, event: Any) -> None:
         if event.client is not None and self._choice.value in self._choices:
