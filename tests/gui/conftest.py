@@ -72,7 +72,7 @@ def _launched(playwright: Playwright) -> Browser:
         return why
     fetch = [_INSTALL]
     if shutil.which("apt-get") and hasattr(os, "geteuid") and os.geteuid() == 0:
-        fetch += [["apt-get", "install", "-y", "--no-install-recommends", "chromium"]]
+        fetch += [["apt-get", "update"], ["apt-get", "install", "-y", "--no-install-recommends", "chromium"]]
     for command in fetch:
         subprocess.run(command, capture_output=True, timeout=600, check=False)
         why = _tried(playwright)
