@@ -1,15 +1,23 @@
 """Export: what other programs can read, with its size, at one click."""
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import viser
 
 from slviewer.errors import SlviewerError
 from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.panel import Stage
+from slviewer.gui.pictures import Painter, opened
+from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, block, cell, link, table, toned
+from slviewer.workflow.wizard import looking
 from slviewer.workflow.wizard.snapshot import ExportView, SessionView, Snapshot
 
+LAYER = "export"
+LIST_PX = 330
+"""Height of the list of files, so that what writes others stays in view."""
 MERGED = "merged"
 CLOUD, MESH = "points, PLY", "mesh, "
 SHAPES = (CLOUD, *(f"{MESH}{kind}" for kind in ("PLY", "STL", "OBJ", "GLB")))
@@ -24,8 +32,12 @@ class Panel:
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
+        self._painter = Painter(stage.failed)
         self._merge = ""
         self._made: tuple[str, ...] = ()
+        self._clouds: dict[str, Any] = {}
+        self._points: np.ndarray | None = None
+        self._visible = False
 
     def build(self) -> None:
         gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
@@ -34,6 +46,7 @@ class Panel:
         with gui.add_folder("Cloud or mesh") as self._shape_folder:
             self._what = Choice(gui, "Of")
             self._shape = gui.add_dropdown("As", SHAPES)
+            bring_button(self._stage, lambda: self._points)
             self._hint = Words(gui)
             self._write = gui.add_button("Write file", icon=viser.Icon.FILE_EXPORT)
             self._write.on_click(safely(self._ask_shape))
@@ -70,6 +83,7 @@ class Panel:
         things += [(scan.name, titled(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"]
         self._what.offer(things)
         self._made = tuple(export.name for export in session.exports)
+        self._clouds = {scan.name: (scan.points, scan.model) for scan in session.scans}
         for button in (self._calibration, self._report):
             change(button, disabled=busy or not ready)
         change(self._write, disabled=busy or not things)
@@ -77,10 +91,12 @@ class Panel:
         self._say()
 
     def shown(self, visible: bool) -> None:
-        """Nothing of this step is in the scene."""
+        self._visible = visible
+        self._stage.scene.show(LAYER, visible)
 
     def _say(self) -> None:
-        """What the file will be, and whether it is there already."""
+        """What the file will be, whether it is there already, and how it looks."""
+        self._look()
         merged_points = self._what.value == MERGED and self._shape.value == CLOUD
         there = merged_points and f"merged_{self._merge}.ply" in self._made
         change(self._write, visible=not there)
@@ -94,6 +110,32 @@ class Panel:
             self._hint.say("Triangles between neighbouring pixels; depth jumps stay open.", "dim")
         else:
             self._hint.say("Every measured point in mm, with its colour.", "dim")
+
+    def _look(self) -> None:
+        """Show in 3D what would be written."""
+        name, merge, operator = self._what.value, self._merge, self._stage.operator
+        if not name:
+            self._painter.forget("cloud")
+            self._stage.scene.clear(LAYER)
+            return
+
+        def load() -> tuple[np.ndarray, np.ndarray | None]:
+            if name == MERGED:
+                whole = looking.merged_cloud(opened(operator), merge)
+                return whole.points, whole.colours
+            cloud = looking.scan_cloud(opened(operator), name)
+            rows, columns = cloud.thinned(120_000)
+            return cloud.points[rows, columns], cloud.texture[rows, columns]
+
+        self._painter.ask("cloud", (name, merge if name == MERGED else self._clouds.get(name)), load, self._draw_cloud)
+
+    def _draw_cloud(self, made: tuple[np.ndarray, np.ndarray | None]) -> None:
+        points, colours = made
+        if colours is not None and colours.shape != points.shape:  # grey
+            colours = np.repeat(colours[..., None], 3, axis=-1)
+        self._points = points
+        self._stage.scene.cloud(LAYER, "cloud", points, (150, 150, 150) if colours is None else colours)
+        self._stage.scene.show(LAYER, self._visible)
 
     def _ask_shape(self) -> None:
         name, shape = self._what.value, self._shape.value
@@ -117,7 +159,7 @@ class Panel:
             )
             for export in sorted(exports, key=_rank)
         ]
-        return table(("File", "size", ""), rows)
+        return Html(f'<div style="max-height:{LIST_PX}px;overflow-y:auto">{table(("File", "size", ""), rows)}</div>')
 
     def _link(self, export: ExportView) -> Html:
         try:

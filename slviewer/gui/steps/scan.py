@@ -11,6 +11,7 @@ from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened, spread
 from slviewer.gui.preview import drawn, legend, light_words
+from slviewer.gui.steps.verify import likely
 from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Picture, Words, block, cell, colour_bar, colours, table, thumbnail, toned
 from slviewer.gui.world import Stand
@@ -77,7 +78,7 @@ class Panel:
             change(self._capture_folder, visible=rig.state != "none")
             change(self._capture, disabled=not ready or rig.state != "open" or rig.capture is not None)
             self._stand.draw(snapshot)
-            scans = session.scans if session else ()
+            scans = ordered(session.scans) if session else []
             change(self._cloud_folder, visible=bool(scans))
             self._gallery.set(gallery(scans, self._scan.value))
             if session is None or not scans:
@@ -85,10 +86,10 @@ class Panel:
                 self._painter.forget("cloud")
                 return
             ready_made = [scan.name for scan in scans if scan.cloud != "absent"]
-            self._scan.offer([(scan.name, titled(scan.name, scan.label)) for scan in scans], (ready_made or [""])[-1])
+            self._scan.offer([(scan.name, titled(scan.name, scan.label)) for scan in scans], (ready_made or [""])[0])
             if new := [name for name in ready_made if name not in self._known]:
                 if self._known:  # just reconstructed: this is what the operator wants to see
-                    self._scan.choose(new[-1])
+                    self._scan.choose(new[0])
                 self._known = tuple(ready_made)
             models = session.calibration.models if session.calibration else ()
             self._model.offer(
@@ -112,12 +113,13 @@ class Panel:
             scan = self._snapshot.scan(self._scan.value) if self._snapshot else None
             if scan is None or self._snapshot is None:
                 return
+            session = self._snapshot.session
             busy = self._snapshot.job is not None and not self._snapshot.job.background
             change(
                 self._reconstruct, disabled=busy, label="Reconstruct" if scan.cloud == "absent" else "Reconstruct again"
             )
             self._words.set(scan_words(scan))
-            self._gallery.set(gallery(self._snapshot.session.scans if self._snapshot.session else (), scan.name))
+            self._gallery.set(gallery(ordered(session.scans) if session else (), scan.name))
             if scan.cloud == "absent":
                 self._painter.forget("cloud")
                 self._cloud = None
@@ -126,11 +128,8 @@ class Panel:
                 self._legend.set("")
                 self._point.set("")
                 return
-            verified = (
-                tuple(row.rms_mm for row in self._snapshot.session.verifications if row.capture == scan.name)
-                if self._snapshot.session
-                else ()
-            )
+            rows = session.verifications if session else ()
+            verified = tuple(row.rms_mm for row in rows if row.capture == scan.name)
             key = (scan.name, scan.model, scan.points, scan.noise_mm, verified)
             operator, colour = self._stage.operator, self._colour.value
 
@@ -223,6 +222,11 @@ def scan_words(scan: ScanView) -> Html:
     if scan.cloud == "stale":
         said = Html(said + block(toned("Made with an older calibration: reconstruct it again.", "warning")))
     return said
+
+
+def ordered(scans: Sequence[ScanView]) -> list[ScanView]:
+    """Scans of objects first, and what was captured to verify behind them; the newest of each first."""
+    return sorted(reversed(scans), key=lambda scan: likely(scan) != "scan")
 
 
 def gallery(scans: Sequence[ScanView], chosen: str) -> Html:
