@@ -108,6 +108,7 @@ class Acquisition:
         with self._condition:
             self._requests.clear()
             self._cancel = self._view.capture is not None
+        self._changed()
 
     @property
     def idle(self) -> bool:

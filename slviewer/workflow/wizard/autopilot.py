@@ -43,7 +43,6 @@ class Autopilot:
         self._poses, self._pause_s = poses, pause_s
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._fly, name="slviewer autopilot", daemon=True)
-        self.problem = ""
 
     @property
     def running(self) -> bool:
@@ -60,8 +59,11 @@ class Autopilot:
     def _fly(self) -> None:
         try:
             self.run()
+            self._operator.tell("good", "autopilot has played the whole wizard: every step is done")
+        except Cancelled:
+            self._operator.tell("info", "autopilot has stopped")
         except SlviewerError as error:
-            self.problem = str(error)
+            self._operator.tell("error", f"autopilot gave up: {error}")
 
     def run(self) -> None:
         """Fly on this thread. Raises Cancelled when stopped, SlviewerError with the notice where an act failed."""

@@ -81,8 +81,11 @@ class Engine:
         """The open session. Raises SessionError where none is open."""
         return self.reader.session
 
-    def open_session(self, path: Path | str) -> None:
-        """Open another session; jobs of the one before are cancelled."""
+    def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
+        """Open another session, with `rig`, else the one that it remembers, else the one in use.
+
+        Jobs of the session before are cancelled.
+        """
         with self.lock:
             if not self.acquisition.idle:
                 raise InputError("a capture is on its way: wait for it, or cancel it, before another session is opened")
@@ -94,11 +97,11 @@ class Engine:
             self._reader, self._session_view, self._queued = Reader(store), None, set()
             if before is not None:
                 before.close()
-            remembered = store.decision("rig")
-            if self._choice is not None:
+            choice = rig or store.decision("rig")
+            if choice and choice != self._choice:
+                self.use_rig(choice)
+            elif self._choice is not None:
                 store.decide("rig", dict(self._choice))
-            elif remembered:
-                self.use_rig(remembered)
             self.board_changed()
 
     def use_rig(self, choice: Choice) -> None:
@@ -106,14 +109,18 @@ class Engine:
         with self.lock:
             store = self.session
             bench = self._set_up(choice, self._board())
-            exposure = store.decision("exposure") if store and store.decision("rig") == dict(choice) else None
-            self._choice, self.bench = dict(choice), bench
-            self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
-            if store is not None:
+            if store is not None and store.decision("rig") != dict(choice):
                 store.decide("rig", dict(choice))
+                store.decide("exposure", None)  # that of another camera says nothing
+            exposure = store.decision("exposure") if store is not None else None
+            self._choice, self.bench, self.preview = dict(choice), bench, None
+            self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
 
     def board_changed(self) -> None:
-        """Look for the board that is now the target, and judge the poses by it."""
+        """Look for the board that is now the target, stand it before a simulated rig, and judge the poses by it."""
+        board, world = self._board(), self.bench.world if self.bench else None
+        if board is not None and world is not None and board != world.board:
+            world.print_board(board)
         self._watch()
         self.queue_unfinished()
 

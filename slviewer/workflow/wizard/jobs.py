@@ -146,6 +146,7 @@ class Jobs:
                 self._condition.notify_all()
             elif self._waiting:
                 self._notices.tell("info", f"{self._waiting.popleft().name}: cancelled")
+        self._changed()
 
     def cancel_all(self) -> None:
         """Cancel what runs and forget what waits, background work too."""
@@ -193,6 +194,8 @@ class Jobs:
             with self._condition:
                 self._running = None
                 self._condition.notify_all()
+            self._changed()
+            with self._condition:
                 self._condition.wait_for(lambda: self._closing or self._waiting or self._waiting_behind)
                 if self._closing:
                     return
@@ -204,7 +207,6 @@ class Jobs:
                 self._run(job)
             except Exception as error:  # whatever it was, the worker lives on
                 self._notices.fail(job.name, error)
-            self._changed()
 
     def _run(self, job: _Job) -> None:
         thread = threading.Thread(target=self._work, args=(job,), name=f"slviewer: {job.name}", daemon=True)

@@ -28,7 +28,7 @@ from slviewer.workflow.wizard.engine import Engine
 from slviewer.workflow.wizard.exporting import FORMATS, Kind, check_export, export_file
 from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.rigs import Choice, SetUp, set_up
-from slviewer.workflow.wizard.snapshot import PreviewView, Snapshot
+from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
 from slviewer.workflow.wizard.taking import sequence_for_poses, take_pose, take_scan
 from slviewer.workflow.wizard.watching import HandsFree
 
@@ -64,10 +64,10 @@ class Operator:
         """Opens `session`, made where it is missing, and `rig`, by default the one that the session remembers."""
         self._engine = Engine(set_up, self.capture_pose)
         self._autopilot: Autopilot | None = None
-        if rig is not None:
-            self.choose_rig(rig)
         if session is not None:
-            self.open_session(session)
+            self.open_session(session, rig)
+        elif rig is not None:
+            self.choose_rig(rig)
 
     def __enter__(self) -> "Operator":
         return self
@@ -125,9 +125,9 @@ class Operator:
     # session and rig
 
     @_request("Opening the session")
-    def open_session(self, path: Path | str) -> None:
-        """Open a session for writing, or make one; jobs of the one before are cancelled."""
-        self._engine.open_session(path)
+    def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
+        """Open a session for writing, or make one, with `rig`, else the one that it remembers, else the one in use."""
+        self._engine.open_session(path, rig)
 
     @_request("Choosing the rig")
     def choose_rig(self, choice: Choice) -> None:
@@ -157,11 +157,13 @@ class Operator:
         """The board that will be held before the rig; poses that were captured are judged by it anew."""
         board, engine = Board.parse(notation), self._engine
         with engine.lock:
-            store, world = engine.store, engine.bench.world if engine.bench else None
-            if world is not None and board != world.board:
-                world.print_board(board)
-            store.decide("target", str(board))
-            engine.board_changed()
+            before = engine.reader.target()
+            engine.store.decide("target", str(board))
+            try:
+                engine.board_changed()
+            except InputError:  # a board that the simulated rig cannot show
+                engine.store.decide("target", before)
+                raise
 
     @_request("Choosing the patterns")
     def choose_patterns(self, name: str) -> None:
@@ -327,6 +329,8 @@ class Operator:
         store, view = self._engine.store, self._engine.teller.now().session
         check_export(kind, file_format or FORMATS.get(kind, ("",))[0])
         chosen = file_format or FORMATS[kind][0]
+        if kind in ("cloud", "mesh"):
+            store.load_capture(name)
         if kind == "merged mesh":
             if view is None or view.merge is None:
                 raise InputError("there is no merge yet: merge scans first")
@@ -373,6 +377,10 @@ class Operator:
                 raise InputError("autopilot is flying already")
             self._autopilot = Autopilot(self, self._autopilot_says, poses=poses, pause_s=pause_s)
             self._autopilot.start()
+
+    def tell(self, level: Level, text: str) -> None:
+        """Put a sentence of the caller's own among the notices."""
+        self._engine.notices.tell(level, text)
 
     def close(self) -> None:
         """Stop everything and let the session go; what was captured is saved already."""

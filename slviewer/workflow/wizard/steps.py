@@ -12,6 +12,8 @@ from slviewer.session.atomic import megabytes
 from slviewer.workflow.models import POSES_FOR_PIXELWISE
 from slviewer.workflow.wizard.snapshot import RigView, SessionView, Space, StepView
 
+COVERED, MANY_POSES = 0.75, 15
+"""Share of the coverage's goal, or number of poses, from which on the poses are enough."""
 Brightness = Literal["", "saturated", "dim"]
 
 
@@ -120,8 +122,12 @@ def _poses_blocked(facts: Facts) -> str:
 
 
 def _poses_done(facts: Facts) -> bool:
-    covered = facts.session is not None and facts.session.coverage is not None and facts.session.coverage.share > 0.9
-    return facts.good_poses >= POSES_FOR_PIXELWISE and (covered or facts.rig.state == "none")
+    covered = (
+        facts.session is not None and facts.session.coverage is not None and facts.session.coverage.share > COVERED
+    )
+    # cells that the projector never reaches cannot be covered: many poses are enough too
+    enough = covered or facts.good_poses >= MANY_POSES or facts.rig.state == "none"
+    return facts.good_poses >= POSES_FOR_PIXELWISE and enough
 
 
 def _poses_now(facts: Facts) -> str:

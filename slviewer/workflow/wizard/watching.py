@@ -1,12 +1,14 @@
 """What the latest preview frame shows: the board, how bright it is, and whether anything moves.
 
-One thread looks; frames that come while it is busy replace one another, so that what is seen is always now.
+One thread makes previews and another looks for the board, which takes longer, above all where there is none. For both,
+frames that come while they are busy replace one another, so that what is seen is always now.
 """
 
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -20,12 +22,14 @@ from slviewer.target.planar import fit_homography, to_image
 from slviewer.workflow.wizard.notices import log
 from slviewer.workflow.wizard.snapshot import BoardSeen, PreviewView
 
+Item = TypeVar("Item")
+
 SEARCH_PX = 800
 """Longest side of the image in which the board is looked for, and which panels show."""
 BINS = 64
 STILL_PX = 0.004
 """A board whose features move less than this share of the image's width between two looks is held still."""
-_REST = 1.0  # times as long as a look took is rested after it: half of one core at most
+_REST = 2.0  # a search for the board is followed by a rest so many times as long: a third of one core at most
 
 
 @dataclass(frozen=True)
@@ -36,32 +40,22 @@ class Watch:
     lens: Lens | None = None
 
 
-class Watcher:
-    """Looks at frames; `seen(view)` is called on its thread for each one it looked at."""
+class Latest(Generic[Item]):
+    """A thread that does `work(item)` for the latest item it was offered, and forgets those that came before."""
 
-    def __init__(self, seen: Callable[[PreviewView], None]) -> None:
-        self._seen = seen
+    def __init__(self, name: str, work: Callable[[Item], None], rest: float = 0.0) -> None:
+        self._work, self._rest = work, rest
         self._condition = threading.Condition()
-        self._frame: np.ndarray | None = None
-        self._watch = Watch()
+        self._item: Item | None = None
         self._closing = False
-        self._number = 0
-        self._stillness = Stillness()
-        self._rate = 0.0
-        self._last = 0.0
-        self._thread = threading.Thread(target=self._serve, name="slviewer watcher", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
         self._thread.start()
 
-    def offer(self, frame: np.ndarray) -> None:
-        """Look at `frame` (h, w) next, instead of any that was not looked at yet."""
+    def offer(self, item: Item) -> None:
+        """Work on this next, instead of any that was not begun yet."""
         with self._condition:
-            self._frame = frame
+            self._item = item
             self._condition.notify_all()
-
-    def look_for(self, watch: Watch) -> None:
-        """Look for another board from now on."""
-        with self._condition:
-            self._watch = watch
 
     def close(self) -> None:
         """End the thread."""
@@ -73,41 +67,72 @@ class Watcher:
     def _serve(self) -> None:
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: self._closing or self._frame is not None)
+                self._condition.wait_for(lambda: self._closing or self._item is not None)
                 if self._closing:
                     return
-                frame, watch = self._frame, self._watch
-                self._frame = None
-            assert frame is not None
+                item, self._item = self._item, None
+            assert item is not None
             begun = time.monotonic()
             try:
-                self._look(frame, watch, begun)
+                self._work(item)
             except Exception:  # a frame that cannot be looked at must not end the preview
                 log.exception("a preview frame could not be looked at")
             with self._condition:
-                self._condition.wait_for(lambda: self._closing, _REST * (time.monotonic() - begun))
+                self._condition.wait_for(lambda: self._closing, self._rest * (time.monotonic() - begun))
 
-    def _look(self, frame: np.ndarray, watch: Watch, now: float) -> None:
+
+class Watcher:
+    """Looks at frames; `seen(view)` is called, on one thread, for each one it looked at."""
+
+    def __init__(self, seen: Callable[[PreviewView], None]) -> None:
+        self._seen = seen
+        self._watch = Watch()
+        self._found: tuple[Watch, BoardSeen | None, str] = (self._watch, None, "")
+        self._stillness = Stillness()
+        self._number, self._rate, self._last = 0, 0.0, 0.0
+        self._finder = Latest("slviewer board finder", self._find, _REST)
+        self._viewer = Latest("slviewer watcher", self._look)
+
+    def offer(self, frame: np.ndarray) -> None:
+        """Look at `frame` (h, w) next, instead of any that was not looked at yet."""
+        self._viewer.offer(frame)
+
+    def look_for(self, watch: Watch) -> None:
+        """Look for another board from now on."""
+        self._watch = watch
+
+    def close(self) -> None:
+        """End both threads."""
+        self._viewer.close()
+        self._finder.close()
+
+    def _look(self, frame: np.ndarray) -> None:
+        now = time.monotonic()
         image, scale = reduced(frame)
-        found, missing = find(watch.board, image)
-        board = None
-        if found is not None and watch.board is not None:
-            # centres of reduced pixels to those of the camera's
-            found = Detection((found.pixels + 0.5) / scale - 0.5, found.ids)
-            still = self._stillness.of(found.pixels, STILL_PX * frame.shape[1], now)
-            board = board_seen(watch.board, found, still, watch.lens)
-        else:
-            self._stillness.lose()
+        if self._watch.board is not None:
+            self._finder.offer((image, scale, now))
         if self._last:
             self._rate += 0.2 * (1 / max(now - self._last, 1e-3) - self._rate)
         self._last = now
         self._number += 1
-        saturated, brightest, histogram = brightness(frame)
-        self._seen(
-            PreviewView(
-                self._number, image, scale, saturated, brightest, histogram, board, missing, None, round(self._rate, 1)
-            )
-        )
+        watch, board, missing = self._found
+        if watch.board != self._watch.board:
+            board, missing = None, ""
+        rate = round(self._rate, 1)
+        self._seen(PreviewView(self._number, image, scale, *brightness(frame), board, missing, None, rate))
+
+    def _find(self, item: tuple[np.ndarray, float, float]) -> None:
+        image, scale, taken = item
+        watch, board = self._watch, None
+        found, missing = find(watch.board, image)
+        if found is not None and watch.board is not None:
+            # centres of reduced pixels to those of the camera's
+            found = Detection((found.pixels + 0.5) / scale - 0.5, found.ids)
+            still = self._stillness.of(found.pixels, STILL_PX * image.shape[1] / scale, taken)
+            board = board_seen(watch.board, found, still, watch.lens)
+        else:
+            self._stillness.lose()
+        self._found = (watch, board, missing)
 
 
 class Stillness:

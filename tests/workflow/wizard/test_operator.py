@@ -1,5 +1,7 @@
 """Requests and what becomes of them, on a small simulated rig: faults, resuming, decisions, hands-free."""
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +19,7 @@ from slviewer.workflow.wizard.snapshot import Snapshot
 
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
 TARGET = "circles:21x16:9"
+ROOT = Path(__file__).parents[3]
 
 
 class Breakable:
@@ -133,6 +136,33 @@ def test_a_device_that_fails_leaves_no_half_capture(operator: Operator, rigs: Br
     assert states(operator.settle()) == {"pose_01": "good"}
 
 
+def test_a_capture_that_is_killed_leaves_every_earlier_pose(tmp_path: Path) -> None:
+    code = f"""
+from slviewer.workflow.wizard.operator import Operator
+operator = Operator({str(tmp_path / "session")!r}, {RIG!r})
+operator.choose_target({TARGET!r})
+operator.wait_for(lambda s: s.rig.state == "open", 20)
+operator.place_at_suggestion()
+operator.capture_pose()
+operator.settle()
+operator.choose_patterns("p18")
+operator.subscribe(lambda s: print(s.rig.capture.frame if s.rig.capture else "", flush=True))
+operator.capture_pose()
+operator.settle()
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert process.stdout is not None
+    assert any(line.strip().isdecimal() and int(line) > 3 for line in process.stdout)
+    process.kill()
+    process.wait()
+    with Operator(tmp_path / "session") as operator:
+        opened(operator)
+        survived = states(operator.settle())
+        assert survived["pose_01"] == "good" and set(survived) <= {"pose_01", "pose_02"}
+        assert operator.capture_pose()
+        assert set(states(operator.settle()).values()) == {"good"}
+
+
 def test_hands_free_captures_a_board_that_is_held_still(operator: Operator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watching.HandsFree, "HOLD_S", 0.2)
     monkeypatch.setattr(watching.HandsFree, "COUNT_S", 0.3)
@@ -156,6 +186,8 @@ def test_a_session_is_opened_for_one_operator_and_changed_for_another(operator: 
     Session.open(tmp_path / "session", write=True).close()
     view = operator.settle()
     assert view.session is not None and view.session.target == "" and view.rig.state == "open"
+    assert operator.session.decision("rig") == RIG
+    assert not operator.choose_target("charuco:8x6:30") and "ChArUco" in last(operator.settle())
     assert not operator.capture_pose() and "choose the target first" in last(operator.settle())
     assert not operator.capture_scan() and "calibrate first" in last(operator.settle())
     assert not operator.calibrate() and not operator.undo_merge() and not operator.verify(["x"], "plane")
