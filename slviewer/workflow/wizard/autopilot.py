@@ -78,7 +78,7 @@ class Autopilot:
 
     def _prepare(self) -> None:
         operator = self._operator
-        if not operator.snapshot().rig.simulated:
+        if not self._settled().rig.simulated:
             self._act("Choosing the simulated rig", lambda: operator.choose_rig(RIG))
         if operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is None:
             raise SlviewerError("the simulated rig does not open")

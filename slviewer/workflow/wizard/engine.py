@@ -5,6 +5,7 @@ Requests (`operator`) and captures (`taking`) reach in here; panels do not.
 
 import shutil
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -60,6 +61,7 @@ class Engine:
         self.jobs = Jobs(self.notices, self.teller.changed)
         self.watcher = Watcher(self._seen)
         self.acquisition = Acquisition(self.notices, self.teller.changed, self.watcher.offer)
+        self.teller.start()
 
     # session and rig
 
@@ -198,9 +200,9 @@ class Engine:
     def _seen(self, view: PreviewView) -> None:
         """A preview was looked at (on the watcher's thread)."""
         hands_free = self.hands_free
-        if hands_free is not None and view.board is not None:
-            countdown = hands_free.countdown(view.board, busy=not self.acquisition.idle)
-            if countdown is not None and countdown <= 0:
+        if hands_free is not None:
+            countdown = hands_free.countdown(view.board, not self.acquisition.idle, time.monotonic())
+            if countdown is not None and countdown <= 0 and view.board is not None:
                 hands_free.took(view.board)
                 self._capture_now()
             else:

@@ -25,6 +25,9 @@ class Teller:
         self._latest = first
         self._listeners: dict[int, Callable[[Snapshot], None]] = {}
         self._thread = threading.Thread(target=self._serve, name="slviewer teller", daemon=True)
+
+    def start(self) -> None:
+        """Begin to make snapshots: once everything is there that `make` looks at."""
         self._thread.start()
 
     def changed(self, session: bool = False) -> None:

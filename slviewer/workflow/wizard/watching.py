@@ -207,16 +207,20 @@ class HandsFree:
 
     def __init__(self) -> None:
         self._taken: np.ndarray | None = None
+        self._begun: float | None = None
 
-    def countdown(self, board: BoardSeen | None, busy: bool) -> float | None:
+    def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
         """Seconds until the capture, 0 or less: now; None where none is coming."""
         if board is None or busy or board.still_s < self.HOLD_S or self._same(board.outline):
+            self._begun = None
             return None
-        return self.HOLD_S + self.COUNT_S - board.still_s
+        if self._begun is None:
+            self._begun = now
+        return self.COUNT_S - (now - self._begun)
 
     def took(self, board: BoardSeen) -> None:
         """The board was captured here; wait until it has been moved away."""
-        self._taken = board.outline
+        self._taken, self._begun = board.outline, None
 
     def _same(self, outline: np.ndarray) -> bool:
         if self._taken is None:

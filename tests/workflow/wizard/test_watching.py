@@ -100,10 +100,15 @@ def test_stillness_starts_anew_with_every_movement() -> None:
 
 def test_hands_free_counts_down_once_a_place() -> None:
     hands_free = HandsFree()
-    assert hands_free.countdown(None, False) is None and hands_free.countdown(seen(0.5), False) is None
-    assert hands_free.countdown(seen(1.25), False) == pytest.approx(0.75)
-    assert hands_free.countdown(seen(1.25), busy=True) is None
-    assert hands_free.countdown(seen(2.1), False) < 0
-    hands_free.took(seen(2.1))
-    assert hands_free.countdown(seen(5), False) is None
-    assert hands_free.countdown(seen(1.5, shift=30), False) == pytest.approx(0.5)
+    assert hands_free.countdown(None, False, 0) is None and hands_free.countdown(seen(0.5), False, 0) is None
+    assert hands_free.countdown(seen(7), False, 1.0) == 1.0  # a slow look skips no countdown
+    assert hands_free.countdown(seen(7.25), False, 1.25) == pytest.approx(0.75)
+    assert hands_free.countdown(seen(0.1), False, 1.5) is None  # moved: it begins anew
+    assert hands_free.countdown(seen(1.25), False, 3.0) == 1.0
+    assert hands_free.countdown(seen(1.25), True, 3.5) is None
+    assert hands_free.countdown(seen(1.5), False, 4.0) == 1.0
+    last = hands_free.countdown(seen(2.6), False, 5.1)
+    assert last is not None and last < 0
+    hands_free.took(seen(2.6))
+    assert hands_free.countdown(seen(5), False, 7.0) is None
+    assert hands_free.countdown(seen(1.5, shift=30), False, 8.0) == 1.0
