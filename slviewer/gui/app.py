@@ -52,12 +52,16 @@ class App:
     def _start(self) -> None:
         page, operator = self.server.viser, self.operator
         page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
-        page.initial_camera.position = (-430.0, -310.0, -70.0)
-        page.initial_camera.look_at = (0.0, 0.0, 420.0)
+        # the camera to the right, what it sees to the left: both in view beside the panels of a small screen
+        page.initial_camera.position = (-810.0, -430.0, -150.0)
+        page.initial_camera.look_at = (40.0, 20.0, 290.0)
+        page.initial_camera.fov = 0.75
         page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
         self._closing = False
         self._changed = threading.Event()
         self._offers: dict[Path, str] = {}
+        self._folder: Path | None = None
+        self._problem = ""
         self._stage = Stage(
             page.gui, Scene(page.scene), operator, self._offer, self._tell, escape, self._go, self._failed
         )
@@ -86,12 +90,19 @@ class App:
                 version, number = self._draw(version, number)
             except Exception as error:
                 version = -1
-                self._failed(error)
+                if repr(error) != self._problem:  # it is tried again, and need not be told again
+                    self._problem = repr(error)
+                    self._failed(error)
                 time.sleep(1.0)
             time.sleep(max(0.0, 1 / DRAWN_PER_S - (time.monotonic() - begun)))
 
     def _draw(self, version: int, number: int) -> tuple[int, int]:
         snapshot, preview = self.operator.snapshot(), self.operator.preview()
+        folder = snapshot.session.folder if snapshot.session else None
+        if folder != self._folder:
+            self._folder = folder
+            self._offers.clear()
+            self.server.downloads.clear()
         if snapshot.version != version or self.shell.due:
             with self.server.viser.atomic():
                 self.shell.draw(snapshot)

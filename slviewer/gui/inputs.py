@@ -15,6 +15,22 @@ def change(handle: Any, **values: Any) -> None:
             setattr(handle, name, value)
 
 
+class Follows:
+    """Sets a handle's value when the session's changes, and only then: what somebody has just entered and is still on
+    its way must not be overwritten by a snapshot that is a moment older.
+    """
+
+    def __init__(self, handle: Any) -> None:
+        self._handle = handle
+        self._told: Any = None
+
+    def tell(self, value: Any) -> None:
+        """The session says so now."""
+        if value != self._told:
+            self._told = value
+            change(self._handle, value=value)
+
+
 def titled(name: str, label: str) -> str:
     """How a capture is called in a list: by its label, and by its name too where these differ."""
     return name if label == name else f"{label} ({name})"

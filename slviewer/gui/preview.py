@@ -54,7 +54,10 @@ def board_words(preview: PreviewView, board: Board | None) -> Html:
 def legend(preview: PreviewView, *words: Html) -> Html:
     """Lines below the picture, the frame rate beside the first."""
     rate = toned(f"{preview.frames_per_s:.0f} pictures/s", "dim")
-    first = f'<div style="display:flex;justify-content:space-between;gap:1em"><span>{words[0]}</span>{rate}</div>'
+    first = (
+        '<div style="display:flex;justify-content:space-between;gap:1em">'
+        f'<span>{words[0]}</span><span style="white-space:nowrap">{rate}</span></div>'
+    )
     return block(Html(first + "".join(f"<div>{word}</div>" for word in words[1:])))
 
 

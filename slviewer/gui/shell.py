@@ -240,9 +240,10 @@ def flown_step(snapshot: Snapshot) -> str:
         return "poses" if session.calibration is None or session.calibration.stale else "calibrate"
     if world.standing != "object":
         return "verify"
-    if job.startswith("Export"):
-        return "export"
-    return "merge" if job.startswith("Merg") or session.merge is not None else "scan"
+    if job.startswith("Merg"):
+        return "merge"
+    latest = next((scan.name for scan in reversed(session.scans) if scan.purpose == "scan"), "")
+    return "export" if session.merge is not None and latest in session.merge.scans else "scan"
 
 
 def notify(client: viser.ClientHandle, level: str, text: str) -> None:

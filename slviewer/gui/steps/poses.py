@@ -7,7 +7,7 @@ import numpy as np
 import viser
 
 from slviewer.gui.coverage import coverage_chart
-from slviewer.gui.inputs import Choice, change
+from slviewer.gui.inputs import Choice, Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.pose_list import PoseBoards, pose_table
 from slviewer.gui.preview import board_words, drawn, legend, light_words
@@ -46,6 +46,7 @@ class Panel:
         self._boards = PoseBoards(stage.scene, LAYER, self._select)
         self._picture = Picture(gui)
         self._counts = Words(gui)
+        self._stands = Words(gui)
         self._place = gui.add_button("Place at suggestion", icon=viser.Icon.TARGET_ARROW, color="cyan", visible=False)
         self._place.on_click(stage.safely(operator.place_at_suggestion))
         self._capture = gui.add_button("Capture pose", icon=viser.Icon.CAMERA, hint="Key: C")
@@ -53,14 +54,17 @@ class Panel:
         self._key = gui.add_command("Capture pose", hotkey="C", icon=viser.Icon.CAMERA, disabled=True)
         self._key.on_trigger(stage.safely(operator.capture_pose))
         self._hands_free = gui.add_checkbox("Hands-free", False, hint="Captures when the board is held still")
+        self._follows = Follows(self._hands_free)
         self._hands_free.on_update(stage.safely_with(self._switch))
+        how = "Hands-free captures by itself when the board is held still; the key C captures too."
+        Words(gui).say(how, "dim")
         self._coverage = Words(gui)
         with gui.add_folder("Captured poses"):
             self._table = Words(gui)
             self._chosen = Choice(gui, "Pose")
             self._chosen.on_change(stage.safely(self._another))
             self._detail = Words(gui)
-            self._acts = gui.add_button_group("With it", ("Exclude", "Include", "Retake", "Delete"))
+            self._acts = gui.add_button_group("This pose", ("Exclude", "Include", "Retake", "Delete"))
             self._acts.on_click(stage.safely(lambda: self._act(self._acts.value)))
         self._sound = Sound(gui)
 
@@ -74,7 +78,7 @@ class Panel:
         change(self._capture, disabled=snapshot.rig.state != "open" or self._board is None)
         change(self._place, visible=snapshot.world is not None)
         change(self._place, disabled=session is None or session.suggestion is None)
-        change(self._hands_free, value=snapshot.hands_free)
+        self._follows.tell(snapshot.hands_free)
         self._draw_world(snapshot)
         if session is self._session:
             return
@@ -131,6 +135,8 @@ class Panel:
     def _draw_world(self, snapshot: Snapshot) -> None:
         """The simulated board and its handle."""
         world, scene = snapshot.world, self._stage.scene
+        other = "" if world is None or world.standing == "board" else world.standing
+        self._stands.say(other and f"The {other} stands before the rig: place the board at the suggestion.", "warning")
         if world is None or world.standing != "board" or self._board is None:
             if self._world is not None:
                 scene.clear(WORLD)

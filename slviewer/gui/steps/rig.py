@@ -4,7 +4,7 @@ import time
 from typing import Any
 
 from slviewer.devices.drivers import available
-from slviewer.gui.inputs import change
+from slviewer.gui.inputs import Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.preview import drawn as drawn_preview
 from slviewer.gui.preview import histogram_chart, legend, light_words
@@ -55,6 +55,7 @@ class Panel:
         step = gui.add_button_group("Brightness", ("Darker", "Brighter"))
         step.on_click(stage.safely(lambda: self._step(step.value)))
         self._light = gui.add_dropdown("Projector shows", tuple(LIGHTS))
+        self._choice_follows, self._light_follows = Follows(self._choice), Follows(self._light)
         self._light.on_update(stage.safely_with(self._shine))
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -63,7 +64,7 @@ class Panel:
         if rig == self._drawn:
             return
         self._says.set(_described(rig))
-        change(self._choice, value=self._chosen(rig))
+        self._choice_follows.tell(self._chosen(rig))
         open_now = rig.state == "open"
         for handle in (self._exposure, self._light):
             change(handle, disabled=not open_now)
@@ -74,7 +75,7 @@ class Panel:
                 change(self._exposure, value=round(rig.exposure_ms, 2))
         shows = next((words for words, light in LIGHTS.items() if light == rig.light), None)
         if shows is not None:
-            change(self._light, value=shows)
+            self._light_follows.tell(shows)
         if not open_now:
             self._picture.hide()
             self._histogram.set("")

@@ -1,5 +1,6 @@
 """Step 2: say which board there is, print it, and see it found."""
 
+from pathlib import Path
 from typing import Any
 
 import viser
@@ -36,6 +37,7 @@ class Panel:
         self._stage = stage
         self._target = ""
         self._board: Board | None = None
+        self._folder: Path | None = None
 
     def build(self) -> None:
         """The board's fields, its sheet, and the picture in which it is found."""
@@ -59,6 +61,10 @@ class Panel:
     def draw(self, snapshot: Snapshot) -> None:
         """The session's board, in the fields too."""
         target = snapshot.session.target if snapshot.session else ""
+        folder = snapshot.session.folder if snapshot.session else None
+        if folder != self._folder:
+            self._folder = folder
+            self._sheet.set("")
         if target != self._target:
             self._target = target
             self._board = Board.parse(target) if target else None
@@ -104,6 +110,7 @@ class Panel:
         corners = board.outline()
         width, height = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
         what = f"{_COUNTED[board.kind]}: {width:.0f} × {height:.0f} mm"
+        change(self._use, disabled=str(board) == self._target)
         if str(board) == self._target:
             state = toned(f"● in use: {board}", "good", bold=True)
         else:
