@@ -30,5 +30,5 @@ def _bring(event: Any, points: np.ndarray | None) -> None:
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     camera = event.client.camera
     with event.client.atomic():
+        camera.position = tuple(middle + _FROM * max(1.45 * size, 50.0))  # which moves the point looked at along
         camera.look_at = tuple(middle)
-        camera.position = tuple(middle + _FROM * max(1.15 * size, 50.0))
