@@ -68,6 +68,7 @@ class Autopilot:
     def run(self) -> None:
         """Fly on this thread. Raises Cancelled when stopped, SlviewerError with the notice where an act failed."""
         try:
+            self._says("Getting ready")
             self._prepare()
             self._calibrate()
             self._verify()
