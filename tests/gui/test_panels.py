@@ -1,0 +1,196 @@
+"""From a calibration to a file: the panels that measure, in a browser, over a recorded session."""
+
+import re
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from wizard_page import SIZE, Opened, button, field
+
+from slviewer.gui.app import App
+from slviewer.gui.pictures import Painter, spread
+from slviewer.gui.steps.scan import ordered, painting, point_words
+from slviewer.gui.steps.verify import distances_table, likely, results_table
+from slviewer.reconstruction.ply import read_ply
+from slviewer.workflow.calibrating import calibrate
+from slviewer.workflow.simulating import simulate
+from slviewer.workflow.wizard.looking import ScanCloud
+from slviewer.workflow.wizard.operator import Operator
+from slviewer.workflow.wizard.snapshot import CentreDistance, ScanView, VerificationRow
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "session"
+    simulate(folder, scale=0.25, poses=8)
+    calibrate(folder, "circles:21x16:9")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def measured(recorded: Path, browser: Browser) -> Iterator[tuple[Page, Operator, list[str]]]:
+    """A page on the recorded session, without a rig."""
+    with Operator(recorded) as engine:
+        wizard = App(engine, port=0)
+        page = browser.new_page(viewport=SIZE)
+        page.set_default_timeout(20_000)
+        found = Opened(page)
+        page.goto(wizard.server.url)
+        button(page, "1. Rig").wait_for()
+        yield page, engine, found.errors
+        page.close()
+        wizard.close()
+
+
+def choose(page: Page, label: str, option: str) -> None:
+    field(page, label).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def test_a_calibration_shows_its_poses_and_what_a_pixel_learnt(measured: tuple[Page, Operator, list[str]]) -> None:
+    page, _, errors = measured
+    button(page, "4. Calibrate").click()
+    expect(page.get_by_text("reprojection RMS, camera")).to_be_visible()
+    expect(page.get_by_text("Reprojection error of each target pose.")).to_be_visible()
+    choose(page, "Pose", "pose_02")
+    expect(page.get_by_text("pose_02, camera: measured minus predicted features")).to_be_visible()
+    choose(page, "Arrows of", "projector")
+    expect(page.get_by_text("pose_02, projector: measured minus predicted features")).to_be_visible()
+    expect(page.get_by_text(re.compile(r"What camera pixel \(\d+, \d+\) learnt from"))).to_be_visible()
+    field(page, "Pixel column u").fill("150")
+    field(page, "Pixel row v").fill("120")
+    expect(page.get_by_text("What camera pixel (150, 120) learnt from")).to_be_visible()
+    field(page, "Pixel row v").fill("0")
+    expect(page.get_by_text("Pixel (150, 0) saw the board too rarely")).to_be_visible()
+
+    button(page, "Exclude pose_02").click()
+    expect(button(page, "Include pose_02 again")).to_be_visible()
+    expect(page.get_by_text("It is excluded now").first).to_be_visible()
+    button(page, "Include pose_02 again").click()
+    expect(button(page, "Exclude pose_02")).to_be_visible()
+    page.get_by_text("Parameters", exact=True).click()
+    expect(page.get_by_text("angle between the axes")).to_be_visible()
+    assert errors == []
+
+
+def test_a_plane_is_measured_and_its_table_written(measured: tuple[Page, Operator, list[str]]) -> None:
+    page, _, errors = measured
+    button(page, "5. Verify").click()
+    choose(page, "Capture", "plane_03")
+    button(page, "Measure as plane").click()
+    expect(page.get_by_text("errors on one colour scale, red is towards the camera")).to_be_visible(timeout=40_000)
+    choose(page, "Capture", "sphere_3")
+    button(page, "Measure as sphere").click()
+    expect(page.get_by_text("errors on one colour scale, red is outwards")).to_be_visible(timeout=40_000)
+    expect(page.get_by_text("error by pixelwise, red is outwards")).to_be_visible()
+    button(page, "Write table as CSV").click()
+    with page.expect_download() as download:
+        page.get_by_text("Download verifications.csv").click()
+    lines = Path(download.value.path()).read_text().splitlines()
+    assert lines[0].startswith("capture,name,shape,model,rms_mm") and len(lines) == 5
+    assert errors == []
+
+
+def test_scans_are_reconstructed_asked_merged_and_exported(
+    measured: tuple[Page, Operator, list[str]], tmp_path: Path
+) -> None:
+    page, operator, errors = measured
+    button(page, "6. Scan").click()
+    for name in ("object_r1", "object_r2"):
+        choose(page, "Scan", name)
+        button(page, "Reconstruct").click()
+        assert operator.wait_for(lambda s, name=name: s.scan(name).cloud == "fresh", 40.0)  # type: ignore[misc]
+    expect(page.get_by_text(re.compile("points drawn; the file holds all"))).to_be_visible()
+    button(page, "Bring into view").click()
+    choose(page, "Colour by", "depth")
+    expect(page.get_by_text(re.compile(r"^\d+\.\d mm$")).first).to_be_visible()
+    page.wait_for_timeout(1000)
+    page.mouse.click(590, 420)  # right of where notifications stand
+    expect(page.get_by_text("absolute phase, axis x")).to_be_visible()
+    field(page, "New name").fill("Lion <b>1</b>")
+    button(page, "Rename scan").click()
+    expect(page.get_by_text("Lion <b>1</b> (object_r2)").first).to_be_visible()
+
+    button(page, "7. Merge").click()
+    button(page, "Merge 2 scans").click()
+    expect(page.get_by_text(re.compile("in the place of"))).to_be_visible(timeout=60_000)
+    choose(page, "Show in 3D", "before, coloured by scan")
+
+    button(page, "8. Export").click()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download").first.click()
+    download.value.save_as(tmp_path / "merged.ply")
+    merged = read_ply(tmp_path / "merged.ply")
+    snapshot = operator.snapshot()
+    assert snapshot.session is not None and snapshot.session.merge is not None
+    assert len(merged.points) == snapshot.session.merge.points and np.isfinite(merged.points).all()
+    button(page, "Write calibration").click()
+    expect(page.get_by_text("calibration.yml").first).to_be_visible()
+
+    button(page, "7. Merge").click()
+    button(page, "Undo this merge").click()
+    expect(button(page, "Undo this merge")).to_be_hidden()
+    assert errors == []
+
+
+def test_a_painter_draws_the_last_wish_and_survives_failures() -> None:
+    failures: list[BaseException] = []
+    painter = Painter(failures.append)
+    begun, go, done = threading.Event(), threading.Event(), threading.Event()
+    shown: list[object] = []
+
+    def slow() -> str:
+        begun.set()
+        go.wait(5)
+        return "old"
+
+    painter.ask("place", 1, slow, shown.append)
+    assert begun.wait(5)
+    painter.ask("place", 2, lambda: 1 / 0, shown.append)
+    painter.ask("place", 3, lambda: "new", shown.append)
+    painter.ask("place", 3, lambda: "the same again", shown.append)
+    painter.ask("broken", 1, lambda: 1 / 0, shown.append)
+    painter.ask("last", 1, lambda: "last", lambda made: (shown.append(made), done.set()))
+    go.set()
+    assert done.wait(5)
+    assert shown == ["new", "last"] and [type(f) for f in failures] == [ZeroDivisionError]
+
+
+def test_what_a_capture_was_taken_for() -> None:
+    def scan(name: str, purpose: str = "scan") -> ScanView:
+        return ScanView(name, name, purpose, "", "fresh", "stereo", 1, None, None, b"")  # type: ignore[arg-type]
+
+    assert [likely(scan(n)) for n in ("plane_01", "sphere_2", "object_r1")] == ["plane", "sphere", "scan"]
+    assert likely(scan("scan_01", "plane")) == "plane"
+    names = [s.name for s in ordered([scan("a"), scan("plane_1"), scan("b")])]
+    assert names == ["b", "a", "plane_1"]
+
+
+def test_tables_escape_names_and_mark_the_best() -> None:
+    def row(model: str, rms: float, shape: str = "plane", radius: float | None = None) -> VerificationRow:
+        return VerificationRow(
+            "c1", "<img src=x>", shape, model, rms, 0.03, radius, 100, 1, 0.99, {"R1": 0, "R2": 90, "R3": 10}, False
+        )  # type: ignore[arg-type]
+
+    html = results_table([row("stereo", 0.2), row("pixelwise", 0.1)])
+    assert "<img" not in html and html.index("0&#46;200") < html.index("0&#46;100")
+    assert re.search(r"font-weight:600\">0&#46;100", html) and "0&#47;90&#47;10" in html
+    assert "97&#46;90" in results_table([row("stereo", 0.2, "sphere", 97.9)])
+    assert distances_table([CentreDistance(("a", "b"), "stereo", 12.5)]).count("12&#46;500") == 1
+    assert distances_table([]) == results_table([]) == ""
+
+
+def test_a_cloud_is_painted_by_what_is_asked() -> None:
+    points = np.full((4, 5, 3), np.nan, np.float32)
+    points[1:, 1:] = np.stack(np.broadcast_arrays(0.0, 1.0, np.linspace(500, 600, 4)), axis=-1)
+    flat = np.ones((4, 5), np.float32)
+    cloud = ScanCloud("a", "stereo", "x", points, flat, flat, flat, np.full((4, 5), 7, np.uint8), {})
+    painted, words = painting(cloud, "depth")
+    assert painted.shape == (4, 5, 3) and len(np.unique(painted[1], axis=0)) == 5 and "mm" in words
+    assert painting(cloud, "texture")[0][0, 0].tolist() == [7, 7, 7]
+    assert "measure this capture" in painting(cloud, "error")[1].replace("&#32;", " ")
+    assert "600&#46;000" in point_words(cloud, 4, 2)
+    assert spread(np.array([np.nan])) == (0.0, 1.0)
