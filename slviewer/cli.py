@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Union
 import tyro
 from tyro.conf import Positional
 
-from slviewer import __version__
+from slviewer import __version__, terminal
 from slviewer.errors import Cancelled, SlviewerError
 
 Axis = Literal["x", "y"]
@@ -356,7 +356,7 @@ def _bench(calibration: bool = False, scale: float = 1.0, json: Path | None = No
     """
     from slviewer.workflow import bench
 
-    result = bench(calibration=calibration, scale=scale, progress=_progress)
+    result = bench(calibration=calibration, scale=scale, progress=terminal.progress)
     _write_json(json, result.to_json())
     print(result.text())
 
@@ -447,19 +447,16 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         run()
     except SlviewerError as error:
-        _clear_progress()
-        print(f"slviewer: {error}", file=sys.stderr)
+        terminal.say(f"slviewer: {error}")
         return error.exit_status
     except KeyboardInterrupt:
-        _clear_progress()
-        print("slviewer: cancelled", file=sys.stderr)
+        terminal.say("slviewer: cancelled")
         return Cancelled.exit_status
     except BrokenPipeError:
         return 1
     except OSError as error:
-        _clear_progress()
         where = f" ({error.filename})" if error.filename else ""
-        print(f"slviewer: {error.strerror or error}{where}", file=sys.stderr)
+        terminal.say(f"slviewer: {error.strerror or error}{where}")
         return 1
     return 0
 
@@ -476,29 +473,8 @@ def _write_json(path: Path | None, data: dict[str, Any]) -> None:
 
 def _ui() -> dict[str, Any]:
     """Callbacks for progress and warnings on standard error."""
-    return {"progress": _progress, "warn": _warn}
-
-
-def _progress(done: float, doing: str) -> None:
-    """One line, redrawn in place on a terminal; silent elsewhere."""
-    if sys.stderr.isatty():
-        end = "\n" if done >= 1 else ""
-        print(f"\r\033[K{100 * done:3.0f} % {doing}", end=end, file=sys.stderr, flush=True)
-
-
-def _clear_progress() -> None:
-    if sys.stderr.isatty():
-        print("\r\033[K", end="", file=sys.stderr)
-
-
-def _warn(message: str) -> None:
-    _clear_progress()
-    print(f"warning: {message}", file=sys.stderr)
-
-
-def _entry() -> None:
-    sys.exit(main())
+    return {"progress": terminal.progress, "warn": terminal.warn}
 
 
 if __name__ == "__main__":
-    _entry()
+    sys.exit(main())

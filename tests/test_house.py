@@ -24,6 +24,7 @@ ROOMS = [
     "workflow",
     "server",
     "gui",
+    "terminal",
     "cli",
 ]
 STRANGERS = [
