@@ -54,7 +54,7 @@ class App:
         page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
         # the camera to the right, what it sees to the left: both in view beside the panels of a small screen
         page.initial_camera.position = (-700.0, -450.0, -520.0)
-        page.initial_camera.look_at = (30.0, 30.0, 340.0)
+        page.initial_camera.look_at = (65.0, 30.0, 335.0)
         page.initial_camera.fov = 0.75
         page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
         self._closing = False

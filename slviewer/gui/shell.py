@@ -28,7 +28,7 @@ _TITLES = {"info": "Note", "good": "Done", "warning": "Take care", "error": "Thi
 _COLOURS: dict[str, Any] = {"info": "blue", "good": "green", "warning": "orange", "error": "red"}
 _SECONDS = {"info": 5.0, "good": 5.0, "warning": 12.0, "error": 20.0}
 _MARKS = {"info": "plain", "good": "good", "warning": "warning", "error": "error"}
-_KEPT = 4  # of the latest notices, in the panel
+_KEPT = 12  # of the latest notices, in the panel
 
 
 class Shell:
@@ -131,8 +131,9 @@ class Shell:
 
     def _follow(self, snapshot: Snapshot) -> None:
         """Show the step that Autopilot is at, when it comes to another one."""
-        flown = flown_step(snapshot)
-        if flown != self._flown:
+        flown, keys = flown_step(snapshot), ["", *self._panels]
+        onward = keys.index(flown) > keys.index(self._flown)  # between two of its acts it may seem to step back
+        if flown != self._flown and (onward or not flown):
             self._flown = flown
             self.go(flown)
 
@@ -209,7 +210,9 @@ class Shell:
         job = snapshot.job
         # here, since it comes and goes with every pose, and must not move what the operator is about to press
         self._busy.say(f"{job.doing or job.name} …" if job is not None and job.background else "Idle", "dim")
-        self._latest.set(latest or block(toned("Nothing yet.", "dim")))
+        # as high as a small screen leaves, so that the panel itself does not scroll
+        style = "max-height:max(6em, calc(100vh - 625px));overflow-y:auto"
+        self._latest.set(f'<div style="{style}">{latest or block(toned("Nothing yet.", "dim"))}</div>')
 
     # asking
 

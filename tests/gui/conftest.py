@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Error, Playwright, sync_playwright
+from playwright.sync_api import Browser, Error, Playwright, expect, sync_playwright
 from wizard_page import SIZE, Opened, button
 
 from slviewer.gui.app import App
@@ -26,6 +26,9 @@ _FLAGS = [
 ]
 _SYSTEM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _INSTALL = [sys.executable, "-m", "playwright", "install", "chromium"]
+
+
+expect.set_options(timeout=20_000)  # a browser that draws in software beside the wizard's own work has its pauses
 
 
 @pytest.fixture(scope="session")
