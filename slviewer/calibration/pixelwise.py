@@ -47,10 +47,12 @@ class PixelFit:
 class PixelwiseModel:
     """The Letter's calibration: a rational function of the phase for each camera pixel and captured axis.
 
-    ``planes`` are the ideal planes of the target poses (eq. 12), reconstructed from ``depth_axis``.
+    ``periods_px`` is the fringe period that the coefficients' phase counts in; a capture of another period is
+    converted to it. ``planes`` are the ideal planes of the target poses (eq. 12), reconstructed from ``depth_axis``.
     """
 
     fits: Mapping[Axis, PixelFit]
+    periods_px: Mapping[Axis, float]
     planes: Mapping[str, Plane]
     depth_axis: Axis
 
@@ -64,14 +66,16 @@ class PixelwiseModel:
         """(h, w, 3) float32 mm; NaN where the phase is invalid, unfitted, or too far from the fitted range."""
         fit = self.fits[phase.axis]
         out = np.empty((*phase.phase.shape, 3), np.float32)
-        _evaluate(phase.phase, fit.coefficients, fit.phase_min, fit.phase_max, REACH, out)
+        ratio = phase.period_px / self.periods_px[phase.axis]
+        _evaluate(phase.phase, ratio, fit.coefficients, fit.phase_min, fit.phase_max, REACH, out)
         return out
 
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
         """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``."""
         c0, c1, c2 = self.fits[phase.axis].coefficients[:3]
-        per_rad = np.abs(c1 - c0 * c2) / (1 + c2 * phase.phase) ** 2
-        return (per_rad * phase.sigma_phase).astype(np.float32)
+        ratio = phase.period_px / self.periods_px[phase.axis]
+        per_rad = np.abs(c1 - c0 * c2) / (1 + c2 * (ratio * phase.phase)) ** 2
+        return (per_rad * ratio * phase.sigma_phase).astype(np.float32)
 
     def median_rms_mm(self, axis: Axis) -> dict[str, float]:
         """The fit's median RMS over the pixels, in z, x and y."""
@@ -86,15 +90,15 @@ class PixelwiseModel:
     def to_dict(self) -> dict[str, Any]:
         """What is not an image, JSON-able."""
         planes = {name: [*plane.normal.tolist(), plane.offset] for name, plane in self.planes.items()}
-        return {"axes": list(self.fits), "planes": planes, "depth_axis": self.depth_axis}
+        return {"periods_px": dict(self.periods_px), "planes": planes, "depth_axis": self.depth_axis}
 
     @classmethod
     def restored(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "PixelwiseModel":
         """The inverse of ``to_dict`` and ``to_arrays``."""
         keys = PixelFit.__annotations__
-        fits = {axis: PixelFit(**{key: arrays[f"{axis}_{key}"] for key in keys}) for axis in data["axes"]}
+        fits = {axis: PixelFit(**{key: arrays[f"{axis}_{key}"] for key in keys}) for axis in data["periods_px"]}
         planes = {name: Plane(np.array(values[:3]), values[3]) for name, values in data["planes"].items()}
-        return cls(fits, planes, data["depth_axis"])
+        return cls(fits, data["periods_px"], planes, data["depth_axis"])
 
 
 def calibrate_pixelwise(
@@ -116,8 +120,9 @@ def calibrate_pixelwise(
     z_ref = mid_depth(stereo)
     width, height = used[0].size
     axes = [axis for axis in stereo.axes if all(axis in o.surfaces for o in used)]
+    periods = {axis: used[0].periods_px[axis] for axis in axes}
     moments = {
-        axis: RationalMoments(_reference_phase(stereo, axis, used[0].periods_px[axis], z_ref), z_ref) for axis in axes
+        axis: RationalMoments(_reference_phase(stereo, axis, period, z_ref), z_ref) for axis, period in periods.items()
     }
     rays = _RayMoments((height, width))
     total, done = 2 * len(used), 0
@@ -128,7 +133,7 @@ def calibrate_pixelwise(
             points = ideal_points(o, stereo, depth_axis, phases[depth_axis], planes[o.name])
             for axis in axes:
                 add = moments[axis].add_refinement if refine else moments[axis].add
-                add(phases[axis], points[..., 2], origin)
+                add(phases[axis] * (o.periods_px[axis] / periods[axis]), points[..., 2], origin)
             if not refine:
                 rays.add(points, origin)
             done += 1
@@ -143,13 +148,16 @@ def calibrate_pixelwise(
         )
     c3, c4, rms_x, rms_y = rays.solve(MIN_POSES)
     fits = {axis: _pixel_fit(m, c3, c4, rms_x, rms_y) for axis, m in moments.items()}
-    return PixelwiseModel(fits, planes, depth_axis)
+    return PixelwiseModel(fits, periods, planes, depth_axis)
 
 
 def pixel_samples(
     observations: Sequence[Observation], stereo: StereoModel, model: PixelwiseModel, axis: Axis, pixel: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What one pixel (u, v) was fitted to: phase (n,) rad and ideal points (n, 3) mm, one of each pose that it saw."""
+    """What one pixel (u, v) was fitted to: phase (n,) rad and ideal points (n, 3) mm, one of each pose that it saw.
+
+    The phase counts in the model's ``periods_px``.
+    """
     u, v = pixel
     phases, points = [], []
     for o in observations:
@@ -161,7 +169,8 @@ def pixel_samples(
         X = triangulate_pixels(stereo.rig, np.array([[u, v]], float), coordinate, model.depth_axis)[0]
         plane = model.planes[o.name]
         points.append(X - (X @ plane.normal - plane.offset) * plane.normal)
-        phases.append(float(o.surfaces[axis].evaluate(np.array([u]), np.array([v]))[0]))
+        phase = float(o.surfaces[axis].evaluate(np.array([u]), np.array([v]))[0])
+        phases.append(phase * o.periods_px[axis] / model.periods_px[axis])
     return np.array(phases), np.array(points).reshape(-1, 3)
 
 
@@ -265,10 +274,10 @@ def _add_rays(points, v0, u0, sums):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def _evaluate(phase, c, phase_min, phase_max, reach, out):  # type: ignore[no-untyped-def]
+def _evaluate(phase, ratio, c, phase_min, phase_max, reach, out):  # type: ignore[no-untyped-def]
     for v in prange(phase.shape[0]):
         for u in range(phase.shape[1]):
-            p = np.float64(phase[v, u])
+            p = ratio * np.float64(phase[v, u])
             margin = reach * (phase_max[v, u] - phase_min[v, u])
             denominator = 1.0 + c[2, v, u] * p
             z = (c[0, v, u] + c[1, v, u] * p) / denominator

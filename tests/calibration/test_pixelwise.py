@@ -79,6 +79,15 @@ def test_predicted_noise_is_the_measured_one(model: PixelwiseModel) -> None:
     assert np.nanstd(ratio) == pytest.approx(1.0, abs=0.02)
 
 
+def test_a_capture_of_another_fringe_period_measures_the_same(model: PixelwiseModel) -> None:
+    phase, _ = phase_of_plane(600.0)
+    finer = PhaseMap(**{**vars(phase), "period_px": 12.0, "phase": (phase.phase * 1.5).astype(np.float32)})
+    clean = model.points(phase)
+    assert np.nanmax(np.abs(model.points(finer) - clean)) < 1e-3
+    # the same error in phase is two thirds of the error in projector px
+    assert np.nanmedian(model.sigma_z(finer, clean) / model.sigma_z(phase, clean)) == pytest.approx(2 / 3, rel=1e-3)
+
+
 def test_it_survives_saving(model: PixelwiseModel) -> None:
     again = PixelwiseModel.restored(model.to_dict(), model.to_arrays())
     phase, _ = phase_of_plane(600.0)
