@@ -226,4 +226,4 @@ class HandsFree:
         if self._taken is None:
             return False
         size = np.linalg.norm(np.ptp(outline, axis=0))
-        return bool(np.abs(outline - self._taken).max() < 0.08 * size)
+        return bool(np.abs(outline - self._taken).max() < 0.03 * size)
