@@ -86,6 +86,12 @@ class SimulatedWorld:
         """Where the thing that stands there is; a sphere's is not turned."""
         return _pose(self.scene)
 
+    @property
+    def turn_deg(self) -> float:
+        """By how much it is turned about the vertical."""
+        R = self.pose.R
+        return float(np.degrees(np.arctan2(R[0, 2], R[2, 2])))
+
     def print_board(self, board: Board, shape: Shape = FLAT) -> None:
         """Take another board, its middle on the camera's axis; it does not replace what stands before the rig.
 
@@ -111,6 +117,17 @@ class SimulatedWorld:
                 scene = _placed(scene, pose)
             self._standing = thing
             self._put(thing, scene)
+
+    def bring(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
+        """Move what stands there along its ray from the camera to a distance in z, turn it so far about the vertical;
+        None leaves one as it is.
+        """
+        with self._lock:
+            pose = self.pose
+            t = pose.t if distance_mm is None else pose.t * distance_mm / pose.t[2]
+            more = 0.0 if turn_deg is None else np.radians(turn_deg - self.turn_deg)
+            R = np.array([[np.cos(more), 0, np.sin(more)], [0, 1, 0], [-np.sin(more), 0, np.cos(more)]])
+            self.place(self._standing, Pose(R @ pose.R, t))
 
     def renderer(self, preview: bool) -> Renderer:
         """Of what stands there now: in full, or a draft for a preview while things move, (h, w) at a smaller scale."""

@@ -1,11 +1,11 @@
 """What stands before the simulated rig, where there is one: chosen, brought to a distance, and turned."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from slviewer.gui.inputs import change
+from slviewer.gui.inputs import Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.widgets import Words
 from slviewer.workflow.wizard.snapshot import Snapshot
@@ -34,9 +34,11 @@ class Stand:
                 hint="Distance from the camera; or drag it in the 3D view",
             )
             self._turn = gui.add_number("Turned, °", 0.0, min=-90.0, max=90.0, step=5.0)
+        self._drawn = [Follows(each) for each in (self._thing, self._distance, self._turn)]
         self._thing.on_update(stage.safely_with(self._choose))
-        self._distance.on_update(stage.safely_with(self._bring))
-        self._turn.on_update(stage.safely_with(self._bring))
+        bring = stage.operator.bring
+        self._distance.on_update(stage.safely_with(_typed(lambda: bring(distance_mm=self._distance.value))))
+        self._turn.on_update(stage.safely_with(_typed(lambda: bring(turn_deg=self._turn.value))))
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show what stands there."""
@@ -50,7 +52,6 @@ class Stand:
         self._says.say(
             "" if fits else f"The {world.standing} stands before the rig: choose what to capture instead.", "warning"
         )
-        change(self._thing, value=world.standing if fits else "something else")
         for number in (self._distance, self._turn):
             change(number, disabled=not fits)
         T = np.asarray(world.T_camera_thing, float)
@@ -61,8 +62,13 @@ class Stand:
         elif not np.array_equal(T, self._T):
             self._stage.scene.move(self._layer, _GIZMO, T)
         self._standing, self._T = world.standing if fits else "", T
-        change(self._distance, value=round(float(np.clip(T[2, 3], NEAREST_MM, FARTHEST_MM)), 1))
-        change(self._turn, value=round(float(np.clip(_turn_deg(T), -90, 90)), 1))
+        drawn = (
+            world.standing if fits else "something else",
+            round(float(np.clip(T[2, 3], NEAREST_MM, FARTHEST_MM)), 1),
+            round(float(np.clip(world.turn_deg, -90, 90)), 1),
+        )
+        for follows, value in zip(self._drawn, drawn, strict=True):
+            follows.tell(value)
 
     def _place(self, T: np.ndarray) -> None:
         self._stage.safely(lambda: self._stage.operator.place(self._standing, T))(None)
@@ -71,21 +77,7 @@ class Stand:
         if event.client_id is not None and self._thing.value in self._things:
             self._stage.operator.place(self._thing.value)
 
-    def _bring(self, event: Any) -> None:
-        if event.client_id is None or not self._standing:  # not typed by anybody, but drawn
-            return
-        T = self._T.copy()
-        T[:3, 3] *= self._distance.value / T[2, 3]  # along the ray from the camera: what is in view stays in view
-        T[:3, :3] = _turned(np.radians(self._turn.value - _turn_deg(T))) @ T[:3, :3]
-        self._stage.operator.place(self._standing, T)
 
-
-def _turn_deg(T: np.ndarray) -> float:
-    """By how much a thing is turned about the vertical."""
-    return float(np.degrees(np.arctan2(T[0, 2], T[2, 2])))
-
-
-def _turned(angle: float) -> np.ndarray:
-    """(3, 3) about y by `angle` rad."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+def _typed(do: Callable[[], Any]) -> Callable[[Any], None]:
+    """Do it where somebody changed an input; not where it was drawn."""
+    return lambda event: do() if event.client_id is not None else None

@@ -1,8 +1,12 @@
 """The wizard's page as a person finds their way in it: by what stands there to be read."""
 
-from playwright.sync_api import ConsoleMessage, Locator, Page
+import re
+
+from playwright.sync_api import ConsoleMessage, Locator, Page, expect
 
 SIZE = {"width": 1280, "height": 800}
+PATIENCE_MS = 60_000
+"""For what is computed, on a machine that is busy with other things."""
 
 
 class Opened:
@@ -27,3 +31,22 @@ def button(page: Page, name: str) -> Locator:
 def field(page: Page, label: str) -> Locator:
     """The input beside this label: viser's labels are text, without a tie to their input."""
     return page.locator(f"xpath=//*[normalize-space(text())='{label}']/following::input[1]")
+
+
+def choose(page: Page, label: str, option: str) -> None:
+    """Choose an option of the dropdown beside this label."""
+    field(page, label).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def pose_row(page: Page, name: str, state: str) -> Locator:
+    """The line of the list of poses that says what became of this one."""
+    return page.locator("div", has_text=re.compile(rf"^{name}\s+{state}")).first
+
+
+def capture_pose(page: Page, name: str) -> None:
+    """Put the simulated board where it is asked for, and capture it as this pose, which must be good."""
+    expect(button(page, "Place at suggestion")).to_be_enabled()
+    button(page, "Place at suggestion").click()
+    button(page, "Capture pose").click()
+    expect(pose_row(page, name, "good")).to_be_visible(timeout=PATIENCE_MS)

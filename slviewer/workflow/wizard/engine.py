@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
@@ -82,6 +83,14 @@ class Engine:
     def store(self) -> Session:
         """The open session. Raises SessionError where none is open."""
         return self.reader.session
+
+    @property
+    def world(self) -> SimulatedWorld:
+        """What stands before the simulated rig. Raises InputError where the rig is a real one."""
+        world = self.bench.world if self.bench else None
+        if world is None:
+            raise InputError("only the simulated rig's things can be placed: choose it in the step Rig")
+        return world
 
     def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
         """Open another session, with `rig`, else the one that it remembers, else the one in use.
@@ -231,7 +240,7 @@ class Engine:
         if bench is not None and bench.world is not None:
             T, pose = np.eye(4), bench.world.pose
             T[:3, :3], T[:3, 3] = pose.R, pose.t
-            world = WorldView(bench.world.standing, T)
+            world = WorldView(bench.world.standing, T, bench.world.turn_deg)
         return Snapshot(
             version=version,
             session=session,

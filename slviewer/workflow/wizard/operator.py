@@ -175,13 +175,15 @@ class Operator:
     @_request("Placing")
     def place(self, thing: Thing, T_camera_thing: np.ndarray | None = None) -> None:
         """Put "board", "plane", "sphere" or "object" before the simulated rig, at T_camera_thing or where it was."""
-        world = self._engine.bench.world if self._engine.bench else None
-        if world is None:
-            raise InputError("only the simulated rig's things can be placed: choose it in the step Rig")
         T = None if T_camera_thing is None else np.asarray(T_camera_thing, float)
         if T is not None and T.shape != (4, 4):
             raise InputError(f"a pose of shape {T.shape} places nothing: give (4, 4)")
-        world.place(thing, None if T is None else Pose(T[:3, :3].copy(), T[:3, 3].copy()))
+        self._engine.world.place(thing, None if T is None else Pose(T[:3, :3].copy(), T[:3, 3].copy()))
+
+    @_request("Placing")
+    def bring(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
+        """Move what stands before the simulated rig to a distance on its ray; turn it so far about the vertical."""
+        self._engine.world.bring(distance_mm, turn_deg)
 
     def place_board(self, T_camera_board: np.ndarray) -> bool:
         """Put the simulated board there."""

@@ -204,10 +204,11 @@ class Space:
 
 @dataclass(frozen=True, eq=False)
 class WorldView:
-    """The simulated world: what stands there, and its T_camera_thing (4, 4) mm."""
+    """The simulated world: what stands there, its T_camera_thing (4, 4) mm, and its turn about the vertical."""
 
     standing: Literal["board", "plane", "sphere", "object"]
     T_camera_thing: np.ndarray
+    turn_deg: float
 
 
 @dataclass(frozen=True, eq=False)

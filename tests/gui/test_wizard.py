@@ -1,0 +1,284 @@
+"""The whole wizard, as someone works with it: to a file that others can read, watched, killed, and with bad cables."""
+
+import logging
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from playwright.sync_api import Browser, Page, expect
+from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose, field, pose_row
+
+from slviewer.devices.faults import Faults, breakable
+from slviewer.gui.app import App
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.workflow.wizard.operator import Operator
+from slviewer.workflow.wizard.rigs import Bench, Choice, set_up
+from slviewer.workflow.wizard.snapshot import SessionView
+
+TARGET = "circles:21x16:9"
+RIG = {"driver": "simulated", "scale": 0.25}
+PATIENCE_S = PATIENCE_MS / 1000
+DEPTHS_MM = (560, 600, 640)
+
+
+def visit(browser: Browser, url: str) -> Opened:
+    """A browser of its own on this address, ready."""
+    page = browser.new_context(viewport=SIZE).new_page()  # type: ignore[arg-type]
+    page.set_default_timeout(20_000)
+    found = Opened(page)
+    page.goto(url)
+    button(page, "1. Rig").wait_for()
+    return found
+
+
+def stand(page: Page, thing: str) -> None:
+    """Let another thing stand before the simulated rig."""
+    choose(page, "Before the rig", thing)
+    expect(field(page, "Before the rig")).to_have_value(thing)
+    expect(page.get_by_text("stands before the rig: choose what to capture instead")).to_be_hidden()
+
+
+def complaints(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [r.getMessage() for r in caplog.records if r.levelno >= logging.ERROR]
+
+
+# the journey
+
+
+@pytest.fixture
+def bare(tmp_path: Path) -> Iterator[Operator]:
+    """A new session, and no rig yet."""
+    with Operator(tmp_path / "session") as engine:
+        yield engine
+
+
+def test_from_an_unknown_rig_to_a_merged_cloud(
+    bare: Operator, browser: Browser, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    app = App(bare, port=0)
+    opened = visit(browser, app.server.url)
+    page = opened.page
+    try:
+        choose(page, "Rig", "Simulated, quarter resolution")
+        expect(page.get_by_text(re.compile("camera 400 × 300 px"))).to_be_visible()
+        button(page, "2. Target").click()
+        button(page, "Use this board").click()
+        expect(page.get_by_text(f"in use: {TARGET}")).to_be_visible()
+
+        button(page, "Continue to Poses").click()
+        for number in range(1, 9):
+            if number == 5:
+                page.reload()
+                expect(pose_row(page, "pose_04", "good")).to_be_visible()
+            capture_pose(page, f"pose_{number:02d}")
+        expect(page.get_by_text("8 poses, 0 scans")).to_be_visible()
+
+        button(page, "4. Calibrate").click()
+        page.get_by_role("button", name="Calibrate", exact=True).click()
+        expect(page.get_by_text("reprojection RMS, camera")).to_be_visible(timeout=PATIENCE_MS)
+        calibration = session_of(bare).calibration
+        assert calibration is not None and not calibration.stale
+
+        verify(page, bare)
+        scan(page, bare)
+        merge(page, bare)
+        take_home(page, bare, tmp_path)
+        assert [n.text for n in bare.snapshot().notices if n.level == "error"] == []
+        assert complaints(caplog) == [] and opened.errors == []
+    finally:
+        page.context.close()
+        app.close()
+
+
+def verify(page: Page, operator: Operator) -> None:
+    """A plane and a sphere, each within what the simulated camera's noise lets one expect."""
+    button(page, "5. Verify").click()
+    for shape, sign in (("plane", "towards the camera"), ("sphere", "outwards")):
+        stand(page, shape)
+        button(page, f"Capture {shape}").click()
+        expect(page.get_by_text(f"errors on one colour scale, red is {sign}")).to_be_visible(timeout=PATIENCE_MS)
+    rows = session_of(operator).verifications
+    assert {(row.shape, row.model) for row in rows} >= {("plane", "stereo"), ("sphere", "stereo")}
+    print([(row.shape, row.model, row.rms_mm, row.noise_floor_mm, row.radius_mm) for row in rows])
+
+
+def scan(page: Page, operator: Operator) -> None:
+    """The object at three depths."""
+    button(page, "6. Scan").click()
+    stand(page, "object")
+    for number, depth in enumerate(DEPTHS_MM, 1):
+        field(page, "At, mm").fill(str(depth))
+        assert operator.wait_for(lambda s, z=depth: abs(s.world.T_camera_thing[2, 3] - z) < 0.5, PATIENCE_S)  # type: ignore[misc, union-attr]
+        button(page, "Capture scan").click()
+        name = f"scan_{number:02d}"
+        assert operator.wait_for(lambda s, n=name: (v := s.scan(n)) is not None and v.cloud == "fresh", PATIENCE_S)  # type: ignore[misc]
+        expect(page.get_by_text(name).first).to_be_visible()
+    expect(page.get_by_text("8 poses, 5 scans")).to_be_visible()
+
+
+def merge(page: Page, operator: Operator) -> None:
+    """All three in the place of the last, by as much as they were moved."""
+    button(page, "7. Merge").click()
+    button(page, "Merge 3 scans").click()
+    expect(page.get_by_text(re.compile("in the place of"))).to_be_visible(timeout=PATIENCE_MS)
+    merged = session_of(operator).merge
+    assert merged is not None and merged.reference == "scan_03" and set(merged.pairs) == {"scan_01", "scan_02"}
+    for name, depth in zip(("scan_01", "scan_02"), DEPTHS_MM, strict=False):
+        rms, overlap, T = merged.pairs[name]
+        print(name, rms, overlap, T)
+
+
+def take_home(page: Page, operator: Operator, folder: Path) -> None:
+    """The merged cloud, as another program reads it."""
+    button(page, "8. Export").click()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download").first.click()
+    assert download.value.suggested_filename.endswith(".ply")
+    download.value.save_as(folder / "home.ply")
+    cloud = trimesh.load(folder / "home.ply")
+    merged = session_of(operator).merge
+    assert merged is not None and isinstance(cloud, trimesh.PointCloud)
+    assert len(cloud.vertices) == merged.points and np.isfinite(cloud.vertices).all()
+    print(cloud.bounds, len(cloud.vertices), cloud.colors[:3])
+
+
+def session_of(operator: Operator) -> SessionView:
+    session = operator.snapshot().session
+    assert session is not None
+    return session
+
+
+# a second browser
+
+
+def test_whoever_watches_sees_the_pose_and_changes_nothing(opened: Opened, operator: Operator, app: App, browser: Browser) -> None:
+    operator.choose_target(TARGET)
+    page, watching = opened.page, visit(browser, app.server.view_url)
+    guest = watching.page
+    button(page, "3. Poses").click()
+    capture_pose(page, "pose_01")
+    expect(guest.get_by_text("You are watching")).to_be_visible()
+    expect(pose_row(guest, "pose_01", "good")).to_be_visible()
+    before = operator.snapshot()
+
+    button(guest, "Place at suggestion").click()
+    button(guest, "Capture pose").click()
+    guest.keyboard.press("c")
+    guest.get_by_role("checkbox", name="Hands-free").click()
+    button(guest, "Delete").click()
+    field(guest, "Folder").fill(str(operator.snapshot().session.folder / "other"))
+    button(guest, "Open or make session").click()
+    button(guest, "8. Export").click()
+
+    capture_pose(page, "pose_02")  # after all that, what the operator asks for is all that happens
+    expect(pose_row(guest, "pose_02", "good")).to_be_visible()
+    after = operator.snapshot()
+    assert app.shell.current == "poses" and not after.hands_free
+    assert after.session is not None and before.session is not None and after.session.folder == before.session.folder
+    assert [pose.name for pose in after.session.poses] == ["pose_01", "pose_02"]
+    assert opened.errors == []
+    guest.context.close()
+
+
+# a process that dies
+
+
+class Program:
+    """`slviewer wizard` as a process of its own."""
+
+    def __init__(self, session: Path, *arguments: str) -> None:
+        command = [sys.executable, "-m", "slviewer.cli", "wizard", str(session), "--port", "0", "--no-browser"]
+        self._process = subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        said = next((line for line in self._process.stdout if "slviewer is ready" in line), "")
+        assert said, "the wizard did not start"
+        self.url = said.split()[-1]
+
+    def kill(self) -> None:
+        """SIGKILL, where there are signals; the end without a farewell elsewhere."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def test_a_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser) -> None:
+    program = Program(tmp_path / "session", "--rig", "simulated:0.25")
+    try:
+        page = visit(browser, program.url).page
+        button(page, "2. Target").click()
+        button(page, "Use this board").click()
+        expect(page.get_by_text(f"in use: {TARGET}")).to_be_visible()
+        button(page, "3. Poses").click()
+        for name in ("pose_01", "pose_02"):
+            capture_pose(page, name)
+        button(page, "Capture pose").click()
+        page.get_by_text("Capturing pose_03: frame").wait_for()
+    finally:
+        program.kill()
+    page.context.close()
+
+    program = Program(tmp_path / "session")
+    try:
+        again = visit(browser, program.url)
+        page = again.page
+        expect(page.get_by_text("2 poses, 0 scans")).to_be_visible()
+        button(page, "3. Poses").click()
+        for name in ("pose_01", "pose_02"):
+            expect(pose_row(page, name, "good")).to_be_visible(timeout=PATIENCE_MS)
+        capture_pose(page, "pose_03")
+        assert again.errors == []
+    finally:
+        program.kill()
+    page.context.close()
+    with Session.open(tmp_path / "session") as session:
+        frames = [session.load_capture(name).frames for name in session.capture_names()]
+        assert len(frames) == 3 and all(np.asarray(f).shape == np.asarray(frames[0]).shape for f in frames)
+
+
+# devices that fail
+
+
+class Breakable:
+    """Sets rigs up as usual, with faults that can be planned."""
+
+    faults: Faults
+
+    def __call__(self, choice: Choice, board: Board | None) -> Bench:
+        bench = set_up(choice, board)
+        rig, self.faults = breakable(bench.rig)
+        return Bench(rig, bench.world, bench.focal_px)
+
+
+def test_a_fault_ends_one_capture_and_says_so(tmp_path: Path, browser: Browser) -> None:
+    rigs = Breakable()
+    with Operator(tmp_path / "session", RIG, set_up=rigs) as operator:
+        assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S)
+        operator.choose_target(TARGET)
+        app = App(operator, port=0)
+        opened = visit(browser, app.server.url)
+        page = opened.page
+        try:
+            button(page, "3. Poses").click()
+            capture_pose(page, "pose_01")
+            for fault, sentence, after in (
+                ("timeout", "the camera gave no frame within 2 s: check its cable and its trigger", "pose_02"),
+                ("unplugged", "the camera does not answer: plug it in again and reconnect", "pose_03"),
+            ):
+                rigs.faults.plan(fault, 10)  # type: ignore[arg-type]
+                button(page, "Capture pose").click()
+                expect(page.get_by_role("alert").filter(has_text=sentence)).to_be_visible()
+                expect(button(page, "Capture pose")).to_be_enabled()
+                expect(page.get_by_text(after)).to_be_hidden()
+                capture_pose(page, after)
+            poses = session_of(operator).poses
+            assert [pose.name for pose in poses] == ["pose_01", "pose_02", "pose_03"]
+            assert [n.level for n in operator.snapshot().notices].count("error") == 2
+            assert opened.errors == []
+        finally:
+            page.context.close()
+            app.close()
