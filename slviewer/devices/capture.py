@@ -1,10 +1,11 @@
 """One capture: every frame of a pattern sequence shown and grabbed."""
 
+import time
 from collections.abc import Callable
 
 import numpy as np
 
-from slviewer.devices.protocols import Rig
+from slviewer.devices.protocols import ColourCamera, Rig
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.sequence import PatternSequence
 
@@ -35,9 +36,25 @@ def capture(
     for k in range(n):
         try:
             rig.projector.show(k)
+            settle(rig)
             rig.camera.grab(out[k])
         except DeviceError as error:
             raise DeviceError(f"the capture ended at frame {k + 1} of {n}, nothing is kept of it: {error}") from error
         if progress is not None:
             progress(k + 1, n)
     return out
+
+
+def colour_texture(rig: Rig) -> np.ndarray | None:
+    """(h, w, 3) RGB of the scene under white light, where the camera of the open rig sees colour; else None."""
+    if not isinstance(rig.camera, ColourCamera):
+        return None
+    rig.projector.show_level(255)
+    settle(rig)
+    return rig.camera.grab_colour()
+
+
+def settle(rig: Rig) -> None:
+    """Wait until what the projector says it shows has reached the scene."""
+    if rig.settle_ms > 0:
+        time.sleep(rig.settle_ms / 1000)

@@ -7,7 +7,7 @@ open or was unplugged; after that, `close` and `open` are the way back, and `clo
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -71,6 +71,27 @@ class Camera(Protocol):
         ...
 
 
+@runtime_checkable
+class ColourCamera(Camera, Protocol):
+    """A camera that also sees colour: `grab` fills one channel, and a texture may be taken in all three."""
+
+    def grab_colour(self) -> np.ndarray:
+        """A fresh (h, w, 3) RGB frame of `dtype`, under the same promise as `grab`."""
+        ...
+
+
+Channel = Literal["red", "green", "blue", "grey"]
+"""What a colour camera decodes; green has the most pixels under a Bayer mosaic, and the most light of most lamps."""
+
+
+def one_channel(rgb: np.ndarray, channel: Channel, out: np.ndarray) -> None:
+    """Fill `out` (h, w) with one channel of (h, w, 3) RGB, or with their mean."""
+    if channel == "grey":
+        np.copyto(out, rgb.mean(axis=2) + 0.5, casting="unsafe")
+    else:
+        np.copyto(out, rgb[..., ("red", "green", "blue").index(channel)])
+
+
 class Projector(Protocol):
     """Shows one image until it is told to show another; `name` and `size` can be read before it is open."""
 
@@ -110,11 +131,15 @@ class Projector(Protocol):
 
 @dataclass(frozen=True)
 class Rig:
-    """A camera and a projector that look at the same place, under the name that the operator chose."""
+    """A camera and a projector that look at the same place, under the name that the operator chose.
+
+    `settle_ms` passes between "shown" and the grab: what was measured of the light's delay beyond the projector's word.
+    """
 
     name: str
     camera: Camera
     projector: Projector
+    settle_ms: float = 0.0
 
     @contextmanager
     def opened(self) -> Iterator["Rig"]:
