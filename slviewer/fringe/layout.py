@@ -97,10 +97,14 @@ def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
 
 
 def white_level(stack: np.ndarray, indices: list[int]) -> float:
-    """The grey level at which the camera clips: 255 for uint8; for uint16 the depth that the largest value asks for."""
-    if stack.dtype == np.uint8:
+    """The grey level at which the camera clips, as `clip_level` takes it from these frames."""
+    return clip_level(stack.dtype, 0 if stack.dtype == np.uint8 else max(int(stack[i].max()) for i in indices))
+
+
+def clip_level(dtype: np.dtype, largest: int) -> float:
+    """255 for uint8; for uint16 full scale at the depth that the largest value asks for."""
+    if dtype == np.uint8:
         return 255.0
-    largest = max(int(stack[i].max()) for i in indices)
     if largest in LEFT_ALIGNED_WHITE:
         return float(largest)
     return float(next(level for level in WHITE_LEVELS if level >= largest))

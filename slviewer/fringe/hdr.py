@@ -1,0 +1,79 @@
+"""Several exposures of one sequence as a single stack: every pixel from the longest exposure that did not clip it.
+
+All frames of a pixel come from one exposure, so that its phase, its Gray threshold and its noise (the variance of a
+grey level is a function of that level alone) are what they would be in an ordinary capture; only neighbours may differ.
+
+Neighbours of a clipped pixel keep the long exposure. To give them up, as a guard against light that spills over, was
+measured on a simulated scene at exposures of 1, 4 and 16: their phase error doubles (0.056 to 0.106 rad; with a
+demosaiced sensor 0.17 to 0.26, with JPEG 0.06 to 0.16), and only a sensor that spills 0.7 % of the excess into each
+neighbour, many times what today's do, would gain by it.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.layout import clip_level
+
+
+def merge_exposures(stacks: Sequence[np.ndarray], exposures: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (n, h, w) and the choice (h, w) uint8, an index into `exposures`, from one stack (n, h, w) an exposure.
+
+    A pixel comes from the longest exposure in which none of its frames is clipped, else from the shortest; exposures
+    are times in any unit and any order. Raises InputError where stacks and exposures do not fit.
+    """
+    shapes = {(np.shape(stack), np.asarray(stack).dtype.str) for stack in stacks}
+    if len(shapes) != 1 or len(stacks) != len(exposures) or stacks[0].ndim != 3:
+        raise InputError(
+            f"{len(exposures)} exposures and stacks of {sorted(shapes)}: give each one (n, h, w), all alike"
+        )
+    choice = choose_exposure(np.stack([peaks(stack) for stack in stacks]), exposures)
+    frames, masks = np.empty_like(stacks[0], order="C"), chosen(choice, len(exposures))
+    for k in range(len(frames)):
+        pick([stack[k] for stack in stacks], masks, frames[k])
+    return frames, choice
+
+
+def peaks(frames: Iterable[np.ndarray]) -> np.ndarray:
+    """(h, w): the largest grey level of each pixel in all `frames` (h, w), which may come one after another."""
+    largest: np.ndarray | None = None
+    for frame in frames:
+        largest = frame.copy() if largest is None else np.maximum(largest, frame, out=largest)
+    if largest is None:
+        raise InputError("an exposure without frames has no peaks: give one frame or more")
+    return largest
+
+
+def choose_exposure(highest: np.ndarray, exposures: Sequence[float]) -> np.ndarray:
+    """(h, w) uint8: which of `exposures` each pixel is taken from, by its `peaks` (k, h, w) in each of them."""
+    if len(highest) != len(exposures) or not 0 < len(exposures) < 256 or min(exposures) <= 0:
+        raise InputError(
+            f"peaks of {len(highest)} stacks and exposures of {list(exposures)}: give one time above 0 each"
+        )
+    if len(set(exposures)) < len(exposures):
+        raise InputError(f"exposures of {', '.join(f'{e:g}' for e in exposures)}: give each once")
+    white = clip_level(highest.dtype, int(highest.max()))
+    order = np.argsort(exposures)
+    choice = np.full(highest.shape[1:], order[0], np.uint8)
+    for index in order[1:]:
+        choice[highest[index] < white] = index
+    return choice
+
+
+def chosen(choice: np.ndarray, exposures: int) -> list[np.ndarray]:
+    """For each exposure the pixels (h, w) that are taken from it, as `pick` wants them: uint8, 0 or 1."""
+    return [(choice == index).astype(np.uint8) for index in range(exposures)]
+
+
+def pick(exposed: Sequence[np.ndarray], masks: Sequence[np.ndarray], out: np.ndarray) -> None:
+    """Fill `out` (h, w), contiguous, from one frame of the sequence as every exposure shows it (h, w)."""
+    for frame, mask in zip(exposed, masks, strict=True):
+        cv2.copyTo(frame, mask, out)
+
+
+def radiance(frame: np.ndarray, choice: np.ndarray, exposures: Sequence[float]) -> np.ndarray:
+    """(h, w) float32: a merged frame as the shortest exposure would have shown it without noise or rounding."""
+    per_level = np.array([min(exposures) / exposure for exposure in exposures], np.float32)
+    return frame * per_level[choice]
