@@ -2,7 +2,7 @@
 
 import contextlib
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -125,14 +125,17 @@ class Session:
         texture: np.ndarray | None = None,
         settings: Mapping[str, Any] | None = None,
         board: object | None = None,
+        exposures_ms: Sequence[float] = (),
         force: bool = False,
     ) -> Capture:
         """Save frames (n, h, w), uint8 or uint16, in the order of the sequence, with an optional colour texture.
 
+        Of two or more `exposures_ms`, the frames are (k n, h, w): the whole sequence in the first, then in the second.
+
         Complete on disk when this returns; absent if it raises: InputError for a name that is taken (unless `force`,
         which moves the old capture to the trash) or frames that do not fit, SessionError where the disk refuses.
         """
-        staged = self._stage(name, role, sequence, frames, texture, source, settings or {}, board, force)
+        staged = self._stage(name, role, sequence, frames, texture, source, settings or {}, board, force, exposures_ms)
         self._commit_capture(staged, name)
         return self.load_capture(name)
 
@@ -167,6 +170,19 @@ class Session:
         target = self._trash_place(name)
         atomic.move(folder, target)
         return target
+
+    def deleted_captures(self, role: Role | None = None) -> list[str]:
+        """Names of the captures in the trash that `restore_capture` can bring back, the last deleted first."""
+        return [name for name, place in self._restorable().items() if role is None or read_capture(place).role == role]
+
+    def restore_capture(self, name: str) -> Capture:
+        """Bring the last deleted capture of that name back. InputError where there is none, or the name is in use."""
+        self._require_writer()
+        place = self._restorable().get(name)
+        if place is None:
+            raise InputError(f"no deleted capture {name!r} can be brought back: another may have its name now")
+        atomic.move(place, self._capture_folder(name))
+        return self.load_capture(name)
 
     # results
 
@@ -300,12 +316,13 @@ class Session:
         settings: Mapping[str, Any],
         board: object | None,
         force: bool,
+        exposures_ms: Sequence[float] = (),
     ) -> Path:
         self._require_writer()
         target = self._capture_folder(name)
         if target.exists() and not force:
             raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")
-        check_capture(role, sequence, frames, texture)
+        check_capture(role, sequence, frames, texture, exposures_ms)
         size = frames.nbytes + (0 if texture is None else texture.nbytes)
         with atomic.staged_folder(target, size) as staged:
             write_capture(
@@ -317,6 +334,7 @@ class Session:
                 source=source,
                 settings=settings,
                 board=None if board is None else str(board),
+                exposures_ms=exposures_ms,
             )
         return staged
 
@@ -328,6 +346,16 @@ class Session:
 
     def _trash_place(self, name: str) -> Path:
         return self.folder / "trash" / f"{name}-{datetime.now(UTC).strftime('%Y%m%dT%H%M%S%f')}"
+
+    def _restorable(self) -> dict[str, Path]:
+        """{name: the place in the trash of its latest version} of captures whose names are free, the latest first."""
+        trash, found = self.folder / "trash", dict[str, Path]()
+        places = [place for place in trash.glob("*-*") if (place / "capture.json").is_file()] if trash.is_dir() else []
+        for place in sorted(places, key=lambda place: place.name.rpartition("-")[2], reverse=True):
+            name = place.name.rpartition("-")[0]
+            if not self._capture_folder(name).exists():
+                found.setdefault(name, place)
+        return found
 
     def _hashes(self, name: str) -> list[str]:
         """Content hashes of the capture and of the result of that name, where there are any."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, texture
+from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.capture import Capture
@@ -59,6 +60,9 @@ def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
     """(h, w) or (h, w, 3) uint8: what the scene looks like under white light."""
     colour = capture.texture
     image = texture(capture.sequence, frames) if colour is None else colour
+    choice = capture.exposure_choice
+    if colour is None and choice is not None:
+        return toned(radiance(image, choice, capture.exposures_ms))
     if image.dtype == np.uint16:
         top = max(int(image.max()), 1)
         image = cv2.convertScaleAbs(image, alpha=255.0 / top)

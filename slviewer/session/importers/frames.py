@@ -40,7 +40,7 @@ from slviewer.session.importers.imported import (
     visible,
 )
 
-_KEYS = {"projector", "phase_sign", "gray_origin", "frame"}
+_KEYS = {"projector", "phase_sign", "gray_origin", "frame", "levels"}
 
 
 def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None) -> Imports:

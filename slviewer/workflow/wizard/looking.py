@@ -9,6 +9,7 @@ import numpy as np
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.errors import InputError
 from slviewer.evaluation.histogram import Histogram, histogram
+from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.sequence import Axis
 from slviewer.reconstruction.ply import Ply, read_ply
 from slviewer.report.data import PixelCurve
@@ -112,6 +113,9 @@ def thumbnail(capture: Capture) -> bytes:
     frames = capture.sequence.frames
     index = min(range(len(frames)), key=lambda k: order.index(frames[k].kind) if frames[k].kind in order else 9)
     image = capture.stack([index])[0]
+    choice = capture.exposure_choice
+    if choice is not None:
+        image = toned(radiance(image, choice, capture.exposures_ms))
     scale = THUMBNAIL_PX / max(image.shape)
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     if small.dtype != np.uint8:
