@@ -18,6 +18,7 @@ def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndar
     """The axis along which frame ``index`` varies, and its uint8 grey levels along it.
 
     A frame without an axis gives (None, one level per projector column). Cosines span 0 ... 255, bits are 0 or 255.
+    Where the sequence has a table of `levels`, the cosines are those that it makes of them.
     """
     if not 0 <= index < len(sequence.frames):
         raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
@@ -27,7 +28,8 @@ def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndar
     if frame.kind == "phase":
         u = np.arange(sequence.extent(frame.axis), dtype=np.float64)
         angle = 2 * np.pi * (u / frame.period_px + sequence.phase_sign * frame.step / frame.steps)
-        return frame.axis, np.floor(127.5 + 127.5 * np.cos(angle) + 0.5).astype(np.uint8)
+        cosine = np.floor(127.5 + 127.5 * np.cos(angle) + 0.5).astype(np.uint8)
+        return frame.axis, cosine if sequence.levels is None else np.array(sequence.levels, np.uint8)[cosine]
     return frame.axis, np.where(_bit(sequence, frame.axis, frame), 255, 0).astype(np.uint8)
 
 

@@ -92,19 +92,25 @@ class PatternSequence:
 
     ``projector`` is (width, height) in px. ``phase_sign`` -1: the frames were made with cos(phi - 2 pi k / n).
     ``gray_origin_px`` is the projector coordinate at which Gray code 0 begins; a displayed column u reaches from
-    u - 0.5 to u + 0.5, hence -0.5. Raises InputError when steps or bits are missing, double, or contradict each other.
+    u - 0.5 to u + 0.5, hence -0.5. ``levels``: for each grey level 0 ... 255 of a cosine the one that is shown in its
+    place, so that a projector whose light is not proportional to it shows cosines; None where they are the same. It
+    records what was shown, and decoding has no use for it. Raises InputError when steps or bits are missing, double, or
+    contradict each other, or the levels are no such table.
     """
 
     projector: tuple[int, int]
     frames: tuple[Frame, ...]
     phase_sign: int = 1
     gray_origin_px: float = -0.5
+    levels: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if len(self.projector) != 2 or min(self.projector) < 1:
             raise InputError(f"a projector of {self.projector} px does not exist: give width and height, like 912x1140")
         if self.phase_sign not in (1, -1):
             raise InputError(f"phase_sign is {self.phase_sign}: use 1 or -1")
+        if self.levels is not None:
+            _check_levels(self.levels)
         for axis in self.axes:
             self._check_phase(axis)
             self._check_bits(axis)
@@ -179,7 +185,7 @@ class PatternSequence:
             "phase_sign": self.phase_sign,
             "gray_origin": self.gray_origin_px,
             "frame": [frame.to_dict() for frame in self.frames],
-        }
+        } | ({} if self.levels is None else {"levels": list(self.levels)})
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "PatternSequence":
@@ -191,7 +197,16 @@ class PatternSequence:
             sign, origin = int(data.get("phase_sign", 1)), float(data.get("gray_origin", -0.5))
         except (TypeError, ValueError) as error:
             raise InputError(f"phase_sign and gray_origin must be numbers ({error}): mend them") from error
-        return cls(parse_size(data.get("projector")), tuple(Frame.from_dict(f) for f in frames), sign, origin)
+        levels = data.get("levels")
+        if levels is not None and not isinstance(levels, list):
+            raise InputError(f"levels is {levels!r}: give a list of 256 grey levels, or leave it out")
+        return cls(
+            parse_size(data.get("projector")),
+            tuple(Frame.from_dict(f) for f in frames),
+            sign,
+            origin,
+            None if levels is None else tuple(levels),
+        )
 
 
 def parse_size(text: Any) -> tuple[int, int]:
@@ -204,6 +219,15 @@ def parse_size(text: Any) -> tuple[int, int]:
     if width < 1 or height < 1:
         raise InputError(f"'{text}' is no projector size: write width and height like 912x1140")
     return width, height
+
+
+def _check_levels(levels: tuple[int, ...]) -> None:
+    whole = all(isinstance(level, int) and not isinstance(level, bool) for level in levels)
+    if not whole or len(levels) != 256 or levels[0] != 0 or levels[-1] != 255 or list(levels) != sorted(levels):
+        raise InputError(
+            f"a table of {len(levels)} grey levels cannot stand in for 0 ... 255: give 256 whole numbers that never "
+            "fall, the first 0 and the last 255, or none"
+        )
 
 
 def _check_complete(found: list[int], wanted: range, what: str) -> None:

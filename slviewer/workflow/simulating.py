@@ -4,6 +4,7 @@ import json
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,4 +84,4 @@ def one_axis(sequence: PatternSequence, axis: Axis) -> PatternSequence:
     """The frames of one axis, and one texture."""
     frames = [f for f in sequence.frames if f.axis == axis]
     texture = [f for f in sequence.frames if f.kind == "texture"][:1]
-    return PatternSequence(sequence.projector, (*frames, *texture), sequence.phase_sign, sequence.gray_origin_px)
+    return replace(sequence, frames=(*frames, *texture))

@@ -1,0 +1,61 @@
+"""How the light that a camera sees grows with the grey level that a projector is told to show.
+
+A response is given as `shown` (n,) grey levels, increasing from 0 to 255, and `seen` (n,) light, 0 for dark and 1 for
+white, noise included. Between them it is a monotone piecewise cubic (PCHIP).
+"""
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import minimize_scalar
+
+from slviewer.errors import InputError
+
+_FINE = 16  # places per grey level at which a response is tabulated before it is inverted
+
+
+def fitted_gamma(shown: np.ndarray, seen: np.ndarray) -> float:
+    """The exponent of the power of shown / 255 that comes nearest to the response."""
+    x, y = _checked(shown, seen)
+    found = minimize_scalar(lambda g: float(np.sum((x**g - y) ** 2)), bounds=(0.2, 5.0), method="bounded")
+    return float(found.x)
+
+
+def nonlinearity(shown: np.ndarray, seen: np.ndarray) -> float:
+    """The largest distance of the response from a straight line, as a share of white."""
+    x, y = _checked(shown, seen)
+    return float(np.abs(y - x).max())
+
+
+def harmonic_error_rad(shown: np.ndarray, seen: np.ndarray, steps: int) -> float:
+    """The rms error of the phase in rad that the response causes in `steps` phase steps, without any blur."""
+    curve = _curve(shown, seen)
+    phase = 2 * np.pi * np.arange(360) / 360
+    k = 2 * np.pi * np.arange(steps)[:, None] / steps
+    light = curve(0.5 + 0.5 * np.cos(phase + k))
+    error = np.angle((light * np.exp(-1j * k)).sum(0) * np.exp(-1j * phase))
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def linearising(shown: np.ndarray, seen: np.ndarray) -> tuple[int, ...]:
+    """For `PatternSequence.levels`: the 256 grey levels to show so that the light grows evenly from dark to white."""
+    x = np.arange(255 * _FINE + 1) / (255 * _FINE)
+    y = np.maximum.accumulate(_curve(shown, seen)(x))
+    levels = np.rint(255 * np.interp(np.arange(256) / 255, y, x)).astype(int)
+    levels[0], levels[255] = 0, 255
+    return tuple(np.maximum.accumulate(levels).tolist())
+
+
+def _curve(shown: np.ndarray, seen: np.ndarray) -> PchipInterpolator:
+    x, y = _checked(shown, seen)
+    rising = (np.maximum.accumulate(y) + np.minimum.accumulate(y[::-1])[::-1]) / 2  # noise must not turn it round
+    rising[0], rising[-1] = 0.0, 1.0
+    return PchipInterpolator(x, np.clip(rising, 0, 1))
+
+
+def _checked(shown: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.asarray(shown, float) / 255, np.asarray(seen, float)
+    if x.ndim != 1 or x.shape != y.shape or len(x) < 3 or x[0] != 0 or x[-1] != 1 or (np.diff(x) <= 0).any():
+        raise InputError("a response needs three or more grey levels that rise from 0 to 255, and the light of each")
+    if not np.isfinite(y).all():
+        raise InputError("a response has light that is no number: measure it where the projector lights the scene")
+    return x, y
