@@ -1,13 +1,18 @@
-"""One capture: every frame of a pattern sequence shown and grabbed."""
+"""One capture: every frame of a pattern sequence shown and grabbed, in one exposure or in several."""
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.devices.protocols import ColourCamera, Rig
+from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.sequence import PatternSequence
+
+MOST_EXPOSURES = 8
+"""More would take longer than anything stands still for."""
 
 
 def capture(
@@ -43,6 +48,79 @@ def capture(
         if progress is not None:
             progress(k + 1, n)
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """What `take` brings home: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the whole sequence in one after
+    the other; what else the camera was set to; and a colour texture (h, w, 3), None of a camera that sees none.
+    """
+
+    frames: np.ndarray
+    settings: CameraSettings
+    exposures_ms: tuple[float, ...] = ()
+    texture: np.ndarray | None = None
+
+
+def take(
+    rig: Rig,
+    sequence: PatternSequence,
+    exposures_ms: Sequence[float] = (),
+    out: np.ndarray | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Taken:
+    """Capture `sequence`, in each of two or more `exposures_ms` if they are given, and the colours after it.
+
+    `out` is (k n, h, w) where it is given, and `progress(done, k n)` as in `capture`. The camera's settings are as
+    before when this returns or raises. Raises InputError for exposures that are none, DeviceError for a camera that
+    cannot be set to them, and whatever `capture` raises.
+    """
+    if not exposures_ms:
+        frames = capture(rig, sequence, out, progress)
+        return Taken(frames, rig.camera.settings(), (), colour_texture(rig))
+    wanted = check_exposures(exposures_ms)
+    n, (width, height) = len(sequence.frames), rig.camera.size
+    if out is None:
+        out = np.empty((n * len(wanted), height, width), rig.camera.dtype)
+    before, taken = rig.camera.settings(), []
+    try:
+        for e, exposure in enumerate(wanted):
+            taken.append(_exposed(rig, exposure))
+            if e and taken[e] <= taken[e - 1]:
+                raise DeviceError(
+                    f"{rig.camera.name} took {taken[e]:g} ms when it was asked for {exposure:g} ms: "
+                    "choose exposures that it can tell apart, or a single one"
+                )
+            capture(rig, sequence, out[e * n : (e + 1) * n], _counting(progress, e * n, len(out)))
+    finally:
+        with contextlib.suppress(DeviceError):  # one that is lost tells so itself
+            rig.camera.apply(before)
+    return Taken(out, rig.camera.settings(), tuple(taken), colour_texture(rig))
+
+
+def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
+    """Two or more exposures in ms, the shortest first. Raises InputError where they are not."""
+    wanted = sorted(CameraSettings(exposure).exposure_ms or 0.0 for exposure in exposures_ms)
+    if len(set(wanted)) < max(2, len(exposures_ms)) or len(wanted) > MOST_EXPOSURES:
+        raise InputError(
+            f"exposures of {', '.join(f'{e:g}' for e in exposures_ms)} ms: give 2 to {MOST_EXPOSURES}, each once"
+        )
+    return wanted
+
+
+def _exposed(rig: Rig, exposure_ms: float) -> float:
+    """Set an exposure; what the camera took."""
+    taken = rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
+    if taken is None:
+        raise DeviceError(f"{rig.camera.name} does not say which exposure it took: capture in a single one")
+    return taken
+
+
+def _counting(
+    progress: Callable[[int, int], None] | None, before: int, frames: int
+) -> Callable[[int, int], None] | None:
+    """The progress of one exposure's frames among all."""
+    return None if progress is None else lambda done, _: progress(before + done, frames)
 
 
 def colour_texture(rig: Rig) -> np.ndarray | None:

@@ -1,0 +1,94 @@
+"""Captures in several exposures and in colour, on devices that work and on those that do not."""
+
+import numpy as np
+import pytest
+from colour_camera import ColouredCamera, coloured
+
+from slviewer.devices.capture import capture, colour_texture, take
+from slviewer.devices.faults import breakable
+from slviewer.devices.protocols import CameraSettings, ColourCamera
+from slviewer.devices.replay import replay
+from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.world import SimulatedWorld
+from slviewer.errors import Cancelled, DeviceError, InputError
+from slviewer.fringe.hdr import merge_exposures
+from slviewer.fringe.presets import complementary
+from slviewer.simulation.rig import letter
+
+WORLD = SimulatedWorld(letter(0.1))
+SEQUENCE = complementary(WORLD.rig.projector.size)
+N = len(SEQUENCE.frames)
+
+
+def rig():
+    return simulated_rig(WORLD)
+
+
+def test_a_sequence_is_taken_in_every_exposure_the_shortest_first():
+    seen = []
+    with rig().opened() as one:
+        one.camera.apply(CameraSettings(1.5, 2.0))
+        taken = take(one, SEQUENCE, (4.0, 0.5), progress=lambda done, of: seen.append((done, of)))
+        assert one.camera.settings() == CameraSettings(1.5, 2.0) == taken.settings
+    assert taken.exposures_ms == (0.5, 4.0) and taken.texture is None
+    assert taken.frames.shape == (2 * N, 120, 160)
+    short, long = taken.frames[:N].astype(float), taken.frames[N:]
+    clear = (long < 250) & (long > 100)  # chosen by one, measured by both: no pixel is there for its noise
+    assert (long[clear] - 3.0).mean() / (short[clear] - 3.0).mean() == pytest.approx(8, rel=0.05)
+    assert seen[0] == (0, 2 * N) and seen[-1] == (2 * N, 2 * N) and [d for d, _ in seen] == sorted(d for d, _ in seen)
+    frames, choice = merge_exposures([taken.frames[:N], long], taken.exposures_ms)
+    assert frames.max() < 255 and 0.05 < np.mean(choice) < 0.95
+
+
+def test_one_exposure_is_what_capture_gives():
+    with rig().opened() as one:
+        taken = take(one, SEQUENCE)
+    with rig().opened() as other:
+        np.testing.assert_array_equal(taken.frames, capture(other, SEQUENCE))
+    assert taken.exposures_ms == () and taken.settings == CameraSettings(1.0, 1.0)
+
+
+def test_the_exposure_is_restored_whatever_happens():
+    def stop(done, _):
+        if done == N + 3:
+            raise Cancelled("enough")
+
+    with rig().opened() as one:
+        with pytest.raises(Cancelled):
+            take(one, SEQUENCE, (0.5, 4.0), progress=stop)
+        assert one.camera.settings().exposure_ms == 1.0
+    broken, faults = breakable(rig())
+    with broken.opened():
+        faults.plan("timeout", 4)
+        with pytest.raises(DeviceError, match=f"frame 5 of {N}"):
+            take(broken, SEQUENCE, (0.5, 4.0))
+        assert broken.camera.settings().exposure_ms == 1.0
+        faults.plan("unplugged", 4)
+        with pytest.raises(DeviceError, match="does not answer"):
+            take(broken, SEQUENCE, (0.5, 4.0))
+
+
+def test_exposures_that_cannot_be_are_refused():
+    with rig().opened() as one:
+        for exposures in ((2.0,), (2.0, 2.0), (-1.0, 2.0), tuple(range(1, 12)), (float("nan"), 1.0)):
+            with pytest.raises(InputError):
+                take(one, SEQUENCE, exposures)
+        with pytest.raises(DeviceError, match="took 100 ms when it was asked for 500 ms"):
+            take(one, SEQUENCE, (200.0, 500.0))
+        frames = capture(one, SEQUENCE)
+    with replay(frames, SEQUENCE).opened() as recorded:
+        with pytest.raises(DeviceError, match="single one"):
+            take(recorded, SEQUENCE, (1.0, 2.0))
+        np.testing.assert_array_equal(take(recorded, SEQUENCE).frames, frames)
+
+
+def test_a_colour_camera_brings_its_colours_home():
+    with coloured(rig()).opened() as one:
+        assert isinstance(one.camera, ColourCamera)
+        taken = take(one, SEQUENCE)
+        assert taken.texture is not None and taken.texture.shape == (120, 160, 3)
+        lit = taken.texture[..., 1] > 60
+        ratio = taken.texture[lit].astype(float) / taken.texture[lit][:, 1:2]
+        np.testing.assert_allclose(ratio.mean(axis=0), [ColouredCamera.RED, 1, ColouredCamera.BLUE], atol=0.02)
+    with rig().opened() as grey:
+        assert colour_texture(grey) is None
