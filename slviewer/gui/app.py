@@ -15,6 +15,7 @@ from slviewer.gui import shell as frame
 from slviewer.gui.panel import Stage
 from slviewer.gui.scene import Scene
 from slviewer.gui.shell import Shell
+from slviewer.gui.views import FIELD_OF_VIEW, OVERVIEW, Eyes
 from slviewer.server.secure import SafeServer, serve
 from slviewer.server.text import escape
 from slviewer.workflow.wizard.notices import words_for
@@ -52,10 +53,8 @@ class App:
     def _start(self) -> None:
         page, operator = self.server.viser, self.operator
         page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
-        # the camera to the right, what it sees to the left: both in view beside the panels of a small screen
-        page.initial_camera.position = (-700.0, -450.0, -520.0)
-        page.initial_camera.look_at = (65.0, 30.0, 335.0)
-        page.initial_camera.fov = 0.75
+        page.initial_camera.position, page.initial_camera.look_at = OVERVIEW
+        page.initial_camera.fov = FIELD_OF_VIEW
         page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
         self._closing = False
         self._changed = threading.Event()
@@ -63,7 +62,15 @@ class App:
         self._folder: Path | None = None
         self._problem = ""
         self._stage = Stage(
-            page.gui, Scene(page.scene), operator, self._offer, self._tell, escape, self._go, self._failed
+            page.gui,
+            Scene(page.scene),
+            Eyes(lambda: page.get_clients().values()),
+            operator,
+            self._offer,
+            self._tell,
+            escape,
+            self._go,
+            self._failed,
         )
         snapshot = operator.snapshot()
         self._told = snapshot.notices[-1].number if snapshot.notices else 0

@@ -3,25 +3,30 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import viser
 
 from slviewer.gui.scene import Scene
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
 
+if TYPE_CHECKING:
+    from slviewer.gui.views import Eyes
+
 
 @dataclass(frozen=True)
 class Stage:
     """What a panel works with.
 
-    `gui` builds inputs, `scene` draws in 3D, `operator` takes requests. `offer(path)` gives the address at which a file
-    of the session is downloaded; `tell(level, text)` shows a notification in every browser; `escape(text)` makes text
-    that was typed or read harmless inside HTML and Markdown. `go(key)` brings another step to the front.
+    `gui` builds inputs, `scene` draws in 3D, `eyes` turns the browsers' views, `operator` takes requests. `offer(path)`
+    gives the address at which a file of the session is downloaded; `tell(level, text)` shows a notification in every
+    browser; `escape(text)` makes text that was typed or read harmless inside HTML and Markdown. `go(key)` brings
+    another step to the front.
     """
 
     gui: viser.GuiApi
     scene: Scene
+    eyes: "Eyes"
     operator: Any
     offer: Callable[[Path], str]
     tell: Callable[[Level, str], None]

@@ -24,10 +24,12 @@ _ICONS = {
     "blocked": viser.Icon.LOCK,
 }
 _STEP_COLOURS = {"done": (211, 249, 216), "ready": (208, 235, 255), "blocked": (233, 236, 239)}
+_ROUND_THE_RIG = ("rig", "target", "poses", "calibrate")  # steps in which the devices matter in 3D
 _TITLES = {"info": "Note", "good": "Done", "warning": "Take care", "error": "This failed"}
 _COLOURS: dict[str, Any] = {"info": "blue", "good": "green", "warning": "orange", "error": "red"}
 _SECONDS = {"info": 5.0, "good": 5.0, "warning": 12.0, "error": 20.0}
 _MARKS = {"info": "plain", "good": "good", "warning": "warning", "error": "error"}
+_ROOM_FOR_SCROLL_BARS = "<style>.mantine-ScrollArea-content{padding-right:10px}</style>"  # they lie on what they scroll
 _KEPT = 12  # of the latest notices, in the panel
 
 
@@ -88,6 +90,7 @@ class Shell:
         panel.dock_right()
         panel.set_width(STEP_PX)
         with panel.add_tab("This step", viser.Icon.HAND_FINGER):
+            Words(gui).set(_ROOM_FOR_SCROLL_BARS)
             self._heading = Words(gui)
             self._wrong = Words(gui)
             self._job_says = Words(gui)
@@ -142,6 +145,8 @@ class Shell:
             self._folders[self._shown_key].visible = False
             self._panels[self._shown_key].shown(False)
         self._shown_key = key
+        if key in _ROUND_THE_RIG:
+            self._stage.eyes.overview()
         self._panels[key].shown(True)
         self._folders[key].visible = True
 
@@ -171,22 +176,16 @@ class Shell:
         change(self._next, visible=ready)
 
     def _draw_job(self, snapshot: Snapshot) -> None:
-        job, capture = snapshot.job, snapshot.rig.capture
-        parts, can_cancel = [], False
-        if capture is not None:
-            also = f", {capture.waiting} more waiting" if capture.waiting else ""
-            says = f"Capturing {capture.name}: frame {capture.frame} of {capture.frames}{also}"
-            parts.append(f"{cell(says)}{meter(capture.frame / max(capture.frames, 1), 'info')}")
-            can_cancel = True
-        if job is not None and not job.background:
-            also = f", {job.waiting} more waiting" if job.waiting else ""
-            says = f"{job.name}: {job.doing or 'begins'}{also} ({job.seconds:.0f} s)"
-            parts.append(f"{cell(says)}{meter(job.share, 'info')}")
-            can_cancel = can_cancel or job.can_cancel
-        self._job_says.set(
-            block(Html("".join(f'<div style="margin-bottom:0.3em">{p}</div>' for p in parts))) if parts else ""
-        )
-        change(self._cancel, visible=can_cancel)
+        work = _work(snapshot)
+        bars = [f'<div style="margin-bottom:0.3em">{cell(says)}{meter(share, "info")}</div>' for says, share in work]
+        self._job_says.set(block(Html("".join(bars))) if bars else "")
+        job = snapshot.job
+        change(self._cancel, visible=bool(work) and (snapshot.rig.capture is not None or bool(job and job.can_cancel)))
+        # beside every step too: it must not scroll out of view, nor move what is about to be pressed
+        if work:
+            self._busy.set(block(Html("".join(bars))))
+        else:
+            self._busy.say(f"{job.doing or job.name} …" if job is not None else "Idle", "dim")
 
     def _draw_session(self, snapshot: Snapshot) -> None:
         session, space = snapshot.session, snapshot.space
@@ -198,6 +197,8 @@ class Shell:
             if space is not None:
                 needs = f"; a capture needs {amount(space.capture_bytes)}" if space.capture_bytes else ""
                 words.append(toned(f"{amount(space.free_bytes)} free{needs}", "dim" if space.enough else "error"))
+            where = f'<span style="overflow-wrap:anywhere">{toned(session.folder, "dim")}</span>'
+            words.insert(1, where)
             self._session_says.set(block(Html("<br>".join(words))))
             before = self._drawn.session.folder if self._drawn is not None and self._drawn.session else None
             if session.folder != before:
@@ -207,9 +208,6 @@ class Shell:
         change(self._autopilot, color="red" if snapshot.autopilot else "teal")
         self._autopilot_says.set(boxed(snapshot.autopilot, "info") if snapshot.autopilot else "")
         latest = "".join(_notice(notice) for notice in reversed(snapshot.notices[-_KEPT:]))
-        job = snapshot.job
-        # here, since it comes and goes with every pose, and must not move what the operator is about to press
-        self._busy.say(f"{job.doing or job.name} …" if job is not None and job.background else "Idle", "dim")
         # as high as a small screen leaves, so that the panel itself does not scroll
         style = "max-height:max(6em, calc(100vh - 625px));overflow-y:auto"
         self._latest.set(f'<div style="{style}">{latest or block(toned("Nothing yet.", "dim"))}</div>')
@@ -268,6 +266,19 @@ def amount(n: int) -> str:
             return f"{size:.0f} {unit}" if unit == "bytes" or size >= 100 else f"{size:.1f} {unit}"
         size /= 1000
     return f"{size:.1f} TB"
+
+
+def _work(snapshot: Snapshot) -> list[tuple[str, float]]:
+    """What is done for the operator now: in words, and the share that is done."""
+    job, capture, found = snapshot.job, snapshot.rig.capture, []
+    if capture is not None:
+        also = f", {capture.waiting} more waiting" if capture.waiting else ""
+        says = f"Capturing {capture.name}: frame {capture.frame} of {capture.frames}{also}"
+        found.append((says, capture.frame / max(capture.frames, 1)))
+    if job is not None and not job.background:
+        also = f", {job.waiting} more waiting" if job.waiting else ""
+        found.append((f"{job.name}: {job.doing or 'begins'}{also} ({job.seconds:.0f} s)", job.share))
+    return found
 
 
 def _panel(key: str) -> Callable[[Stage], Panel]:

@@ -1,6 +1,6 @@
-"""Where a browser looks from: everybody turns the 3D view for himself, and a button brings a cloud before his eyes."""
+"""Where the browsers look from: everybody turns the 3D view for himself; new clouds are brought before all eyes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,32 @@ from slviewer.gui.panel import Stage
 
 _FROM = np.array([-0.45, -0.35, -0.82])
 """From a little to the left and above of where the camera looks from: depth is seen, and nothing is upside down."""
+OVERVIEW = ((-430.0, -560.0, -820.0), (55.0, 40.0, 330.0))
+"""Position and point looked at, mm: the rig and what stands at its working distance, in a narrow window too."""
+FIELD_OF_VIEW = 0.75  # rad
+
+
+class Eyes:
+    """All browsers' views; `clients()` gives those that are there."""
+
+    def __init__(self, clients: Callable[[], Iterable[viser.ClientHandle]]) -> None:
+        self._clients = clients
+        self._about = ""
+
+    def overview(self) -> None:
+        """Look at the whole rig again, where a cloud has been looked at."""
+        if self._about:
+            self._about = ""
+            for client in self._clients():
+                _look(client, *(np.array(each) for each in OVERVIEW))
+
+    def at(self, about: str, points: np.ndarray | None) -> None:
+        """Look at the points (..., 3) mm, unless what they are `about` is looked at already."""
+        if points is None or about == self._about:
+            return
+        self._about = about
+        for client in self._clients():
+            bring(client, points)
 
 
 def bring_button(stage: Stage, points: Callable[[], np.ndarray | None]) -> viser.GuiButtonHandle:
@@ -19,16 +45,24 @@ def bring_button(stage: Stage, points: Callable[[], np.ndarray | None]) -> viser
     return button
 
 
-def _bring(event: Any, points: np.ndarray | None) -> None:
-    if event.client is None or points is None:
-        return
+def bring(client: viser.ClientHandle, points: np.ndarray) -> None:
+    """Let one browser look at the points (..., 3) mm; nothing happens where none is valid."""
     flat = points.reshape(-1, 3)
     flat = flat[np.isfinite(flat[:, 2])][:: max(1, len(flat) // 20_000)]
     if not len(flat):
         return
     low, high = np.percentile(flat, [2, 98], axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    camera = event.client.camera
-    with event.client.atomic():
-        camera.position = tuple(middle + _FROM * max(1.45 * size, 50.0))  # which moves the point looked at along
-        camera.look_at = tuple(middle)
+    away = max(1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0)  # the field of view is that of the height
+    _look(client, middle + _FROM * away, middle)
+
+
+def _bring(event: Any, points: np.ndarray | None) -> None:
+    if event.client is not None and points is not None:
+        bring(event.client, points)
+
+
+def _look(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
+    with client.atomic():
+        client.camera.position = tuple(position)  # which moves the point looked at along
+        client.camera.look_at = tuple(at)

@@ -20,7 +20,7 @@ class Stand:
     def __init__(self, stage: Stage, layer: str, things: Sequence[str]) -> None:
         self._stage, self._layer, self._things = stage, layer, tuple(things)
         self._T = np.eye(4)
-        self._standing = ""
+        self._standing = self._handled = ""
         gui = stage.gui
         with gui.add_folder("Simulated rig", visible=False) as self._folder:
             self._says = Words(gui)
@@ -31,12 +31,14 @@ class Stand:
                 min=NEAREST_MM,
                 max=FARTHEST_MM,
                 step=5.0,
-                hint="Distance from the camera; or drag it in the 3D view",
+                hint="Distance from the camera",
             )
             self._turn = gui.add_number("Turned, °", 0.0, min=-90.0, max=90.0, step=5.0)
+            self._handles = gui.add_checkbox("3D handles", False, hint="To drag and turn it in the 3D view")
         self._drawn = [Follows(each) for each in (self._thing, self._distance, self._turn)]
         self._thing.on_update(stage.safely_with(self._choose))
         bring = stage.operator.bring
+        self._handles.on_update(stage.safely(self._draw_handles))
         self._distance.on_update(stage.safely_with(_typed(lambda: bring(distance_mm=self._distance.value))))
         self._turn.on_update(stage.safely_with(_typed(lambda: bring(turn_deg=self._turn.value))))
 
@@ -45,8 +47,8 @@ class Stand:
         world = snapshot.world
         change(self._folder, visible=world is not None)
         if world is None:
-            self._stage.scene.remove(self._layer, _GIZMO)
             self._standing = ""
+            self._draw_handles()
             return
         fits = world.standing in self._things
         self._says.say(
@@ -55,13 +57,8 @@ class Stand:
         for number in (self._distance, self._turn):
             change(number, disabled=not fits)
         T = np.asarray(world.T_camera_thing, float)
-        if not fits:
-            self._stage.scene.remove(self._layer, _GIZMO)
-        elif self._standing != world.standing:
-            self._stage.scene.gizmo(self._layer, _GIZMO, T, lambda T: None, self._place)
-        elif not np.array_equal(T, self._T):
-            self._stage.scene.move(self._layer, _GIZMO, T)
         self._standing, self._T = world.standing if fits else "", T
+        self._draw_handles()
         drawn = (
             world.standing if fits else "something else",
             round(float(np.clip(T[2, 3], NEAREST_MM, FARTHEST_MM)), 1),
@@ -69,6 +66,16 @@ class Stand:
         )
         for follows, value in zip(self._drawn, drawn, strict=True):
             follows.tell(value)
+
+    def _draw_handles(self) -> None:
+        scene, wanted = self._stage.scene, self._standing if self._handles.value else ""
+        if not wanted:
+            scene.remove(self._layer, _GIZMO)
+        elif wanted != self._handled:
+            scene.gizmo(self._layer, _GIZMO, self._T, lambda T: None, self._place)
+        else:
+            scene.move(self._layer, _GIZMO, self._T)
+        self._handled = wanted
 
     def _place(self, T: np.ndarray) -> None:
         self._stage.safely(lambda: self._stage.operator.place(self._standing, T))(None)

@@ -32,7 +32,8 @@ def pose_bars(
         axes.bar(at + 0.4 * i - 0.2, values[:, i], 0.38, color=colour, label=label)
         if np.isfinite(rms):
             axes.axhline(rms, color=colour, linewidth=1, linestyle=(0, (4, 2)))
-    axes.set_xticks(at, names, rotation=90 if len(names) > 12 else 0, fontsize=SMALL_PT)
+    crowded = len(names) * max(map(len, names)) > width / 9
+    axes.set_xticks(at, names, rotation=90 if crowded else 0, fontsize=SMALL_PT)
     axes.set_xlim(-0.7, len(names) - 0.3)
     legend(axes, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, columnspacing=1.2)
     worst = names[int(np.argmax(np.nan_to_num(values).max(axis=1)))]

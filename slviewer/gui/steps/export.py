@@ -93,6 +93,7 @@ class Panel:
     def shown(self, visible: bool) -> None:
         self._visible = visible
         self._stage.scene.show(LAYER, visible)
+        self._show_closely()
 
     def _say(self) -> None:
         """What the file will be, whether it is there already, and how it looks."""
@@ -136,6 +137,11 @@ class Panel:
         self._points = points
         self._stage.scene.cloud(LAYER, "cloud", points, (150, 150, 150) if colours is None else colours)
         self._stage.scene.show(LAYER, self._visible)
+        self._show_closely()
+
+    def _show_closely(self) -> None:
+        if self._visible:
+            self._stage.eyes.at(f"{LAYER} {self._what.value}", self._points)
 
     def _ask_shape(self) -> None:
         name, shape = self._what.value, self._shape.value

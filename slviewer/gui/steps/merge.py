@@ -68,19 +68,21 @@ class Panel:
     def shown(self, visible: bool) -> None:
         self._visible = visible
         self._stage.scene.show(LAYER, visible)
+        self._look()
 
     # drawing
 
     def _draw_boxes(self, scans: list[ScanView]) -> None:
         """One check box a scan, made and taken away as scans come and go."""
         gui, names = self._stage.gui, [scan.name for scan in scans]
+        labels = [scan.label for scan in scans]
         self._none.say(
             "" if scans else "No scan is reconstructed yet: capture two or more in the step Scan.", "warning"
         )
         for name in [name for name in self._boxes if name not in names]:
             self._boxes.pop(name).remove()
         for scan in scans:
-            label = titled(scan.name, scan.label)
+            label = scan.label if labels.count(scan.label) == 1 else titled(scan.name, scan.label)
             if scan.name not in self._boxes:
                 with self._scans_folder:
                     box = gui.add_checkbox(label, True)
@@ -164,6 +166,11 @@ class Panel:
         scene.show(LAYER, self._visible)
         legend = f'<div style="display:flex;flex-wrap:wrap;gap:0 1em;align-items:center">{"".join(words)}</div>'
         self._legend.set(block(Html(legend)) if words else "")
+        self._look()
+
+    def _look(self) -> None:
+        if self._visible:
+            self._stage.eyes.at(f"{LAYER} {self._view.value}", self._points)
 
     # requests
 

@@ -12,6 +12,7 @@ from slviewer.gui.panel import Stage
 from slviewer.gui.pose_list import PoseBoards, pose_table
 from slviewer.gui.preview import board_words, drawn, legend, light_words
 from slviewer.gui.scene import GHOST
+from slviewer.gui.undelete import Undelete
 from slviewer.gui.widgets import Html, Picture, Sound, Words, block, boxed, cell, thumbnail, toned
 from slviewer.target.board import Board
 from slviewer.workflow.wizard.snapshot import PoseView, PreviewView, Snapshot
@@ -66,6 +67,7 @@ class Panel:
             self._detail = Words(gui)
             self._acts = gui.add_button_group("This pose", ("Exclude", "Include", "Retake", "Delete"))
             self._acts.on_click(stage.safely(lambda: self._act(self._acts.value)))
+            self._undelete = Undelete(stage)
         self._sound = Sound(gui)
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -93,6 +95,7 @@ class Panel:
             self._chosen.choose(latest)
         self._latest = latest
         self._table.set(pose_table(poses))
+        self._undelete.offer(session.deleted_poses if session else ())
         self._boards.draw(poses, self._board, snapshot.rig.camera, self._chosen.value)
         self._draw_chosen(snapshot)
 

@@ -12,6 +12,7 @@ from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened, spread
 from slviewer.gui.preview import drawn, legend, light_words
 from slviewer.gui.steps.verify import likely
+from slviewer.gui.undelete import Undelete
 from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Picture, Words, block, cell, colour_bar, colours, table, thumbnail, toned
 from slviewer.gui.world import Stand
@@ -67,6 +68,7 @@ class Panel:
                 "Delete scan", icon=viser.Icon.TRASH, color="red", hint="It goes to the session's trash"
             )
             delete.on_click(safely(lambda: operator.delete(self._scan.value)))
+        self._undelete = Undelete(self._stage)
         self._scan.on_change(safely(self._refresh))
         self._colour.on_update(safely(self._refresh))
 
@@ -78,6 +80,7 @@ class Panel:
             change(self._capture_folder, visible=rig.state != "none")
             change(self._capture, disabled=not ready or rig.state != "open" or rig.capture is not None)
             self._stand.draw(snapshot)
+            self._undelete.offer(session.deleted_scans if session else ())
             scans = ordered(session.scans) if session else []
             change(self._cloud_folder, visible=bool(scans))
             self._gallery.set(gallery(scans, self._scan.value))
@@ -104,6 +107,7 @@ class Panel:
         self._visible = visible
         self._stage.scene.show(LAYER, visible)
         self._stage.scene.on_pick(self._pick if visible else None)
+        self._look()
 
     # drawing
 
@@ -154,6 +158,11 @@ class Panel:
         if fresh:
             self._stage.scene.remove(LAYER, "picked")
             self._point.set("")
+        self._look()
+
+    def _look(self) -> None:
+        if self._visible and self._cloud is not None:
+            self._stage.eyes.at(f"{LAYER} {self._cloud.name}", self._cloud.points)
 
     def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
         cloud = self._cloud

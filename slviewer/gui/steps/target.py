@@ -20,6 +20,7 @@ KINDS: dict[str, Kind] = {
     "Chessboard": "chessboard",
     "ChArUco": "charuco",
 }
+DICTIONARIES = tuple(f"DICT_{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000))
 _COUNTED = {
     "circles": "circles across and down, and the distance between their centres",
     "acircles": "circles in a row, rows, and half the distance between neighbours of a row",
@@ -47,12 +48,14 @@ class Panel:
         self._columns = gui.add_number("Across", board.columns, min=2, max=200, step=1)
         self._rows = gui.add_number("Down", board.rows, min=3, max=200, step=1)
         self._pitch = gui.add_number("Pitch, mm", float(board.pitch_mm), min=0.1, max=1000.0, step=0.01)
+        self._marker = gui.add_number("Marker, mm", 1.0, min=0.1, max=1000.0, step=0.01, visible=False)
+        self._dictionary = gui.add_dropdown("Dictionary", DICTIONARIES, visible=False)
         self._counts = Words(gui)
         self._use = gui.add_button("Use this board", icon=viser.Icon.CHECK)
         self._print = gui.add_button("Make PDF to print", icon=viser.Icon.PRINTER, color="gray")
         self._sheet = Words(gui)
         self._picture = Picture(gui, "Live picture")
-        for field in (self._columns, self._rows, self._pitch):
+        for field in (self._columns, self._rows, self._pitch, self._marker, self._dictionary):
             field.on_update(stage.safely_with(self._edited))
         self._kind.on_update(stage.safely_with(self._another_kind))
         self._use.on_click(stage.safely(lambda: stage.operator.choose_target(str(self._entered()))))
@@ -83,13 +86,21 @@ class Panel:
     def _entered(self) -> Board:
         """The board that the fields describe; InputError where there is none such."""
         kind = KINDS[self._kind.value]
-        return Board.parse(f"{kind}:{int(self._columns.value)}x{int(self._rows.value)}:{self._pitch.value:g}")
+        notation = f"{kind}:{int(self._columns.value)}x{int(self._rows.value)}:{self._pitch.value:g}"
+        markers = f":{self._marker.value:g}:{self._dictionary.value}" if kind == "charuco" else ""
+        return Board.parse(notation + markers)
 
     def _fill(self, board: Board) -> None:
         change(self._kind, value=next(words for words, kind in KINDS.items() if kind == board.kind))
         change(self._columns, value=board.columns)
         change(self._rows, value=board.rows)
         change(self._pitch, value=float(board.pitch_mm))
+        markers = board.kind == "charuco"
+        for field in (self._marker, self._dictionary):
+            change(field, visible=markers)
+        if markers:
+            change(self._marker, value=board.marker_mm)
+            change(self._dictionary, value=board.dictionary)
 
     def _another_kind(self, event: Any) -> None:
         if event.client is not None:

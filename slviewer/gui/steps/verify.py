@@ -45,7 +45,7 @@ class Panel:
         self._lock = threading.RLock()
         self._snapshot: Snapshot | None = None
         self._measured: tuple[str, ...] = ()
-        self._points: np.ndarray | None = None
+        self._cloud: looking.ScanCloud | None = None
         self._visible = False
 
     def build(self) -> None:
@@ -64,7 +64,7 @@ class Panel:
             self._maps = Plot(gui)
             self._model = Choice(gui, "Colours in 3D", "By whose error the cloud is coloured")
             self._legend = Words(gui)
-            bring_button(self._stage, lambda: self._points)
+            bring_button(self._stage, lambda: self._cloud.points if self._cloud else None)
         with gui.add_folder("All results", visible=False) as self._table_folder:
             self._table = Words(gui)
             self._write = gui.add_button("Write table as CSV", icon=viser.Icon.TABLE_EXPORT, color="gray")
@@ -121,6 +121,7 @@ class Panel:
     def shown(self, visible: bool) -> None:
         self._visible = visible
         self._stage.scene.show(LAYER, visible)
+        self._look()
 
     # drawing
 
@@ -161,7 +162,7 @@ class Panel:
 
     def _draw_cloud(self, made: Any) -> None:
         cloud, model, shape = made
-        self._points = cloud.points
+        self._cloud = cloud
         limit = error_limit(list(cloud.errors.values()))
         rows, columns = cloud.thinned(120_000)
         painted = colours(cloud.errors[model][rows, columns], -limit, limit, "error")
@@ -169,6 +170,11 @@ class Panel:
         self._stage.scene.show(LAYER, self._visible)
         said = f"error by {model}, {_SIGN[shape]}; grey: not counted; {shown:,} points drawn"
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", said))
+        self._look()
+
+    def _look(self) -> None:
+        if self._visible and self._cloud is not None:
+            self._stage.eyes.at(f"{LAYER} {self._cloud.name}", self._cloud.points)
 
     # requests
 

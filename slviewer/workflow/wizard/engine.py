@@ -186,6 +186,12 @@ class Engine:
                 background=True,
             )
 
+    def look_again(self, capture: Capture) -> None:
+        """The same for a capture that was looked at before, and whose results are gone."""
+        with self.lock:
+            self._queued = {key for key in self._queued if key[0] != capture.hash}
+        self.queue_unfinished()
+
     def _finish(self, reader: Reader, capture: Capture, report: Reporter) -> None:
         if capture.name not in reader.session.capture_names():
             return  # deleted since

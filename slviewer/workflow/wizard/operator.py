@@ -251,6 +251,11 @@ class Operator:
             if store.state_of(f"{kind}/{name}") != "absent":
                 store.trash_result(f"{kind}/{name}")
 
+    @_request("Bringing back")
+    def undelete(self, name: str) -> None:
+        """Bring a deleted capture back from the trash; what was computed from it is computed again."""
+        self._engine.look_again(self._engine.store.restore_capture(name))
+
     @_request("Renaming")
     def rename(self, name: str, label: str) -> None:
         """Give a capture a name for people, any text; its files keep theirs."""

@@ -115,6 +115,8 @@ class Reader:
             merge=self._merge(merges[-1], hashes) if merges else None,
             merges=len(merges),
             exports=listed(session),
+            deleted_poses=tuple(session.deleted_captures("calibration")),
+            deleted_scans=tuple(session.deleted_captures("scan")),
         )
 
     # poses

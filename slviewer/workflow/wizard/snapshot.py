@@ -229,6 +229,8 @@ class SessionView:
     merge: MergeView | None = None
     merges: int = 0  # how many undo can take back
     exports: tuple[ExportView, ...] = ()
+    deleted_poses: tuple[str, ...] = ()  # what can be brought back, the last deleted first
+    deleted_scans: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

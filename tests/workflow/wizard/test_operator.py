@@ -191,3 +191,17 @@ def test_a_session_is_opened_for_one_operator_and_changed_for_another(operator: 
     assert not operator.capture_pose() and "choose the target first" in last(operator.settle())
     assert not operator.capture_scan() and "calibrate first" in last(operator.settle())
     assert not operator.calibrate() and not operator.undo_merge() and not operator.verify(["x"], "plane")
+
+
+def test_a_deleted_pose_can_be_brought_back(operator: Operator) -> None:
+    operator.capture_pose()
+    operator.settle()
+    operator.delete("pose_01")
+    gone = operator.settle().session
+    assert gone is not None and gone.poses == () and gone.deleted_poses == ("pose_01",) and gone.deleted_scans == ()
+    operator.undelete("pose_01")
+    back = operator.settle()
+    assert back.session is not None and back.session.deleted_poses == ()
+    assert states(back) == {"pose_01": "good"} and not any(notice.level == "error" for notice in back.notices)
+    operator.undelete("pose_01")
+    assert "no deleted capture 'pose_01'" in last(operator.settle())
