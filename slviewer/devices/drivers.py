@@ -18,7 +18,8 @@ class Driver:
 
     `what`: in a few words, what it drives. `packages`: how to install each package that must be importable, such as
     ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, whole rigs (where both
-    devices share something), or several of these.
+    devices share something), or several of these. `channel`: its factories also take the keyword `channel`, the wire to
+    the projector page.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Driver:
     camera: Callable[..., Camera] | None = None
     projector: Callable[..., Projector] | None = None
     rig: Callable[..., Rig] | None = None
+    channel: bool = False
 
     @property
     def missing(self) -> str:

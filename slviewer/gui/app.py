@@ -5,21 +5,25 @@ import signal
 import threading
 import time
 import webbrowser
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import viser
 
+from slviewer.devices.channel import Channel
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.gui import shell as frame
 from slviewer.gui.panel import Stage
 from slviewer.gui.scene import Scene
 from slviewer.gui.shell import Shell
 from slviewer.gui.views import FIELD_OF_VIEW, OVERVIEW, Eyes
+from slviewer.server.projector_page import serve_projector
 from slviewer.server.secure import SafeServer, serve
 from slviewer.server.text import escape
 from slviewer.workflow.wizard.notices import words_for
 from slviewer.workflow.wizard.operator import Operator
+from slviewer.workflow.wizard.rigs import set_up
 from slviewer.workflow.wizard.snapshot import Level
 
 log = logging.getLogger("slviewer.gui")
@@ -32,11 +36,25 @@ _BRAND = (25, 113, 194)
 class App:
     """A running wizard: its engine, its server, and the thread that draws the newest snapshot."""
 
-    def __init__(self, operator: Operator, host: str = "127.0.0.1", port: int = 8080, **options: Any) -> None:
-        """Serve `operator`; `options` are those of `serve`. Raises SlviewerError where the address can't be served."""
+    def __init__(
+        self,
+        operator: Operator,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        *,
+        channel: Channel | None = None,
+        **options: Any,
+    ) -> None:
+        """Serve `operator`, and the projector page where `channel` is given, the one that its rigs are set up with.
+
+        `options` are those of `serve`. Raises SlviewerError where the address can't be served.
+        """
         self.operator = operator
+        self.channel = channel
         self.server: SafeServer = serve(host, port, label="slviewer", **options)
         try:
+            if channel is not None:
+                serve_projector(self.server, channel)
             self._start()
         except BaseException:
             self.server.stop()
@@ -158,12 +176,13 @@ def run(
 
     Raises SlviewerError where the session, the rig or the address cannot be used.
     """
-    with Operator() as operator:
+    channel = Channel()
+    with Operator(set_up=partial(set_up, channel=channel)) as operator:
         _granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
         begun = operator.wait_for(lambda s: s.session is not None, 60.0)
         if rig or begun is None or begun.rig.state == "none":
             _granted(operator, operator.choose_rig(rig_choice(rig or "simulated")))
-        app = App(operator, host, port)
+        app = App(operator, host, port, channel=channel)
         try:
             print(f"slviewer is ready: {app.server.url}")
             print(f"to watch only:     {app.server.view_url}", flush=True)

@@ -1,0 +1,127 @@
+"""A projector that any computer has: a page, full screen on the projector's output, that shows patterns pixel by pixel.
+
+A pattern varies along one axis, so that its profile alone is sent; the page keeps the profiles of one sequence, and
+repeats one over its canvas when it is shown. "Shown" is said two animation frames later: the picture is composited by
+then, not yet emitted, and what the display adds is measured and waited for as the rig's `settle_ms`.
+"""
+
+from collections.abc import Sequence
+
+from slviewer.devices.channel import Channel, Page
+from slviewer.devices.drivers import Driver
+from slviewer.devices.opening import Openable
+from slviewer.devices.protocols import check_index, check_level, check_sequence
+from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.patterns import profile
+from slviewer.fringe.sequence import PatternSequence
+
+_LARGEST_PX = 16384
+
+
+class BrowserProjector(Openable):
+    """The page at the other end of `channel`, as a projector of `size` (width, height) px.
+
+    A capture that loses its page, or during which the page's window changes, ends with a DeviceError; `load` then sends
+    the patterns again, to whatever page is ready by then.
+    """
+
+    def __init__(self, channel: Channel, size: tuple[int, int]) -> None:
+        super().__init__("the browser projector")
+        self.size = size
+        self._channel = channel
+        self._sequence: PatternSequence | None = None
+        self._sent: tuple[list[str], bytes] | None = None
+        self._page: Page | None = None  # that has what was sent
+        self._changes = 0
+
+    def open(self) -> None:
+        """Dark. Raises DeviceError with what to change where the page cannot show each pixel as it is."""
+        super().open()
+        try:
+            self._forget()
+            self._channel.expect(self.size)
+            self._channel.page()
+            self.show_level(None)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the page to its marker."""
+        if self._open:
+            self._channel.keep(None)
+        self._forget()
+        super().close()
+
+    def load(self, sequence: PatternSequence) -> None:
+        """Send all its patterns; nothing is sent where the page has them. Raises InputError, or DeviceError."""
+        self.check_open()
+        check_sequence(self, sequence)
+        page = self._channel.page()
+        profiles = [profile(sequence, k) for k in range(len(sequence.frames))]
+        axes: list[str] = [axis or "x" for axis, _ in profiles]
+        sent = axes, b"".join(levels.tobytes() for _, levels in profiles)
+        if page is not self._page or sent != self._sent:
+            self._forget()
+            page.ask("load", sent[1], size=self.size, axes=axes)
+        self._sequence, self._sent, self._page, self._changes = sequence, sent, page, page.changes
+
+    def show(self, index: int) -> None:
+        """Show one of them. Raises DeviceError where the page is not the one, or not as, it was when they were sent."""
+        self.check_open()
+        check_index(self, self._sequence, index)
+        page = self._page
+        try:
+            assert page is not None
+            page.ask("show", index=index)
+            if page.changes != self._changes:
+                raise DeviceError("the projector page's window changed while patterns were shown: capture again")
+        except BaseException:
+            self._forget()
+            raise
+
+    def show_level(self, grey: int | None) -> None:
+        """Even light, which a page that is reloaded shows again."""
+        self.check_open()
+        level = check_level(grey)
+        page = self._channel.page()
+        self._channel.keep(level)
+        page.ask("level", grey=level)
+
+    def show_marker(self) -> None:
+        """A picture by which a person, and a camera, knows this screen: four corner squares of different sizes, large
+        first at the top left, smallest at the bottom left, white on black, and the projector's size in words.
+        """
+        self.check_open()
+        self._channel.page().ask("marker")
+
+    def _forget(self) -> None:
+        self._sequence = self._sent = self._page = None
+
+
+def browser_projector(size: Sequence[int] | None = None, channel: Channel | None = None) -> BrowserProjector:
+    """The projector page's projector, of `size` (width, height) px; None: as the connected page's screen has.
+
+    Raises DeviceError without a channel, and where the size is to be the page's and no page is connected.
+    """
+    if channel is None:
+        raise DeviceError(
+            "the browser projector's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
+        )
+    if size is None:
+        found = channel.standing().size
+        if found is None:
+            raise DeviceError("open the projector page first, or say the projector's size")
+        return BrowserProjector(channel, found)
+    if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= _LARGEST_PX for side in size):
+        raise InputError(f"{size!r} is no size of a projector: give its width and height in px, such as [1920, 1080]")
+    return BrowserProjector(channel, (size[0], size[1]))
+
+
+DRIVER = Driver(
+    "browser",
+    "a page, full screen on the projector's output",
+    needs="the projector page, open in a browser on the projector's screen",
+    projector=browser_projector,
+    channel=True,
+)

@@ -1,0 +1,224 @@
+"""The wire between a projector, on the thread that owns it, and its page, which a server reaches on its event loop.
+
+The projector's side asks and waits; the server's side connects a page, hands on what it says, and tells when it is
+gone. One window at a time is the projector: it stays so when it is reloaded, and another one takes over only when
+somebody asks for that in it. What the page says of its screen is judged here whether or not a projector is open, and
+the page is told the same words as the operator.
+"""
+
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import msgspec
+
+from slviewer.devices.screen import Screen, refusal
+from slviewer.errors import DeviceError, InputError
+
+ANSWER_S = 1.8
+"""A page that is alive answers within two animation frames; a request ends within two seconds in any case."""
+
+Send = Callable[[bytes | None], None]
+"""Queue a message for the page, from any thread, and return at once; None: end it, another window took over."""
+
+_NO_PAGE = "no projector page is connected: open the projector's link on the projector's screen"
+
+
+class Hello(msgspec.Struct, tag_field="op", tag="hello"):
+    """A page's first message; `window` is the same after a reload, `take`: somebody asked for it to take over."""
+
+    window: str
+    take: bool
+    screen: Screen
+
+
+class Report(msgspec.Struct, tag_field="op", tag="screen"):
+    """The page's screen has changed."""
+
+    screen: Screen
+
+
+class Done(msgspec.Struct, tag_field="op", tag="done"):
+    """Request `number` was carried out, or why it was not."""
+
+    number: int
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where the projector page stands: "waiting" for one to be opened, "refused" or "ready", and the same in words.
+
+    `size` is the (width, height) px of the page's screen, None while there is none.
+    """
+
+    state: Literal["waiting", "refused", "ready"]
+    words: str
+    size: tuple[int, int] | None = None
+
+
+class Page:
+    """One connection of a projector page. Asked from the projector's thread, fed from the server's."""
+
+    def __init__(self, condition: threading.Condition, hello: Hello, send: Send) -> None:
+        self.window, self.screen = hello.window, hello.screen
+        self.send = send
+        self.changes = 0  # of its screen since it connected
+        self.refused, self.gone = "", ""
+        self.told: tuple | None = None
+        self._condition = condition
+        self._number = 0
+        self._answer: Done | None = None
+
+    def ask(self, op: str, payload: bytes = b"", **fields: Any) -> None:
+        """Have the page do it, and wait until it says that it has. Raises DeviceError within two seconds."""
+        with self._condition:
+            self._number += 1
+            self.check()
+            self.send(_packed({"op": op, "number": self._number, **fields}, payload))
+            end = time.monotonic() + ANSWER_S
+            while self._answer is None or self._answer.number != self._number:
+                self.check()
+                left = end - time.monotonic()
+                if left <= 0:
+                    raise DeviceError(
+                        f"the projector page did not answer within {ANSWER_S:g} s: look whether its window is covered, "
+                        "its computer asleep, or the network down"
+                    )
+                self._condition.wait(left)
+            if self._answer.why:
+                raise DeviceError(f"the projector page failed, {self._answer.why}: reload it")
+
+    def check(self) -> None:
+        """Raise DeviceError if it is gone, or its screen cannot show the patterns."""
+        if self.gone or self.refused:
+            raise DeviceError(self.gone or self.refused)
+
+    def answered(self, done: Done) -> None:
+        """Keep an answer for whoever waits for it."""
+        self._answer = done
+
+
+class Channel:
+    """Where a projector finds its page. Every method may be called from any thread; only `wait_ready` waits."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._page: Page | None = None
+        self._size: tuple[int, int] | None = None
+        self._light: int | None = None
+
+    # for whoever shows where it stands
+
+    def standing(self) -> Standing:
+        """Where the page stands now."""
+        with self._condition:
+            page = self._page
+            if page is None:
+                return Standing("waiting", "waiting for the page")
+            size = page.screen.pixels
+            if page.refused:
+                return Standing("refused", page.refused, size)
+            return Standing("ready", f"ready {size[0]} x {size[1]}", size)
+
+    def wait_ready(self, timeout_s: float) -> Standing:
+        """Where it stands as soon as it is ready, or when the time is up."""
+        with self._condition:
+            self._condition.wait_for(lambda: self.standing().state == "ready", timeout_s)
+            return self.standing()
+
+    # the projector's side
+
+    def expect(self, size: tuple[int, int]) -> None:
+        """Judge pages by patterns of this size (width, height) from now on."""
+        with self._condition:
+            self._size = size
+            self._tell()
+
+    def keep(self, grey: int | None) -> None:
+        """The light that a page shows after it was reloaded; None: no projector is open, it shows its marker."""
+        with self._condition:
+            self._light = grey
+            self._tell()
+
+    def page(self) -> Page:
+        """The page, connected and able to show the patterns. Raises DeviceError with what to change."""
+        with self._condition:
+            if self._page is None:
+                raise DeviceError(_NO_PAGE)
+            self._page.check()
+            return self._page
+
+    # the server's side
+
+    def connect(self, hello: str | bytes, send: Send) -> Page | None:
+        """The page that says hello; None where another window is the projector. Raises InputError for nonsense."""
+        said: Hello = _said(hello, Hello)
+        with self._condition:
+            before = self._page
+            if before is not None:
+                if said.window != before.window and not said.take:
+                    return None
+                self._end(
+                    before,
+                    "the projector page was reloaded, or connected anew"
+                    if said.window == before.window
+                    else "another window was made the projector",
+                )
+                before.send(None)
+            page = self._page = Page(self._condition, said, send)
+            self._tell()
+            return page
+
+    def received(self, page: Page, message: str | bytes) -> None:
+        """What a connected page says. Raises InputError for nonsense."""
+        said = _said(message, Report | Done)
+        with self._condition:
+            if isinstance(said, Done):
+                page.answered(said)
+            elif said.screen != page.screen:
+                page.screen = said.screen
+                page.changes += 1
+                self._tell()
+            self._condition.notify_all()
+
+    def disconnect(self, page: Page) -> None:
+        """The page is gone."""
+        with self._condition:
+            if self._page is page:
+                self._page = None
+                self._end(page, "the projector page was closed, or its connection was lost")
+
+    def _end(self, page: Page, why: str) -> None:
+        page.gone = f"{why}: capture again once it is ready"
+        self._condition.notify_all()
+
+    def _tell(self) -> None:
+        """Judge the page, and let it say where it stands if that is news to it."""
+        page = self._page
+        if page is None:
+            return
+        page.refused = refusal(page.screen, self._size)
+        self._condition.notify_all()
+        size = self._size or page.screen.pixels
+        told = (page.refused, size, self._light is None)
+        if told != page.told:
+            page.told = told
+            fields = {"refused": page.refused, "covers": page.screen.covers, "size": size, "light": self._light}
+            page.send(_packed({"op": "stand", **fields}))
+
+
+def _packed(header: dict[str, Any], payload: bytes = b"") -> bytes:
+    """The length of the header as 4 bytes, little endian, then the header as JSON, then the payload."""
+    text = msgspec.json.encode(header)
+    return struct.pack("<I", len(text)) + text + payload
+
+
+def _said(message: str | bytes, kind: Any) -> Any:
+    try:
+        return msgspec.json.decode(message, type=kind)
+    except (msgspec.MsgspecError, UnicodeError) as error:
+        raise InputError(f"what the projector page says is not understood ({error}): reload it") from error

@@ -1,0 +1,78 @@
+"""A browser window as a projector: whether each pixel of a pattern becomes one pixel of the screen."""
+
+from typing import Annotated
+
+import msgspec
+
+_Count = Annotated[int, msgspec.Meta(ge=0, le=2**16)]
+_Ratio = Annotated[float, msgspec.Meta(gt=0, le=64)]
+
+_EXACT_PX = 0.01  # browsers round the ratio to single precision; a window that is cut off is 0.25 px or more away
+
+
+class Screen(msgspec.Struct, frozen=True):
+    """What the page reports of its window.
+
+    `dpr`: device pixels per page pixel. `inner`, `whole`: (width, height) of the window's inside and of its screen in
+    page pixels. `box`: the inside in device pixels as the browser laid it out, None where a browser does not tell.
+    `full`: shown full screen on request. `pinched`: magnification by touch.
+    """
+
+    dpr: _Ratio
+    inner: tuple[_Count, _Count]
+    whole: tuple[_Count, _Count]
+    box: tuple[_Count, _Count] | None
+    full: bool
+    visible: bool
+    pinched: _Ratio
+
+    @property
+    def covers(self) -> bool:
+        """Whether the window fills its screen, by request or because it was opened so (kiosk, F11)."""
+        return self.full or self.inner == self.whole
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """(width, height) device px of the window if it covers its screen, else of the screen."""
+        width, height = self.inner if self.covers else self.whole
+        return round(width * self.dpr), round(height * self.dpr)
+
+    @property
+    def exact(self) -> bool:
+        """Whether the window, once it covers its screen, is a whole number of device pixels wide and high."""
+        sides = [self.dpr * side for side in self.inner]
+        whole = tuple(round(side) for side in sides)
+        near = all(abs(side - px) < _EXACT_PX for side, px in zip(sides, whole, strict=True))
+        # a ratio that developer tools emulate is not in the box, which is then in page pixels
+        return near and self.box in (None, whole, self.inner)
+
+
+def refusal(screen: Screen, size: tuple[int, int] | None) -> str:
+    """Why patterns of `size` (width, height), where it is known, cannot be shown there, and what to change; or ""."""
+    if not screen.visible:
+        return (
+            "the projector page is hidden: bring its window to the front of the projector's screen, and leave nothing "
+            "on top of it"
+        )
+    if not screen.covers:
+        return (
+            "the projector page does not fill its screen: put its window on the projector's screen and click into it "
+            "(or press F11)"
+        )
+    if abs(screen.pinched - 1) > 1e-3:
+        return "the projector page is magnified by touch: pinch it back to its normal size, or reload it"
+    if not screen.exact:
+        width, height = (screen.dpr * side for side in screen.inner)
+        return (
+            f"the projector page would resample the patterns, its window is {width:g} x {height:g} px at "
+            f"{screen.dpr:g} px per page pixel: set the scaling of the projector's display to 100 % in the system's "
+            "display settings, and the page's zoom to 100 % (Ctrl+0)"
+        )
+    if size is not None and screen.pixels != size:
+        (columns, rows), (width, height) = screen.pixels, size
+        return (
+            f"the projector page fills {columns} x {rows} px and the patterns have {width} x {height}, which must fill "
+            f"it exactly: set the resolution of that display to {width} x {height}, or choose {columns} x {rows} as "
+            "the projector's size"
+        )
+    return ""

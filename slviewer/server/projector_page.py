@@ -1,0 +1,63 @@
+"""The projector's page, and its end of the wire: what a browser projector sends, and what its page answers."""
+
+import asyncio
+import contextlib
+from importlib import resources
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from slviewer.devices.channel import Channel
+from slviewer.errors import InputError
+from slviewer.server.secure import SafeServer
+
+PATH = "/projector"
+ANOTHER_WINDOW, NOT_UNDERSTOOD = 4001, 1008
+"""Why the connection was closed: the page then waits for somebody to ask for it, or connects again."""
+_HELLO_S = 5.0
+
+
+def serve_projector(server: SafeServer, channel: Channel) -> None:
+    """Serve the page at `server.link(PATH)`, to the operator alone, and connect it to `channel`."""
+    html = resources.files("slviewer.server").joinpath("projector.html").read_text("utf-8")
+
+    async def handle(connection: ServerConnection) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            await _talk(connection, channel)
+
+    server.routes.page(PATH, html)
+    server.routes.websocket(PATH, handle)
+
+
+async def _talk(connection: ServerConnection, channel: Channel) -> None:
+    """Both directions, until one side ends it."""
+    loop, outbox = asyncio.get_running_loop(), asyncio.Queue[bytes | None]()
+
+    def send(message: bytes | None) -> None:
+        with contextlib.suppress(RuntimeError):  # the server has stopped, and the page is gone with it
+            loop.call_soon_threadsafe(outbox.put_nowait, message)
+
+    async def write() -> None:
+        while (message := await outbox.get()) is not None:
+            await connection.send(message)
+        await connection.close(ANOTHER_WINDOW, "another window is the projector")
+
+    try:
+        page = channel.connect(await asyncio.wait_for(connection.recv(), _HELLO_S), send)
+    except (InputError, TimeoutError):
+        await connection.close(NOT_UNDERSTOOD, "not understood")
+        return
+    if page is None:
+        await connection.close(ANOTHER_WINDOW, "another window is the projector")
+        return
+    writer = asyncio.create_task(write())
+    try:
+        async for message in connection:
+            channel.received(page, message)
+    except InputError:
+        await connection.close(NOT_UNDERSTOOD, "not understood")
+    finally:
+        channel.disconnect(page)
+        writer.cancel()
+        with contextlib.suppress(ConnectionClosed, asyncio.CancelledError):
+            await writer
