@@ -272,6 +272,18 @@ class Session:
         path = self.folder / "decisions.json"
         return atomic.read_json(path).get(what) if path.exists() else None
 
+    def save_rig(self, name: str, text: str) -> Path:
+        """Keep the operator's own rig, TOML, in place of one of that name; returns its file."""
+        self._require_writer()
+        path = self.folder / "rigs" / f"{safe_name(name)}.toml"
+        atomic.replace_file(path, text.encode())
+        return path
+
+    def rigs(self) -> dict[str, Path]:
+        """The files of the operator's own rigs by name."""
+        files = sorted((self.folder / "rigs").glob("[!.]*.toml"), key=lambda path: natural_key(path.stem))
+        return {path.stem: path for path in files}
+
     @property
     def exports(self) -> Path:
         """The folder for files made for other programs; made where it is missing."""

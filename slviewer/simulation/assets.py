@@ -1,4 +1,4 @@
-"""Where the things are that ship with slviewer and are not code: rig presets and the demo object."""
+"""Where the things are that ship with slviewer and are not code: rigs to choose, the simulated rig, the demo object."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def asset(name: str) -> Path:
-    """Path of a shipped file, such as ``rigs/letter.toml``: beside the package in a checkout, inside it in a wheel.
+    """Path of a shipped file, such as ``rigs/webcam.toml``: beside the package in a checkout, inside it in a wheel.
 
     Raises `InputError` if the installation lacks it.
     """
@@ -16,3 +16,11 @@ def asset(name: str) -> Path:
         if (folder / name).is_file():
             return folder / name
     raise InputError(f"the shipped file assets/{name} is missing: install slviewer again")
+
+
+def asset_folder(name: str) -> Path:
+    """Path of a shipped folder, such as ``rigs``. Raises `InputError` if the installation lacks it."""
+    for folder in (_PACKAGE / "assets", _PACKAGE.parent / "assets"):
+        if (folder / name).is_dir():
+            return folder / name
+    raise InputError(f"the shipped folder assets/{name} is missing: install slviewer again")

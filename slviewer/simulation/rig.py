@@ -15,7 +15,7 @@ from slviewer.simulation.waves import random_waves
 
 @dataclass(frozen=True)
 class Sensor:
-    """How light becomes grey levels; the field's comments stand in ``assets/rigs/letter.toml``.
+    """How light becomes grey levels; the field's comments stand in ``assets/simulation/letter.toml``.
 
     Noise of one pixel of one frame: variance = read_variance + shot_variance (level - dark_level), in grey levels
     squared, then rounding to 8 bits adds 1/12. It is the same at every scale, so that figures can be compared.
@@ -85,7 +85,7 @@ def letter(
         raise InputError(f"a local distortion of {local_distortion_px:g} px is not between 0 and 5 px")
     if texture not in ("coarse", "fine"):
         raise InputError(f"the local distortion's texture is coarse or fine, not {texture!r}")
-    preset = tomllib.loads(asset("rigs/letter.toml").read_text(encoding="utf-8"))
+    preset = tomllib.loads(asset("simulation/letter.toml").read_text(encoding="utf-8"))
     local = preset["local_distortion"]
     rms = local["rms_px"] if local_distortion_px is None else local_distortion_px
     streams = np.random.SeedSequence([seed, 0x51]).spawn(3)

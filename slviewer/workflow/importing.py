@@ -1,9 +1,7 @@
 """Bringing captures and calibrations that other tools made into a session: all of them, or none."""
 
 import dataclasses
-import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -14,10 +12,10 @@ from slviewer.fringe.sequence import parse_size
 from slviewer.session.importers import frames as frames_layout
 from slviewer.session.importers import opencv_calibration, p18, procam_calibration
 from slviewer.session.importers.imported import ImportedCapture, Imports
-from slviewer.session.store import Session, is_session
 from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import available, load_stereo, save_imported_stereo
+from slviewer.workflow.opening import opened_or_made
 
 Role = Literal["calibration", "scan"]
 Size = str | tuple[int, int]
@@ -97,7 +95,7 @@ def import_opencv_calibration(
     stereo one that it was made from.
     """
     matrices = opencv_calibration.read(Path(file), list(keys))
-    with _open(session) as store:
+    with opened_or_made(session) as store:
         there = available(store)
         if there and not force:
             raise InputError(
@@ -121,18 +119,18 @@ def _save(found: Imports, session: Path | str, role: Role, force: bool, progress
     for message in found.warnings:
         warn(message)
 
-    def checked() -> Iterator[ImportedCapture]:
+    def read() -> Iterator[ImportedCapture]:
         for i, recording in enumerate(found.recordings):
             progress(i / len(found), f"reading {recording.name}")
-            yield _checked(recording.read(), warn)
+            yield checked(recording.read(), warn)
 
-    with _open(session) as store:
-        saved = store.save_captures(checked(), role, force=force)
+    with opened_or_made(session) as store:
+        saved = store.save_captures(read(), role, force=force)
     progress(1.0, "imported")
     return [capture.name for capture in saved]
 
 
-def _checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
+def checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
     """The capture, with its Gray origin found if it was not given; InputError where codes contradict the projector."""
     sequence = capture.sequence
     if not capture.settings.get("gray_origin_given", True) and any(f.kind == "gray" for f in sequence.frames):
@@ -144,21 +142,3 @@ def _checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
             warn(f"{capture.name}: Gray code 0 was found to begin at projector px {origins[0]:.2f}")
     check_projector(capture.name, sequence, decode_frames(capture.name, sequence, capture.frames))
     return dataclasses.replace(capture, sequence=sequence)
-
-
-@contextmanager
-def _open(session: Path | str) -> Iterator[Session]:
-    """The session, open for writing; one that had to be made goes again if nothing could be saved in it."""
-    folder = Path(session).expanduser().absolute()
-    fresh, parent_fresh = not is_session(folder), not folder.exists()
-    store = Session.open_or_create(folder)
-    try:
-        with store:
-            yield store
-    except BaseException:
-        if fresh:
-            for entry in folder.iterdir():
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-            if parent_fresh:
-                folder.rmdir()
-        raise

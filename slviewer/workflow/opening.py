@@ -1,10 +1,11 @@
 """A session by its folder, or one that is open already."""
 
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from slviewer.session.store import Session
+from slviewer.session.store import Session, is_session
 
 SessionLike = Path | str | Session
 
@@ -17,3 +18,21 @@ def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
     else:
         with Session.open(session, write=write) as store:
             yield store
+
+
+@contextmanager
+def opened_or_made(session: Path | str) -> Iterator[Session]:
+    """The session, open for writing; one that had to be made goes again if nothing could be saved in it."""
+    folder = Path(session).expanduser().absolute()
+    fresh, parent_fresh = not is_session(folder), not folder.exists()
+    store = Session.open_or_create(folder)
+    try:
+        with store:
+            yield store
+    except BaseException:
+        if fresh:
+            for entry in folder.iterdir():
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            if parent_fresh:
+                folder.rmdir()
+        raise

@@ -1,8 +1,9 @@
-"""The one thread that owns camera and projector: it shows, grabs, saves, and never computes.
+"""The one thread that owns camera and projector: it shows, grabs, saves, and computes nothing of its own.
 
 Between captures it grabs previews and hands on the latest one. A capture is saved by the request's own `save` before
 anything else happens, or it never existed. A fault ends the capture in which it happens, with a sentence; the devices
-are then closed and opened again, every `RETRY_S` until they answer, and the preview goes on.
+are then closed and opened again, every `RETRY_S` until they answer, and the preview goes on. Other work that needs the
+open devices, such as a check of the rig, takes its turn among the captures, and ends and fails as they do.
 """
 
 import threading
@@ -10,13 +11,15 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import Taken, take
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import Cancelled, DeviceError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.workflow.feedback import Progress
 from slviewer.workflow.wizard.notices import Notices, words_for
 from slviewer.workflow.wizard.snapshot import CaptureProgress, RigView
 
@@ -25,18 +28,36 @@ PREVIEWS_PER_S = 10.0
 LIGHTS = {"white": 255, "grey": 128, "dark": None}
 """What the projector may show between captures, as grey levels; "pattern" is a sequence's first frame."""
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True)
 class CaptureRequest:
-    """`save(frames, settings)` must put the capture on disk, and is called on the acquisition thread; `saved` after it.
+    """`save(taken)` must put the capture on disk, and is called on the acquisition thread; `saved` after it.
 
-    `frames` are this thread's own and overwritten by the next capture.
+    The frames that are taken, in each of `exposures_ms` where there are any, are this thread's own and overwritten by
+    the next capture.
     """
 
     name: str
     sequence: PatternSequence
-    save: Callable[[np.ndarray, CameraSettings], None]
+    save: Callable[[Taken], None]
     saved: Callable[[], None]
+    exposures_ms: tuple[float, ...] = ()
+
+    @property
+    def frames(self) -> int:
+        """How many are taken."""
+        return len(self.sequence.frames) * max(1, len(self.exposures_ms))
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Work with the open rig that is no capture."""
+
+    name: str
+    work: Callable[[Rig, Progress], Any]
+    done: Callable[[Any], None]
 
 
 class Acquisition:
@@ -48,7 +69,7 @@ class Acquisition:
     def __init__(self, notices: Notices, changed: Callable[[], None], offer: Callable[[np.ndarray], None]) -> None:
         self._notices, self._changed, self._offer = notices, changed, offer
         self._condition = threading.Condition()
-        self._requests: deque[CaptureRequest] = deque()
+        self._requests: deque[CaptureRequest | _Task] = deque()
         self._wanted: Rig | None = None
         self._settings: CameraSettings | None = None
         self._light: tuple[str, PatternSequence | None] = ("white", None)
@@ -96,15 +117,19 @@ class Acquisition:
 
     def capture(self, request: CaptureRequest) -> None:
         """Queue a capture. Raises DeviceError where no rig is open."""
-        with self._condition:
-            if self._view.state != "open":
-                why = self._view.fault or "choose a rig first, and wait until its preview runs"
-                raise DeviceError(f"{request.name} cannot be captured: {why}")
-            self._requests.append(request)
-            self._condition.notify_all()
+        self._queue(request, "captured")
+
+    def run(self, name: str, task: Callable[[Rig, Progress], T], done: Callable[[T], None]) -> None:
+        """Queue other work with the open rig; `done(result)` is called on this thread, and must return at once.
+
+        The task may show, grab and set what it likes: the light and the settings of before are restored after it. Its
+        progress is seen in `view().capture`, and cancels it. What it raises is told as a capture's fault is. Raises
+        DeviceError where no rig is open.
+        """
+        self._queue(_Task(name, task, done), "done")
 
     def cancel(self) -> None:
-        """Stop the capture that runs, and forget those that wait."""
+        """Stop the capture or the task that runs, and forget those that wait."""
         with self._condition:
             self._requests.clear()
             self._cancel = self._view.capture is not None
@@ -112,12 +137,12 @@ class Acquisition:
 
     @property
     def idle(self) -> bool:
-        """Whether no capture runs or waits."""
+        """Whether no capture and no task runs or waits."""
         with self._condition:
             return not self._requests and self._view.capture is None
 
     def names(self) -> list[str]:
-        """Captures that run or wait."""
+        """Captures and tasks that run or wait."""
         with self._condition:
             running = [] if self._view.capture is None else [self._view.capture.name]
             return running + [request.name for request in self._requests]
@@ -139,6 +164,14 @@ class Acquisition:
         if self._thread is not None:
             self._thread.join(5.0)
 
+    def _queue(self, request: CaptureRequest | _Task, done: str) -> None:
+        with self._condition:
+            if self._view.state != "open":
+                why = self._view.fault or "choose a rig first, and wait until its preview runs"
+                raise DeviceError(f"{request.name} cannot be {done}: {why}")
+            self._requests.append(request)
+            self._condition.notify_all()
+
     # on the thread
 
     def _serve(self) -> None:
@@ -151,7 +184,7 @@ class Acquisition:
                 if self._is_open and self._rig is self._wanted and self._requests:
                     request = self._requests.popleft()
                     self._cancel = False
-                    n = len(request.sequence.frames)
+                    n = request.frames if isinstance(request, CaptureRequest) else 0
                     self._view = replace(self._view, capture=CaptureProgress(request.name, 0, n, 0))
                 wanted = self._wanted
             try:
@@ -159,7 +192,7 @@ class Acquisition:
                     self._close_devices()
                     self._rig, self._next_try = wanted, 0.0
                 elif request is not None:
-                    self._take(request)
+                    self._serve_request(request)
                     preview = 0.0
                 elif wanted is not None and not self._is_open:
                     if time.monotonic() >= self._next_try:
@@ -221,41 +254,58 @@ class Acquisition:
         self._rig.camera.grab(frame)
         self._offer(frame)
 
-    def _take(self, request: CaptureRequest) -> None:
-        assert self._rig is not None
+    def _serve_request(self, request: CaptureRequest | _Task) -> None:
         try:
             self._prepare()
-            self._lit = None  # the capture leaves its last frame on the projector
-            frames = capture(self._rig, request.sequence, self._frames(request.sequence), self._count)
-            request.save(frames, self._rig.camera.settings())
-            request.saved()
+            self._lit = None  # what is shown and set from here on is the request's
+            if isinstance(request, CaptureRequest):
+                self._take(request)
+            else:
+                self._do(request)
         except Cancelled:
-            self._notices.tell("info", f"{request.name}: cancelled, nothing is kept of it")
-            return
+            kept = ", nothing is kept of it" if isinstance(request, CaptureRequest) else ""
+            self._notices.tell("info", f"{request.name}: cancelled{kept}")
         except DeviceError:
             raise
         except SlviewerError as error:  # the disk refused, or the patterns: the devices are well
             self._notices.tell("error", f"{request.name}: {error}")
-            return
         finally:
             self._say(capture=None)
 
-    def _frames(self, sequence: PatternSequence) -> np.ndarray:
+    def _take(self, request: CaptureRequest) -> None:
+        assert self._rig is not None
+        taken = take(self._rig, request.sequence, request.exposures_ms, self._frames(request.frames), self._count)
+        request.save(taken)
+        request.saved()
+
+    def _do(self, task: _Task) -> None:
+        assert self._rig is not None
+        self._applied = None
+        task.done(task.work(self._rig, self._share))
+
+    def _frames(self, count: int) -> np.ndarray:
         """One buffer for all captures of one size: page faults of a fresh one would cost the frame rate."""
         assert self._rig is not None
         width, height = self._rig.camera.size
-        shape, dtype = (len(sequence.frames), height, width), self._rig.camera.dtype
+        shape, dtype = (count, height, width), self._rig.camera.dtype
         if self._buffer is None or self._buffer.shape != shape or self._buffer.dtype != dtype:
+            self._buffer = None  # before the next one is made
             self._buffer = np.empty(shape, dtype)
         return self._buffer
 
     def _count(self, frame: int, frames: int) -> None:
+        self._progress(frame=frame, frames=frames)
+
+    def _share(self, share: float, doing: str) -> None:
+        self._progress(frame=round(100 * share), frames=100, doing=doing)
+
+    def _progress(self, **changes: object) -> None:
         if self._cancel:
             raise Cancelled("cancelled")
         with self._condition:
             current = self._view.capture
             if current is not None:
-                self._view = replace(self._view, capture=replace(current, frame=frame, frames=frames))
+                self._view = replace(self._view, capture=replace(current, **changes))  # type: ignore[arg-type]
         self._changed()
 
     def _lose(self, error: Exception) -> None:

@@ -16,6 +16,7 @@ from slviewer.session.capture import Capture
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
+from slviewer.workflow.capturing import PATTERNS
 from slviewer.workflow.models import available, best, load_model, load_stereo
 from slviewer.workflow.wizard.exporting import listed
 from slviewer.workflow.wizard.snapshot import (
@@ -30,9 +31,6 @@ from slviewer.workflow.wizard.snapshot import (
     VerificationRow,
 )
 from slviewer.workflow.wizard.suggestion import Features, Plan, plan
-
-PATTERNS = "complementary"
-"""The sequence where the session names none: its codes forgive blurred edges, and it is shorter than the Letter's."""
 
 
 class Reader:

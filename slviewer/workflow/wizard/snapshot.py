@@ -42,12 +42,16 @@ class JobView:
 
 @dataclass(frozen=True)
 class CaptureProgress:
-    """A capture on its way: frames taken, of how many, and how many captures wait behind it."""
+    """A capture on its way: frames taken, of how many, and how many captures wait behind it.
+
+    Other work with the devices says what it is `doing`, and its `frame` of `frames` are percent.
+    """
 
     name: str
     frame: int
     frames: int
     waiting: int
+    doing: str = ""
 
 
 @dataclass(frozen=True)

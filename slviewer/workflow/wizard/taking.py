@@ -5,11 +5,11 @@ from typing import Literal
 
 import numpy as np
 
-from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.capture import Taken, check_exposures
 from slviewer.errors import DeviceError, InputError, SessionError
-from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.atomic import megabytes
+from slviewer.workflow.capturing import keep, sequence_for
 from slviewer.workflow.simulating import one_axis
 from slviewer.workflow.wizard.acquisition import CaptureRequest
 from slviewer.workflow.wizard.engine import Engine
@@ -18,11 +18,16 @@ Purpose = Literal["scan", "plane", "sphere"]
 
 
 def sequence_for_poses(engine: Engine) -> PatternSequence:
-    """Both axes of the session's pattern sequence, for the projector of the rig."""
-    projector = engine.acquisition.view().projector
-    if projector is None:
+    """Both axes of the session's pattern sequence, for the projector of the rig, or what a recording answers to."""
+    if engine.bench is None:
         raise DeviceError("no rig is chosen: choose one in the step Rig")
-    return PRESETS[engine.reader.patterns()](projector)
+    return sequence_for(engine.bench, engine.reader.patterns())
+
+
+def exposures_ms(engine: Engine) -> tuple[float, ...]:
+    """The exposures of every capture as the session decided them ("exposures", a list of ms); empty: a single one."""
+    decided = engine.store.decision("exposures") or ()
+    return tuple(check_exposures(decided)) if decided else ()
 
 
 def take_pose(engine: Engine, name: str | None = None) -> None:
@@ -37,11 +42,8 @@ def take_pose(engine: Engine, name: str | None = None) -> None:
     sequence, name = sequence_for_poses(engine), name or _next_name(engine, "pose")
     source = engine.acquisition.view().name
 
-    def save(frames: np.ndarray, camera: CameraSettings) -> None:
-        settings = {"purpose": "pose", "exposure_ms": camera.exposure_ms, "gain": camera.gain}
-        store.save_capture(
-            name, "calibration", sequence, frames, source=source, settings=settings, board=target, force=retake
-        )
+    def save(taken: Taken) -> None:
+        keep(store, name, "calibration", sequence, taken, source=source, purpose="pose", board=target, force=retake)
         if retake and name in store.excluded():
             store.include(name)
 
@@ -56,13 +58,14 @@ def take_scan(engine: Engine, purpose: Purpose, label: str, follow: Callable[[st
         raise InputError("calibrate first: without a calibration a capture cannot be measured")
     # half of the frames, of the axis along which the projector's picture moves more with depth
     shift = np.abs(np.diag(view.calibration.K_projector)[:2] * view.calibration.t[:2])
-    sequence = one_axis(sequence_for_poses(engine), "x" if shift[0] >= shift[1] else "y")
+    sequence = sequence_for_poses(engine)
+    if engine.bench is not None and engine.bench.reel is None:
+        sequence = one_axis(sequence, "x" if shift[0] >= shift[1] else "y")
     name = _next_name(engine, purpose)
     source = engine.acquisition.view().name
 
-    def save(frames: np.ndarray, camera: CameraSettings) -> None:
-        settings = {"purpose": purpose, "exposure_ms": camera.exposure_ms, "gain": camera.gain}
-        store.save_capture(name, "scan", sequence, frames, source=source, settings=settings)
+    def save(taken: Taken) -> None:
+        keep(store, name, "scan", sequence, taken, source=source, purpose=purpose)
         if label.strip():
             store.decide("names", {**(store.decision("names") or {}), name: label.strip()})
 
@@ -73,22 +76,27 @@ def _take(
     engine: Engine,
     name: str,
     sequence: PatternSequence,
-    save: Callable[[np.ndarray, CameraSettings], None],
+    save: Callable[[Taken], None],
     follow: Callable[[], object],
 ) -> None:
-    space = engine.space(len(sequence.frames))
+    exposures = exposures_ms(engine)
+    space = engine.space(len(sequence.frames) * max(1, len(exposures)))
     if space is not None and not space.enough:
         raise SessionError(
             f"{name} needs {megabytes(space.capture_bytes or 0)} and {megabytes(space.free_bytes)} are free on "
             f"{engine.store.folder}: free some space first"
         )
 
+    bench = engine.bench
+
     def saved() -> None:
         engine.queue_unfinished()
         follow()
         engine.teller.changed(session=True)
+        if bench is not None and bench.reel is not None:
+            bench.reel.wind_on()
 
-    engine.acquisition.capture(CaptureRequest(name, sequence, save, saved))
+    engine.acquisition.capture(CaptureRequest(name, sequence, save, saved, exposures))
 
 
 def _next_name(engine: Engine, kind: str) -> str:

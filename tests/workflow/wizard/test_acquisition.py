@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from slviewer.devices.capture import Taken
 from slviewer.devices.faults import Faults, breakable
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import simulated_rig
@@ -43,7 +44,10 @@ class Bench:
 
     def request(self, name: str, sequence: PatternSequence = SEQUENCE) -> CaptureRequest:
         return CaptureRequest(
-            name, sequence, lambda frames, camera: self.saved.append((name, frames.copy(), camera)), lambda: None
+            name,
+            sequence,
+            lambda taken: self.saved.append((name, taken.frames.copy(), taken.settings)),
+            lambda: None,
         )
 
     def until(self, condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
@@ -138,7 +142,7 @@ def test_devices_that_do_not_open_are_tried_again_and_told_of_once(
 
 
 def test_a_disk_that_refuses_loses_the_capture_but_not_the_rig(bench: Bench) -> None:
-    def save(frames: np.ndarray, camera: CameraSettings) -> None:
+    def save(taken: Taken) -> None:
         raise SessionError("the disk is full: free some space")
 
     bench.open()
