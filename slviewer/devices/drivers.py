@@ -2,7 +2,7 @@
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
@@ -19,7 +19,7 @@ class Driver:
     `what`: in a few words, what it drives. `packages`: how to install each package that must be importable, such as
     ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, whole rigs (where both
     devices share something), or several of these. `channel`: its factories also take the keyword `channel`, the wire to
-    the projector page.
+    the projector page. `found`: looks for what is connected, a line each.
     """
 
     name: str
@@ -30,6 +30,7 @@ class Driver:
     projector: Callable[..., Projector] | None = None
     rig: Callable[..., Rig] | None = None
     channel: bool = False
+    found: Callable[[], Sequence[str]] | None = None
 
     @property
     def missing(self) -> str:
