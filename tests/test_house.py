@@ -25,6 +25,7 @@ ROOMS = [
     "server",
     "gui",
     "terminal",
+    "commands",
     "cli",
 ]
 STRANGERS = [

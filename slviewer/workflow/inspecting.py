@@ -13,7 +13,7 @@ def inspect(session: SessionLike) -> str:
         lines = [f"{store.folder}: {len(captures)} capture{'s' * (len(captures) != 1)}"]
         for capture in captures:
             note = f"  [excluded: {excluded[capture.name]}]" if capture.name in excluded else ""
-            lines.append(f"  {capture.name:<16} {capture.role:<12} {_described(capture)}{note}")
+            lines.append(f"  {summary(capture)}{note}")
         for name in available(store):
             state = store.state_of(f"calibration/{name}")
             poses = store.load_result(f"calibration/{name}", only=())[0]["inputs"]
@@ -29,8 +29,15 @@ def inspect(session: SessionLike) -> str:
     return "\n".join(lines)
 
 
-def _described(capture: Capture) -> str:
+def summary(capture: Capture) -> str:
+    """A capture in one line."""
     sequence, (width, height) = capture.sequence, capture.size
     periods = ", ".join(f"{axis} {sequence.period_px(axis):g} px" for axis in sequence.axes)
     projector = f"{sequence.projector[0]}x{sequence.projector[1]}"
-    return f"camera {width}x{height}, projector {projector}, {len(sequence.frames)} frames, period {periods}"
+    said = (
+        f"{capture.name:<16} {capture.role:<12} camera {width}x{height}, projector {projector}, "
+        f"{len(sequence.frames)} frames, period {periods}"
+    )
+    if capture.exposures_ms:
+        said += f", exposures {', '.join(f'{exposure:g}' for exposure in capture.exposures_ms)} ms"
+    return said + (", colour" if capture.meta.get("texture") else "")

@@ -50,6 +50,14 @@ def presets(session: Session | None = None) -> list[Preset]:
     return [_read(name, path) for name, path in {**own, **shipped}.items()]
 
 
+def rigs(session: Session | None = None) -> str:
+    """The rigs that can be chosen by name, in words."""
+    lines = ["rigs:"]
+    for preset in presets(session):
+        lines.append(f"  {preset.name}: {preset.what}" + (f" ({preset.missing})" if preset.missing else ""))
+    return "\n".join(lines)
+
+
 def load_rig(path_or_name: Path | str, session: Session | None = None) -> dict[str, Any]:
     """The checked choice in a TOML file, or of the preset of that name.
 

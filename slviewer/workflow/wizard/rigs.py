@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from slviewer.devices.channel import Channel
-from slviewer.devices.drivers import Driver, driver
+from slviewer.devices.drivers import Driver, driver, drivers
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
@@ -74,6 +74,12 @@ def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = Non
         return Bench(rig, focal_px=focal)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the rig {dict(choice)} cannot be set up ({error}): choose it again") from error
+
+
+def needs_page(choice: Choice) -> bool:
+    """Whether one of a choice's devices is reached through the projector page."""
+    parts = [choice, *(part for key in ("camera", "projector") if isinstance(part := choice.get(key), Mapping))]
+    return any(drivers()[str(part["driver"])].channel for part in parts if str(part.get("driver")) in drivers())
 
 
 def rig_factory(found: Driver) -> Callable[..., Any] | None:

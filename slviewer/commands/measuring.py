@@ -1,0 +1,111 @@
+"""From captures to clouds: calibrate, reconstruct, verify, merge."""
+
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from slviewer import workflow
+from slviewer.commands.parsing import Axis, ModelName, deferred, ui, write_json
+
+
+@deferred
+def calibrate(
+    session: Positional[Path],
+    target: str,
+    models: tuple[ModelName, ...] = ("stereo", "pixelwise"),
+    smoothing: Literal["spline", "polynomial"] = "spline",
+    degree: int = 5,
+    json: Path | None = None,
+) -> None:
+    """Calibrate from the session's target poses.
+
+    Args:
+        session: Session folder.
+        target: circles:21x16:9 (columns x rows : pitch mm), acircles:…, chessboard:9x7:75 (inner corners : square mm),
+            charuco:….
+        models: Which models to fit.
+        smoothing: How the Letter's step 2 smooths a board's phase; the spline keeps the local distortion.
+        degree: Degree of the polynomial, with --smoothing polynomial.
+        json: Write the result to this file too.
+    """
+    result = workflow.calibrate(session, target, models=models, smoothing=smoothing, degree=degree, **ui())
+    write_json(json, result.to_json())
+    print(result.text())
+
+
+@deferred
+def reconstruct(
+    session: Positional[Path],
+    capture: Positional[str],
+    model: ModelName | None = None,
+    axis: Axis | None = None,
+    out: Path | None = None,
+    grid: Path | None = None,
+) -> None:
+    """Reconstruct a capture as a cloud; a board pose also says how flat each model measures the board.
+
+    Args:
+        session: Session folder.
+        capture: Name of the capture.
+        model: Which calibration to use; by default the best one available.
+        axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
+        out: PLY file; by default in the session's exports. That of a board pose holds the points inside the board's
+            outline.
+        grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as .npy.
+    """
+    print(workflow.reconstruct(session, capture, model=model, axis=axis, out=out, grid=grid, **ui()).text())
+
+
+@deferred
+def verify(
+    session: Positional[Path],
+    captures: Positional[tuple[str, ...]],
+    shape: Literal["plane", "sphere"],
+    model: tuple[ModelName, ...] = (),
+    range: tuple[float, float] | None = None,
+    radius: float | None = None,
+    axis: Axis | None = None,
+    json: Path | None = None,
+) -> None:
+    """Measure captures of a plane or a sphere with each model, and compare.
+
+    Args:
+        session: Session folder.
+        captures: Names of the captures.
+        shape: What the captures show.
+        model: Which calibrations to compare; by default all there are.
+        range: Near and far end of the calibrated depths R2, mm; by default those of the board poses.
+        radius: Nominal radius of the sphere, mm: helps to find it; the fitted radius stays free.
+        axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
+        json: Write the result to this file too.
+    """
+    result = workflow.verify(
+        session, captures, shape, models=model, depth_range=range, radius=radius, axis=axis, **ui()
+    )
+    write_json(json, result.to_json())
+    print(result.text())
+
+
+@deferred
+def merge(
+    session: Positional[Path],
+    captures: Positional[tuple[str, ...]],
+    reference: str,
+    out: Path,
+    model: ModelName | None = None,
+    json: Path | None = None,
+) -> None:
+    """Register scans to a reference scan by ICP, and merge them into one cloud.
+
+    Args:
+        session: Session folder.
+        captures: Names of the captures.
+        reference: The capture whose frame the merged cloud takes.
+        out: PLY file.
+        model: Which calibration to use; by default the best one available.
+        json: Write the registrations to this file too.
+    """
+    result = workflow.merge(session, captures, reference, out, model=model, **ui())
+    write_json(json, result.to_json())
+    print(result.text())

@@ -1,0 +1,43 @@
+"""What commands have in common: how their arguments are read, and where their words go."""
+
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import tyro
+
+from slviewer import terminal
+
+Axis = Literal["x", "y"]
+ModelName = Literal["stereo", "pixelwise"]
+Role = Literal["calibration", "scan"]
+
+
+def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """Parsing ends before the command runs, so that no error of the command is taken for one of its arguments."""
+
+    @functools.wraps(command)
+    def parse(*args: Any, **kwargs: Any) -> Callable[[], None]:
+        return functools.partial(command, *args, **kwargs)
+
+    return parse
+
+
+def union(commands: dict[str, Callable[..., Any]]) -> Any:
+    """The type whose value is one of the commands, for tyro."""
+    choices = [Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)] for name, f in commands.items()]
+    return Union[tuple(choices)]  # noqa: UP007 (built at run time)
+
+
+def write_json(path: Path | None, data: dict[str, Any]) -> None:
+    """Write a result to a file, where one is asked for."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(data, indent=2) + "\n")
+
+
+def ui() -> dict[str, Any]:
+    """Callbacks for progress and warnings on standard error."""
+    return {"progress": terminal.progress, "warn": terminal.warn}

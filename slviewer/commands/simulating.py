@@ -1,0 +1,51 @@
+"""Without a rig: simulated sessions, and the Letter's experiments on them."""
+
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from slviewer import workflow
+from slviewer.commands.parsing import deferred, ui, write_json
+
+
+@deferred
+def simulate(
+    session: Positional[Path],
+    preset: Literal["letter"] = "letter",
+    scale: float = 1.0,
+    poses: int = 25,
+    seed: int = 0,
+) -> None:
+    """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object at three depths.
+
+    Args:
+        session: Session folder to make.
+        preset: Which rig.
+        scale: Resolution of the camera, as a share of the preset's.
+        poses: How many target poses.
+        seed: Another seed is another rig of the same kind.
+    """
+    names = workflow.simulate(session, preset=preset, scale=scale, poses=poses, seed=seed, **ui())
+    print(f"{len(names)} captures simulated into {session}")
+
+
+@deferred
+def reproduce(
+    quick: bool = False,
+    out: Path | None = None,
+    json: Path | None = None,
+    seed: int = 0,
+) -> None:
+    """Repeat the Letter's experiments on the simulated rig, and put its figures beside ours.
+
+    Args:
+        quick: Half resolution; its figures are its own.
+        out: Folder for the session and the report; by default reproduction, or reproduction-quick.
+        json: Write the figures to this file too.
+        seed: Another seed is another rig of the same kind.
+    """
+    folder = out or Path("reproduction-quick" if quick else "reproduction")
+    result = workflow.reproduce(folder, quick=quick, seed=seed, **ui())
+    write_json(json, result.to_json())
+    print(result.text())

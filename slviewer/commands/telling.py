@@ -1,0 +1,68 @@
+"""What goes on paper, on a page, or to the terminal: patterns, targets, reports, figures."""
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from slviewer import terminal, workflow
+from slviewer.commands.parsing import deferred, ui, write_json
+
+
+@deferred
+def patterns(preset: str, projector: str, out: Path) -> None:
+    """Write the images of a pattern sequence, and the TOML that `import frames` reads.
+
+    Args:
+        preset: p18, complementary, gray or multifrequency.
+        projector: Width x height of the projector, px.
+        out: Folder to make.
+    """
+    print(f"{workflow.patterns(preset, projector, out)} patterns written to {out}")
+
+
+@deferred
+def target(board: Positional[str], out: Path) -> None:
+    """Draw a printable target to exact scale.
+
+    Args:
+        board: circles:21x16:9, acircles:…, chessboard:9x7:75 or charuco:….
+        out: A .pdf or .svg file.
+    """
+    workflow.target(board, out)
+    print(f"{board} drawn to {out}: print at 100 %, and measure it")
+
+
+@deferred
+def report(session: Positional[Path], out: Path) -> None:
+    """Write one self-contained HTML report of a session.
+
+    Args:
+        session: Session folder.
+        out: The .html file.
+    """
+    workflow.report(session, out, **ui())
+    print(f"report written to {out}")
+
+
+@deferred
+def inspect(session: Positional[Path]) -> None:
+    """Say what a session holds, and what is stale.
+
+    Args:
+        session: Session folder.
+    """
+    print(workflow.inspect(session))
+
+
+@deferred
+def bench(calibration: bool = False, scale: float = 1.0, json: Path | None = None) -> None:
+    """Time the main stages on this machine, beside what they cannot beat.
+
+    Args:
+        calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full size).
+        scale: Resolution of the camera, as a share of 1600x1200.
+        json: Write the figures to this file too.
+    """
+    result = workflow.bench(calibration=calibration, scale=scale, progress=terminal.progress)
+    write_json(json, result.to_json())
+    print(result.text())
