@@ -1,0 +1,138 @@
+"""What a window must be like to show patterns, and which window is the projector (the page: tests/server)."""
+
+import msgspec
+import pytest
+
+from slviewer.devices.browser import browser_projector
+from slviewer.devices.channel import Channel, Standing
+from slviewer.devices.drivers import driver
+from slviewer.devices.screen import Screen, refusal
+from slviewer.errors import DeviceError, InputError
+
+FULL_HD = Screen(1.0, (1920, 1080), (1920, 1080), (1920, 1080), True, True, 1.0)
+
+
+def screen(**changes: object) -> Screen:
+    return msgspec.structs.replace(FULL_HD, **changes)
+
+
+def hello(window: str = "a", take: bool = False, shown: Screen = FULL_HD) -> bytes:
+    return msgspec.json.encode({"op": "hello", "window": window, "take": take, "screen": shown})
+
+
+@pytest.mark.parametrize(
+    ("shown", "size"),
+    [
+        (FULL_HD, (1920, 1080)),
+        (FULL_HD, None),
+        (screen(full=False), (1920, 1080)),  # a kiosk, or F11
+        (screen(box=None), (1920, 1080)),
+        (screen(dpr=1.5, inner=(1280, 720), whole=(1280, 720)), (1920, 1080)),
+        (screen(dpr=2.0, inner=(456, 570), whole=(456, 570), box=(912, 1140)), (912, 1140)),
+        (screen(dpr=4 / 3 + 4e-8, inner=(1440, 810), whole=(1440, 810)), (1920, 1080)),
+        (screen(dpr=2.0, inner=(960, 540)), (1920, 1080)),  # the page's zoom is 200 %: each pixel is still one
+    ],
+)
+def test_windows_that_show_each_pixel_as_it_is(shown, size):
+    assert refusal(shown, size) == ""
+    assert shown.pixels == (size or (1920, 1080))
+
+
+@pytest.mark.parametrize(
+    ("shown", "size", "words"),
+    [
+        (screen(visible=False), None, "is hidden: bring its window to the front"),
+        (screen(full=False, inner=(1920, 969)), None, "does not fill its screen: put its window on the projector's"),
+        (screen(pinched=1.2), None, "magnified by touch"),
+        (screen(dpr=1.25, inner=(1537, 864)), None, "its window is 1921.25 x 1080 px at 1.25 px per page pixel"),
+        (screen(dpr=1.1, inner=(1745, 982)), None, "set the scaling of the projector's display to 100 %"),
+        (screen(dpr=1.25, inner=(1092, 768), box=(1366, 960)), None, "would resample"),
+        (FULL_HD, (912, 1140), "fills 1920 x 1080 px and the patterns have 912 x 1140"),
+        (FULL_HD, (912, 1140), "set the resolution of that display to 912 x 1140, or choose 1920 x 1080 as the pro"),
+        (FULL_HD, (1919, 1080), "must fill it exactly"),
+        (FULL_HD, (3840, 2160), "fills 1920 x 1080 px and the patterns have 3840 x 2160"),
+    ],
+)
+def test_windows_that_would_spoil_patterns_are_refused_with_what_to_change(shown, size, words):
+    assert words in refusal(shown, size)
+
+
+def test_without_a_server_the_driver_says_who_has_one():
+    assert driver("browser").channel and not driver("browser").missing
+    with pytest.raises(DeviceError, match="slviewer wizard"):
+        browser_projector()
+
+
+def test_the_size_is_the_pages_unless_it_is_given():
+    channel = Channel()
+    assert browser_projector([912, 1140], channel).size == (912, 1140)
+    with pytest.raises(DeviceError, match="open the projector page first"):
+        browser_projector(channel=channel)
+    channel.connect(hello(), lambda message: None)
+    assert browser_projector(channel=channel).size == (1920, 1080)
+    for size in ([0, 5], [5], [1.5, 2], "912x1140"):
+        with pytest.raises(InputError, match="no size of a projector"):
+            browser_projector(size, channel)  # type: ignore[arg-type]
+
+
+def test_no_page_is_said_at_once():
+    projector = browser_projector([912, 1140], Channel())
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="no projector page is connected: open the projector's link"):
+            projector.open()
+    projector.close()
+    with pytest.raises(DeviceError, match="is not open"):
+        projector.show_level(255)
+
+
+def test_one_window_is_the_projector_until_another_is_asked_for():
+    channel, sent = Channel(), {"first": [], "again": [], "other": []}
+    assert channel.standing() == Standing("waiting", "waiting for the page")
+    first = channel.connect(hello("a"), sent["first"].append)
+    assert channel.standing() == Standing("ready", "ready 1920 x 1080", (1920, 1080))
+    assert channel.connect(hello("b"), sent["other"].append) is None and sent["other"] == []
+    again = channel.connect(hello("a"), sent["again"].append)  # reloaded, its old connection not yet gone
+    assert sent["first"][-1] is None and "reloaded" in first.gone
+    channel.disconnect(first)
+    assert channel.page() is again
+    other = channel.connect(hello("b", take=True), sent["other"].append)
+    assert sent["again"][-1] is None and "another window" in again.gone and channel.page() is other
+    channel.disconnect(other)
+    assert channel.standing().state == "waiting" and channel.wait_ready(0.01).state == "waiting"
+
+
+def test_what_the_page_says_is_judged_by_what_is_expected():
+    channel, sent = Channel(), []
+    page = channel.connect(hello(), sent.append)
+    channel.expect((912, 1140))
+    assert channel.standing().state == "refused" and "912 x 1140" in channel.standing().words
+    with pytest.raises(DeviceError, match="choose 1920 x 1080"):
+        channel.page()
+    told = len(sent)
+    channel.expect((912, 1140))
+    assert len(sent) == told, "what is no news is not sent again"
+    small = screen(inner=(912, 1140), box=None)
+    channel.received(page, msgspec.json.encode({"op": "screen", "screen": small}))
+    assert channel.standing().words == "ready 912 x 1140" and len(sent) == told + 1 and page.changes == 1
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"",
+        b"{}",
+        b"\xff",
+        '{"op": "done"}',
+        '{"op": "screen", "screen": {}}',
+        hello(),
+        msgspec.json.encode({"op": "screen", "screen": {**msgspec.structs.asdict(FULL_HD), "dpr": 0}}),
+    ],
+)
+def test_nonsense_is_refused(message):
+    channel = Channel()
+    page = channel.connect(hello(), lambda message: None)
+    with pytest.raises(InputError, match="not understood"):
+        channel.received(page, message)
+    if message != hello():
+        with pytest.raises(InputError, match="not understood"):
+            channel.connect(message, lambda message: None)

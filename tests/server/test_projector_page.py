@@ -1,0 +1,354 @@
+"""The projector page in a real browser: pixels, words, and everything that may happen to a page in the middle."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from server_client import until
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from slviewer.devices.browser import BrowserProjector, browser_projector
+from slviewer.devices.channel import Channel
+from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.patterns import render
+from slviewer.fringe.presets import complementary
+from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.server.projector_page import PATH, serve_projector
+from slviewer.server.secure import SafeServer, serve
+
+SIZE = (360, 270)
+SEQUENCE = complementary(SIZE)
+KINDS = [next(i for i, f in enumerate(SEQUENCE.frames) if (f.kind, f.axis) == kind) for kind in
+         {(f.kind, f.axis): None for f in SEQUENCE.frames}]  # fmt: skip
+ELSEWHERE = "Another window is the projector"
+
+Opens = Callable[..., Page]
+
+
+@pytest.fixture
+def channel(server: SafeServer) -> Iterator[Channel]:
+    channel = Channel()
+    serve_projector(server, channel)
+    yield channel
+    server.routes.remove(PATH)
+
+
+@pytest.fixture
+def opens(browser: Browser, server: SafeServer) -> Iterator[Opens]:
+    """Opens a projector page in a browser of its own, whose screen is its window unless another one is given."""
+    contexts, errors = [], []
+
+    def opened(size: tuple[int, int] = SIZE, ratio: float = 1.0, screen: tuple[int, int] | None = None) -> Page:
+        width, height = (math.ceil(side / ratio) for side in size)
+        whole = {"width": screen[0], "height": screen[1]} if screen else None
+        viewport = {"width": width, "height": height}
+        context = browser.new_context(viewport=viewport, screen=whole, device_scale_factor=ratio)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(server.link(PATH))
+        assert page.url.endswith(PATH), "the token must not stay in the address"
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert not errors
+
+
+@pytest.fixture
+def projector(channel: Channel) -> Iterator[BrowserProjector]:
+    projector = browser_projector(SIZE, channel)
+    yield projector
+    projector.close()
+
+
+def seen(page: Page) -> np.ndarray:
+    """(h, w, 3) device pixels of the page's window."""
+    return cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+
+
+def shows(page: Page, picture: np.ndarray) -> bool:
+    return np.array_equal(seen(page), np.repeat(picture[..., None], 3, axis=2))
+
+
+def ready(channel: Channel, projector: BrowserProjector) -> None:
+    """Open, with the sequence loaded."""
+    assert channel.wait_ready(10.0).state == "ready", channel.standing()
+    projector.open()
+    projector.load(SEQUENCE)
+
+
+def fails(words: str, doing: Callable[..., object], *args: object) -> None:
+    begun = time.monotonic()
+    with pytest.raises(DeviceError, match=words):
+        doing(*args)
+    assert time.monotonic() - begun < 2.5
+
+
+@pytest.mark.parametrize("ratio", [1, 1.25, 1.5, 2])
+def test_every_pixel_of_a_pattern_is_one_pixel_of_the_screen(opens, channel, projector, ratio):
+    page = opens(ratio=ratio)
+    ready(channel, projector)
+    for index in KINDS:
+        projector.show(index)
+        assert shows(page, render(SEQUENCE, index)), SEQUENCE.frames[index]
+    projector.show_level(129)
+    assert shows(page, np.full(SIZE[::-1], 129, np.uint8))
+    projector.show(0)
+    assert shows(page, render(SEQUENCE, 0)), "even light must leave the patterns loaded"
+
+
+def test_frames_appear_in_the_order_in_which_they_are_asked_for(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    # what the canvas holds at each animation frame: the sum of a pattern is its fingerprint
+    page.evaluate(
+        """window.held = []; (function look() {
+            const { data } = context.getImageData(0, 0, 360, 270);
+            let sum = 0;
+            for (let i = 0; i < data.length; i += 4) sum = (sum * 31 + data[i]) % 1000003;
+            if (held.at(-1) !== sum) held.push(sum);
+            requestAnimationFrame(look);
+        })()"""
+    )
+    order = np.random.default_rng(3).permutation(len(SEQUENCE.frames))[:12]
+    took = []
+    for index in order:
+        begun = time.perf_counter()
+        projector.show(int(index))
+        took.append(1e3 * (time.perf_counter() - begun))
+    held = page.evaluate("held")
+
+    def fingerprint(index: int) -> int:
+        total = 0
+        for grey in render(SEQUENCE, index).ravel().tolist():
+            total = (total * 31 + grey) % 1000003
+        return total
+
+    assert held[-len(order) :] == [fingerprint(int(index)) for index in order]
+    assert 15 < np.median(took) < 300, "two animation frames are 17 to 33 ms"
+
+
+def test_a_sequence_is_sent_once_and_fast(opens, channel):
+    size = (912, 1140)
+    opens(size)
+    assert channel.wait_ready(10.0).state == "ready"
+    projector = browser_projector(None, channel)
+    assert projector.size == size
+    sequence = PatternSequence(size, tuple(Frame("phase", axis, k, 25, 18.0) for axis in ("x", "y") for k in range(25)))
+    projector.open()
+    with pytest.raises(DeviceError, match="load a sequence"):
+        projector.show(0)
+    begun = time.monotonic()
+    projector.load(sequence)
+    assert time.monotonic() - begun < 2.0
+    sent = []
+    page = channel.page()
+    real, page.send = page.send, lambda message: (sent.append(message), real(message))
+    projector.load(sequence)
+    assert sent == []
+    with pytest.raises(InputError):
+        projector.load(SEQUENCE)
+    with pytest.raises(InputError):
+        projector.show(50)
+    projector.show(49)
+    assert len(sent) == 1
+    projector.close()
+
+
+def test_a_window_that_would_resample_is_refused_in_words(opens, channel):
+    size = (402, 300)
+    page = opens(size, ratio=1.25)
+    projector = browser_projector(size, channel)
+    assert until(lambda: channel.standing().state == "refused")
+    fails("its window is 402.5 x 300 px at 1.25 px per page pixel: set the scaling", projector.open)
+    expect(page.locator("main")).to_contain_text("its window is 402.5 x 300 px at 1.25 px per page pixel")
+    page.close()
+    assert until(lambda: channel.standing().state == "waiting")
+
+
+def test_a_screen_of_another_size_is_refused_in_words(opens, channel, projector):
+    page = opens((800, 600))
+    assert channel.wait_ready(10.0).words == "ready 800 x 600"  # nobody has said yet what patterns come
+    fails("fills 800 x 600 px and the patterns have 360 x 270", projector.open)
+    expect(page.locator("main")).to_contain_text("set the resolution of that display to 360 x 270, or choose 800 x 600")
+    page.set_viewport_size({"width": 360, "height": 270})
+    assert channel.wait_ready(5.0).words == "ready 360 x 270"
+    expect(page.locator("h1")).to_have_text("slviewer projector")
+    ready(channel, projector)
+    projector.show(1)
+    assert shows(page, render(SEQUENCE, 1))
+
+
+def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel, projector):
+    page = opens(screen=(1280, 800))
+    assert until(lambda: channel.standing().state == "refused")
+    fails("does not fill its screen", projector.open)
+    page.get_by_role("button", name="Fill this screen").click()
+    ready(channel, projector)
+    projector.show(0)
+    page.evaluate("document.exitFullscreen()")
+    assert until(lambda: channel.standing().state == "refused")
+    fails("does not fill its screen", projector.show, 1)
+    fails("does not fill its screen", projector.load, SEQUENCE)
+    expect(page.get_by_role("button", name="Fill this screen")).to_be_visible()
+
+
+def test_the_marker_tells_the_screen_and_its_sides(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    projector.show_marker()
+    side = SIZE[1] / 16
+
+    def square(turned: np.ndarray) -> float:
+        """Side of the white square in the top left corner, px."""
+        return float(np.argmin(turned[0, :, 1] > 127))
+
+    picture = seen(page)
+    corners = [square(turned) for turned in (picture, picture[:, ::-1], picture[::-1, ::-1], picture[::-1])]
+    assert np.allclose(corners, [4 * side, 3 * side, 2 * side, side], atol=1)
+    expect(page.locator("main")).to_contain_text("360 x 270")
+    projector.show_level(0)
+    assert not seen(page).any()
+    projector.close()
+    expect(page.locator("h1")).to_be_visible()  # and again while nothing is open
+
+
+def test_a_reload_ends_the_capture_and_the_next_one_is_whole(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    projector.show_level(200)
+    projector.show(3)
+    page.reload()
+    assert channel.wait_ready(5.0).state == "ready"
+    assert until(lambda: shows(page, np.full(SIZE[::-1], 200, np.uint8))), "the light comes back by itself"
+    fails("reloaded|closed", projector.show, 4)
+    fails("load a sequence", projector.show, 5)
+    projector.load(SEQUENCE)
+    projector.show(4)
+    assert shows(page, render(SEQUENCE, 4))
+
+
+def test_a_lost_connection_is_made_again_by_the_page(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    page.evaluate("socket.close()")
+    assert until(lambda: channel.standing().state == "waiting")
+    fails("connection was lost", projector.show, 0)
+    assert channel.wait_ready(5.0).state == "ready"
+    projector.close()
+    ready(channel, projector)
+    projector.show(2)
+    assert shows(page, render(SEQUENCE, 2))
+
+
+def test_a_server_that_starts_again_finds_its_page(browser, channel):
+    server = serve(port=0)
+    serve_projector(server, channel)
+    page = browser.new_page(viewport={"width": 360, "height": 270})
+    page.goto(server.link(PATH))
+    assert channel.wait_ready(5.0).state == "ready"
+    server.stop()
+    expect(page.locator("h1")).to_have_text("slviewer does not answer")
+    assert channel.standing().state == "waiting"
+    again = serve(port=server.port, token=server.access.token, view_token=server.access.view_token)
+    serve_projector(again, channel)
+    assert channel.wait_ready(8.0).state == "ready"
+    page.close()
+    again.stop()
+
+
+def test_a_page_that_is_closed_in_the_middle_is_missed_at_once(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    projector.show(0)
+    page.close()
+    fails("closed|hidden", projector.show, 1)  # hidden is the last thing that some browsers say
+    assert until(lambda: channel.standing().state == "waiting", 2.0)
+    fails("no projector page is connected", projector.load, SEQUENCE)
+    projector.close()
+    fails("no projector page is connected", projector.open)
+
+
+def test_a_page_that_hangs_is_given_up(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    page.evaluate(
+        "setTimeout(() => { const end = performance.now() + 2200; while (performance.now() < end); }, 0); null"
+    )
+    fails("did not answer within 1.8 s", projector.show, 1)
+    page.evaluate("null")  # waits for it
+    projector.load(SEQUENCE)
+    projector.show(1)
+    assert shows(page, render(SEQUENCE, 1)), "an answer that came too late is not taken for the next one's"
+
+
+def test_a_window_that_changes_and_changes_back_still_ends_the_capture(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    projector.show(0)
+    for width in (380, 360):
+        page.set_viewport_size({"width": width, "height": 270})
+        assert until(lambda width=width: channel.standing().size == (width, 270))
+    fails("window changed while patterns were shown", projector.show, 1)
+    projector.load(SEQUENCE)
+    projector.show(1)
+    assert shows(page, render(SEQUENCE, 1))
+
+
+def test_a_hidden_page_is_no_projector(opens, channel, projector):
+    page = opens()
+    ready(channel, projector)
+    page.evaluate(
+        """Object.defineProperty(document, "visibilityState", { value: "hidden" });
+        document.dispatchEvent(new Event("visibilitychange"))"""
+    )
+    assert until(lambda: channel.standing().state == "refused")
+    fails("page is hidden: bring its window to the front", projector.show, 1)
+
+
+def test_a_second_window_takes_over_only_when_it_is_asked_to(opens, channel, projector):
+    first = opens()
+    ready(channel, projector)
+    second = opens()
+    expect(second.locator("h1")).to_have_text(ELSEWHERE)
+    projector.show(1)
+    assert shows(first, render(SEQUENCE, 1)), "it must not disturb the first"
+    second.get_by_role("button", name="Use this window instead").click()
+    expect(first.locator("h1")).to_have_text(ELSEWHERE)
+    fails("another window was made the projector", projector.show, 2)
+    projector.load(SEQUENCE)
+    projector.show(2)
+    assert shows(second, render(SEQUENCE, 2))
+    first.reload()
+    expect(first.locator("h1")).to_have_text(ELSEWHERE)
+    projector.show(3)
+    assert shows(second, render(SEQUENCE, 3))
+
+
+def test_the_page_is_the_operators_alone(browser, server, channel, operator, watcher, stranger):
+    assert operator.get(PATH).status == 200
+    for other in (watcher, stranger):
+        assert other.get(PATH).status == 403
+        with pytest.raises(InvalidStatus):
+            other.open(PATH)
+    page = browser.new_page()
+    assert page.goto(f"http://127.0.0.1:{server.port}{PATH}").status == 403
+    page.close()
+    assert channel.standing().state == "waiting"
+
+
+def test_nonsense_ends_its_own_connection_only(opens, channel, projector, operator):
+    opens()
+    ready(channel, projector)
+    with operator.open(PATH) as socket_:
+        socket_.send("nonsense")
+        with pytest.raises(ConnectionClosed):
+            socket_.recv(3)
+        assert socket_.close_code == 1008
+    projector.show(0)
