@@ -12,7 +12,7 @@ from slviewer.workflow.wizard.operator import Operator
 
 RIG = {"driver": "simulated", "scale": 0.25}
 
-expect.set_options(timeout=20_000)  # a browser that draws in software beside the wizard's own work has its pauses
+expect.set_options(timeout=40_000)  # a browser that draws in software beside the wizard's own work has its pauses
 
 
 @pytest.fixture

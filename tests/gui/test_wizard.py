@@ -24,6 +24,8 @@ from slviewer.workflow.wizard.snapshot import SessionView
 TARGET = "circles:21x16:9"
 RIG = {"driver": "simulated", "scale": 0.25}
 PATIENCE_S = PATIENCE_MS / 1000
+ON_THE_CLOUD = (530, 420)
+"""Page px, in the middle of the scene."""
 DEPTHS_MM = (560, 600, 640)
 
 
@@ -76,7 +78,10 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
             if number == 5:
                 page.reload()
                 expect(pose_row(page, "pose_04", "good")).to_be_visible()
-            capture_pose(page, f"pose_{number:02d}")
+            if number == 8:
+                hands_free(page, "pose_08")
+            else:
+                capture_pose(page, f"pose_{number:02d}")
         expect(page.get_by_text("8 poses, 0 scans")).to_be_visible()
 
         button(page, "4. Calibrate").click()
@@ -121,6 +126,36 @@ def scan(page: Page, operator: Operator) -> None:
         assert operator.wait_for(lambda s, n=name: (v := s.scan(n)) is not None and v.cloud == "fresh", PATIENCE_S)  # type: ignore[misc]
         expect(page.get_by_text(name).first).to_be_visible()
     expect(page.get_by_text("8 poses, 5 scans")).to_be_visible()
+    ask(page, "Clicked point")
+
+    button(page, "4. Calibrate").click()  # its curves, at a pixel of this cloud
+    choose(page, "Cloud to click", "scan_01")
+    before = field(page, "Pixel column u").input_value()
+    for _ in range(20):
+        page.mouse.click(*ON_THE_CLOUD)
+        page.wait_for_timeout(500)
+        if field(page, "Pixel column u").input_value() != before:
+            break
+    expect(field(page, "Pixel column u")).not_to_have_value(before)
+
+
+def ask(page: Page, answer: str) -> None:
+    """Click on the cloud, which comes before the eyes by itself, until it answers."""
+    for _ in range(20):
+        page.mouse.click(*ON_THE_CLOUD)
+        page.wait_for_timeout(500)
+        if page.get_by_text(answer).is_visible():
+            return
+    raise AssertionError(f"no click on the cloud brought {answer!r}")
+
+
+def hands_free(page: Page, name: str) -> None:
+    """The next pose by holding still."""
+    page.get_by_role("checkbox", name="Hands-free").check()
+    button(page, "Place at suggestion").click()
+    expect(page.get_by_text("Hold still")).to_be_visible()
+    expect(pose_row(page, name, "good")).to_be_visible(timeout=PATIENCE_MS)
+    page.get_by_role("checkbox", name="Hands-free").uncheck()
 
 
 def merge(page: Page, operator: Operator) -> None:

@@ -242,6 +242,7 @@ class Panel:
             self._painter.forget("cloud")
             self._cloud = None
             self._stage.scene.clear(LAYER)
+            self._stage.eyes.overview()
             self._refresh()
             return
         self._refresh()
@@ -254,6 +255,8 @@ class Panel:
         z = cloud.points[rows, columns, 2]
         self._stage.scene.cloud(LAYER, "cloud", cloud.points[rows, columns], colours(z, *spread(z)))
         self._stage.scene.show(LAYER, self._visible)
+        if self._visible:
+            self._stage.eyes.at(f"{LAYER} {cloud.name}", cloud.points)
 
     def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
         cloud = self._cloud

@@ -30,7 +30,6 @@ from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.rigs import Choice, SetUp, set_up
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
 from slviewer.workflow.wizard.taking import sequence_for_poses, take_pose, take_scan
-from slviewer.workflow.wizard.watching import HandsFree
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -202,6 +201,7 @@ class Operator:
     @_request("Capturing the pose")
     def capture_pose(self) -> None:
         """Capture the board where it is; it is judged in the background."""
+        self._engine.hands_free.took()  # first: what cannot be captured is not tried again with every preview
         take_pose(self._engine)
 
     @_request("Retaking the pose")
@@ -227,7 +227,7 @@ class Operator:
     @_request("Switching hands-free capture")
     def set_hands_free(self, on: bool) -> None:
         """Capture a pose by itself whenever the board is held still in a new place."""
-        self._engine.hands_free = HandsFree() if on else None
+        self._engine.hands_free.on = on
 
     # poses and scans
 

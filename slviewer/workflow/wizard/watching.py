@@ -206,21 +206,25 @@ class HandsFree:
     COUNT_S = 1.0
 
     def __init__(self) -> None:
+        self.on = False
         self._taken: np.ndarray | None = None
+        self._just_took = False
         self._begun: float | None = None
 
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
         """Seconds until the capture, 0 or less: now; None where none is coming."""
-        if board is None or busy or board.still_s < self.HOLD_S or self._same(board.outline):
+        if self._just_took and board is not None and not busy:
+            self._taken, self._just_took = board.outline, False
+        if not self.on or board is None or busy or board.still_s < self.HOLD_S or self._same(board.outline):
             self._begun = None
             return None
         if self._begun is None:
             self._begun = now
         return self.COUNT_S - (now - self._begun)
 
-    def took(self, board: BoardSeen) -> None:
-        """The board was captured here; wait until it has been moved away."""
-        self._taken, self._begun = board.outline, None
+    def took(self) -> None:
+        """A capture was asked for, by whatever means; where the board is seen after it counts as taken."""
+        self._just_took, self._begun = True, None
 
     def _same(self, outline: np.ndarray) -> bool:
         if self._taken is None:

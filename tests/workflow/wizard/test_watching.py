@@ -100,6 +100,8 @@ def test_stillness_starts_anew_with_every_movement() -> None:
 
 def test_hands_free_counts_down_once_a_place() -> None:
     hands_free = HandsFree()
+    assert hands_free.countdown(seen(7), False, 0) is None
+    hands_free.on = True
     assert hands_free.countdown(None, False, 0) is None and hands_free.countdown(seen(0.5), False, 0) is None
     assert hands_free.countdown(seen(7), False, 1.0) == 1.0  # a slow look skips no countdown
     assert hands_free.countdown(seen(7.25), False, 1.25) == pytest.approx(0.75)
@@ -109,6 +111,7 @@ def test_hands_free_counts_down_once_a_place() -> None:
     assert hands_free.countdown(seen(1.5), False, 4.0) == 1.0
     last = hands_free.countdown(seen(2.6), False, 5.1)
     assert last is not None and last < 0
-    hands_free.took(seen(2.6))
+    hands_free.took()
+    assert hands_free.countdown(seen(2.6), True, 6.0) is None
     assert hands_free.countdown(seen(5), False, 7.0) is None
     assert hands_free.countdown(seen(1.5, shift=30), False, 8.0) == 1.0
