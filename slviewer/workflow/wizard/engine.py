@@ -46,7 +46,7 @@ class Engine:
         self.log = LogKeeper()
         self.preview: PreviewView | None = None
         self.preview_listeners: list[Callable[[PreviewView], None]] = []
-        self.hands_free: HandsFree | None = None
+        self.hands_free = HandsFree()
         self.autopilot = ""
         self.bench: Bench | None = None
         self._choice: Choice | None = None
@@ -214,15 +214,11 @@ class Engine:
 
     def _seen(self, view: PreviewView) -> None:
         """A preview was looked at (on the watcher's thread)."""
-        hands_free = self.hands_free
-        if hands_free is not None:
-            countdown = hands_free.countdown(view.board, not self.acquisition.idle, time.monotonic())
-            if countdown is not None and countdown <= 0 and view.board is not None:
-                hands_free.took(view.board)
-                self._capture_now()
-            else:
-                view = replace(view, countdown_s=countdown)
-        self.preview = view
+        countdown = self.hands_free.countdown(view.board, not self.acquisition.idle, time.monotonic())
+        now = countdown is not None and countdown <= 0
+        self.preview = view = replace(view, countdown_s=None if now else countdown)
+        if now:
+            self._capture_now()
         brightness: Brightness = "saturated" if view.saturated > SATURATED else "dim" if view.brightest < DIM else ""
         if self.acquisition.view().light != "white":
             brightness = ""
@@ -256,7 +252,7 @@ class Engine:
             notices=self.notices.all(),
             steps=views(Facts(session, rig, space, self._brightness)),
             space=space,
-            hands_free=self.hands_free is not None,
+            hands_free=self.hands_free.on,
             autopilot=self.autopilot,
         )
 
