@@ -8,7 +8,7 @@ import inspect
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,35 +26,29 @@ _PROVIDED = ("channel", "board")
 
 @dataclass(frozen=True)
 class Preset:
-    """A rig with a name: `what` it is in a sentence, the `choice` it stands for, and the file that says so."""
+    """A rig with a name: `what` it is in a sentence, the `choice` it stands for, the file that says so, and `problem`,
+    why it cannot be used here and how to mend that, empty if it can.
+    """
 
     name: str
     what: str
     choice: Mapping[str, Any]
     source: Path
-
-    @property
-    def missing(self) -> str:
-        """What this machine lacks for it, and how to install it; empty if it can be used."""
-        needed = {name: drivers()[name] for name in _driver_names(self.choice) if name in drivers()}
-        return "; ".join(found.missing for found in needed.values() if found.missing)
+    problem: str = ""
 
 
 def presets(session: Session | None = None) -> list[Preset]:
-    """The session's own rigs, then those that are shipped; a session's hides a shipped one of the same name.
-
-    Raises InputError for a file that is no rig.
-    """
+    """The session's own rigs, then those that are shipped; a session's hides a shipped one of the same name."""
     own = {} if session is None else session.rigs()
     shipped = {path.stem: path for path in sorted(asset_folder(FOLDER).glob("*.toml")) if path.stem not in own}
-    return [_read(name, path) for name, path in {**own, **shipped}.items()]
+    return [_described(name, path) for name, path in {**own, **shipped}.items()]
 
 
 def rigs(session: Session | None = None) -> str:
     """The rigs that can be chosen by name, in words."""
     lines = ["rigs:"]
     for preset in presets(session):
-        lines.append(f"  {preset.name}: {preset.what}" + (f" ({preset.missing})" if preset.missing else ""))
+        lines.append(f"  {preset.name}: {preset.what}" + (f" (not here: {preset.problem})" if preset.problem else ""))
     return "\n".join(lines)
 
 
@@ -75,7 +69,7 @@ def load_rig(path_or_name: Path | str, session: Session | None = None) -> dict[s
         named = {preset.name: preset for preset in presets(session)}
         if str(path_or_name) not in named:
             raise InputError(f"no rig is called {str(path_or_name)!r}: use {_names(session)}, or name a TOML file")
-        found = named[str(path_or_name)]
+        found = _read(str(path_or_name), named[str(path_or_name)].source)
     for name in _driver_names(found.choice):
         driver(name)  # raises where it cannot be used
     return dict(found.choice)
@@ -141,6 +135,16 @@ def _read(name: str, path: Path) -> Preset:
         raise InputError(f"{path}: what = {what!r} is no text: mend it")
     check_choice(choice, str(path))
     return Preset(name, what, choice, path)
+
+
+def _described(name: str, path: Path) -> Preset:
+    """The preset in a file whatever is wrong with it, which its `problem` says."""
+    try:
+        found = _read(name, path)
+        needed = (drivers()[driver_name] for driver_name in dict.fromkeys(_driver_names(found.choice)))
+        return replace(found, problem="; ".join(each.missing for each in needed if each.missing))
+    except InputError as error:
+        return Preset(name, "", {}, path, str(error))
 
 
 def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:

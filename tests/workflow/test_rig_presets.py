@@ -42,7 +42,7 @@ def test_what_is_shipped_can_be_chosen():
     shipped = {preset.name: preset for preset in presets()}
     assert {"simulated", "replay"} <= set(shipped)
     for preset in shipped.values():
-        assert preset.what.endswith(".") and "rigs" in preset.source.parts
+        assert preset.what.endswith(".") and "rigs" in preset.source.parts and preset.problem == ""
         check_choice(preset.choice, preset.name)
         assert f"  {preset.name}: {preset.what}" in rigs()
     bench = set_up(load_rig("simulated"), None)
@@ -119,3 +119,12 @@ def test_a_missing_package_says_how_to_install_it(fake: None, tmp_path: Path):
     file.write_text(to_toml({**BENCH, "camera": {"driver": "lacking", "source": "0"}}))
     with pytest.raises(DeviceError, match="no_such_package is missing: pip install it"):
         load_rig(file)
+
+
+def test_a_rig_that_cannot_be_used_is_listed_with_its_problem(fake: None, session: Session):
+    save_rig(session, "far", {**BENCH, "camera": {"driver": "lacking", "source": "0"}}, "Far away.")
+    (session.folder / "rigs" / "broken.toml").write_text("driver = ")
+    listed = {preset.name: preset for preset in presets(session)}
+    assert listed["far"].what == "Far away." and "pip install it" in listed["far"].problem
+    assert "cannot be read as TOML" in listed["broken"].problem and listed["simulated"].problem == ""
+    assert "far: Far away. (not here: the package no_such_package is missing" in rigs(session)
