@@ -19,6 +19,7 @@ from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
+from slviewer.workflow.rig_presets import save_rig
 from slviewer.workflow.wizard import work
 from slviewer.workflow.wizard.acquisition import Acquisition
 from slviewer.workflow.wizard.diagnostics import LogKeeper
@@ -123,9 +124,19 @@ class Engine:
             if store is not None and store.decision("rig") != dict(choice):
                 store.decide("rig", dict(choice))
                 store.decide("exposure", None)  # that of another camera says nothing
+                store.decide("exposures", None)
             exposure = store.decision("exposure") if store is not None else None
+            exposure = exposure or {key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)}
             self._choice, self.bench, self.preview = dict(choice), bench, None
             self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
+
+    def save_rig(self, name: str, what: str) -> None:
+        """Keep the rig in use, with its exposure, as one of the session's own."""
+        if self._choice is None:
+            raise InputError("no rig is in use: choose one in the step Rig")
+        now = self.acquisition.view()
+        exposure = {"exposure_ms": now.exposure_ms, "gain": now.gain}
+        save_rig(self.store, name, {**self._choice, **{k: v for k, v in exposure.items() if v}}, what)
 
     def board_changed(self) -> None:
         """Look for the board that is now the target, stand it before a simulated rig, and judge the poses by it."""

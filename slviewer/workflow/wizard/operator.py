@@ -11,6 +11,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
+from slviewer.devices.capture import check_exposures
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.world import Thing
 from slviewer.errors import InputError, SlviewerError
@@ -141,6 +142,16 @@ class Operator:
         self._engine.acquisition.apply(settings)
         if self.session is not None:
             self.session.decide("exposure", {"exposure_ms": settings.exposure_ms, "gain": settings.gain})
+
+    @_request("Setting the exposures")
+    def set_exposures(self, exposures_ms: Sequence[float]) -> None:
+        """Take every capture in several exposures, for shiny and dark parts; empty: in a single one."""
+        self._engine.store.decide("exposures", check_exposures(exposures_ms) if exposures_ms else [])
+
+    @_request("Saving the rig")
+    def save_rig(self, name: str, what: str = "") -> None:
+        """Keep the rig in use, with its exposure, under a name in the session; `rig_presets` finds it there."""
+        self._engine.save_rig(name, what)
 
     @_request("Changing the light")
     def shine(self, light: str) -> None:

@@ -81,7 +81,12 @@ class Reader:
         if rig.projector is None:
             return None
         patterns, projector = self.patterns(), rig.projector
-        return self._keep(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
+        shown = self._keep(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
+        return shown * max(1, len(self.exposures_ms()))
+
+    def exposures_ms(self) -> tuple[float, ...]:
+        """The exposures of every capture; empty: a single one, the camera's."""
+        return tuple(float(exposure) for exposure in self.session.decision("exposures") or ())
 
     def read(self, rig: RigView, focal_px: float | None) -> SessionView:
         """The session now. `rig` tells sizes before there are poses; `focal_px` is its lens's nominal focal length."""
@@ -113,6 +118,7 @@ class Reader:
             merge=self._merge(merges[-1], hashes) if merges else None,
             merges=len(merges),
             exports=listed(session),
+            exposures_ms=self.exposures_ms(),
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
         )

@@ -235,6 +235,7 @@ class SessionView:
     exports: tuple[ExportView, ...] = ()
     deleted_poses: tuple[str, ...] = ()  # what can be brought back, the last deleted first
     deleted_scans: tuple[str, ...] = ()
+    exposures_ms: tuple[float, ...] = ()  # of every capture; empty: a single one, the camera's
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from slviewer.devices.capture import Taken, check_exposures
+from slviewer.devices.capture import Taken
 from slviewer.errors import DeviceError, InputError, SessionError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.atomic import megabytes
@@ -22,12 +22,6 @@ def sequence_for_poses(engine: Engine) -> PatternSequence:
     if engine.bench is None:
         raise DeviceError("no rig is chosen: choose one in the step Rig")
     return sequence_for(engine.bench, engine.reader.patterns())
-
-
-def exposures_ms(engine: Engine) -> tuple[float, ...]:
-    """The exposures of every capture as the session decided them ("exposures", a list of ms); empty: a single one."""
-    decided = engine.store.decision("exposures") or ()
-    return tuple(check_exposures(decided)) if decided else ()
 
 
 def take_pose(engine: Engine, name: str | None = None) -> None:
@@ -79,7 +73,7 @@ def _take(
     save: Callable[[Taken], None],
     follow: Callable[[], object],
 ) -> None:
-    exposures = exposures_ms(engine)
+    exposures = engine.reader.exposures_ms()
     space = engine.space(len(sequence.frames) * max(1, len(exposures)))
     if space is not None and not space.enough:
         raise SessionError(
