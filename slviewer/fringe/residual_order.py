@@ -1,0 +1,230 @@
+"""Which step each phase-shifted frame really shows.
+
+Every way in which frames can be out of order is tried as an explanation: it fits when it leaves as little as the noise,
+and it is believed when what it explains is what such a fault would have caused. Only the frames' products with each
+other are needed for that, (n, n) numbers.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from slviewer.fringe.residual_sample import Fringe, columns
+from slviewer.fringe.suspect import Fault, Suspect
+
+_AS_EXPECTED = 0.7
+"""What an explanation must explain, as a share of what its fault would have caused."""
+_STRANGE = 0.08
+"""rms error, as a share of the modulation, with which a frame that nothing explains is strange."""
+_STRANGE_NOISE = 5.0  # and it must exceed this many times the variance of what fits
+_AS_GOOD = (
+    1.3  # explanations within so many times the noise of the best, and this share of the fringe's square, are equal
+)
+_AS_GOOD_FRINGE = 1e-3
+_SAME = 1e-6
+_ALIKE = 0.1  # difference of repeated frames in square, as a share of what their neighbours differ by
+_LIGHT_ALONE = 0.4  # of its difference that remains when its light is made that of the others
+_DARKEST = 0.6  # no lamp flickers by more
+_MOST_FAULTS = 3
+
+
+@dataclass(frozen=True)
+class _Story:
+    """What the frames show: `steps` by place in the order of showing, 0 for this period's first frame."""
+
+    fault: Fault
+    steps: dict[int, int]
+    place: int
+    other: int = 0
+
+
+def order_suspects(sampled: Fringe) -> list[Suspect]:
+    """The frames that do not show their own step, in words; where two explanations are equal, both are given."""
+    n = sampled.steps
+    if n == 3:
+        return _repeated(sampled)
+    products = _Products(sampled)
+    now = _Story("strange", {k: k for k in range(n)}, 0)
+    told: list[Suspect] = []
+    for _ in range(_MOST_FAULTS):
+        found = _best(products, now, n)
+        if found is None:
+            break
+        now = found[0]
+        told.append(_told(found, sampled.shift.indices))
+    return told
+
+
+def strange_suspects(sampled: Fringe) -> list[Suspect]:
+    """Frames that no step explains: what is left when order and light have been looked at."""
+    n = sampled.steps
+    products = _Products(sampled)
+    steps = {k: k for k in range(n)}
+    out: list[Suspect] = []
+    while len(out) < _MOST_FAULTS:
+        left, freedom = products.left(steps)
+        without = {k: products.left({i: s for i, s in steps.items() if i != k}) for k in steps}
+        k = min(without, key=lambda i: without[i][0])
+        rest, more = without[k]
+        if more < 1:
+            break
+        gain = left - rest - (freedom - more) * rest / more
+        if gain < max(_STRANGE**2 * products.strength, _STRANGE_NOISE * rest / more):
+            break
+        if _only_light(sampled, k):
+            break
+        del steps[k]
+        i = sampled.shift.indices[k]
+        out.append(
+            Suspect(
+                i,
+                "strange",
+                f"frame {i + 1} does not fit the other steps: something else was shown, or something moved",
+            )
+        )
+    return out
+
+
+def _only_light(sampled: Fringe, k: int) -> bool:
+    """Whether frame k is what the others lead to expect, brighter or darker."""
+    n, others = sampled.steps, np.delete(np.arange(sampled.steps), k)
+    weights = columns(np.array([k]), n, sampled.own) @ np.linalg.pinv(columns(others, n, sampled.own))
+    expected = np.einsum("k,kp->p", weights[0].astype(np.float32), sampled.frames[others])
+    seen = sampled.frames[k]
+    scale = float(seen @ expected) / max(float(expected @ expected), 1e-9)
+    if not _DARKEST < scale < 1 / _DARKEST:
+        return False
+    return float(np.mean((seen - scale * expected) ** 2)) < _LIGHT_ALONE * float(np.mean((seen - expected) ** 2))
+
+
+class _Products:
+    """Mean products of the frames, and of those around them, over the sampled pixels."""
+
+    def __init__(self, sampled: Fringe) -> None:
+        first = sampled.shift.indices[0]
+        mean = sampled.frames.mean(axis=0)  # a background fits anything, and takes the large numbers with it
+        rows = {k: frame for k, frame in enumerate(sampled.frames)}
+        rows |= {i - first: frame for i, frame in sampled.beside.items()}
+        self.places = sorted(rows)
+        data = np.stack([rows[place] - mean for place in self.places])
+        self._products = (data @ data.T).astype(float) / data.shape[1]
+        self._index = {place: i for i, place in enumerate(self.places)}
+        self._n, self._own = sampled.steps, sampled.own
+        self.strength = float(np.mean(sampled.modulation**2, dtype=float)) / 2
+
+    def left(self, steps: dict[int, int]) -> tuple[float, int]:
+        """Squared grey levels that remain at a pixel when the frames at these places show these steps; and freedom."""
+        rows = [self._index[place] for place in steps]
+        keep, freedom = _keep(tuple(steps.values()), self._n, self._own)
+        return float(np.sum(keep * self._products[np.ix_(rows, rows)])), freedom
+
+    def caused(self, before: dict[int, int], after: dict[int, int]) -> float:
+        """What would remain of the fringe alone under `before`, where `after` is true; of the places of both."""
+        shared = [place for place in before if place in after]
+        keep, _ = _keep(tuple(before[place] for place in shared), self._n, self._own)
+        fringe = columns(np.array([after[place] for place in shared]), self._n, 1)[:, 1:]
+        return self.strength * float(np.sum(fringe * (keep @ fringe)))
+
+
+@lru_cache(4096)
+def _keep(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
+    """(len(steps),) * 2, which takes from frames of these steps what they explain; and the freedom that remains."""
+    basis, sizes, _ = np.linalg.svd(columns(np.array(steps), n, own), full_matrices=False)
+    basis = basis[:, sizes > 1e-6 * sizes[0]]
+    return np.eye(len(steps)) - basis @ basis.T, len(steps) - basis.shape[1]
+
+
+def _best(products: _Products, now: _Story, n: int) -> list[_Story] | None:
+    """The explanation to believe instead of `now`, if there is one, and those that are as good."""
+    left, freedom = products.left(now.steps)
+    least = min(products.caused(now.steps, now.steps | {k: k - 1}) for k in range(1, n))
+    if left < _AS_EXPECTED * least:
+        return None
+    judged = [(story, *products.left(story.steps)) for story in _stories(now.steps, products.places, n)]
+    judged = [each for each in judged if each[2] >= 1]
+    if not judged:
+        return None
+    noise = min(rest / more for _, rest, more in judged)
+    limit = _AS_GOOD * noise + _AS_GOOD_FRINGE * products.strength
+    fitting = [each for each in judged if each[1] / each[2] <= limit]
+    # The one that explains the most frames is the most easily refuted, hence the one to believe.
+    fine = _SAME * products.strength
+    story, rest, more = min(fitting, key=lambda each: (-each[2], round(each[1] / fine), _rank(each[0])))
+    gain = (left - freedom * noise) - (rest - more * noise)
+    caused = products.caused(now.steps, story.steps)
+    if caused > least / 2:
+        believed = gain > _AS_EXPECTED * caused
+    else:  # all steps are turned alike, and only the frames that are left out tell
+        believed = gain > max(_STRANGE**2 * products.strength, _STRANGE_NOISE * noise)
+    if story.fault == "strange" or not believed:
+        return None
+    swaps = [s for s, r, m in fitting if s.fault == "swapped" and m == more and abs(r - rest) <= fine]
+    return swaps if story.fault == "swapped" else [story]
+
+
+def _rank(story: _Story) -> int:
+    """Faults that happen often before those that do not."""
+    beside = abs(story.place - story.other) == 1
+    if story.fault in ("late", "early"):
+        return (0 if story.fault == "late" else 4) if beside else 5
+    return {"swapped": 1, "dropped": 2, "lag": 3}.get(story.fault, 6)
+
+
+def _stories(now: dict[int, int], places: list[int], n: int) -> Iterator[_Story]:
+    """All that may have happened to the frames besides what is known already, the simplest first."""
+    for k in range(n):
+        for j in (k - 1, k + 1, *range(n)):
+            if 0 <= j < n and j != now.get(k):
+                yield _Story("late" if j < k else "early", now | {k: j}, k, j)
+    for k in now:
+        yield _Story("strange", {i: s for i, s in now.items() if i != k}, k)
+    for k in range(n - 1):
+        if now.get(k) == k and now.get(k + 1) == k + 1:
+            yield _Story("swapped", now | {k: k + 1, k + 1: k}, k, k + 1)
+    if any(now.get(k) != k for k in range(n)):
+        return
+    for k in range(1, n - 1):
+        yield _Story("dropped", {j: j if j < k else j + 1 for j in range(n - 1)}, k)
+    after = [place for place in places if place >= n]
+    if after:
+        for k in range(1, n):
+            late = {j: j if j < k else j - 1 for j in range(n)}
+            yield _Story("lag", late | {n: n - 1}, k, 1)
+        for shift in (1, 2):
+            known = {j: j - shift for j in (*range(shift, n), *after) if 0 <= j - shift < n}
+            yield _Story("lag", known, 0, shift)
+    if -1 in places:
+        yield _Story("dropped", {j: j + 1 for j in range(-1, n - 1)}, 0)
+
+
+def _told(stories: list[_Story], indices: tuple[int, ...]) -> Suspect:
+    texts = list(dict.fromkeys(_words(story, indices) for story in stories))
+    return Suspect(indices[stories[0].place], stories[0].fault, ", or ".join(texts))
+
+
+def _words(story: _Story, indices: tuple[int, ...]) -> str:
+    frame = indices[story.place] + 1
+    other = indices[story.other] + 1 if story.other < len(indices) else frame
+    if story.fault == "late":
+        return f"frame {frame} shows the pattern of frame {other}: it is late or repeated"
+    if story.fault == "early":
+        return f"frame {frame} shows the pattern of frame {other}: it came too early"
+    if story.fault == "swapped":
+        return f"frames {frame} and {other} have changed places"
+    if story.fault == "dropped":
+        return f"frame {frame} is missing, and those that follow came too early"
+    images = "one image" if story.other == 1 else f"{story.other} images"
+    return f"from frame {frame} on the camera is {images} behind the projector"
+
+
+def _repeated(sampled: Fringe) -> list[Suspect]:
+    """Three steps: two frames alike, where any two should differ by as much as any other two."""
+    frames = sampled.frames
+    differences = [float(np.mean((frames[k] - frames[k - 1]) ** 2)) for k in range(3)]
+    out = []
+    for k in (1, 2):
+        if differences[k] < _ALIKE * max(differences) + 2 * sampled.variance:
+            out.append(_told([_Story("late", {}, k, k - 1)], sampled.shift.indices))
+    return out[:1]

@@ -1,0 +1,143 @@
+"""A sample of the pixels that see fringes, and the cosine through each of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.fringe import limits
+from slviewer.fringe.layout import Shift
+
+PIXELS = 60_000
+"""So many are looked at: their statistics are good to half a percent."""
+FEWEST = 500
+"""Fewer valid pixels than this say nothing about a frame."""
+HIGHEST = 6
+"""The highest harmonic of the fringe that gamma is thought to make."""
+_OUTLIER_CLIPS = 0.5  # a frame that alone clips so many pixels shows something else, and must not hide itself
+
+
+@dataclass(frozen=True, eq=False)
+class Fringe:
+    """The frames of one period at p valid pixels, float32 grey levels.
+
+    ``frames`` and ``fitted`` (n, p): as seen, less what gamma adds in all of them; and background + modulation cos.
+    ``beside``: frames shown right before and after these, by index, (p,) each. ``modulation`` (p,). ``keep`` (n, n)
+    takes the residual from frames: what a background and harmonics 1 ... `own` do not explain.
+    """
+
+    shift: Shift
+    frames: np.ndarray
+    fitted: np.ndarray
+    beside: dict[int, np.ndarray]
+    modulation: np.ndarray
+    own: int
+    noise: tuple[float, float]
+
+    @property
+    def steps(self) -> int:
+        """How many there are."""
+        return len(self.frames)
+
+    @property
+    def keep(self) -> np.ndarray:
+        """See the class."""
+        basis, _ = np.linalg.qr(columns(np.arange(self.steps), self.steps, self.own))
+        return np.eye(self.steps) - basis @ basis.T
+
+    @property
+    def variance(self) -> float:
+        """Of one grey level, by the noise, in squared grey levels; over the sampled pixels."""
+        a, b = self.noise
+        return a + b * float(np.maximum(self.fitted, 0).mean())
+
+
+def columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
+    """(len(steps), 1 + 2 own): what a pixel may show at each step of n: a constant, cosines and sines."""
+    angle = 2 * np.pi * np.asarray(steps, float) / n
+    harmonics = [f(h * angle) for h in range(1, own + 1) for f in (np.cos, np.sin)]
+    return np.stack([np.ones_like(angle), *harmonics], axis=1)
+
+
+def spread_rows(height: int, width: int, pixels: int = PIXELS) -> np.ndarray:
+    """Evenly spread rows that hold about so many pixels."""
+    count = min(height, max(1, round(pixels / width)))
+    return np.unique(np.linspace(0, height - 1, count).round().astype(int))
+
+
+def fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: float) -> Fringe | None:
+    """The sampled fringes of one period; None where too few pixels see any."""
+    rows = spread_rows(*stack.shape[1:])
+    frames = np.stack([stack[i][rows].ravel() for i in shift.indices])
+    clipped = (frames >= white) | (frames == 0)
+    frames = frames.astype(np.float32)
+    n = len(frames)
+    background, phasor = _cosine(frames)
+    least = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * roughness(frames, stack.shape[2]))
+    modulated = np.abs(phasor) > least
+    if np.count_nonzero(modulated) < FEWEST:
+        return None
+    shares = clipped[:, modulated].mean(axis=1)
+    counts = shares <= max(_OUTLIER_CLIPS, 2 * float(np.median(shares)))
+    valid = modulated & ~clipped[counts].any(axis=0)
+    if np.count_nonzero(valid) < FEWEST:
+        return None
+    frames, background, phasor = frames[:, valid], background[valid], phasor[valid]
+    # n steps leave harmonics of each pixel's own to fit, as long as enough remains to contradict.
+    own = 2 if n >= 10 else 1
+    if n > 3:
+        frames = frames - _gamma(frames, phasor, own)
+        background, phasor = _cosine(frames)
+    angle = (2 * np.pi * np.arange(n) / n)[:, None]
+    fitted = background + np.real(phasor * np.exp(1j * angle).astype(np.complex64))
+    beside = {i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _neighbours(shift.indices, len(stack))}
+    return Fringe(shift, frames, fitted, beside, np.abs(phasor), own, noise)
+
+
+def roughness(frames: np.ndarray, width: int) -> float:
+    """Grey levels by which neighbours along a row differ from a smooth curve; a fault of a frame does not enter it."""
+    third = np.diff(frames.reshape(len(frames), -1, width), n=3, axis=-1)
+    return float(np.median(np.abs(third))) / (0.6745 * np.sqrt(20))  # 1 + 9 + 9 + 1 variances
+
+
+def _cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Background (p,) float32 and modulation e^(i phase) (p,) complex64, for a positive sign of the phase shift."""
+    n = len(frames)
+    wave = np.exp(-2j * np.pi * np.arange(n) / n).astype(np.complex64) * np.float32(2 / n)
+    cosine, sine = (np.einsum("k,kp->p", part, frames) for part in (wave.real.copy(), wave.imag.copy()))
+    return frames.mean(axis=0), cosine + 1j * sine
+
+
+def _gamma(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:
+    """(n, p): the harmonics beyond `own` that all pixels have in common, each with its own fringe's phase and strength.
+
+    Harmonic m of the fringe appears among n steps as the m-th, or as the one that it cannot be told from.
+    """
+    n = len(frames)
+    k = np.arange(n)
+    strength = np.abs(phasor)
+    unit = phasor / np.maximum(strength, np.float32(1e-6))
+    added = np.zeros_like(frames)
+    for q in range(own + 1, n // 2 + 1):
+        regressors = [strength * unit**m for m in range(2, HIGHEST + 1) if (m - q) % n == 0]
+        regressors += [strength * np.conj(unit**m) for m in range(2, HIGHEST + 1) if (m + q) % n == 0]
+        if not regressors:
+            continue
+        wave = np.exp(-2j * np.pi * q * k / n).astype(np.complex64)
+        scale = np.float32((1 if 2 * q == n else 2) / n)
+        seen = scale * (
+            np.einsum("k,kp->p", wave.real.copy(), frames) + 1j * np.einsum("k,kp->p", wave.imag.copy(), frames)
+        )
+        design = np.stack(regressors)
+        normal, moment = design.conj() @ design.T, design.conj() @ seen
+        weights = np.linalg.pinv(normal, rcond=1e-4) @ moment
+        common = np.einsum("r,rp->p", weights, design)
+        added += np.real(common * np.conj(wave)[:, None])
+    return added
+
+
+def _neighbours(indices: tuple[int, ...], count: int) -> list[int]:
+    """Frames shown up to two before and after, where these were shown one after the other."""
+    if indices != tuple(range(indices[0], indices[0] + len(indices))):
+        return []
+    around = (indices[0] - 2, indices[0] - 1, indices[-1] + 1, indices[-1] + 2)
+    return [i for i in around if 0 <= i < count]

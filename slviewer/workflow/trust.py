@@ -1,0 +1,59 @@
+"""What a capture says about itself: frames that were late, lost, out of order or lit otherwise."""
+
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.residual import FrameResiduals, frame_residuals
+from slviewer.fringe.sequence import PatternSequence
+
+_MOST = 4  # sentences about one capture
+
+
+def residuals(sequence: PatternSequence, stack: np.ndarray) -> list[FrameResiduals]:
+    """How the frames of each axis fit together; an axis that cannot be decoded alone is left out."""
+    found = []
+    for axis in sequence.axes:
+        try:
+            found.append(frame_residuals(sequence, stack, axis))
+        except InputError:  # decoding says it, with what to do
+            continue
+    return found
+
+
+def capture_warnings(sequence: PatternSequence, stack: np.ndarray) -> list[str]:
+    """One sentence for each frame of a capture (n, h, w) that contradicts the others; none for a sound one."""
+    return warnings_of(residuals(sequence, stack))
+
+
+def warnings_of(found: list[FrameResiduals]) -> list[str]:
+    """The same, from what `residuals` found."""
+    sentences = list(dict.fromkeys(s.sentence for axis in found for s in axis.suspects))
+    if len(sentences) > _MOST:
+        more = len(sentences) - _MOST + 1
+        sentences = [
+            *sentences[: _MOST - 1],
+            f"and {more} more frames do not fit: run the preflight, then capture again",
+        ]
+    return sentences
+
+
+def described(found: list[FrameResiduals]) -> list[dict[str, Any]]:
+    """Plain values to keep beside a capture: each frame's residual, and its relative light."""
+    return [
+        {
+            "axis": axis.axis,
+            "frames": [
+                {"frame": f.frame, "rms": _plain(f.rms), "sigmas": _plain(f.sigmas), "light": _plain(f.light)}
+                for f in axis.frames
+            ],
+            "suspects": [{"frame": s.frame, "fault": s.fault, "sentence": s.sentence} for s in axis.suspects],
+            "said": axis.said,
+        }
+        for axis in found
+    ]
+
+
+def _plain(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None

@@ -1,0 +1,204 @@
+"""Frames that do not fit their capture are named, and sound captures are left in peace."""
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fringe_scene import capture, slope
+
+from slviewer.fringe.presets import complementary, gray, gray_bits, multifrequency, p18, phase_steps
+from slviewer.fringe.residual import frame_residuals
+from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.session.importers import procam_calibration
+from slviewer.simulation.boards import Pose, blank_board
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+
+PROJECTOR = (256, 128)
+COORDINATE = slope(start=20.0)
+SEQUENCES = {
+    "p18": p18(PROJECTOR),
+    "gray": gray(PROJECTOR),
+    "eight": complementary(PROJECTOR, 8, 16.0),
+    "five": complementary(PROJECTOR, 5, 16.0),
+    "four": complementary(PROJECTOR, 4, 16.0),
+    "three": complementary(PROJECTOR, 3, 16.0),
+    "levels": multifrequency(PROJECTOR, 6),
+}
+
+
+def told(sequence: PatternSequence, stack: np.ndarray) -> dict[int, str]:
+    return {s.frame: s.fault for s in frame_residuals(sequence, stack, "x").suspects}
+
+
+def late(stack: np.ndarray, k: int) -> np.ndarray:
+    stack = stack.copy()
+    stack[k] = stack[k - 1]
+    return stack
+
+
+def swapped(stack: np.ndarray, k: int) -> np.ndarray:
+    stack = stack.copy()
+    stack[[k, k + 1]] = stack[[k + 1, k]]
+    return stack
+
+
+def dropped(stack: np.ndarray, k: int) -> np.ndarray:
+    stack = stack.copy()
+    stack[k:-1] = stack[k + 1 :]
+    return stack
+
+
+def brighter(stack: np.ndarray, k: int, times: float = 1.05) -> np.ndarray:
+    stack = stack.copy()
+    stack[k] = np.clip(np.rint(times * stack[k].astype(float)), 0, np.iinfo(stack.dtype).max)
+    return stack
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        {"gamma": 2.2},
+        {"defocus": 3.0},
+        {"gain": 12.0, "ambient": 40.0, "shot": 0.02},
+        {"gain": 300.0},
+        {"shot": 0.1},
+    ],
+    ids=str,
+)
+def test_sound_captures_are_left_in_peace(name, how):
+    for seed in range(3):
+        assert told(SEQUENCES[name], capture(SEQUENCES[name], COORDINATE, seed=seed, **how)) == {}
+
+
+@pytest.mark.parametrize("how", [{}, {"gamma": 2.2}, {"gain": 25.0, "shot": 0.02}], ids=str)
+@pytest.mark.parametrize("name", ["p18", "eight", "five", "levels"])
+def test_a_misplaced_step_is_named(name, how):
+    sequence = SEQUENCES[name]
+    stack = capture(sequence, COORDINATE, **how)
+    n = sequence.frames[0].steps
+    for k in (1, n // 2, n - 1):
+        assert told(sequence, late(stack, k)) == {k: "late"}
+    for k in (0, n // 2 - 1, n - 2):
+        assert told(sequence, swapped(stack, k)) == {k: "swapped"}
+    assert told(sequence, dropped(stack, n // 2 - 1)).get(n // 2 - 1) == "dropped" or name == "five"
+    strange = stack.copy()
+    strange[0] = stack[-1]  # what was shown before the capture
+    assert told(sequence, strange) == {0: "strange"}
+    for lag in (1, 2):
+        behind = np.concatenate([stack[-1:].repeat(lag, 0), stack[:-lag]])
+        assert told(sequence, behind)[0] == "lag"
+
+
+@pytest.mark.parametrize("name", ["p18", "eight", "levels"])
+def test_a_frame_that_is_lit_otherwise_is_named(name):
+    sequence = SEQUENCES[name]
+    stack = capture(sequence, COORDINATE, shot=0.02)
+    for k in (0, 3, 5):
+        for times in (0.95, 1.05):
+            assert told(sequence, brighter(stack, k, times)) == {k: "light"}
+            found = frame_residuals(sequence, brighter(stack, k, times), "x")
+            assert found.frames[k].light == pytest.approx(times, abs=0.012)
+
+
+def test_a_lamp_that_never_stands_still_is_told_once():
+    stack = capture(SEQUENCES["p18"], COORDINATE).astype(float)
+    stack *= (1 + 0.06 * np.cos(2.4 * np.arange(len(stack))))[:, None, None]
+    found = frame_residuals(SEQUENCES["p18"], np.clip(stack, 0, 255).astype(np.uint8), "x")
+    assert [s.fault for s in found.suspects if s.frame < 18] == ["light"]
+    assert "mains" in found.suspects[0].sentence
+
+
+def test_the_residual_is_the_noise_and_shows_who_is_wrong():
+    sequence = SEQUENCES["p18"]
+    stack = capture(sequence, COORDINATE, read=1.5, shot=0.01)
+    clean = frame_residuals(sequence, stack, "x")
+    assert len(clean.frames) == 18 and clean.said == ""
+    assert all(0.9 < f.sigmas < 1.1 and 1.2 < f.rms < 2.5 for f in clean.frames)
+    assert all(abs(f.light - 1) < 0.005 for f in clean.frames)
+    wrong = frame_residuals(sequence, late(stack, 6), "x").frames
+    assert wrong[6].rms > 3 * np.median([f.rms for f in wrong]) and wrong[6].rms > 8
+
+
+def test_three_steps_say_that_they_cannot_tell():
+    sequence = SEQUENCES["three"]
+    stack = capture(sequence, COORDINATE)
+    found = frame_residuals(sequence, stack, "x")
+    assert "three steps fit any three frames" in found.said and np.isnan(found.frames[0].sigmas)
+    for k in (1, 2):
+        assert told(sequence, late(stack, k)) == {k: "late"}
+
+
+def test_four_steps_know_that_something_is_wrong():
+    sequence = SEQUENCES["four"]
+    stack = capture(sequence, COORDINATE)
+    for k in (1, 2, 3):
+        assert told(sequence, late(stack, k)) == {k: "late"}
+    assert told(sequence, swapped(stack, 1)) == {1: "swapped"}
+    (either,) = frame_residuals(sequence, swapped(stack, 0), "x").suspects
+    assert "frames 1 and 2 have changed places" in either.sentence and "frames 3 and 4" in either.sentence
+    assert told(sequence, brighter(stack, 2)) == {0: "strange"}
+
+
+def test_gray_frames_that_are_late_lost_or_swapped_are_named():
+    sequence = SEQUENCES["p18"]
+    stack = capture(sequence, COORDINATE)
+    bits = [i for i in sequence.find("gray", "x") if 4 <= 2 ** (6 - sequence.frames[i].bit) < 16]
+    for k in (18, *bits):
+        assert told(sequence, late(stack, k)).get(k) == "late"
+    for k in bits[:-1]:
+        assert told(sequence, swapped(stack, k)).get(k) == "swapped"
+
+
+def test_bits_and_inverses_must_add_up():
+    sequence = SEQUENCES["gray"]
+    stack = capture(sequence, COORDINATE)
+    for k in (1, 2, 3, 5):
+        assert told(sequence, late(stack, k)) == {k: "late"}
+    assert told(sequence, swapped(stack, 2)) == {2: "swapped"}
+    assert set(told(sequence, swapped(stack, 1))) == {0, 2}
+    assert told(sequence, dropped(stack, 2))[2] == "lag"
+    assert told(sequence, brighter(stack, 0)) == {0: "light"}
+
+
+def test_it_looks_at_a_full_camera_within_a_fraction_of_a_second():
+    rig = letter(1.0)
+    renderer = Renderer(rig, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0]))))
+    sequence = PatternSequence(rig.projector.size, p18(rig.projector.size).frames[:26])
+    stack = renderer.capture(sequence)
+    stack[:, 500:560, 700:760] = np.minimum(2.5 * stack[:, 500:560, 700:760].astype(float), 255)  # a specular spot
+    assert told(sequence, stack) == {}
+    assert told(sequence, late(stack, 9)) == {9: "late"}
+    times = []
+    for _ in range(3):
+        begin = time.process_time()
+        frame_residuals(sequence, stack, "x")
+        times.append(time.process_time() - begin)
+    assert min(times) < 0.5
+
+
+def test_twelve_bits_in_sixteen():
+    sequence = SEQUENCES["eight"]
+    stack = capture(sequence, COORDINATE).astype(np.uint16) * 16
+    assert told(sequence, stack) == {}
+    assert told(sequence, late(stack, 3)) == {3: "late"}
+
+
+def test_photographed_captures(real_data: Path):
+    for recording in procam_calibration.read(real_data / "kamino_procam_jpg90"):
+        for axis in recording.sequence.axes:
+            assert frame_residuals(recording.sequence, recording.frames, axis).suspects == ()
+    for k in (2, 5, 8):
+        assert told(recording.sequence, late(recording.frames, k)) == {k: "late"}
+    folder = real_data / "slmaster_david" / "L"
+    stack = np.stack([cv2.imread(str(folder / f"{i}.png"), cv2.IMREAD_GRAYSCALE) for i in range(10)])
+    steps = [*phase_steps("x", 4, 18.0), *gray_bits("x", 5), Frame("complementary", "x")]
+    david = PatternSequence((32 * 18, 32 * 18), tuple(steps), gray_origin_px=-9.0)
+    assert told(david, stack) == {}
+    for k in (1, 2, 3, 4):
+        assert told(david, late(stack, k)) == {k: "late"}
+    assert told(david, swapped(stack, 1)) == {1: "swapped"}
