@@ -1,0 +1,232 @@
+"""A camera for everything that OpenCV can open: a webcam, a video file, an MJPEG (http://…) or RTSP address.
+
+Frames have 8 bits: OpenCV gives no more of any of these. A webcam's exposure, white balance and focus stay where they
+are when it is opened, as nothing may change by itself during a capture.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import get_args
+
+import cv2
+import numpy as np
+
+from slviewer.devices.drivers import Driver
+from slviewer.devices.opencv_controls import (
+    Dialect,
+    dialect,
+    exposure_ms,
+    set_exposure,
+    set_value,
+    switch_automatics_off,
+)
+from slviewer.devices.opencv_reader import OPENING_S, Reader
+from slviewer.devices.opencv_source import connect, described, found
+from slviewer.devices.opening import Openable
+from slviewer.devices.protocols import CameraSettings, Channel, check_frame, one_channel
+from slviewer.errors import DeviceError, InputError
+
+SETTLING = 3
+"""Pictures that a webcam takes until an exposure that was set is the one that they have."""
+
+
+@dataclass(frozen=True)
+class Controls:
+    """What a webcam is set to when it is opened: exposure in ms, gain and focus in the camera's own units, the white
+    balance in K. None: as it is then.
+    """
+
+    exposure_ms: float | None = None
+    gain: float | None = None
+    focus: float | None = None
+    white_balance: float | None = None
+
+
+class OpenCVCamera(Openable):
+    """One `channel` of an OpenCV source. `notes` says in sentences what could not be set, or was set to other values,
+    since it was opened.
+
+    A gain in the camera's own units is no factor on the grey levels, so that `settings` does not tell it and `apply`
+    cannot set it: `controls` do.
+    """
+
+    dtype = np.dtype(np.uint8)
+
+    def __init__(
+        self,
+        source: int | str,
+        size: tuple[int, int] | None = None,
+        controls: Controls | None = None,
+        channel: Channel = "green",
+    ) -> None:
+        super().__init__(described(source))
+        self._connect = partial(connect, source, size)
+        self._controls, self._channel = controls or Controls(), channel
+        self._reader: Reader | None = None
+        self._words: Dialect | None = None
+        self._next: np.ndarray | None = None  # the video's picture that was read to learn its size
+        self._read, self._unsettled = 0, 0
+        self._said: dict[str, str] = {}
+        self.size = size or self._probed()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What an operator should know of its settings, a sentence each."""
+        return tuple(f"{self.name}: {sentence}" for sentence in self._said.values() if sentence)
+
+    def open(self) -> None:
+        """Start reading. Raises DeviceError where it does not answer, or its frames have not the size they should."""
+        super().open()
+        try:
+            if self._reader is not None:
+                self._reader.join(OPENING_S)  # it may hang in a call, the device still in its hands
+            self._reader = Reader(self.name, self._connect)
+            self._next, self._read = self._checked(self._reader.first()), 0
+            self._said = {}
+            self._reader.do(self._prepare)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Give it back, if need be when it returns from a call in which it hangs."""
+        if self._reader is not None:
+            self._reader.close()
+        super().close()
+
+    def grab(self, out: np.ndarray) -> None:
+        """A picture whose exposure began after this call; of a video file, its next one."""
+        check_frame(self, out)
+        image = self._picture()
+        if image.ndim == 2:
+            np.copyto(out, image)
+        else:
+            one_channel(image[..., ::-1], self._channel, out)
+
+    def grab_colour(self) -> np.ndarray:
+        """The same in colour; of a source that has none, three equal channels."""
+        image = self._picture()
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
+
+    def settings(self) -> CameraSettings:
+        """The exposure, where the camera tells it."""
+        words = self._words
+        reader = self._opened()
+        return CameraSettings(None if words is None else reader.do(lambda capture: exposure_ms(capture, words)))
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set the exposure; what could not be set is in `notes`."""
+        words, ms = self._words, settings.exposure_ms
+        reader = self._opened()
+        if words is not None and ms is not None:
+            self._said["exposure"] = reader.do(lambda capture: set_exposure(capture, words, ms))
+            self._unsettled = SETTLING
+        if words is not None and settings.gain is not None:
+            self._said["gain"] = "its gain counts in units of its own: set it in the rig's file, as the camera's gain"
+        return self.settings()
+
+    def _opened(self) -> Reader:
+        self.check_open()
+        assert self._reader is not None
+        return self._reader
+
+    def _prepare(self, capture: cv2.VideoCapture) -> None:
+        """Set what is to be set at the start; on the reader's thread."""
+        words = self._words = dialect(capture)
+        wanted = self._controls
+        if words is None:
+            if self._opened().live or wanted != Controls():
+                self._said["controls"] = (
+                    "its exposure, gain, focus and white balance cannot be set from here: set them at the camera "
+                    "itself, and switch off everything automatic"
+                )
+            return
+        self._said |= switch_automatics_off(capture, words)
+        if wanted.exposure_ms is not None:
+            self._said["exposure"] = set_exposure(capture, words, wanted.exposure_ms)
+        for control, value, what in (
+            (cv2.CAP_PROP_GAIN, wanted.gain, "gain"),
+            (cv2.CAP_PROP_FOCUS, wanted.focus, "focus"),
+            (words.white_balance, wanted.white_balance, "white balance"),
+        ):
+            if value is not None:
+                self._said[what] = set_value(capture, control, value, what)
+        self._unsettled = SETTLING
+
+    def _picture(self) -> np.ndarray:
+        """(h, w, 3) BGR or (h, w)."""
+        reader = self._opened()
+        if reader.live:
+            image = reader.picture(later=self._unsettled)
+            self._unsettled = 0
+            return self._checked(image)
+        following, self._next = self._next, None
+        if following is None:
+            read, following = reader.do(lambda capture: capture.read())
+            if not read:
+                raise DeviceError(
+                    f"{self.name} has ended after {self._read} pictures: close it and open it again to start over"
+                )
+        self._read += 1
+        return self._checked(following)
+
+    def _checked(self, image: np.ndarray) -> np.ndarray:
+        height, width = image.shape[:2]
+        if (width, height) != self.size:
+            raise DeviceError(
+                f"{self.name} gives pictures of {width} x {height} px instead of {self.size[0]} x {self.size[1]}: "
+                f"choose {width} x {height} as its size, or another that it has"
+            )
+        if image.dtype != np.uint8:
+            raise DeviceError(f"{self.name} gives {image.dtype} and not 8 bits: switch it to an 8-bit format")
+        return image
+
+    def _probed(self) -> tuple[int, int]:
+        """Its size when nobody asks for one."""
+        reader = Reader(self.name, self._connect)
+        try:
+            height, width = reader.first().shape[:2]
+            return width, height
+        finally:
+            reader.close()
+
+
+def opencv_camera(
+    source: int | str = 0,
+    size: Sequence[int] | None = None,
+    exposure_ms: float | None = None,
+    gain: float | None = None,
+    focus: float | None = None,
+    white_balance: float | None = None,
+    channel: Channel = "green",
+) -> OpenCVCamera:
+    """The webcam of that number, or what is at a path or an address.
+
+    `size` is (width, height) px, which a webcam is switched to; without it, the source must answer now to tell its own.
+    Raises InputError for options that are none, DeviceError for a source that does not answer.
+    """
+    if isinstance(source, str) and source.isdecimal():
+        source = int(source)
+    if not isinstance(source, int | str) or isinstance(source, bool) or (isinstance(source, int) and source < 0):
+        raise InputError(f"{source!r} is no camera: give a webcam's number, a video file, or an address")
+    if size is not None and (len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size)):
+        raise InputError(f"{size!r} is no size of a camera: give its width and height in px, such as [1280, 720]")
+    if channel not in get_args(Channel):
+        raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
+    for value in (gain, focus, white_balance):
+        if value is not None and not math.isfinite(value):
+            raise InputError("a gain, a focus or a white balance that is no number cannot be set: give one")
+    CameraSettings(exposure_ms)
+    controls = Controls(exposure_ms, gain, focus, white_balance)
+    return OpenCVCamera(source, None if size is None else (size[0], size[1]), controls, channel)
+
+
+DRIVER = Driver(
+    "opencv",
+    "a webcam, a video file, or a stream (MJPEG, RTSP)",
+    needs="a camera's number, a file, or an address, as `source`",
+    camera=opencv_camera,
+    found=found,
+)

@@ -1,0 +1,117 @@
+"""What OpenCV's ways to a webcam call its exposure, gain, focus and white balance, and in which units.
+
+A camera may refuse a value, round it or ignore it: what counts is what it says when it is asked afterwards.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+
+UNKNOWN = -1.0
+"""What OpenCV says for a control that it does not know (`getProperty` of every backend)."""
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """One backend's words. `automatics`: each automatic control, and the value that switches it off; empty where a
+    value that is set switches its own automatic off.
+    """
+
+    to_ms: Callable[[float], float]
+    from_ms: Callable[[float], float]
+    white_balance: int
+    automatics: tuple[tuple[str, int, float], ...] = ()
+
+
+# V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us; V4L2_EXPOSURE_MANUAL is 1 (docs.kernel.org, "Camera Control Reference").
+# OpenCV 4 and later hands both on as they are (modules/videoio/src/cap_v4l.cpp; the 0.25 and 0.75 of older advice are
+# those of its normalised ranges, which `CAP_PROP_MODE` 0 switches off).
+_V4L2 = Dialect(
+    to_ms=lambda value: value / 10,
+    from_ms=lambda ms: max(1.0, round(ms * 10)),
+    white_balance=cv2.CAP_PROP_WB_TEMPERATURE,
+    automatics=(
+        ("exposure", cv2.CAP_PROP_AUTO_EXPOSURE, 1.0),
+        ("white balance", cv2.CAP_PROP_AUTO_WB, 0.0),
+        ("focus", cv2.CAP_PROP_AUTOFOCUS, 0.0),
+    ),
+)
+
+
+# Windows counts in powers of two of a second (learn.microsoft.com, "ICameraControl::put_Exposure"); OpenCV cuts the
+# fraction off, and sets each value with the flag that says "manual" (cap_dshow.cpp, cap_msmf.cpp: setProperty).
+def _windows(white_balance: int) -> Dialect:
+    return Dialect(lambda value: 1000 * 2.0**value, lambda ms: float(round(math.log2(ms / 1000))), white_balance)
+
+
+_DIALECTS = {
+    "V4L2": _V4L2,
+    "DSHOW": _windows(cv2.CAP_PROP_WHITE_BALANCE_BLUE_U),
+    "MSMF": _windows(cv2.CAP_PROP_TEMPERATURE),
+}
+
+
+def dialect(capture: cv2.VideoCapture) -> Dialect | None:
+    """How the open `capture` is spoken to; None where its controls are out of reach, as a stream's are, and any camera's
+    on macOS (cap_avfoundation_mac.mm sets a size and a frame rate only).
+    """
+    found = _DIALECTS.get(capture.getBackendName())
+    if found is _V4L2:
+        capture.set(cv2.CAP_PROP_MODE, 0)
+    return found
+
+
+def switch_automatics_off(capture: cv2.VideoCapture, words: Dialect) -> dict[str, str]:
+    """Leave exposure, white balance and focus at what they are now; what is to be said of those that stay automatic.
+
+    A pattern sequence means nothing when its frames are exposed differently.
+    """
+    said = {}
+    if words.automatics:
+        for what, control, off in words.automatics:
+            if capture.get(control) != UNKNOWN and not (capture.set(control, off) and capture.get(control) == off):
+                said[f"automatic {what}"] = (
+                    f"its automatic {what} cannot be switched off: look for a switch at the camera itself"
+                )
+        return said
+    for what, control in (
+        ("exposure", cv2.CAP_PROP_EXPOSURE),
+        ("white balance", words.white_balance),
+        ("focus", cv2.CAP_PROP_FOCUS),
+    ):
+        now = capture.get(control)
+        if now != UNKNOWN and not capture.set(control, now):
+            said[f"automatic {what}"] = (
+                f"its automatic {what} cannot be switched off: do it in the system's camera settings"
+            )
+    return said
+
+
+def exposure_ms(capture: cv2.VideoCapture, words: Dialect) -> float | None:
+    """What is set now; None where the camera does not tell."""
+    value = capture.get(cv2.CAP_PROP_EXPOSURE)
+    ms = 0.0 if value == UNKNOWN else words.to_ms(value)
+    return ms if 0 < ms < 1e5 else None
+
+
+def set_exposure(capture: cv2.VideoCapture, words: Dialect, ms: float) -> str:
+    """Set it to the nearest that the camera has; what is to be said if that is another, or none."""
+    value = words.from_ms(ms)
+    capture.set(cv2.CAP_PROP_EXPOSURE, value)
+    taken = exposure_ms(capture, words)
+    if taken is None:
+        return "its exposure cannot be set: set it at the camera itself"
+    if abs(taken - ms) > 0.01 * ms:
+        return f"its exposure is {taken:g} ms, {ms:g} ms were asked for"
+    return ""
+
+
+def set_value(capture: cv2.VideoCapture, control: int, value: float, what: str) -> str:
+    """Set a control in the camera's own units; what is to be said if it then has another value, or none."""
+    capture.set(control, value)
+    taken = capture.get(control)
+    if taken == UNKNOWN != value:
+        return f"its {what} cannot be set: set it at the camera itself"
+    return "" if abs(taken - value) < 0.5 else f"its {what} is {taken:g}, {value:g} was asked for"

@@ -1,0 +1,286 @@
+"""One video capture on a thread of its own, which alone knows which of its pictures are new.
+
+Calls into a capture may block for as long as a driver or a network likes, so that whoever needs a picture waits here,
+and not longer than `PATIENCE_S`. A live source is read without a break, wanted or not: what nobody reads piles up in
+the buffers of the driver, of the network and of the sender, and comes out later as if it were new.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+
+from slviewer.errors import DeviceError
+
+PATIENCE_S = 2.5
+"""Without a picture for so long, a source is lost."""
+
+OPENING_S = 6.0
+"""A webcam's driver may take seconds to start it."""
+
+FRAMES = 3
+"""The first picture that arrives after a question was being exposed before it. So may the second have been, by a sensor
+that exposes its next picture while it reads out the one before; the third began after it."""
+
+_WARM_UP_S = 0.5
+_ENDED_S = 0.5
+_WINDOW_S = 4.0
+_SATURATED = 0.95
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Connected:
+    """An open capture. One that is not `live` gives its next picture on request; where not even `grab_waits` for a
+    picture of a live one, `read` does.
+    """
+
+    capture: cv2.VideoCapture
+    live: bool
+    grab_waits: bool = True
+
+
+class Pace:
+    """Tells by the rhythm of their arrival which pictures are new and which have waited in a buffer."""
+
+    def __init__(self) -> None:
+        self._arrivals: deque[tuple[float, float]] = deque()
+
+    def add(self, now: float, busy: float) -> float | None:
+        """A picture arrives at `now` s, when the reader has computed for `busy` s in all.
+
+        The time since the one before, in mean frame periods; None before three have arrived. The mean is taken over
+        seconds, so that pictures which come in clumps, or in a flood after a pause, do not shorten it.
+        """
+        arrivals = self._arrivals
+        periods = None
+        if len(arrivals) > 2:
+            mean = (arrivals[-1][0] - arrivals[0][0]) / (len(arrivals) - 1)
+            periods = (now - arrivals[-1][0]) / max(mean, 1e-6)
+        arrivals.append((now, busy))
+        while len(arrivals) > 3 and arrivals[1][0] < now - _WINDOW_S:  # a pause stays until its flood has gone by
+            arrivals.popleft()
+        return periods
+
+    @property
+    def saturated(self) -> bool:
+        """Whether the reader never waits: it is slower than the source, and what it reads is always late."""
+        (start, idle), (end, busy) = self._arrivals[0], self._arrivals[-1]
+        return end - start > _WINDOW_S / 2 and busy - idle > _SATURATED * (end - start)
+
+
+class _Job:
+    """Something to do with the capture between two pictures."""
+
+    def __init__(self, work: Callable[[cv2.VideoCapture], Any]) -> None:
+        self._work = work
+        self.done = False
+        self._result: Any = None
+        self._error: Exception | None = None
+
+    def run(self, capture: cv2.VideoCapture) -> None:
+        try:
+            self._result = self._work(capture)
+        except Exception as error:
+            self._error = error
+        self.done = True
+
+    def result(self) -> Any:
+        if self._error is not None:
+            raise self._error
+        return self._result
+
+
+class _Wanted:
+    """A picture that somebody waits for, after so many that count."""
+
+    def __init__(self, frames: int) -> None:
+        self.left = frames
+        self.paused = False
+        self.image: np.ndarray | None = None
+
+
+class Reader:
+    """Reads what `connect` opens, from when it is made until `close`. Its methods belong to one other thread.
+
+    `connect` may raise DeviceError. So does every method once the source is lost: make another reader then.
+    """
+
+    def __init__(self, name: str, connect: Callable[[], Connected]) -> None:
+        self._name, self._connect = name, connect
+        self._condition = threading.Condition()
+        self._jobs: deque[_Job] = deque()
+        self._wanted: _Wanted | None = None
+        self._first: np.ndarray | None = None
+        self._arrived = time.monotonic()
+        self._lost = ""
+        self._closing = False
+        self._live = False
+        self._pace = Pace()
+        self._thread = threading.Thread(target=self._serve, name=f"slviewer {name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def live(self) -> bool:
+        """Whether pictures come by themselves."""
+        return self._live
+
+    def first(self) -> np.ndarray:
+        """The first good picture, (h, w, 3) BGR or (h, w), as soon as the source is open. Raises DeviceError."""
+        with self._condition:
+            self._wait(lambda: self._first is not None, OPENING_S)
+            assert self._first is not None
+            return self._first
+
+    def do(self, work: Callable[[cv2.VideoCapture], T]) -> T:
+        """What `work(capture)` returns, done on the reader's thread between two pictures."""
+        job = _Job(work)
+        with self._condition:
+            self._jobs.append(job)
+            self._condition.notify_all()
+            self._wait(lambda: job.done, PATIENCE_S)
+        return job.result()
+
+    def picture(self, later: int = 0) -> np.ndarray:
+        """A live source's picture, its exposure begun after this call, or `later` pictures after that one.
+
+        The delay within an encoder and a network cannot be seen from here: it is the rig's to measure and to wait for.
+        """
+        wanted = _Wanted(FRAMES + later)
+        with self._condition:
+            self._wanted = wanted
+            try:
+                # some sources may be slow and others may come in clumps: the end is when nothing counts for too long
+                self._wait(lambda: wanted.image is not None, PATIENCE_S, PATIENCE_S * wanted.left)
+            finally:
+                self._wanted = None
+        assert wanted.image is not None
+        return wanted.image
+
+    def close(self) -> None:
+        """Give the capture back, at once or when it returns from the call in which it hangs."""
+        with self._condition:
+            self._closing = True
+            self._condition.notify_all()
+        self.join(0.5)
+
+    def join(self, timeout_s: float) -> None:
+        """Wait until the capture has been given back."""
+        self._thread.join(timeout_s)
+
+    def _wait(self, ready: Callable[[], bool], patience_s: float, longest_s: float = 0.0) -> None:
+        """Until `ready()`, on the condition. Raises DeviceError once no picture has come for `patience_s`."""
+        asked = time.monotonic()
+        while not ready():
+            if self._lost:
+                raise DeviceError(self._lost)
+            now = time.monotonic()
+            silent = now - max(self._arrived, asked) if longest_s else now - asked
+            if silent > patience_s:
+                raise DeviceError(
+                    f"{self._name} gave no picture within {patience_s:g} s: check its cable and whether another "
+                    "program uses it"
+                )
+            if longest_s and now - asked > longest_s:
+                raise DeviceError(
+                    f"the pictures of {self._name} come too unevenly to tell new ones from old ones: "
+                    "use a cable instead of a radio link, or a lower frame rate"
+                )
+            self._condition.wait(0.1)
+
+    # on its own thread
+
+    def _serve(self) -> None:
+        capture = None
+        try:
+            connected = self._connect()
+            capture = connected.capture
+            self._begin(connected)
+            while not self._closing:
+                with self._condition:
+                    if not connected.live:
+                        self._condition.wait_for(lambda: self._jobs or self._closing)
+                    jobs = list(self._jobs)
+                    self._jobs.clear()
+                for job in jobs:
+                    job.run(capture)
+                if jobs:
+                    with self._condition:
+                        self._condition.notify_all()
+                if connected.live and not self._closing:
+                    self._read(connected)
+        except DeviceError as error:
+            self._give_up(str(error))
+        except Exception as error:
+            self._give_up(f"{self._name} failed ({error}): close it and open it again")
+        finally:
+            if capture is not None:
+                capture.release()
+
+    def _begin(self, connected: Connected) -> None:
+        """The first good picture. What comes at first may be dark, and out of the buffers that opening has filled."""
+        begun = time.monotonic()
+        read, image = connected.capture.read()
+        frames = 1
+        while connected.live and not self._closing:
+            late = time.monotonic() - begun
+            if (read and frames > 2 and late > _WARM_UP_S) or (not read and late > PATIENCE_S):
+                break
+            if not read:
+                time.sleep(0.02)
+            read, image = connected.capture.read()
+            frames += read
+        if not read:
+            raise DeviceError(
+                f"{self._name} was found and gives no picture: check whether another program uses it, or another size"
+            )
+        with self._condition:
+            self._first, self._live, self._arrived = image, connected.live, time.monotonic()
+            self._condition.notify_all()
+
+    def _read(self, connected: Connected) -> None:
+        """The next picture of a live source, unpacked only if it is the one that is wanted."""
+        image = None
+        if connected.grab_waits:
+            read = connected.capture.grab()
+        else:
+            read, image = connected.capture.read()
+        now = time.monotonic()
+        if not read:
+            if now - self._arrived > _ENDED_S:
+                raise DeviceError(f"{self._name} gives no more pictures: plug it in or start it again, and reconnect")
+            time.sleep(0.01)
+            return
+        self._arrived = now
+        periods = self._pace.add(now, time.thread_time())
+        wanted = self._wanted
+        if wanted is None or periods is None or periods < 0.5:  # None, or hard on the one before: out of a buffer
+            return
+        if periods > 2 and not wanted.paused:  # after a pause of the reader's own, the first of those that waited
+            wanted.paused = True
+            return
+        wanted.left -= 1
+        if wanted.left > 0:
+            return
+        if self._pace.saturated:
+            raise DeviceError(
+                f"{self._name} sends pictures faster than this computer can unpack them, so that they grow old: "
+                "lower their size or their rate"
+            )
+        if image is None:
+            read, image = connected.capture.retrieve()
+        if read:
+            with self._condition:
+                wanted.image = image
+                self._condition.notify_all()
+
+    def _give_up(self, why: str) -> None:
+        with self._condition:
+            self._lost = why
+            self._condition.notify_all()

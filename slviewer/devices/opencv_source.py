@@ -1,0 +1,125 @@
+"""Opening what OpenCV calls a video: which backend, how long, and what is live."""
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import cv2
+
+from slviewer.devices.opencv_reader import PATIENCE_S, Connected
+from slviewer.errors import DeviceError
+
+# named, as OpenCV's own choice differs between its builds, and with it the units of every control
+_WEBCAMS = {"win32": (cv2.CAP_DSHOW, cv2.CAP_MSMF), "darwin": (cv2.CAP_AVFOUNDATION,)}.get(
+    sys.platform, (cv2.CAP_V4L2,)
+)
+_TRIED = 4  # webcams, where the system lists none
+_SYSFS = Path("/sys/class/video4linux")
+
+
+def described(source: int | str) -> str:
+    """What an operator calls it; an address without the password in it."""
+    if isinstance(source, int):
+        return f"the camera {source}"
+    if _is_address(source):
+        address = urlsplit(source)
+        return f"the stream {address.hostname or ''}{address.path.rstrip('/')}"
+    return f"the camera {source}" if _is_device(source) else f"the video {Path(source).name}"
+
+
+def connect(source: int | str, size: tuple[int, int] | None) -> Connected:
+    """Open it, a webcam at `size` (width, height) px if it has it. Raises DeviceError."""
+    _quieten()
+    if isinstance(source, int) or _is_device(source):
+        return _webcam(source, size)
+    name = described(source)
+    if _is_address(source):
+        limit = int(1000 * PATIENCE_S)
+        # one thread: a decoder that works on several pictures at once keeps as many of them back
+        options = {
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: limit,
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC: limit,
+            cv2.CAP_PROP_N_THREADS: 1,
+        }
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [part for option in options.items() for part in option])
+        if not capture.isOpened():
+            raise DeviceError(
+                f"{name} does not answer, or not with a video: check that its camera is switched on, and its address"
+            )
+        return Connected(capture, live=capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0)
+    if not Path(source).is_file():
+        raise DeviceError(f"{name} does not exist: check its path, {source}")
+    capture = cv2.VideoCapture(source)
+    if not capture.isOpened():
+        raise DeviceError(f"{name} cannot be read as a video: convert it, to MJPEG in an AVI file for instance")
+    return Connected(capture, live=False)
+
+
+def found() -> list[str]:
+    """Webcams that are connected, a line each. Where the system lists them, none is opened for it."""
+    if sys.platform == "linux":
+        return listed(_SYSFS)
+    _quieten()
+    lines = []
+    for index in range(_TRIED):
+        with contextlib.suppress(DeviceError):
+            connected = _webcam(index, None)
+            lines.append(f"source {index}")
+            connected.capture.release()
+    return lines
+
+
+def listed(sysfs: Path) -> list[str]:
+    """The same from Linux's list: its names, and who may not be opened. A camera's further nodes carry no pictures."""
+    lines = []
+    for node in sorted(sysfs.glob("video*"), key=lambda node: (len(node.name), node.name)):
+        with contextlib.suppress(OSError):
+            if int((node / "index").read_text()) == 0:
+                device = Path("/dev") / node.name
+                locked = "" if os.access(device, os.R_OK | os.W_OK) else f", no permission to use {device}"
+                lines.append(f"source {node.name.removeprefix('video')}: {(node / 'name').read_text().strip()}{locked}")
+    return lines
+
+
+def _webcam(source: int | str, size: tuple[int, int] | None) -> Connected:
+    for backend in _WEBCAMS:
+        capture = cv2.VideoCapture(source, backend)
+        if capture.isOpened():
+            break
+    else:
+        raise DeviceError(
+            f"{described(source)} does not answer: check its cable, whether another program uses it, and what "
+            "`slviewer devices` finds"
+        )
+    if size is not None and not _sized(capture, size):
+        # many webcams have their larger sizes compressed only, and OpenCV tries that last
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
+        _sized(capture, size)
+    # DirectShow's grab only asks whether the camera is there (cap_dshow.cpp: grabFrame)
+    return Connected(capture, live=True, grab_waits=backend != cv2.CAP_DSHOW)
+
+
+def _sized(capture: cv2.VideoCapture, size: tuple[int, int]) -> bool:
+    """Switch to `size`; whether the camera has it."""
+    sides = dict(zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), size, strict=True))
+    for side, pixels in sides.items():
+        capture.set(side, pixels)
+    return all(capture.get(side) == pixels for side, pixels in sides.items())
+
+
+def _is_address(source: str) -> bool:
+    return "://" in source
+
+
+def _is_device(source: str) -> bool:
+    return source.startswith("/dev/")
+
+
+def _quieten() -> None:
+    """Keep the libraries' own words out of the terminal: what matters is raised. What somebody set to debug, stays."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s until a webcam without pictures is given up
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -1,0 +1,80 @@
+"""A camera on the network: an HTTP server that sends what it sees, picture after picture, on 127.0.0.1."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
+import numpy as np
+
+
+class NetworkCamera(ThreadingHTTPServer):
+    """Looks at `picture`, (h, w) or (h, w, 3) BGR, `fps` times a second, and sends `clump` pictures at a time."""
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, picture: np.ndarray, fps: float = 30.0, clump: int = 1, port: int = 0) -> None:
+        super().__init__(("127.0.0.1", port), _Sender)
+        self.picture, self.fps, self.clump = picture, fps, clump
+        self.going = threading.Event()
+        self.going.set()
+        self.dead = False
+        self._thread = threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        return self.server_address[1]
+
+    @property
+    def url(self) -> str:
+        return f"http://somebody:secret@127.0.0.1:{self.port}/video"
+
+    def die(self) -> None:
+        """End all connections and listen no more."""
+        self.dead = True
+        self.going.set()
+        self.shutdown()
+        self.server_close()
+        self._thread.join(2)
+
+
+class _Sender(BaseHTTPRequestHandler):
+    server: NetworkCamera
+
+    def log_message(self, *args: object) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=picture")
+        self.end_headers()
+        clump, due = b"", time.monotonic()
+        sent = 0
+        while not self.server.dead:
+            jpeg = cv2.imencode(".jpg", self.server.picture)[1].tobytes()
+            head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
+            clump += head + jpeg + b"\r\n"
+            sent += 1
+            due = max(due + 1 / self.server.fps, time.monotonic() - 0.1)
+            time.sleep(max(0.0, due - time.monotonic()))
+            self.server.going.wait()
+            try:
+                if sent % self.server.clump == 0:
+                    self.wfile.write(clump)
+                    clump = b""
+            except OSError:
+                return
+
+
+@contextmanager
+def network_camera(picture: np.ndarray, fps: float = 30.0, clump: int = 1, port: int = 0) -> Iterator[NetworkCamera]:
+    camera = NetworkCamera(picture, fps, clump, port)
+    try:
+        yield camera
+    finally:
+        if not camera.dead:
+            camera.die()
