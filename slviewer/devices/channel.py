@@ -207,7 +207,7 @@ class Channel:
         told = (page.refused, size, self._light is None)
         if told != page.told:
             page.told = told
-            fields = {"refused": page.refused, "covers": page.screen.covers, "size": size, "light": self._light}
+            fields = {"refused": page.refused, "full": page.screen.full_screen, "size": size, "light": self._light}
             page.send(_packed({"op": "stand", **fields}))
 
 

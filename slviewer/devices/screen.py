@@ -15,7 +15,8 @@ class Screen(msgspec.Struct, frozen=True):
 
     `dpr`: device pixels per page pixel. `inner`, `whole`: (width, height) of the window's inside and of its screen in
     page pixels. `box`: the inside in device pixels as the browser laid it out, None where a browser does not tell.
-    `full`: shown full screen on request. `pinched`: magnification by touch.
+    `full`: shown full screen on request. `settled`: the browser no longer shows over the page that Esc leaves full
+    screen. `pinched`: magnification by touch.
     """
 
     dpr: _Ratio
@@ -23,23 +24,24 @@ class Screen(msgspec.Struct, frozen=True):
     whole: tuple[_Count, _Count]
     box: tuple[_Count, _Count] | None
     full: bool
+    settled: bool
     visible: bool
     pinched: _Ratio
 
     @property
-    def covers(self) -> bool:
-        """Whether the window fills its screen, by request or because it was opened so (kiosk, F11)."""
+    def full_screen(self) -> bool:
+        """Whether it is shown so, on request or because it was opened so (kiosk, F11)."""
         return self.full or self.inner == self.whole
 
     @property
     def pixels(self) -> tuple[int, int]:
-        """(width, height) device px of the window if it covers its screen, else of the screen."""
-        width, height = self.inner if self.covers else self.whole
+        """(width, height) device px of the window if it is full screen, else of the screen."""
+        width, height = self.inner if self.full_screen else self.whole
         return round(width * self.dpr), round(height * self.dpr)
 
     @property
     def exact(self) -> bool:
-        """Whether the window, once it covers its screen, is a whole number of device pixels wide and high."""
+        """Whether the window is a whole number of device pixels wide and high."""
         sides = [self.dpr * side for side in self.inner]
         whole = tuple(round(side) for side in sides)
         near = all(abs(side - px) < _EXACT_PX for side, px in zip(sides, whole, strict=True))
@@ -54,7 +56,7 @@ def refusal(screen: Screen, size: tuple[int, int] | None) -> str:
             "the projector page is hidden: bring its window to the front of the projector's screen, and leave nothing "
             "on top of it"
         )
-    if not screen.covers:
+    if not screen.full_screen:
         return (
             "the projector page does not fill its screen: put its window on the projector's screen and click into it "
             "(or press F11)"
@@ -68,6 +70,13 @@ def refusal(screen: Screen, size: tuple[int, int] | None) -> str:
             f"{screen.dpr:g} px per page pixel: set the scaling of the projector's display to 100 % in the system's "
             "display settings, and the page's zoom to 100 % (Ctrl+0)"
         )
+    if screen.inner != screen.whole:  # zoomed, beside a bar, or full screen inside a tab that is recorded
+        (width, height), (columns, rows) = screen.inner, screen.whole
+        return (
+            f"the projector page is full screen and {width} x {height} page pixels large where its screen has "
+            f"{columns} x {rows}: set the page's zoom to 100 % (Ctrl+0), close any bar that the browser shows above "
+            "it, and let nothing share or record this tab"
+        )
     if size is not None and screen.pixels != size:
         (columns, rows), (width, height) = screen.pixels, size
         return (
@@ -75,4 +84,6 @@ def refusal(screen: Screen, size: tuple[int, int] | None) -> str:
             f"it exactly: set the resolution of that display to {width} x {height}, or choose {columns} x {rows} as "
             "the projector's size"
         )
+    if not screen.settled:
+        return "the browser still shows a notice over the projector page: wait a few seconds"
     return ""

@@ -9,7 +9,7 @@ from slviewer.devices.drivers import driver
 from slviewer.devices.screen import Screen, refusal
 from slviewer.errors import DeviceError, InputError
 
-FULL_HD = Screen(1.0, (1920, 1080), (1920, 1080), (1920, 1080), True, True, 1.0)
+FULL_HD = Screen(1.0, (1920, 1080), (1920, 1080), (1920, 1080), True, True, True, 1.0)
 
 
 def screen(**changes: object) -> Screen:
@@ -30,7 +30,6 @@ def hello(window: str = "a", take: bool = False, shown: Screen = FULL_HD) -> byt
         (screen(dpr=1.5, inner=(1280, 720), whole=(1280, 720)), (1920, 1080)),
         (screen(dpr=2.0, inner=(456, 570), whole=(456, 570), box=(912, 1140)), (912, 1140)),
         (screen(dpr=4 / 3 + 4e-8, inner=(1440, 810), whole=(1440, 810)), (1920, 1080)),
-        (screen(dpr=2.0, inner=(960, 540)), (1920, 1080)),  # the page's zoom is 200 %: each pixel is still one
     ],
 )
 def test_windows_that_show_each_pixel_as_it_is(shown, size):
@@ -47,8 +46,11 @@ def test_windows_that_show_each_pixel_as_it_is(shown, size):
         (screen(dpr=1.25, inner=(1537, 864)), None, "its window is 1921.25 x 1080 px at 1.25 px per page pixel"),
         (screen(dpr=1.1, inner=(1745, 982)), None, "set the scaling of the projector's display to 100 %"),
         (screen(dpr=1.25, inner=(1092, 768), box=(1366, 960)), None, "would resample"),
+        (screen(dpr=2.0, inner=(960, 540)), None, "960 x 540 page pixels large where its screen has 1920 x 1080"),
+        (screen(inner=(1920, 980), box=None), None, "set the page's zoom to 100 %"),
         (FULL_HD, (912, 1140), "fills 1920 x 1080 px and the patterns have 912 x 1140"),
         (FULL_HD, (912, 1140), "set the resolution of that display to 912 x 1140, or choose 1920 x 1080 as the pro"),
+        (screen(settled=False), (1920, 1080), "still shows a notice over the projector page: wait a few seconds"),
         (FULL_HD, (1919, 1080), "must fill it exactly"),
         (FULL_HD, (3840, 2160), "fills 1920 x 1080 px and the patterns have 3840 x 2160"),
     ],
@@ -111,7 +113,7 @@ def test_what_the_page_says_is_judged_by_what_is_expected():
     told = len(sent)
     channel.expect((912, 1140))
     assert len(sent) == told, "what is no news is not sent again"
-    small = screen(inner=(912, 1140), box=None)
+    small = screen(inner=(912, 1140), whole=(912, 1140), box=None)
     channel.received(page, msgspec.json.encode({"op": "screen", "screen": small}))
     assert channel.standing().words == "ready 912 x 1140" and len(sent) == told + 1 and page.changes == 1
 

@@ -83,6 +83,12 @@ def ready(channel: Channel, projector: BrowserProjector) -> None:
     projector.load(SEQUENCE)
 
 
+def settle(page: Page) -> None:
+    """Let the time be over for which a browser says how full screen is left."""
+    page.wait_for_function("document.fullscreenElement !== null")
+    page.evaluate("report(); settlesAt = 0; report()")
+
+
 def fails(words: str, doing: Callable[..., object], *args: object) -> None:
     begun = time.monotonic()
     with pytest.raises(DeviceError, match=words):
@@ -190,10 +196,21 @@ def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel
     assert until(lambda: channel.standing().state == "refused")
     fails("does not fill its screen", projector.open)
     page.get_by_role("button", name="Fill this screen").click()
+    assert until(lambda: "where its screen has 1280 x 800" in channel.standing().words)
+    grown = {"width": SIZE[0], "height": SIZE[1], "screenWidth": SIZE[0], "screenHeight": SIZE[1]}
+    session = page.context.new_cdp_session(page)  # without a display the window does not grow by itself
+    session.send("Emulation.setDeviceMetricsOverride", {**grown, "deviceScaleFactor": 1, "mobile": False})
+    assert until(lambda: "still shows a notice" in channel.standing().words)
+    assert 5000 < page.evaluate("settlesAt - performance.now()") < 6000
+    settle(page)
     ready(channel, projector)
+    assert page.evaluate("document.fullscreenElement !== null")
     projector.show(0)
+    session.send(
+        "Emulation.setDeviceMetricsOverride", {**grown, "height": 200, "deviceScaleFactor": 1, "mobile": False}
+    )
     page.evaluate("document.exitFullscreen()")
-    assert until(lambda: channel.standing().state == "refused")
+    assert until(lambda: "does not fill" in channel.standing().words)
     fails("does not fill its screen", projector.show, 1)
     fails("does not fill its screen", projector.load, SEQUENCE)
     expect(page.get_by_role("button", name="Fill this screen")).to_be_visible()
@@ -322,6 +339,8 @@ def test_a_second_window_takes_over_only_when_it_is_asked_to(opens, channel, pro
     second.get_by_role("button", name="Use this window instead").click()
     expect(first.locator("h1")).to_have_text(ELSEWHERE)
     fails("another window was made the projector", projector.show, 2)
+    settle(second)
+    assert channel.wait_ready(5.0).state == "ready"
     projector.load(SEQUENCE)
     projector.show(2)
     assert shows(second, render(SEQUENCE, 2))
