@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from slviewer import terminal, workflow
-from slviewer.commands.parsing import Role, deferred
+from slviewer.commands.parsing import Role, deferred, ui
 
 if TYPE_CHECKING:
     from slviewer.devices.channel import Channel
@@ -68,7 +68,7 @@ def capture(
             gain=gain,
             force=force,
             set_up=set_up,
-            progress=terminal.progress,
+            **ui(),
         )
     print(workflow.summary(saved))
 

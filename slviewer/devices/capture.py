@@ -77,7 +77,7 @@ def take(
     """
     if not exposures_ms:
         frames = capture(rig, sequence, out, progress)
-        return Taken(frames, rig.camera.settings(), (), colour_texture(rig))
+        return Taken(frames, rig.camera.settings(), (), _colours(rig))
     wanted = check_exposures(exposures_ms)
     n, (width, height) = len(sequence.frames), rig.camera.size
     if out is None:
@@ -95,7 +95,7 @@ def take(
     finally:
         with contextlib.suppress(DeviceError):  # one that is lost tells so itself
             rig.camera.apply(before)
-    return Taken(out, rig.camera.settings(), tuple(taken), colour_texture(rig))
+    return Taken(out, rig.camera.settings(), tuple(taken), _colours(rig))
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
@@ -106,6 +106,13 @@ def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
             f"exposures of {', '.join(f'{e:g}' for e in exposures_ms)} ms: give 2 to {MOST_EXPOSURES}, each once"
         )
     return wanted
+
+
+def _colours(rig: Rig) -> np.ndarray | None:
+    """The colour texture; None also where it fails: the frames are whole, and a lost device tells so itself."""
+    with contextlib.suppress(DeviceError):
+        return colour_texture(rig)
+    return None
 
 
 def _exposed(rig: Rig, exposure_ms: float) -> float:

@@ -15,9 +15,10 @@ from slviewer.session.capture import Capture, Role
 from slviewer.session.names import safe_name
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.workflow.feedback import Progress, unheard
+from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.opening import opened_or_made
 from slviewer.workflow.rig_presets import load_rig
+from slviewer.workflow.trust import capture_warnings
 from slviewer.workflow.wizard.rigs import Bench, SetUp, set_up
 
 PATTERNS = "complementary"
@@ -38,12 +39,14 @@ def capture(
     force: bool = False,
     set_up: SetUp = set_up,
     progress: Progress = unheard,
+    warn: Warn = unwarned,
 ) -> Capture:
     """Show a pattern sequence, photograph it, and save it in a session, which is made if it does not exist.
 
     `rig` is a choice, a TOML file that holds one, or a preset's name. `patterns` names a sequence, by default the
     session's, and `board` the target of a calibration pose, by default the session's too. `exposure_ms` and `gain` are
-    by default the rig's; two or more `exposures_ms` are merged, pixel by pixel, when the capture is read. Raises
+    by default the rig's; two or more `exposures_ms` are merged, pixel by pixel, when the capture is read. `warn` hears
+    what the camera could not be set to, and which frames contradict the others. Raises
     InputError, DeviceError, SessionError, and whatever `progress` raises; nothing is kept then.
     """
     if exposure_ms is not None and exposures_ms:
@@ -64,6 +67,8 @@ def capture(
             wanted = CameraSettings(exposure_ms or choice.get("exposure_ms"), gain or choice.get("gain"))
             if wanted != CameraSettings():
                 devices.camera.apply(wanted)
+            for note in getattr(devices.camera, "notes", ()):
+                warn(note)
             taken = take(
                 devices,
                 sequence,
@@ -74,6 +79,8 @@ def capture(
         purpose = "pose" if role == "calibration" else "scan"
         shown = str(target) if target is not None and role == "calibration" else None
         saved = keep(store, name, role, sequence, taken, source=devices.name, purpose=purpose, board=shown, force=force)
+    for sentence in capture_warnings(sequence, saved.frames):
+        warn(f"{name}: {sentence}")
     progress(1.0, "captured")
     return saved
 

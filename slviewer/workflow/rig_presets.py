@@ -20,8 +20,6 @@ from slviewer.workflow.wizard.rigs import ABOUT, Choice, rig_factory
 
 FOLDER = "rigs"
 _NUMBERS = ("settle_ms", "focal_px", "exposure_ms", "gain")
-_PROVIDED = ("channel", "board")
-"""Arguments of factories that the program supplies: nobody writes them into a file."""
 
 
 @dataclass(frozen=True)
@@ -154,15 +152,18 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     make = _factory(drivers()[name], part)
     if make is None:
         raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
-    known = inspect.signature(make).parameters.values()
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in known):
+    parameters = inspect.signature(make).parameters.values()
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
-    taken = [parameter.name for parameter in known if parameter.name not in _PROVIDED]
+    # what the program supplies nobody writes into a file
+    provided = ("board", *(("channel",) if drivers()[name].channel else ()))
+    known = [parameter for parameter in parameters if parameter.name not in provided]
+    taken = [parameter.name for parameter in known]
     unknown = sorted(set(options) - set(taken))
     if unknown:
         use = f"use {', '.join(taken)}" if taken else "it takes none"
         raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}: {use}")
-    required = [p.name for p in known if p.default is p.empty and p.name not in (*_PROVIDED, *options)]
+    required = [p.name for p in known if p.default is p.empty and p.name not in options]
     if required:
         raise InputError(f"{where}: the driver {name} needs {required[0]}: add it")
 

@@ -90,5 +90,13 @@ def test_a_colour_camera_brings_its_colours_home():
         lit = taken.texture[..., 1] > 60
         ratio = taken.texture[lit].astype(float) / taken.texture[lit][:, 1:2]
         np.testing.assert_allclose(ratio.mean(axis=0), [ColouredCamera.RED, 1, ColouredCamera.BLUE], atol=0.02)
+    with coloured(rig()).opened() as one:
+
+        def gone() -> np.ndarray:
+            raise DeviceError("the video has ended")
+
+        one.camera.grab_colour, one.camera.grab = gone, one.camera._camera.grab
+        taken = take(one, SEQUENCE)
+        assert taken.texture is None and taken.frames.any()  # the frames are whole
     with rig().opened() as grey:
         assert colour_texture(grey) is None

@@ -27,7 +27,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def projector(size: tuple[int, int], gamma: float = 1.0, channel: object = None) -> None: ...
 
-    monkeypatch.setitem(drivers(), "fake", Driver("fake", "nothing", camera=camera, projector=projector))
+    monkeypatch.setitem(drivers(), "fake", Driver("fake", "nothing", camera=camera, projector=projector, channel=True))
     lacking = Driver("lacking", "nothing", packages={"no_such_package": "pip install it"}, camera=camera)
     monkeypatch.setitem(drivers(), "lacking", lacking)
 
