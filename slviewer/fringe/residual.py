@@ -95,12 +95,12 @@ def _residuals(sampled: Fringe, lit: np.ndarray) -> list[FrameResidual]:
 
 
 def _light(sampled: Fringe) -> np.ndarray:
-    """(n,) relative light of each frame, 1 in the middle; NaN for three steps, which cannot tell it from a fringe.
+    """(n,) relative light of each frame, 1 in the middle; NaN where it cannot be told from a fringe.
 
     To first order a frame of light 1 + e leaves e times itself, less the part that the fit of the cosine takes up.
     """
     n = sampled.steps
-    if n == 3:
+    if n == 3 or not sampled.turns:
         return np.full(n, np.nan)
     predicted, keep = sampled.fitted, sampled.keep
     left = keep.astype(np.float32) @ sampled.frames

@@ -22,6 +22,7 @@ _FEWEST_EDGES = 30
 _BROKEN, _WHOLE = 0.5, 0.9
 """Shares of a bit's edges that obey the code: fewer than the one are a fault, and more than the other explain it."""
 _SAME = 0.1  # rms difference of repeated frames, as a share of the contrast
+_SHARP = 0.5  # of the pixels, that must be read in it: fine stripes blur to the same grey
 _STRIPED = 0.03  # of the pixels that must be dark, and bright, in a frame that could be told from its neighbour
 _SUM = 0.2  # rms, as a share of the contrast, by which a bit and its inverse may differ from what all pairs add up to
 _READABLE = 6.0  # px: mean width of stripes that can be read at most pixels
@@ -117,7 +118,8 @@ def _repeated(lines: _Lines, code: list[int]) -> list[Suspect]:
         difference = (lines.frames[i] - lines.frames[i - 1]) / lines.contrast
         share = float(lines.bit(i - 1).mean())
         striped = min(share, 1 - share) > _STRIPED and _edges(lines, i - 1) >= _FEWEST_EDGES
-        if striped and float(np.sqrt(np.mean(difference**2))) < _SAME:
+        sharp = float(lines.decided(i - 1).mean()) > _SHARP
+        if striped and sharp and float(np.sqrt(np.mean(difference**2))) < _SAME:
             out.append(Suspect(i, "late", f"frame {i + 1} shows the pattern of frame {i}: it is late or repeated"))
     return out
 
@@ -176,6 +178,8 @@ def _disordered(lines: _Lines, bits: Sequence[int], inverse: Sequence[int]) -> l
     fitting = [(edges.explained(order), suspect) for order, suspect in stories if edges.obeyed(order, _WHOLE)]
     most = max((explained for explained, _ in fitting), default=0)
     best = [suspect for explained, suspect in fitting if explained == most]
+    if len(best) > 2:
+        return best[-1:]
     return [replace(best[0], sentence=", or ".join(suspect.sentence for suspect in best))] if best else []
 
 

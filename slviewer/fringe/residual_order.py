@@ -22,7 +22,7 @@ _STRANGE_NOISE = 5.0  # and it must exceed this many times the variance of what 
 _AS_GOOD = (
     1.3  # explanations within so many times the noise of the best, and this share of the fringe's square, are equal
 )
-_AS_GOOD_FRINGE = 1e-3
+_AS_GOOD_FRINGE = 3e-3
 _SAME = 1e-6
 _ALIKE = 0.1  # difference of repeated frames in square, as a share of what their neighbours differ by
 _LIGHT_ALONE = 0.4  # of its difference that remains when its light is made that of the others
@@ -43,9 +43,12 @@ class _Story:
 def order_suspects(sampled: Fringe) -> list[Suspect]:
     """The frames that do not show their own step, in words; where two explanations are equal, both are given."""
     n = sampled.steps
+    products = _Products(sampled, sampled.frames)
+    if repeated := _repeated(sampled, products):
+        return [_told([_Story("late", {}, k, k - 1)], sampled.shift.indices) for k in repeated]
     if n == 3:
-        return _repeated(sampled)
-    products = _Products(sampled)
+        return []
+    products = _undisturbed(sampled, products)
     now = _Story("strange", {k: k for k in range(n)}, 0)
     told: list[Suspect] = []
     for _ in range(_MOST_FAULTS):
@@ -60,7 +63,7 @@ def order_suspects(sampled: Fringe) -> list[Suspect]:
 def strange_suspects(sampled: Fringe) -> list[Suspect]:
     """Frames that no step explains: what is left when order and light have been looked at."""
     n = sampled.steps
-    products = _Products(sampled)
+    products = _undisturbed(sampled, _Products(sampled, sampled.frames))
     steps = {k: k for k in range(n)}
     out: list[Suspect] = []
     while len(out) < _MOST_FAULTS:
@@ -102,17 +105,20 @@ def _only_light(sampled: Fringe, k: int) -> bool:
 class _Products:
     """Mean products of the frames, and of those around them, over the sampled pixels."""
 
-    def __init__(self, sampled: Fringe) -> None:
+    def __init__(self, sampled: Fringe, frames: np.ndarray) -> None:
         first = sampled.shift.indices[0]
-        mean = sampled.frames.mean(axis=0)  # a background fits anything, and takes the large numbers with it
-        rows = {k: frame for k, frame in enumerate(sampled.frames)}
+        mean = frames.mean(axis=0)  # a background fits anything, and takes the large numbers with it
+        rows = dict(enumerate(frames))
         rows |= {i - first: frame for i, frame in sampled.beside.items()}
         self.places = sorted(rows)
         data = np.stack([rows[place] - mean for place in self.places])
         self._products = (data @ data.T).astype(float) / data.shape[1]
         self._index = {place: i for i, place in enumerate(self.places)}
         self._n, self._own = sampled.steps, sampled.own
-        self.strength = float(np.mean(sampled.modulation**2, dtype=float)) / 2
+        # The fringe at step angle d is its real part times cos d, less its imaginary part times sin d.
+        parts = np.stack([sampled.phasor.real, -sampled.phasor.imag])
+        self._fringe = (parts @ parts.T).astype(float) / parts.shape[1]
+        self.strength = float(np.trace(self._fringe)) / 2
 
     def left(self, steps: dict[int, int]) -> tuple[float, int]:
         """Squared grey levels that remain at a pixel when the frames at these places show these steps; and freedom."""
@@ -125,7 +131,11 @@ class _Products:
         shared = [place for place in before if place in after]
         keep, _ = _keep(tuple(before[place] for place in shared), self._n, self._own)
         fringe = columns(np.array([after[place] for place in shared]), self._n, 1)[:, 1:]
-        return self.strength * float(np.sum(fringe * (keep @ fringe)))
+        return float(np.sum(keep * (fringe @ self._fringe @ fringe.T)))
+
+    def least(self, steps: dict[int, int], n: int) -> float:
+        """What the least of faults, one frame that is late, leaves."""
+        return min(self.caused(steps, steps | {k: k - 1}) for k in range(1, n))
 
 
 @lru_cache(4096)
@@ -136,10 +146,24 @@ def _keep(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
     return np.eye(len(steps)) - basis @ basis.T, len(steps) - basis.shape[1]
 
 
+def _undisturbed(sampled: Fringe, products: _Products) -> _Products:
+    """The products to judge by: a frame far off its place spoils what gamma is thought to add."""
+    nominal = {k: k for k in range(sampled.steps)}
+    if products.left(nominal)[0] < _AS_EXPECTED * products.least(nominal, sampled.steps):
+        return products
+    raw = _Products(sampled, sampled.seen)
+
+    def lowest(judge: _Products) -> float:
+        left = [judge.left(story.steps) for story in _stories(nominal, judge.places, sampled.steps)]
+        return min((rest / more for rest, more in left if more >= 1), default=np.inf)
+
+    return min((products, raw), key=lowest)
+
+
 def _best(products: _Products, now: _Story, n: int) -> list[_Story] | None:
     """The explanation to believe instead of `now`, if there is one, and those that are as good."""
     left, freedom = products.left(now.steps)
-    least = min(products.caused(now.steps, now.steps | {k: k - 1}) for k in range(1, n))
+    least = products.least(now.steps, n)
     if left < _AS_EXPECTED * least:
         return None
     judged = [(story, *products.left(story.steps)) for story in _stories(now.steps, products.places, n)]
@@ -219,12 +243,18 @@ def _words(story: _Story, indices: tuple[int, ...]) -> str:
     return f"from frame {frame} on the camera is {images} behind the projector"
 
 
-def _repeated(sampled: Fringe) -> list[Suspect]:
-    """Three steps: two frames alike, where any two should differ by as much as any other two."""
-    frames = sampled.frames
-    differences = [float(np.mean((frames[k] - frames[k - 1]) ** 2)) for k in range(3)]
-    out = []
-    for k in (1, 2):
-        if differences[k] < _ALIKE * max(differences) + 2 * sampled.variance:
-            out.append(_told([_Story("late", {}, k, k - 1)], sampled.shift.indices))
-    return out[:1]
+def _repeated(sampled: Fringe, products: _Products) -> list[int]:
+    """Steps that are the frame before once more, where any two that follow each other should differ alike."""
+    n, seen = sampled.steps, sampled.seen
+    differences = np.array([float(np.mean((seen[k] - seen[k - 1]) ** 2)) for k in range(1, n)])
+    noise = 2 * sampled.roughness**2
+    usual = float(np.max(differences) if n == 3 else np.median(differences))
+    if noise > 0.5 * usual:
+        return []
+    alike = [k for k in range(1, n) if differences[k - 1] < _ALIKE * usual + 1.5 * noise]
+    if n == 3 or len(alike) > _MOST_FAULTS:
+        return alike[:1] if n == 3 else []
+    nominal = {k: k for k in range(n)}
+    left, _ = products.left(nominal)
+    rest, _ = products.left({k: k for k in range(n) if k not in alike})
+    return alike if rest < left / 2 and left > products.least(nominal, n) / 3 else []

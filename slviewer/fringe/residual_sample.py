@@ -13,6 +13,7 @@ FEWEST = 500
 """Fewer valid pixels than this say nothing about a frame."""
 HIGHEST = 6
 """The highest harmonic of the fringe that gamma is thought to make."""
+_ONE_SIDED = 0.5
 _OUTLIER_CLIPS = 0.5  # a frame that alone clips so many pixels shows something else, and must not hide itself
 
 
@@ -20,18 +21,21 @@ _OUTLIER_CLIPS = 0.5  # a frame that alone clips so many pixels shows something 
 class Fringe:
     """The frames of one period at p valid pixels, float32 grey levels.
 
-    ``frames`` and ``fitted`` (n, p): as seen, less what gamma adds in all of them; and background + modulation cos.
-    ``beside``: frames shown right before and after these, by index, (p,) each. ``modulation`` (p,). ``keep`` (n, n)
-    takes the residual from frames: what a background and harmonics 1 ... `own` do not explain.
+    ``seen``, ``frames`` and ``fitted`` (n, p): as seen; less what gamma adds in all of them; and background +
+    modulation cos. ``beside``: frames shown right before and after these, by index, (p,) each. ``phasor`` (p,)
+    complex64, modulation e^(i phase). ``keep`` (n, n) takes the residual from frames: what a background and harmonics
+    1 ... `own` do not explain. ``roughness``: grey levels by which neighbouring pixels differ, noise and texture.
     """
 
     shift: Shift
+    seen: np.ndarray
     frames: np.ndarray
     fitted: np.ndarray
     beside: dict[int, np.ndarray]
-    modulation: np.ndarray
+    phasor: np.ndarray
     own: int
     noise: tuple[float, float]
+    roughness: float
 
     @property
     def steps(self) -> int:
@@ -45,10 +49,9 @@ class Fringe:
         return np.eye(self.steps) - basis @ basis.T
 
     @property
-    def variance(self) -> float:
-        """Of one grey level, by the noise, in squared grey levels; over the sampled pixels."""
-        a, b = self.noise
-        return a + b * float(np.maximum(self.fitted, 0).mean())
+    def turns(self) -> bool:
+        """Whether the pixels see the fringe in all its phases, which tells a change of light from one of phase."""
+        return abs(complex(np.mean(self.phasor / np.maximum(np.abs(self.phasor), 1e-6)))) < _ONE_SIDED
 
 
 def columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
@@ -72,7 +75,8 @@ def fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: f
     frames = frames.astype(np.float32)
     n = len(frames)
     background, phasor = _cosine(frames)
-    least = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * roughness(frames, stack.shape[2]))
+    rough = roughness(frames, stack.shape[2])
+    least = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * rough)
     modulated = np.abs(phasor) > least
     if np.count_nonzero(modulated) < FEWEST:
         return None
@@ -81,16 +85,17 @@ def fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: f
     valid = modulated & ~clipped[counts].any(axis=0)
     if np.count_nonzero(valid) < FEWEST:
         return None
-    frames, background, phasor = frames[:, valid], background[valid], phasor[valid]
+    seen, background, phasor = frames[:, valid], background[valid], phasor[valid]
+    frames = seen
     # n steps leave harmonics of each pixel's own to fit, as long as enough remains to contradict.
     own = 2 if n >= 10 else 1
     if n > 3:
-        frames = frames - _gamma(frames, phasor, own)
+        frames = seen - _gamma(seen, phasor, own)
         background, phasor = _cosine(frames)
     angle = (2 * np.pi * np.arange(n) / n)[:, None]
     fitted = background + np.real(phasor * np.exp(1j * angle).astype(np.complex64))
     beside = {i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _neighbours(shift.indices, len(stack))}
-    return Fringe(shift, frames, fitted, beside, np.abs(phasor), own, noise)
+    return Fringe(shift, seen, frames, fitted, beside, phasor, own, noise, rough)
 
 
 def roughness(frames: np.ndarray, width: int) -> float:
