@@ -11,7 +11,7 @@ from typing import Any
 
 import viser
 
-from slviewer.devices.channel import Channel
+from slviewer.devices.channel import Channel, Standing
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.gui import shell as frame
 from slviewer.gui.panel import Stage
@@ -89,6 +89,7 @@ class App:
             escape,
             self._go,
             self._failed,
+            self._page_standing,
         )
         snapshot = operator.snapshot()
         self._told = snapshot.notices[-1].number if snapshot.notices else 0
@@ -104,13 +105,15 @@ class App:
         self._changed.set()
 
     def _draw_forever(self) -> None:
-        version, number = -1, -1
+        version, number, standing = -1, -1, None
         while not self._closing:
             begun = time.monotonic()
-            self._changed.wait(1.0)
+            self._changed.wait(0.5)
             self._changed.clear()
             if self._closing:
                 return
+            if standing != (standing := self._page_standing()):
+                version = -1
             try:
                 version, number = self._draw(version, number)
             except Exception as error:
@@ -160,6 +163,9 @@ class App:
             self._offers[path] = self.server.downloads.offer(path, within=folder)
         return self._offers[path]
 
+    def _page_standing(self) -> Standing | None:
+        return None if self.channel is None else self.channel.standing()
+
     def _greet(self, client: viser.ClientHandle) -> None:
         if self.server.role(client.client_id) == "viewer":
             frame.greet_viewer(client)
@@ -185,7 +191,8 @@ def run(
         app = App(operator, host, port, channel=channel)
         try:
             print(f"slviewer is ready: {app.server.url}")
-            print(f"to watch only:     {app.server.view_url}", flush=True)
+            print(f"to watch only:     {app.server.view_url}")
+            print(f"projector page:    {app.server.link('/projector')}", flush=True)
             if not app.server.loopback:
                 print("Others on this network can read what is sent: use a network that you trust.", flush=True)
             if open_browser:

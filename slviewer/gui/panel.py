@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import viser
 
+from slviewer.devices.channel import Standing
 from slviewer.gui.scene import Scene
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
 
@@ -21,7 +22,7 @@ class Stage:
     `gui` builds inputs, `scene` draws in 3D, `eyes` turns the browsers' views, `operator` takes requests. `offer(path)`
     gives the address at which a file of the session is downloaded; `tell(level, text)` shows a notification in every
     browser; `escape(text)` makes text that was typed or read harmless inside HTML and Markdown. `go(key)` brings
-    another step to the front.
+    another step to the front. `projector_page()` says where the projector page stands; None where none is served.
     """
 
     gui: viser.GuiApi
@@ -33,6 +34,7 @@ class Stage:
     escape: Callable[[str], str]
     go: Callable[[str], None]
     failed: Callable[[BaseException], None]
+    projector_page: Callable[[], Standing | None] = lambda: None
 
     def safely(self, do: Callable[[], Any]) -> Callable[[Any], None]:
         """A callback for viser that calls `do()`; whatever it raises becomes a notification in plain words.

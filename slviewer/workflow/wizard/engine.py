@@ -27,7 +27,7 @@ from slviewer.workflow.wizard.jobs import Jobs, Reporter
 from slviewer.workflow.wizard.looking import thumbnail
 from slviewer.workflow.wizard.notices import Notices
 from slviewer.workflow.wizard.reading import Reader
-from slviewer.workflow.wizard.rigs import Bench, Choice, SetUp
+from slviewer.workflow.wizard.rigs import Bench, Choice, SetUp, needs_page
 from slviewer.workflow.wizard.snapshot import PreviewView, RigView, SessionView, Snapshot, Space, WorldView
 from slviewer.workflow.wizard.steps import Brightness, Facts, views
 from slviewer.workflow.wizard.telling import Teller
@@ -248,7 +248,13 @@ class Engine:
             self._read(reader, rig, bench)
         session = self._session_view if reader is not None else None
         space = self.space(reader.frames_of_a_pose(rig) if reader is not None else None)
-        rig = replace(rig, simulated=bench is not None and bench.world is not None)
+        choice = self._choice
+        rig = replace(
+            rig,
+            simulated=bench is not None and bench.world is not None,
+            choice=choice,
+            page=choice is not None and needs_page(choice),
+        )
         world = None
         if bench is not None and bench.world is not None:
             T, pose = np.eye(4), bench.world.pose

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -68,6 +68,9 @@ class RigView:
     light: str = "white"  # what the projector shows between captures
     fault: str = ""  # why it is lost, in a sentence
     capture: CaptureProgress | None = None
+    choice: Mapping[str, Any] | None = None  # what the operator chose
+    page: bool = False  # whether it needs the projector page
+    notes: tuple[str, ...] = ()  # what its camera could not be set to
 
 
 @dataclass(frozen=True, eq=False)
