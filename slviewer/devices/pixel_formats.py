@@ -1,0 +1,144 @@
+"""GenICam's pixel formats: which bits of a buffer are which pixel, by the names of the Pixel Format Naming Convention.
+
+Grey levels stay as the camera gives them: 10 and 12 bits become uint16 of 0 ... 1023 and 0 ... 4095, whose full scale
+`fringe.layout.clip_level` knows. "p" formats are one stream of bits, the lowest first; GigE Vision's older "Packed"
+ones keep the upper eight bits of two pixels around a byte with the rest of both.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+
+_NAME = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG)|RGBa?|BGRa?)(8|10|12|14|16)(p|Packed)?")
+_ORDERS = {"RGB": (0, 1, 2), "RGBa": (0, 1, 2), "BGR": (2, 1, 0), "BGRa": (2, 1, 0)}
+_DEMOSAIC = {
+    "BayerRG": cv2.COLOR_BayerRGGB2RGB,
+    "BayerGR": cv2.COLOR_BayerGRBG2RGB,
+    "BayerGB": cv2.COLOR_BayerGBRG2RGB,
+    "BayerBG": cv2.COLOR_BayerBGGR2RGB,
+}
+
+_Bits = tuple[int, int, int]  # byte, which of its bits, by how much they move to the left
+_GROUPS: dict[tuple[int, str], tuple[int, tuple[tuple[_Bits, _Bits], ...]]] = {
+    (10, "p"): (
+        5,
+        (
+            ((0, 0xFF, 0), (1, 0x03, 8)),
+            ((1, 0xFC, -2), (2, 0x0F, 6)),
+            ((2, 0xF0, -4), (3, 0x3F, 4)),
+            ((3, 0xC0, -6), (4, 0xFF, 2)),
+        ),
+    ),
+    (12, "p"): (3, (((0, 0xFF, 0), (1, 0x0F, 8)), ((1, 0xF0, -4), (2, 0xFF, 4)))),
+    (10, "Packed"): (3, (((0, 0xFF, 2), (1, 0x03, 0)), ((2, 0xFF, 2), (1, 0x30, -4)))),
+    (12, "Packed"): (3, (((0, 0xFF, 4), (1, 0x0F, 0)), ((2, 0xFF, 4), (1, 0xF0, -4)))),
+}
+"""Bytes of a group, and the pixels that they hold."""
+
+
+@dataclass(frozen=True)
+class PixelFormat:
+    """`kind` is Mono, BayerRG ..., RGB, RGBa, BGR or BGRa; `packing` "p", "Packed" or ""."""
+
+    name: str
+    kind: str
+    bits: int
+    packing: str
+
+    @property
+    def dtype(self) -> np.dtype:
+        """uint8, or uint16 for more than 8 bits."""
+        return np.dtype(np.uint8 if self.bits == 8 else np.uint16)
+
+    @property
+    def colour(self) -> bool:
+        """Whether it tells colours."""
+        return self.kind != "Mono"
+
+    @property
+    def samples(self) -> int:
+        """Numbers for a pixel."""
+        return len(self.kind) if self.kind in _ORDERS else 1
+
+    def nbytes(self, size: tuple[int, int], padding: int = 0) -> int:
+        """Bytes of an image of `size` (width, height) whose rows end with `padding` bytes; lines are seamless at 0."""
+        width, height = size
+        return self._bytes(width * height) if padding == 0 else height * (self._bytes(width) + padding)
+
+    def _bytes(self, pixels: int) -> int:
+        if self.packing == "Packed":
+            return 3 * (pixels // 2) + 2 * (pixels % 2)
+        stored = self.bits if self.packing else 8 * self.dtype.itemsize
+        return (pixels * self.samples * stored + 7) // 8
+
+    def unpack(self, data: np.ndarray, out: np.ndarray, padding: int = 0) -> None:
+        """Fill `out`, contiguous (h, w), or (h, w, samples), of `dtype`, from the bytes of a buffer."""
+        height, width = out.shape[:2]
+        rows, pixels = (1, width * height) if padding == 0 else (height, width)
+        used = self._bytes(pixels)
+        lines = data[: self.nbytes((width, height), padding)].reshape(rows, used + padding)[:, :used]
+        if self.packing:
+            _unpack(lines, out.reshape(rows, pixels), *_GROUPS[self.bits, self.packing])
+        elif self.bits == 8:
+            np.copyto(out.reshape(rows, used), lines)
+        else:
+            np.copyto(out.reshape(rows, used // 2), np.ascontiguousarray(lines).view("<u2"))
+
+    def rgb(self, samples: np.ndarray) -> np.ndarray:
+        """(h, w, 3) RGB of what `unpack` fills; no copy except of a Bayer mosaic, whose gaps are filled linearly."""
+        if self.kind in _ORDERS:
+            reverse = _ORDERS[self.kind] == (2, 1, 0)
+            return samples[..., 2::-1] if reverse else samples[..., :3]
+        if self.kind in _DEMOSAIC:
+            return cv2.cvtColor(samples, _DEMOSAIC[self.kind])
+        raise InputError(f"{self.name} tells no colours: choose a colour format")
+
+
+def pixel_format(name: str) -> PixelFormat | None:
+    """The format called so; None for one that is not read here."""
+    match = _NAME.fullmatch(name)
+    if match is None:
+        return None
+    kind, bits, packing = match[1], int(match[2]), match[3] or ""
+    if kind in _ORDERS:
+        packing = packing.replace("Packed", "")  # RGB8Packed is the old name of RGB8
+        known = bits == 8 and not packing
+    else:
+        known = not packing or (bits, packing) in _GROUPS
+    return PixelFormat(name, kind, bits, packing) if known else None
+
+
+def best_format(names: Sequence[str]) -> PixelFormat | None:
+    """The one to use among those that a camera offers, None if none can be read.
+
+    Unpacked and up to 12 bits deep where there is such a one; a camera that offers colours is a colour camera, and
+    its mosaic comes before colours that it would fill in itself and send as three.
+    """
+    formats = [found for name in names if (found := pixel_format(name)) is not None and found.bits <= 12]
+    colours = [found for found in formats if found.colour]
+    return max(colours or formats, key=lambda f: (not f.packing, f.samples == 1, f.bits, -f.samples), default=None)
+
+
+def _unpack(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[_Bits, _Bits], ...]) -> None:
+    """Fill `out` (rows, n) uint16 from (rows, bytes) in groups, of which the last may be short."""
+    count = len(pixels)
+    groups = -(-out.shape[1] // count)
+    whole = out
+    if groups * group != lines.shape[1]:
+        lines = np.pad(lines, ((0, 0), (0, groups * group - lines.shape[1])))
+    if groups * count != out.shape[1]:
+        whole = np.empty((len(out), groups * count), np.uint16)
+    for k, parts in enumerate(pixels):
+        levels = [_moved(lines[:, byte::group] & np.uint8(bits), shift) for byte, bits, shift in parts]
+        np.bitwise_or(*levels, out=whole[:, k::count])
+    if whole is not out:
+        out[:] = whole[:, : out.shape[1]]
+
+
+def _moved(bits: np.ndarray, left: int) -> np.ndarray:
+    return np.left_shift(bits, left, dtype=np.uint16) if left > 0 else np.right_shift(bits, -left, dtype=np.uint16)
