@@ -54,8 +54,8 @@ _DIALECTS = {
 
 
 def dialect(capture: cv2.VideoCapture) -> Dialect | None:
-    """How the open `capture` is spoken to; None where its controls are out of reach, as a stream's are, and any camera's
-    on macOS (cap_avfoundation_mac.mm sets a size and a frame rate only).
+    """How the open `capture` is spoken to; None where its controls are out of reach: those of a stream, and on macOS
+    those of any camera (cap_avfoundation_mac.mm sets a size and a frame rate only).
     """
     found = _DIALECTS.get(capture.getBackendName())
     if found is _V4L2:

@@ -37,7 +37,8 @@ def connect(source: int | str, size: tuple[int, int] | None) -> Connected:
     name = described(source)
     if _is_address(source):
         limit = int(1000 * PATIENCE_S)
-        # one thread: a decoder that works on several pictures at once keeps as many of them back
+        # one thread: a decoder that works on several pictures at once keeps as many of them back. A stream that changes
+        # its size is scaled to the one that it had, and nothing tells
         options = {
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: limit,
             cv2.CAP_PROP_READ_TIMEOUT_MSEC: limit,
