@@ -123,7 +123,7 @@ def test_pictures_that_come_in_clumps_are_never_taken_for_new_ones():
 class Painter(Openable):
     """A projector whose light is what the network camera sees: the number of the pattern, 255 for even light."""
 
-    size = (64, 48)
+    size = (16, 8)
 
     def __init__(self, seen) -> None:
         super().__init__("the painter")
