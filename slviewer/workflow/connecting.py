@@ -9,7 +9,8 @@ from slviewer.errors import SlviewerError
 @dataclass(frozen=True)
 class DriverView:
     """One driver: what it drives and offers ("camera", "projector", "rig"), what is connected, a line each (None where
-    it cannot look), what it needs, and what this machine lacks for it with how to install it, empty if nothing.
+    nobody looked, and `trouble` may say why), what it needs, and what this machine lacks for it with how to install it,
+    empty if nothing.
     """
 
     name: str
@@ -18,21 +19,12 @@ class DriverView:
     connected: tuple[str, ...] | None
     needs: str
     missing: str
+    trouble: str = ""
 
 
 def list_drivers() -> list[DriverView]:
-    """All drivers, those that can be used here first. One that fails while it looks says so in place of a device."""
-    return [
-        DriverView(
-            found.name,
-            found.what,
-            tuple(part for part in ("camera", "projector", "rig") if getattr(found, part) is not None),
-            _connected(found),
-            found.needs,
-            found.missing,
-        )
-        for found in available()
-    ]
+    """All drivers, those that can be used here first."""
+    return [_looked(found) for found in available()]
 
 
 def devices() -> str:
@@ -43,16 +35,20 @@ def devices() -> str:
         lines.append(f"  cannot be used here, {driver.missing}" if driver.missing else "  can be used")
         if driver.needs:
             lines.append(f"  needs {driver.needs}")
+        if driver.trouble:
+            lines.append(f"  could not look for what is connected: {driver.trouble}")
         if driver.connected is not None:
             lines += [f"  connected: {line}" for line in driver.connected] or ["  connected: nothing was found"]
         blocks.append("\n".join(lines))
     return "\n".join(blocks)
 
 
-def _connected(driver: Driver) -> tuple[str, ...] | None:
-    if driver.missing or driver.found is None:
-        return None
-    try:
-        return tuple(driver.found())
-    except SlviewerError as error:
-        return (str(error),)
+def _looked(driver: Driver) -> DriverView:
+    offers = tuple(part for part in ("camera", "projector", "rig") if getattr(driver, part) is not None)
+    connected, trouble = None, ""
+    if driver.found is not None and not driver.missing:
+        try:
+            connected = tuple(driver.found())
+        except SlviewerError as error:
+            trouble = str(error)
+    return DriverView(driver.name, driver.what, offers, connected, driver.needs, driver.missing, trouble)

@@ -8,7 +8,8 @@ import pytest
 from colour_camera import coloured
 
 from slviewer.cli import main
-from slviewer.errors import Cancelled, InputError, SessionError
+from slviewer.devices.drivers import Driver, drivers
+from slviewer.errors import Cancelled, DeviceError, InputError, SessionError
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.session.store import Session
@@ -159,3 +160,29 @@ def test_devices_says_what_there_is(run: Run):
     assert status == 0
     for line in ("simulated (rig)", "browser (projector)", "needs the projector page", "rigs:", "  replay: Recorded"):
         assert line in text
+
+
+def test_devices_says_what_is_connected_and_what_is_missing(run: Run, monkeypatch: pytest.MonkeyPatch):
+    def none_to_ask() -> list[str]:
+        raise DeviceError("no producer is installed: install one")
+
+    def camera() -> None: ...
+
+    for added in (
+        Driver(
+            "far", "nothing", packages={"no_such_package": "pip install it"}, camera=camera, found=lambda: ["never"]
+        ),
+        Driver("near", "nothing", camera=camera, found=lambda: ["the camera A", "the camera B"]),
+        Driver("empty", "nothing", camera=camera, found=list),
+        Driver("blind", "nothing", camera=camera, found=none_to_ask),
+    ):
+        monkeypatch.setitem(drivers(), added.name, added)
+    text = run("devices")[1]
+    for line in (
+        "  cannot be used here, the package no_such_package is missing: pip install it",
+        "  connected: the camera A\n  connected: the camera B",
+        "empty (camera): nothing\n  can be used\n  connected: nothing was found",
+        "  could not look for what is connected: no producer is installed: install one",
+    ):
+        assert line in text
+    assert "never" not in text

@@ -236,7 +236,8 @@ class Acquisition:
             if settings is None:
                 with self._condition:
                     self._applied = self._settings = taken
-            self._say(exposure_ms=taken.exposure_ms, gain=taken.gain)
+            notes = tuple(getattr(self._rig.camera, "notes", ()))  # of drivers that keep some
+            self._say(exposure_ms=taken.exposure_ms, gain=taken.gain, notes=notes)
         if light != self._lit:
             name, pattern = light
             if pattern is None:

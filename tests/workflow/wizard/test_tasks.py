@@ -152,3 +152,9 @@ def test_a_colour_camera_leaves_its_texture_in_the_session(bench: Bench, tmp_pat
         texture = store.load_capture("scan_01").texture
     assert texture is not None and texture.shape == (120, 160, 3)
     assert texture[..., 0].mean() == pytest.approx(0.8 * texture[..., 1].mean(), rel=0.02)
+
+
+def test_what_the_camera_could_not_be_set_to_is_seen(bench: Bench) -> None:
+    bench.rig.camera.notes = ("its gain cannot be set",)  # type: ignore[attr-defined]
+    bench.open()
+    assert bench.acquisition.view().notes == ("its gain cannot be set",)
