@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from slviewer import __version__, terminal
-from slviewer.commands.devices import capture, devices
+from slviewer.commands.devices import capture, devices, preflight
 from slviewer.commands.importing import bring_in
 from slviewer.commands.measuring import calibrate, merge, reconstruct, verify
 from slviewer.commands.parsing import union
@@ -23,6 +23,7 @@ from slviewer.errors import Cancelled, SlviewerError
 COMMANDS: dict[str, Callable[..., Any]] = {
     "wizard": wizard,
     "devices": devices,
+    "preflight": preflight,
     "capture": capture,
     "import": bring_in,
     "calibrate": calibrate,

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from slviewer import terminal, workflow
-from slviewer.commands.parsing import Role, deferred, ui
+from slviewer.commands.parsing import Role, deferred, ui, write_json
+from slviewer.errors import DeviceError
 
 if TYPE_CHECKING:
     from slviewer.devices.channel import Channel
@@ -73,6 +74,33 @@ def capture(
     print(workflow.summary(saved))
 
 
+@deferred
+def preflight(
+    rig: str,
+    session: Path | None = None,
+    exposure_ms: float | None = None,
+    gain: float | None = None,
+    port: int = 8080,
+    json: Path | None = None,
+) -> None:
+    """Check a rig in about 10 s: right screen, delay, order of frames, light, stillness; say how to mend what is wrong.
+
+    Args:
+        rig: A TOML file that describes the rig, or the name of one that `slviewer devices` lists.
+        session: A session, whose own rigs are known by name too.
+        exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
+        gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
+        port: Port of the projector page, where the rig's projector is one; 0 takes any free one.
+        json: Write the result to this file too.
+    """
+    with _set_up(port) as set_up:
+        found = workflow.check_rig(rig, session=session, exposure_ms=exposure_ms, gain=gain, set_up=set_up, **ui())
+    write_json(json, found.to_dict())
+    print(workflow.in_words(found))
+    if found.verdict == "bad":
+        raise DeviceError("the rig is not fit to capture with: mend what is marked bad, then check it again")
+
+
 @contextmanager
 def _set_up(port: int) -> Iterator["SetUp"]:
     """How rigs are set up; the projector page is served for one that needs it, until the block ends."""
@@ -89,7 +117,6 @@ def _set_up(port: int) -> Iterator["SetUp"]:
 def _page(port: int, ended: ExitStack) -> "Channel":
     """The wire to the projector page, once it is open and ready. Raises DeviceError where nobody opens it."""
     from slviewer.devices.channel import Channel
-    from slviewer.errors import DeviceError
     from slviewer.server.projector_page import PATH, serve_projector
     from slviewer.server.secure import serve
 

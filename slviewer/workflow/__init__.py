@@ -14,6 +14,8 @@ _HOMES = {
     "devices": "connecting",
     "rigs": "rig_presets",
     "capture": "capturing",
+    "check_rig": "checking",
+    "in_words": "checking",
     "summary": "inspecting",
     "calibrate": "calibrating",
     "reconstruct": "reconstructing",

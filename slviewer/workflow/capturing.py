@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.devices.capture import Taken, check_exposures, take
-from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import InputError, SessionError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence
@@ -64,11 +64,7 @@ def capture(
         sequence = sequence_for(bench, patterns or str(store.decision("patterns") or PATTERNS))
         _check_space(store, bench, len(sequence.frames) * max(1, len(exposures)))
         with bench.rig.opened() as devices:
-            wanted = CameraSettings(exposure_ms or choice.get("exposure_ms"), gain or choice.get("gain"))
-            if wanted != CameraSettings():
-                devices.camera.apply(wanted)
-            for note in getattr(devices.camera, "notes", ()):
-                warn(note)
+            set_camera(devices, choice, exposure_ms, gain, warn)
             taken = take(
                 devices,
                 sequence,
@@ -83,6 +79,15 @@ def capture(
         warn(f"{name}: {sentence}")
     progress(1.0, "captured")
     return saved
+
+
+def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn) -> None:
+    """Set the open rig's camera to what is asked for, else to what its choice says; `warn` hears what could not be."""
+    wanted = CameraSettings(exposure_ms or choice.get("exposure_ms"), gain or choice.get("gain"))
+    if wanted != CameraSettings():
+        rig.camera.apply(wanted)
+    for note in getattr(rig.camera, "notes", ()):
+        warn(note)
 
 
 def sequence_for(bench: Bench, patterns: str) -> PatternSequence:

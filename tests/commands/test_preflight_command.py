@@ -1,0 +1,69 @@
+"""`slviewer preflight`: what it says, what it writes, and how it ends."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.cli import main
+from slviewer.devices.drivers import Driver, drivers
+from slviewer.devices.opening import Openable
+from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.simulated import preset_rig
+from slviewer.session.store import Session
+from slviewer.workflow.rig_presets import save_rig, to_toml
+
+
+class BlindCamera(Openable):
+    """Looks elsewhere: noise that no projector changes."""
+
+    size, dtype = (160, 120), np.dtype(np.uint8)
+    notes = ("its gain cannot be set",)
+
+    def __init__(self) -> None:
+        super().__init__("the blind camera")
+        self._rng = np.random.default_rng(0)
+
+    def grab(self, out: np.ndarray) -> None:
+        out[:] = np.clip(self._rng.normal(60, 2, out.shape), 0, 255)
+
+    def settings(self) -> CameraSettings:
+        return CameraSettings(8.0)
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        return self.settings()
+
+
+def test_a_sound_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Session.create(tmp_path / "session") as store:
+        save_rig(store, "small", {"driver": "simulated", "scale": 0.25, "exposure_ms": 0.9})
+    found = tmp_path / "found.json"
+    arguments = ["preflight", "--rig", "small", "--session", str(tmp_path / "session"), "--json", str(found)]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "good     screen: " in said and "settle_ms = " in said and "bad" not in said
+    written = json.loads(found.read_text())
+    assert written["verdict"] == "good" and 0.1 < written["seconds"] < 30
+    assert {check["name"] for check in written["checks"]} >= {"screen", "latency", "order", "flicker"}
+
+
+def test_a_rig_that_is_not_fit_ends_with_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lamp = preset_rig(scale=0.1).projector
+    blind = Driver("blind", "nothing", camera=BlindCamera, projector=lambda: lamp)
+    monkeypatch.setitem(drivers(), "blind", blind)
+    file = tmp_path / "blind.toml"
+    file.write_text(to_toml({"camera": {"driver": "blind"}, "projector": {"driver": "blind"}}))
+    assert main(["preflight", "--rig", str(file), "--json", str(tmp_path / "found.json")]) == 1
+    said = capsys.readouterr()
+    assert "bad " in said.out and "-> " in said.out
+    assert "warning: its gain cannot be set" in said.err and "not fit to capture with" in said.err
+    assert json.loads((tmp_path / "found.json").read_text())["verdict"] == "bad"
+
+
+def test_a_rig_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["preflight", "--rig", "nothing"]) == 1
+    assert "no rig is called 'nothing'" in capsys.readouterr().err
+    assert main(["preflight"]) == 2
