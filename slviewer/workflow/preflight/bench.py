@@ -1,0 +1,108 @@
+"""The rig under test: light shown, images grabbed and timed, and what the checks know of each other's findings."""
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from slviewer.devices.protocols import Rig
+from slviewer.fringe.layout import white_level
+
+_PIXELS = 150_000
+"""So many pixels of an image are looked at."""
+_PATIENCE_S = 0.35
+_PATIENT_GRABS = 4
+"""What a reference waits for: longer than any projector and camera take between them."""
+_MEAN = 8
+_SIGMAS = 6.0
+
+
+class Bench:
+    """An open rig. Images come as (h, w) float32 grey levels of every `stride`-th row and column.
+
+    ``settle_ms`` and ``stale`` are what the latency check finds: the time to wait after a change, and how many images
+    to throw away. ``dark`` and ``white`` are the references, ``lit`` (h, w) bool where the projector's light is seen;
+    ``noise`` of one grey level, and ``unsteady``, by how much whole images differ, as a share of the white light (rms).
+    """
+
+    def __init__(self, rig: Rig, tick: Callable[[str], None]) -> None:
+        self.rig, self._tick = rig, tick
+        width, height = rig.camera.size
+        self._frame = np.empty((height, width), rig.camera.dtype)
+        self.stride = max(1, math.ceil(math.sqrt(width * height / _PIXELS)))
+        self.settle_ms = rig.settle_ms
+        self.stale = 0
+        self.frame_ms = 0.0
+        self.noise, self.unsteady = 0.0, 0.0
+        shape = self._frame[:: self.stride, :: self.stride].shape
+        self.dark, self.white = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self.lit = np.zeros(shape, bool)
+
+    def grab(self) -> np.ndarray:
+        """The next image, sampled."""
+        self.rig.camera.grab(self._frame)
+        return self._frame[:: self.stride, :: self.stride].astype(np.float32)
+
+    def timed(self) -> tuple[float, np.ndarray]:
+        """When grabbing began, in s of the monotonic clock, and the image."""
+        begin = time.monotonic()
+        return begin, self.grab()
+
+    def show(self, grey: int | None, doing: str) -> None:
+        """Even light, without waiting for it. May raise Cancelled."""
+        self._tick(doing)
+        self.rig.projector.show_level(grey)
+
+    def look(self, grey: int | None, doing: str, images: int = 1) -> np.ndarray:
+        """The mean image under even light that has arrived."""
+        self.show(grey, doing)
+        self.wait()
+        return np.mean([self.grab() for _ in range(images)], axis=0) if images > 1 else self.grab()
+
+    def wait(self) -> None:
+        """Let the light arrive, and the images that are older than it pass."""
+        time.sleep(self.settle_ms / 1000)
+        for _ in range(self.stale):
+            self.grab()
+
+    def find_references(self) -> None:
+        """Measure dark and white, with patience: nothing is known yet of the rig's delays."""
+        taken = []
+        for grey, doing in ((None, "dark"), (255, "white light")):
+            self.show(grey, doing)
+            end, passed = time.monotonic() + _PATIENCE_S, 0
+            while time.monotonic() < end or passed < _PATIENT_GRABS:
+                self.grab()
+                passed += 1
+                time.sleep(max(0.0, min(0.02, end - time.monotonic())))
+            taken.append(np.stack([self.grab() for _ in range(_MEAN)]))
+        dark, white = taken
+        self.dark, self.white = dark.mean(axis=0), white.mean(axis=0)
+        difference = white[1] - white[0]
+        self.noise = float(np.median(np.abs(difference - np.median(difference)))) / 0.6745 / math.sqrt(2)
+        # Light that flickers lifts whole images, and must not pass for the projector's.
+        swing = max(float(np.std([np.median(image) for image in images])) for images in taken)
+        self.lit = self.white - self.dark > max(_SIGMAS * self.noise, 0.02 * self.full, 3 * swing)
+        if self.lit.any():
+            self.unsteady = max(float(np.std([self.share(i, self.lit) for i in images])) for images in taken)
+
+    @property
+    def full(self) -> float:
+        """The grey level at which the camera clips."""
+        seen = np.stack([self.white, self.dark]).astype(self._frame.dtype)
+        return white_level(seen, [0, 1])
+
+    @property
+    def contrast(self) -> float:
+        """Grey levels of the projector's white light where it is seen, in the middle."""
+        return float(np.median((self.white - self.dark)[self.lit])) if self.lit.any() else 0.0
+
+    def usable(self) -> np.ndarray:
+        """(h, w) bool: lit, and not clipped in white light."""
+        return self.lit & (self.white < 0.985 * self.full) & (self.dark < 0.9 * self.full)
+
+    def share(self, image: np.ndarray, where: np.ndarray) -> float:
+        """The projector's light in an image, 0 for dark, 1 for white, summed over some pixels."""
+        span = float((self.white - self.dark)[where].sum(dtype=float))
+        return float((image - self.dark)[where].sum(dtype=float)) / span if span else 0.0
