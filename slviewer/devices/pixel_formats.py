@@ -89,8 +89,18 @@ class PixelFormat:
         else:
             np.copyto(out.reshape(rows, used // 2), np.ascontiguousarray(lines).view("<u2"))
 
+    def samples_of(self, data: np.ndarray, size: tuple[int, int], padding: int = 0) -> np.ndarray:
+        """(h, w), or (h, w, samples), of `dtype`: the buffer's own bytes where they are such an array already."""
+        width, height = size
+        shape = (height, width) if self.samples == 1 else (height, width, self.samples)
+        if self.bits == 8 and padding == 0:
+            return data[: self.nbytes(size)].reshape(shape)
+        out = np.empty(shape, self.dtype)
+        self.unpack(data, out, padding)
+        return out
+
     def rgb(self, samples: np.ndarray) -> np.ndarray:
-        """(h, w, 3) RGB of what `unpack` fills; no copy except of a Bayer mosaic, whose gaps are filled linearly."""
+        """(h, w, 3) RGB of what `samples_of` gives; only a Bayer mosaic is copied, its gaps are filled linearly."""
         if self.kind in _ORDERS:
             reverse = _ORDERS[self.kind] == (2, 1, 0)
             return samples[..., 2::-1] if reverse else samples[..., :3]
@@ -134,8 +144,8 @@ def _unpack(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[
     if groups * count != out.shape[1]:
         whole = np.empty((len(out), groups * count), np.uint16)
     for k, parts in enumerate(pixels):
-        levels = [_moved(lines[:, byte::group] & np.uint8(bits), shift) for byte, bits, shift in parts]
-        np.bitwise_or(*levels, out=whole[:, k::count])
+        first, second = (_moved(lines[:, byte::group] & np.uint8(bits), left) for byte, bits, left in parts)
+        np.bitwise_or(first, second, out=whole[:, k::count])
     if whole is not out:
         out[:] = whole[:, : out.shape[1]]
 

@@ -61,9 +61,11 @@ def test_colours_in_any_order_are_rgb(name):
     stored = seen if name.startswith("RGB") else seen[..., ::-1]
     if found.samples == 4:
         stored = np.concatenate([stored, np.full((4, 6, 1), 9, np.uint8)], axis=2)
-    out = np.zeros((4, 6, found.samples), np.uint8)
-    found.unpack(np.frombuffer(stored.tobytes(), np.uint8), out)
-    np.testing.assert_array_equal(found.rgb(out), seen)
+    for padding in (0, 5):
+        data = np.frombuffer(b"".join(row.tobytes() + b"x" * padding for row in stored), np.uint8)
+        rgb = found.rgb(found.samples_of(data, (6, 4), padding))
+        np.testing.assert_array_equal(rgb, seen)
+        assert np.shares_memory(rgb, data) == (padding == 0)
 
 
 @pytest.mark.parametrize("name", ["BayerRG8", "BayerGR8", "BayerGB12", "BayerBG10"])

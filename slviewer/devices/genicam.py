@@ -1,0 +1,207 @@
+"""USB3 Vision and GigE Vision cameras, through the GenTL producer that their maker installs."""
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any, get_args
+
+import numpy as np
+
+from slviewer.devices.drivers import Driver
+from slviewer.devices.genicam_features import Features, Trigger
+from slviewer.devices.gentl import Found, connected
+from slviewer.devices.gentl_link import Image, Link, asked
+from slviewer.devices.opening import Openable
+from slviewer.devices.pixel_formats import PixelFormat
+from slviewer.devices.protocols import Camera, CameraSettings, Channel, check_frame, one_channel
+from slviewer.errors import DeviceError, InputError
+
+IN_FLIGHT = 2
+"""Frames of a camera that runs by its own clock, or a line's, that may have begun before a call and arrive after it:
+one that is being exposed, and the one before, which is being read out and sent."""
+
+_ANSWER_S = 2.0
+
+
+class GenicamCamera(Openable):
+    """Grey levels as they come from the camera: uint8, or uint16 with its 10 or 12 bits at the bottom.
+
+    With a software trigger each grab starts its own exposure. Of a camera that runs free, or by a line whose pulses
+    repeat (a projector's frame clock), buffers are thrown away until one comes whose exposure began after the call. A
+    frame that is late or incomplete is a DeviceError, and never mistaken for the next: the stream begins anew after it.
+    """
+
+    def __init__(
+        self,
+        camera: Found,
+        size: tuple[int, int],
+        pixels: PixelFormat,
+        trigger: Trigger,
+        line: str | None,
+        first: CameraSettings,
+    ) -> None:
+        super().__init__(f"the camera {camera}")
+        self.size, self.dtype, self.pixels = size, pixels.dtype, pixels
+        self._camera, self._trigger, self._line, self._first = camera, trigger, line, first
+        self._link: Link | None = None
+        self._timeout_s = _ANSWER_S
+
+    def open(self) -> None:
+        """Claim the camera and let it run. Raises DeviceError where it is gone, in use, or not as it was."""
+        super().open()
+        try:
+            self._link = Link(self._camera)
+            features = self._features()
+            features.prepare(self.pixels, self._trigger, self._line)
+            if features.size() != self.size:
+                (width, height), (columns, rows) = features.size(), self.size
+                raise DeviceError(
+                    f"{self.name} has images of {width}x{height} px, no longer {columns}x{rows}: choose it anew"
+                )
+            self.apply(self._first)
+            self._link.start()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Give it back, running free."""
+        super().close()
+        link, self._link = self._link, None
+        if link is not None:
+            link.stop()
+            with contextlib.suppress(Exception):
+                Features(link.node_map, self.name).release()
+            link.close()
+
+    def grab(self, out: np.ndarray) -> None:
+        """A frame whose exposure began after the call."""
+        self.check_open()
+        check_frame(self, out)
+        with self._fresh() as image:
+            self.pixels.unpack(image.data, out, image.padding)
+
+    def settings(self) -> CameraSettings:
+        """What is set; None for what it lacks, and for a gain in steps of its own."""
+        self.check_open()
+        return self._features().settings()
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set the nearest that it can do. What it lacks stays None."""
+        self.check_open()
+        features = self._features()
+        features.apply(settings)
+        taken = features.settings()
+        self._timeout_s = _ANSWER_S + (taken.exposure_ms or 0.0) / 1000
+        return taken
+
+    @contextlib.contextmanager
+    def _fresh(self) -> Iterator[Image]:
+        link = self._link
+        assert link is not None
+        try:
+            if not link.streaming:
+                link.start()
+            link.drop_filled()
+            if self._trigger == "software":
+                self._features().fire()
+            else:
+                for _ in range(IN_FLIGHT):
+                    link.drop_next(self._timeout_s)
+            with link.next(self._timeout_s, self.pixels.nbytes) as image:
+                if image.size != self.size:
+                    raise DeviceError(f"{self.name} sent a frame of {image.size}, not {self.size}: choose it anew")
+                yield image
+        except BaseException:
+            link.stop()  # what is still on its way must not be the next grab's
+            raise
+
+    def _features(self) -> Features:
+        assert self._link is not None
+        return Features(self._link.node_map, self.name)
+
+
+class GenicamColourCamera(GenicamCamera):
+    """One channel of its colours, and all three as a texture."""
+
+    def __init__(self, *what: Any, channel: Channel) -> None:
+        super().__init__(*what)
+        self.channel = channel
+
+    def grab(self, out: np.ndarray) -> None:
+        """The channel of a frame whose exposure began after the call."""
+        self.check_open()
+        check_frame(self, out)
+        with self._fresh() as image:
+            one_channel(self._rgb(image), self.channel, out)
+
+    def grab_colour(self) -> np.ndarray:
+        """The whole of such a frame, (h, w, 3) RGB."""
+        self.check_open()
+        with self._fresh() as image:
+            return np.array(self._rgb(image))
+
+    def _rgb(self, image: Image) -> np.ndarray:
+        return self.pixels.rgb(self.pixels.samples_of(image.data, image.size, image.padding))
+
+
+def genicam_camera(
+    producer: str | None = None,
+    serial: str | int | None = None,
+    model: str | None = None,
+    exposure_ms: float | None = None,
+    gain: float | None = None,
+    pixel_format: str | None = None,
+    channel: Channel = "green",
+    trigger: Trigger | None = None,
+    line: str | None = None,
+) -> Camera:
+    """The connected camera of that serial number or model, or the only one there is; not opened yet.
+
+    `producer` is the .cti file of its maker's software, None: all that are installed. `exposure_ms` and `gain` are set
+    when it is opened, None: left as they are. `pixel_format` None: the deepest mono of up to 12 bits that comes
+    unpacked; of a colour camera its colours, of which `channel` is decoded. `trigger` "software" (where it has one),
+    "hardware" with the name of its `line`, or "free". Raises InputError for what the camera has not, or where several
+    fit; DeviceError where none is connected.
+    """
+    if channel not in get_args(Channel):
+        raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
+    camera = _choose(connected(producer), None if serial is None else str(serial), model)
+    name, first = f"the camera {camera}", CameraSettings(exposure_ms, gain)
+    with asked(camera) as node_map:
+        features = Features(node_map, name)
+        pixels, begun = features.format(pixel_format), features.trigger(trigger, line)
+        features.check_settings(first)
+        what = (camera, features.size(), pixels, begun, line, first)
+    return GenicamColourCamera(*what, channel=channel) if pixels.colour else GenicamCamera(*what)
+
+
+def _choose(cameras: list[Found], serial: str | None, model: str | None) -> Found:
+    listed = "; ".join(map(str, cameras))
+    fitting = [
+        camera
+        for camera in cameras
+        if serial in (None, camera.serial) and (model is None or model.casefold() == camera.model.casefold())
+    ]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise InputError(f"{len(fitting)} cameras fit ({listed}): say which one by its `serial` number")
+    if cameras:
+        raise DeviceError(f"no such camera is connected, only {listed}: choose one of them, or plug yours in")
+    raise DeviceError("no camera is connected: plug one in, wait until it has started, and close other programs")
+
+
+def found() -> list[str]:
+    """One line for each camera that is connected: maker, model, serial number. Raises DeviceError without producers."""
+    return [str(camera) for camera in connected()]
+
+
+_INSTALL = "pip install 'slviewer[genicam]'"
+DRIVER = Driver(
+    "genicam",
+    "a USB3 Vision or GigE Vision camera (FLIR, Basler, IDS, …)",
+    needs="the software of the camera's maker, which brings a GenTL producer (a .cti file)",
+    packages={"harvesters": _INSTALL, "genicam": _INSTALL},
+    camera=genicam_camera,
+    found=found,
+)
