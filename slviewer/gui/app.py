@@ -21,6 +21,8 @@ from slviewer.gui.views import FIELD_OF_VIEW, OVERVIEW, Eyes
 from slviewer.server.projector_page import serve_projector
 from slviewer.server.secure import SafeServer, serve
 from slviewer.server.text import escape
+from slviewer.session.store import Session
+from slviewer.workflow.rig_presets import load_rig
 from slviewer.workflow.wizard.notices import words_for
 from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.rigs import set_up
@@ -187,7 +189,7 @@ def run(
         _granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
         begun = operator.wait_for(lambda s: s.session is not None, 60.0)
         if rig or begun is None or begun.rig.state == "none":
-            _granted(operator, operator.choose_rig(rig_choice(rig or "simulated")))
+            _granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
         app = App(operator, host, port, channel=channel)
         try:
             print(f"slviewer is ready: {app.server.url}")
@@ -204,11 +206,11 @@ def run(
             app.close()
 
 
-def rig_choice(text: str) -> dict[str, Any]:
-    """What `Operator.choose_rig` takes: "simulated" (half resolution), "simulated:0.25", or a driver's name."""
+def rig_choice(text: str, session: Session | None = None) -> dict[str, Any]:
+    """What `Operator.choose_rig` takes: "simulated" (half resolution), "simulated:0.25", a preset's name or a file."""
     name, _, scale = text.partition(":")
     if name != "simulated":
-        return {"driver": text}
+        return load_rig(text, session)
     try:
         return {"driver": name, "scale": float(scale or 0.5)}
     except ValueError:

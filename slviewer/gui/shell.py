@@ -274,6 +274,8 @@ def _work(snapshot: Snapshot) -> list[tuple[str, float]]:
     if capture is not None:
         also = f", {capture.waiting} more waiting" if capture.waiting else ""
         says = f"Capturing {capture.name}: frame {capture.frame} of {capture.frames}{also}"
+        if capture.doing:
+            says = f"{capture.name}: {capture.doing}{also}"
         found.append((says, capture.frame / max(capture.frames, 1)))
     if job is not None and not job.background:
         also = f", {job.waiting} more waiting" if job.waiting else ""

@@ -18,7 +18,7 @@ from slviewer.target.board import Board
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.opening import opened_or_made
 from slviewer.workflow.rig_presets import load_rig
-from slviewer.workflow.trust import capture_warnings
+from slviewer.workflow.trust import keep_residuals
 from slviewer.workflow.wizard.rigs import Bench, SetUp, set_up
 
 PATTERNS = "complementary"
@@ -75,8 +75,8 @@ def capture(
         purpose = "pose" if role == "calibration" else "scan"
         shown = str(target) if target is not None and role == "calibration" else None
         saved = keep(store, name, role, sequence, taken, source=devices.name, purpose=purpose, board=shown, force=force)
-    for sentence in capture_warnings(sequence, saved.frames):
-        warn(f"{name}: {sentence}")
+        for sentence in keep_residuals(store, name):
+            warn(f"{name}: {sentence}")
     progress(1.0, "captured")
     return saved
 

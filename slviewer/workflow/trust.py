@@ -7,6 +7,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.residual import FrameResiduals, frame_residuals
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.session.store import Session
 
 _MOST = 4  # sentences about one capture
 
@@ -20,6 +21,14 @@ def residuals(sequence: PatternSequence, stack: np.ndarray) -> list[FrameResidua
         except InputError:  # decoding says it, with what to do
             continue
     return found
+
+
+def keep_residuals(session: Session, name: str) -> list[str]:
+    """Look at a capture's frames, keep what is found as the result `trust/<name>`, and return what must be told."""
+    capture = session.load_capture(name)
+    found = residuals(capture.sequence, capture.frames)
+    session.save_result(f"trust/{name}", {"inputs": session.input_hashes(name), "axes": described(found)}, {})
+    return warnings_of(found)
 
 
 def capture_warnings(sequence: PatternSequence, stack: np.ndarray) -> list[str]:

@@ -7,6 +7,7 @@ from slviewer.gui.inputs import Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.preview import drawn as drawn_preview
 from slviewer.gui.preview import histogram_chart, legend, light_words
+from slviewer.gui.rig_check import RigCheck
 from slviewer.gui.rig_choice import RigChoice
 from slviewer.gui.widgets import Picture, Words
 from slviewer.workflow.wizard.snapshot import PreviewView, RigView, Snapshot
@@ -39,10 +40,12 @@ class Panel:
         self._light = gui.add_dropdown("Projector shows", tuple(LIGHTS))
         self._light_follows = Follows(self._light)
         self._light.on_update(stage.safely_with(self._shine))
+        self._check = RigCheck(stage)
 
     def draw(self, snapshot: Snapshot) -> None:
         """The rig as it is."""
         self._rig.draw(snapshot)
+        self._check.draw(snapshot)
         rig = snapshot.rig
         if rig == self._drawn:
             return

@@ -107,6 +107,14 @@ class Acquisition:
             self._settings = settings
             self._condition.notify_all()
 
+    def set_delay(self, settle_ms: float) -> None:
+        """Wait so long between "shown" and the grab from the next capture on; the devices stay open."""
+        with self._condition:
+            if self._wanted is not None:
+                settled = replace(self._wanted, settle_ms=settle_ms)
+                self._rig = settled if self._rig is self._wanted else self._rig
+                self._wanted = settled
+
     def shine(self, light: str, pattern: PatternSequence | None = None) -> None:
         """Show one of LIGHTS between captures, or the first frame of `pattern`."""
         with self._condition:

@@ -19,7 +19,9 @@ from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
+from slviewer.workflow.preflight.checks import Preflight
 from slviewer.workflow.rig_presets import save_rig
+from slviewer.workflow.trust import keep_residuals
 from slviewer.workflow.wizard import work
 from slviewer.workflow.wizard.acquisition import Acquisition
 from slviewer.workflow.wizard.diagnostics import LogKeeper
@@ -50,6 +52,7 @@ class Engine:
         self.hands_free = HandsFree()
         self.autopilot = ""
         self.bench: Bench | None = None
+        self.preflight: Preflight | None = None  # of the rig in use
         self._choice: Choice | None = None
         self._reader: Reader | None = None
         self._session_view: SessionView | None = None
@@ -125,10 +128,20 @@ class Engine:
                 store.decide("rig", dict(choice))
                 store.decide("exposure", None)  # that of another camera says nothing
                 store.decide("exposures", None)
+                store.decide("levels", None)
             exposure = store.decision("exposure") if store is not None else None
             exposure = exposure or {key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)}
-            self._choice, self.bench, self.preview = dict(choice), bench, None
+            self._choice, self.bench, self.preview, self.preflight = dict(choice), bench, None, None
             self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
+
+    def set_delay(self, settle_ms: float) -> None:
+        """Wait so long between "shown" and the grab from now on; the session remembers it with the rig."""
+        with self.lock:
+            if self._choice is None or self.bench is None:
+                return
+            self._choice = {**self._choice, "settle_ms": settle_ms}
+            self.acquisition.set_delay(settle_ms)
+            self.store.decide("rig", dict(self._choice))
 
     def save_rig(self, name: str, what: str) -> None:
         """Keep the rig in use, with its exposure, as one of the session's own."""
@@ -209,6 +222,9 @@ class Engine:
         if not reader.has_thumbnail(capture):
             reader.add_thumbnail(capture, thumbnail(capture))
             self.teller.changed(session=True)
+        if reader.session.state_of(f"trust/{capture.name}") != "fresh":
+            for sentence in keep_residuals(reader.session.guarded(report.saving), capture.name):
+                self.notices.tell("warning", f"{capture.name}: {sentence}")
         target = reader.target()
         if reader.lacks_judgement(capture, target):
             judged = work.judge_pose(reader.session, capture.name, Board.parse(target), report)
@@ -271,6 +287,7 @@ class Engine:
             space=space,
             hands_free=self.hands_free.on,
             autopilot=self.autopilot,
+            preflight=self.preflight,
         )
 
     def _read(self, reader: Reader, rig: RigView, bench: Bench | None) -> None:

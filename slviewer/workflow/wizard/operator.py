@@ -21,6 +21,8 @@ from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
 from slviewer.workflow.calibrating import CalibrationResult
 from slviewer.workflow.merging import Merge
+from slviewer.workflow.preflight.checks import Preflight, Verdict
+from slviewer.workflow.preflight.run import preflight
 from slviewer.workflow.verifying import Shape
 from slviewer.workflow.wizard import diagnostics, work
 from slviewer.workflow.wizard.acquisition import LIGHTS
@@ -31,6 +33,13 @@ from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.rigs import Choice, SetUp, set_up
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
 from slviewer.workflow.wizard.taking import sequence_for_poses, take_pose, take_scan
+
+_CHECKED: dict[Verdict, tuple[Level, str]] = {
+    "good": ("good", "the rig is fit to capture with"),
+    "warning": ("warning", "the rig can capture, and could do better: the step Rig says how"),
+    "bad": ("error", "the rig is not fit to capture with: the step Rig says what to mend"),
+    "unknown": ("warning", "the rig could not be checked: the step Rig says why"),
+}
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -148,6 +157,28 @@ class Operator:
         """Take every capture in several exposures, for shiny and dark parts; empty: in a single one."""
         self._engine.store.decide("exposures", check_exposures(exposures_ms) if exposures_ms else [])
 
+    @_request("Checking the rig")
+    def check_rig(self) -> None:
+        """Run the preflight, some 10 s; the snapshot tells what it found, and the delay that it measured is heeded."""
+        engine = self._engine
+
+        def done(found: Preflight) -> None:
+            engine.preflight = found
+            if found.settle_ms is not None:
+                engine.set_delay(found.settle_ms)
+            level, words = _CHECKED[found.verdict]
+            engine.notices.tell(level, words)
+
+        engine.acquisition.run("Checking the rig", lambda rig, progress: preflight(rig, progress=progress), done)
+
+    @_request("Linearising the projector")
+    def linearise(self, on: bool) -> None:
+        """Project through the table of grey levels that the check of the rig has measured, or as it is."""
+        found = self._engine.preflight
+        if on and (found is None or found.levels is None):
+            raise InputError("no table of grey levels is measured: check the rig first")
+        self._engine.store.decide("levels", list(found.levels) if on and found and found.levels else None)
+
     @_request("Saving the rig")
     def save_rig(self, name: str, what: str = "") -> None:
         """Keep the rig in use, with its exposure, under a name in the session; `rig_presets` finds it there."""
@@ -258,7 +289,7 @@ class Operator:
         store = self._engine.store
         store.trash_capture(name)
         store.include(name)
-        for kind in ("poses", "clouds", "verify"):
+        for kind in ("poses", "clouds", "verify", "trust"):
             if store.state_of(f"{kind}/{name}") != "absent":
                 store.trash_result(f"{kind}/{name}")
 

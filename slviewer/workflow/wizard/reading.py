@@ -84,6 +84,11 @@ class Reader:
         shown = self._keep(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
         return shown * max(1, len(self.exposures_ms()))
 
+    def levels(self) -> tuple[int, ...] | None:
+        """The table of grey levels that makes the projector's light proportional, where the operator wants it."""
+        decided = self.session.decision("levels")
+        return tuple(int(level) for level in decided) if decided else None
+
     def exposures_ms(self) -> tuple[float, ...]:
         """The exposures of every capture; empty: a single one, the camera's."""
         return tuple(float(exposure) for exposure in self.session.decision("exposures") or ())
@@ -119,6 +124,7 @@ class Reader:
             merges=len(merges),
             exports=listed(session),
             exposures_ms=self.exposures_ms(),
+            linear=self.levels() is not None,
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
         )

@@ -10,6 +10,7 @@ import numpy as np
 
 from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.geometry.lens import Lens
+from slviewer.workflow.preflight.checks import Preflight
 
 Level = Literal["info", "good", "warning", "error"]
 PoseState = Literal["judging", "good", "refused", "excluded", "used", "left out"]
@@ -238,6 +239,7 @@ class SessionView:
     exports: tuple[ExportView, ...] = ()
     deleted_poses: tuple[str, ...] = ()  # what can be brought back, the last deleted first
     deleted_scans: tuple[str, ...] = ()
+    linear: bool = False  # whether patterns pass the table of grey levels that makes the light proportional
     exposures_ms: tuple[float, ...] = ()  # of every capture; empty: a single one, the camera's
 
 
@@ -255,6 +257,7 @@ class Snapshot:
     space: Space | None
     hands_free: bool
     autopilot: str  # what it does now; empty where it rests
+    preflight: Preflight | None = None  # what the last check of the rig in use said
 
     def step(self, key: str) -> StepView:
         """The step called `key`."""

@@ -1,6 +1,7 @@
 """Captures as the wizard takes them: what is projected, under which name it is saved, and what follows."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -21,7 +22,9 @@ def sequence_for_poses(engine: Engine) -> PatternSequence:
     """Both axes of the session's pattern sequence, for the projector of the rig, or what a recording answers to."""
     if engine.bench is None:
         raise DeviceError("no rig is chosen: choose one in the step Rig")
-    return sequence_for(engine.bench, engine.reader.patterns())
+    sequence = sequence_for(engine.bench, engine.reader.patterns())
+    levels = engine.reader.levels()
+    return sequence if levels is None else replace(sequence, levels=levels)
 
 
 def take_pose(engine: Engine, name: str | None = None) -> None:
