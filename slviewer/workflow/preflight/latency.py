@@ -27,6 +27,11 @@ class _Change:
     begun: tuple[float, ...]
     arrived: bool
 
+    def arrival_ms(self, stale: int) -> float:
+        """When the first right image was begun, where images are so many behind; 0 for the very first."""
+        place = len(self.begun) - 1 - stale
+        return 1000 * self.begun[place] if place > 0 else 0.0
+
 
 def latency(bench: Bench) -> tuple[Check, float | None]:
     """The check, and the `settle_ms` that follows from it; fills in the bench's frame time, delay and stale images."""
@@ -47,9 +52,9 @@ def latency(bench: Bench) -> tuple[Check, float | None]:
             ),
             None,
         )
-    settle = _settle_ms([1000 * change.begun[-1] for change in changes], bench.frame_ms)
+    settle = _settle_ms([change.arrival_ms(0) for change in changes], bench.frame_ms)
     bench.stale = max(_stale(bench, settle, i) for i in range(_PROOFS))
-    fresh = [1000 * change.begun[max(0, len(change.begun) - 1 - bench.stale)] for change in changes]
+    fresh = [change.arrival_ms(bench.stale) for change in changes]
     settle = _settle_ms(fresh, bench.frame_ms)
     bench.settle_ms = settle
     images = [len(change.begun) - 1 - bench.stale for change in changes]
@@ -118,9 +123,6 @@ def _near(bench: Bench) -> float:
 
 
 def _settle_ms(arrivals_ms: list[float], frame_ms: float) -> float:
-    """The worst arrival, and half a frame because another one may be worse; 0 where every first image was right.
-
-    An arrival is when the first right image was begun: 0, to within the time of a call, where nothing had to pass.
-    """
+    """The worst arrival, and half a frame because another one may be worse; 0 where every first image was right."""
     worst = max(arrivals_ms)
-    return 0.0 if worst < 1.0 else float(math.ceil(worst + 0.5 * frame_ms))
+    return float(math.ceil(worst + 0.5 * frame_ms)) if worst else 0.0
