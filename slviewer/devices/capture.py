@@ -43,6 +43,8 @@ def capture(
             rig.projector.show(k)
             settle(rig)
             rig.camera.grab(out[k])
+            if k == n - 1:
+                rig.projector.show(k)  # one that changed during this exposure says so only when it is asked again
         except DeviceError as error:
             raise DeviceError(f"the capture ended at frame {k + 1} of {n}, nothing is kept of it: {error}") from error
         if progress is not None:

@@ -19,7 +19,9 @@ SIMULATED: dict[str, dict[str, Any]] = {
     "Simulated, full resolution": {"driver": "simulated", "scale": 1.0},
     "Simulated, quarter resolution": {"driver": "simulated", "scale": 0.25},
 }
-_CHOOSE, _OWN = "Choose …", "A camera and a projector …"
+_CHOOSE, _OWN, _REPLAY = "Choose …", "A camera and a projector …", "replay"
+_FIRST = "opencv"
+"""What most have: a webcam."""
 _WHICH = ("source", "serial")
 """What drivers call the one device among several, or where it is."""
 
@@ -49,10 +51,17 @@ class RigChoice:
             self._use = gui.add_button("Use these devices", icon=viser.Icon.PLUG_CONNECTED)
             self._use.on_click(stage.safely(lambda: stage.operator.choose_rig(self._entered())))
         self._page = Words(gui)
+        with gui.add_folder("Recording", visible=False) as self._recording:
+            self._folder = gui.add_text("Folder", "", hint="A session, or folders of images that can be imported")
+            play = gui.add_button("Play it back", icon=viser.Icon.PLAYER_PLAY)
+            play.on_click(
+                stage.safely(lambda: stage.operator.choose_rig({"driver": "replay", "source": self._folder.value}))
+            )
         with gui.add_folder("Keep this rig", visible=False, expand_by_default=False) as self._keeping:
             self._name = gui.add_text("Name", "", hint="It is then offered by this name, with its exposure")
             keep = gui.add_button("Keep", icon=viser.Icon.DEVICE_FLOPPY, color="gray")
             keep.on_click(stage.safely(lambda: stage.operator.save_rig(self._name.value)))
+        self._needs_page = False
         self._draw_devices()
         self._offer()
 
@@ -63,15 +72,13 @@ class RigChoice:
             self._offer()
         rig = snapshot.rig
         self._follows.tell(self._chosen(rig))
-        self._says.set(_described(rig))
-        own = self._choice.value == _OWN
-        change(self._devices, visible=own)
+        preset = self._presets.get(self._choice.value)
+        what = "" if preset is None else block(toned(preset.problem or preset.what, "dim"))
+        self._says.set(what + _described(rig))
+        self._draw_folders()
         change(self._keeping, visible=rig.state == "open" and not rig.simulated)
-        self._page.set(
-            _page_words(self._stage.projector_page())
-            if rig.page or (own and self._projectors[self._projector.value].channel)
-            else ""
-        )
+        self._needs_page = rig.page
+        self._draw_page()
 
     def _offer(self) -> None:
         session = self._stage.operator.session
@@ -89,17 +96,28 @@ class RigChoice:
         if rig.choice.get("driver") == "simulated":
             scale = rig.choice.get("scale", 1.0)
             return next((words for words, how in SIMULATED.items() if how["scale"] == scale), _CHOOSE)
+        if rig.choice.get("driver") == _REPLAY:
+            return _REPLAY
         return next((name for name, p in self._presets.items() if _same(p.choice, rig.choice)), _OWN)
 
     def _choose(self, event: Any) -> None:
         if event.client is None:
             return
         chosen = self._choice.value
-        change(self._devices, visible=chosen == _OWN)
+        self._draw_folders()
         if chosen in SIMULATED:
             self._stage.operator.choose_rig(SIMULATED[chosen])
-        elif chosen in self._presets:
+        elif chosen in self._presets and chosen != _REPLAY:
             self._stage.operator.choose_rig(self._presets[chosen].choice)
+
+    def _draw_folders(self) -> None:
+        change(self._devices, visible=self._choice.value == _OWN)
+        change(self._recording, visible=self._choice.value == _REPLAY)
+        self._draw_page()
+
+    def _draw_page(self) -> None:
+        own = self._choice.value == _OWN and self._projectors[self._projector.value].channel
+        self._page.set(_page_words(self._stage.projector_page()) if self._needs_page or own else "")
 
     # devices of one's own
 
@@ -109,6 +127,7 @@ class RigChoice:
         self._lacking.say(lacking, "warning")
         change(self._use, disabled=bool(lacking))
         change(self._source, visible=_which(chosen[0]) is not None)
+        self._draw_page()
 
     def _entered(self) -> Choice:
         camera, projector = self._cameras[self._camera.value], self._projectors[self._projector.value]
@@ -128,7 +147,8 @@ class RigChoice:
 
 
 def _by_words(drivers: list[Driver]) -> dict[str, Driver]:
-    return {f"{driver.name}: {driver.what}": driver for driver in drivers}
+    likely = sorted(drivers, key=lambda driver: driver.name != _FIRST)
+    return {f"{driver.name}: {driver.what}": driver for driver in likely}
 
 
 def _which(driver: Driver) -> str | None:

@@ -1,0 +1,104 @@
+"""Devices as people have them, driven by the wizard: a camera on the network looks at the projector page."""
+
+import re
+import sys
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from wizard_page import SIZE, Opened, button, choose, field
+
+from slviewer.devices.channel import Channel
+from slviewer.fringe.decode import decode
+from slviewer.gui.app import App
+from slviewer.session.store import Session
+from slviewer.workflow.wizard.operator import Operator
+from slviewer.workflow.wizard.rigs import set_up
+from slviewer.workflow.wizard.snapshot import Snapshot
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "devices"))
+from mjpeg import NetworkCamera, network_camera  # noqa: E402
+
+SCREEN = (320, 240)
+SETTLE_MS = 400.0
+"""A screenshot, its JPEG and the camera's pace: what a camera that takes screenshots needs to see what is shown."""
+
+
+def look(page: Page, camera: NetworkCamera) -> None:
+    """Let the camera see the page as it is now, in blurred light as through a lens."""
+    seen = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    camera.picture = cv2.GaussianBlur((0.8 * seen + 10).astype(np.uint8), (3, 3), 0)
+
+
+def watch(operator: Operator, page: Page, camera: NetworkCamera, until: str, condition) -> Snapshot:
+    """Look until the snapshot fulfils the condition."""
+    for _ in range(600):
+        look(page, camera)
+        snapshot = operator.snapshot()
+        if condition(snapshot):
+            return snapshot
+        page.wait_for_timeout(20)
+    raise AssertionError(f"no {until}: {[n.text for n in operator.snapshot().notices]}")
+
+
+def test_a_network_camera_and_a_browser_capture_what_is_projected(browser: Browser, tmp_path: Path) -> None:
+    channel = Channel()
+    with (
+        network_camera(np.full((SCREEN[1], SCREEN[0], 3), 40, np.uint8)) as camera,
+        Operator(tmp_path / "session", set_up=partial(set_up, channel=channel)) as operator,
+    ):
+        app = App(operator, port=0, channel=channel)
+        page = browser.new_context(viewport=SIZE).new_page()  # type: ignore[arg-type]
+        projector = browser.new_context(viewport={"width": SCREEN[0], "height": SCREEN[1]}).new_page()
+        opened = Opened(page)
+        try:
+            page.goto(app.server.url)
+            button(page, "1. Rig").click()
+            choose(page, "Rig", "A camera and a projector …")
+            expect(page.get_by_text("Projector page: waiting for the page")).to_be_visible()
+            assert app.server.access.token not in page.content()  # whoever only watches reads this too
+            projector.goto(app.server.link("/projector"))
+            expect(page.get_by_text("Projector page: ready 320 x 240")).to_be_visible()
+            field(page, "Which").fill(camera.url)
+            page.wait_for_timeout(500)
+            button(page, "Use these devices").click()
+            watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
+            expect(page.get_by_text(re.compile("camera 320 × 240 px, projector 320 × 240 px"))).to_be_visible()
+            expect(page.get_by_text("its settings are its own").or_(page.get_by_text("settings")).first).to_be_visible()
+
+            operator.choose_rig({**operator.snapshot().rig.choice, "settle_ms": SETTLE_MS})
+            watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
+            operator.choose_target("circles:7x5:10")
+            operator.choose_patterns("gray")
+            operator.capture_pose()
+            watch(operator, projector, camera, "capture", lambda s: bool(s.session and s.session.poses))
+            coordinates(tmp_path / "session")
+
+            operator.capture_pose()
+            watch(operator, projector, camera, "frame", lambda s: s.rig.capture is not None and s.rig.capture.frame > 3)
+            projector.reload()
+            lost = watch(operator, projector, camera, "fault", lambda s: s.notices[-1].level == "error")
+            assert "nothing is kept of it" in lost.notices[-1].text
+            watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
+            session = operator.snapshot().session
+            assert session is not None and [pose.name for pose in session.poses] == ["pose_01"]
+            assert opened.errors == []
+        finally:
+            projector.context.close()
+            page.context.close()
+            app.close()
+
+
+def coordinates(folder: Path) -> None:
+    """The camera looks straight at the screen, so that each pixel must read its own column and row."""
+    capture = Session.open(folder).load_capture("pose_01")
+    truth = np.meshgrid(np.arange(SCREEN[0]), np.arange(SCREEN[1]))
+    for axis, own in zip(("x", "y"), truth, strict=True):
+        found = decode(capture.sequence, capture.frames, axis)  # type: ignore[arg-type]
+        off = found.coordinate - own
+        assert found.mask.mean() > 0.85
+        assert 0.0 < np.sqrt(np.nanmean(off**2)) < 0.6 and abs(np.nanmedian(off)) == pytest.approx(0, abs=0.5)
+    assert capture.texture is not None and capture.texture.shape == (*SCREEN[::-1], 3)
