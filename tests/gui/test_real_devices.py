@@ -20,7 +20,7 @@ from slviewer.workflow.wizard.rigs import set_up
 from slviewer.workflow.wizard.snapshot import Snapshot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "devices"))
-from mjpeg import NetworkCamera, network_camera  # noqa: E402
+from mjpeg import NetworkCamera, network_camera
 
 SCREEN = (320, 240)
 SETTLE_MS = 400.0
