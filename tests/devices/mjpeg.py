@@ -11,7 +11,10 @@ import numpy as np
 
 
 class NetworkCamera(ThreadingHTTPServer):
-    """Looks at `picture`, (h, w) or (h, w, 3) BGR, `fps` times a second, and sends `clump` pictures at a time."""
+    """Looks at `picture`, (h, w) or (h, w, 3) BGR, `fps` times a second, and sends `clump` pictures at a time.
+
+    Once it was told to `take` pictures, it sends each of these instead, when it is taken.
+    """
 
     daemon_threads = True
     allow_reuse_address = True
@@ -22,6 +25,8 @@ class NetworkCamera(ThreadingHTTPServer):
         self.going = threading.Event()
         self.going.set()
         self.dead = False
+        self.taken = 0
+        self._shutter = threading.Condition()
         self._thread = threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         self._thread.start()
 
@@ -32,6 +37,18 @@ class NetworkCamera(ThreadingHTTPServer):
     @property
     def url(self) -> str:
         return f"http://somebody:secret@127.0.0.1:{self.port}/video"
+
+    def take(self, picture: np.ndarray) -> None:
+        """Send this picture to whoever looks now."""
+        with self._shutter:
+            self.picture, self.taken = picture, self.taken + 1
+            self._shutter.notify_all()
+
+    def wait_for_another(self, taken: int) -> int:
+        """Wait until another picture than number `taken` is there; its number."""
+        with self._shutter:
+            self._shutter.wait_for(lambda: self.taken != taken, 0.5)
+            return self.taken
 
     def die(self) -> None:
         """End all connections and listen no more."""
@@ -54,7 +71,10 @@ class _Sender(BaseHTTPRequestHandler):
         self.end_headers()
         clump, due = b"", time.monotonic()
         sent = 0
+        taken = self.server.taken
         while not self.server.dead:
+            if self.server.taken:
+                taken = self.server.wait_for_another(taken)
             jpeg = cv2.imencode(".jpg", self.server.picture)[1].tobytes()
             head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
             clump += head + jpeg + b"\r\n"
