@@ -1,4 +1,4 @@
-"""The projector coordinate at a board feature, read from the phase around it."""
+"""The projector coordinate at a board feature, and its slopes there, read from the phase around it."""
 
 import numpy as np
 
@@ -9,14 +9,16 @@ ONE_SIDED = 0.35
 two opposite squares are bright, and their middle is the corner."""
 
 
-def local_values(field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Value of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic fit over the window around each.
+def local_values(
+    field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radius: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic fit around each.
 
     ``radius`` (n,) px is half a window's width; ``weight`` (h, w) is 0 where the field must not be used, so that a dark
-    circle's centre is read from its bright surroundings alone. Returns (n,) float64; NaN where the surroundings are too
-    few (30) or lie on one side only.
+    circle's centre is read from its bright surroundings alone. Returns (n,) float64, and its change a px along u and v
+    (n, 2); NaN where the surroundings are too few (30) or lie on one side only.
     """
-    out = np.full(len(pixels), np.nan)
+    out = np.full((len(pixels), 3), np.nan)
     _local_fits(
         np.ascontiguousarray(field, np.float64),
         np.ascontiguousarray(weight, np.float64),
@@ -24,7 +26,7 @@ def local_values(field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radi
         np.ascontiguousarray(radius, np.float64),
         out,
     )
-    return out
+    return out[:, 0], out[:, 1:]
 
 
 @kernel()
@@ -120,4 +122,6 @@ def _local_fits(field, weight, pixels, radius, out):  # type: ignore[no-untyped-
             if robust[k] > 0.1:
                 kept += 1
         if kept >= 0.5 * count:
-            out[i] = solution[0] + middle
+            out[i, 0] = solution[0] + middle
+            out[i, 1] = solution[1] / r
+            out[i, 2] = solution[2] / r

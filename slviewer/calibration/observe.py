@@ -19,6 +19,8 @@ from slviewer.geometry.splines import Surface, fit_surface
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
+READING = 2
+"""How poses are read; what a session keeps of another reading is read anew."""
 SAMPLES = 30_000
 """Pixels that one smoothing fit takes; more change the result by less than the noise."""
 LEAST_CLEAR = 0.25
@@ -53,6 +55,9 @@ class Observation:
     ``camera`` and ``projector`` are (n, 2) px, row by row with ``points`` (n, 3) mm on the board; a projector
     coordinate that could not be read is NaN. ``surfaces`` hold the smoothed absolute phase (rad) over the board for
     each captured axis; ``region`` says where they hold: the board's outline where measured phase lies close by.
+    ``slopes`` (n, 2, 2): how the projector's coordinates change a camera px along u and v at each feature. Circles of
+    ``radius_mm`` are at the centroids of their images, which ``calibration.centres`` corrects; 0: at their centres.
+    ``marked``: the board's mark was seen, so that its numbering is the board's own.
     """
 
     name: str
@@ -64,6 +69,9 @@ class Observation:
     size: tuple[int, int]
     box: tuple[int, int, int, int]
     packed_region: np.ndarray = field(repr=False)
+    slopes: np.ndarray | None = field(default=None, repr=False)
+    radius_mm: float = 0.0
+    marked: bool = False
 
     @property
     def region(self) -> np.ndarray:
@@ -86,7 +94,11 @@ class Observation:
             "size": np.array(self.size),
             "box": np.array(self.box),
             "region": self.packed_region,
+            "radius_mm": np.array(self.radius_mm),
+            "marked": np.array(self.marked),
         }
+        if self.slopes is not None:
+            arrays["slopes"] = self.slopes
         for axis, surface in self.surfaces.items():
             trend = surface.trend if isinstance(surface, Surface) else surface
             arrays |= {
@@ -120,6 +132,9 @@ class Observation:
             (width, height),
             (left, top, right, bottom),
             arrays["region"],
+            arrays.get("slopes"),
+            float(arrays["radius_mm"]) if "radius_mm" in arrays else 0.0,
+            bool(arrays["marked"]) if "marked" in arrays else False,
         )
 
 
@@ -142,7 +157,7 @@ def observe(
     typical_pitch = float(np.median(pitch))
     box = _bounding_box(inside)
     bright = {axis: bright_pixels(phase, inside, typical_pitch) for axis, phase in phases.items()}
-    projector = _projector_pixels(detection, phases, bright, pitch)
+    projector, _ = _projector_pixels(detection, phases, bright, pitch)
     plane = BoardPlane.through(detection.pixels, projector, (width, height))
     for axis in phases:
         if plane:  # a hand before the board is none of it
@@ -154,7 +169,7 @@ def observe(
                 f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis} pattern: "
                 "light the whole board with the projector, and raise the exposure"
             )
-    projector = _projector_pixels(detection, phases, bright, pitch)
+    projector, slopes = _projector_pixels(detection, phases, bright, pitch)
     surfaces: dict[Axis, Surface | Polynomial2D] = {}
     supported = inside.copy()
     for axis, phase in phases.items():
@@ -171,6 +186,9 @@ def observe(
         size=(width, height),
         box=box,
         packed_region=np.packbits(supported[v0:v1, u0:u1]),
+        slopes=slopes,
+        radius_mm=detection.radius_mm,
+        marked=detection.marked,
     )
 
 
@@ -214,14 +232,17 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
 
 def _projector_pixels(
     detection: Detection, phases: Mapping[Axis, PhaseMap], bright: Mapping[Axis, np.ndarray], pitch: np.ndarray
-) -> np.ndarray:
-    """(n, 2) px: the projector coordinates of the features, NaN where one could not be read."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 2) px: the projector coordinates of the features, NaN where one could not be read; (n, 2, 2): their change a
+    camera px."""
     projector = np.full((len(detection.ids), 2), np.nan)
+    slopes = np.full((len(detection.ids), 2, 2), np.nan)
     for axis, phase in phases.items():
         coordinate = np.where(bright[axis], phase.coordinate, 0.0)
         weight = _weight(phase, bright[axis])
-        projector[:, AXES.index(axis)] = local_values(coordinate, weight, detection.pixels, 0.8 * pitch)
-    return projector
+        values = local_values(coordinate, weight, detection.pixels, 0.8 * pitch)
+        projector[:, AXES.index(axis)], slopes[:, AXES.index(axis)] = values
+    return projector, slopes
 
 
 def _weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:

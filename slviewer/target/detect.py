@@ -21,11 +21,13 @@ class Detection:
     All of them in order for grids of circles and chessboards, those that were seen for ChArUco. A circle's pixel is the
     centroid of its image, which perspective and distortion move away from the image of its centre (some hundredths of
     a pixel; it grows with the square of the radius): ``radius_mm``, 0 for corners, is there to correct that.
+    ``marked``: the mark beside the first circle was seen, so that the numbering is the board's own at any turn.
     """
 
     pixels: np.ndarray
     ids: np.ndarray
     radius_mm: float = 0.0
+    marked: bool = False
 
 
 def detect(board: Board, image: np.ndarray) -> Detection:

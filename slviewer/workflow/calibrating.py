@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.centres import calibrate_centred
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
-from slviewer.calibration.stereo import StereoModel, calibrate_stereo
+from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -113,7 +114,7 @@ def calibrate(
         observations = _observe_all(store, names, board, step_2, left_out, reading)
         projector = store.load_capture(names[0]).sequence.projector
         progress(0.6, "stereo calibration")
-        stereo = calibrate_stereo(observations, projector, str(board), left_out)
+        stereo, observations = calibrate_centred(observations, projector, str(board), left_out)
         for name, why in stereo.left_out.items():
             if name not in excluded:
                 warn(f"{name} is left out: {why}")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.calibration.observe import Observation, Smoothing, observe
+from slviewer.calibration.observe import READING, Observation, Smoothing, observe
 from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
@@ -46,6 +46,7 @@ def judge(
     meta = {
         "target": str(board),
         "smoothing": _settings(smoothing),
+        "reading": READING,
         "refused": judged.refused,
         "inputs": {capture.name: capture.hash},
     }
@@ -60,7 +61,7 @@ def known(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judg
     if store.state_of(result) != "fresh":
         return None
     meta = store.load_result(result, only=())[0]
-    if (meta["target"], meta["smoothing"]) != (str(board), _settings(smoothing)):
+    if (meta["target"], meta["smoothing"], meta.get("reading")) != (str(board), _settings(smoothing), READING):
         return None
     if meta["refused"]:
         return Judged(name, None, meta["refused"])
