@@ -222,14 +222,15 @@ class Engine:
         if not reader.has_thumbnail(capture):
             reader.add_thumbnail(capture, thumbnail(capture))
             self.teller.changed(session=True)
-        if reader.session.state_of(f"trust/{capture.name}") != "fresh":
-            for sentence in keep_residuals(reader.session.guarded(report.saving), capture.name):
-                self.notices.tell("warning", f"{capture.name}: {sentence}")
         target = reader.target()
         if reader.lacks_judgement(capture, target):
             judged = work.judge_pose(reader.session, capture.name, Board.parse(target), report)
             if judged.observation is None:
                 self.notices.tell("warning", f"{capture.name} cannot be used: {judged.refused}")
+            self.teller.changed(session=True)  # before what may wait
+        if reader.session.state_of(f"trust/{capture.name}") != "fresh":
+            for sentence in keep_residuals(reader.session.guarded(report.saving), capture.name):
+                self.notices.tell("warning", f"{capture.name}: {sentence}")
 
     def _judging_failed(self, reader: Reader, capture: Capture, error: BaseException) -> None:
         self.notices.fail(f"Looking at {capture.name}", error)
