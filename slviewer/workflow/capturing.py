@@ -7,7 +7,7 @@ from typing import Any
 
 from slviewer.devices.capture import Taken, check_exposures, take
 from slviewer.devices.protocols import CameraSettings, Rig
-from slviewer.errors import InputError, SessionError
+from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.atomic import megabytes
@@ -46,8 +46,8 @@ def capture(
     `rig` is a choice, a TOML file that holds one, or a preset's name. `patterns` names a sequence, by default the
     session's, and `board` the target of a calibration pose, by default the session's too. `exposure_ms` and `gain` are
     by default the rig's; two or more `exposures_ms` are merged, pixel by pixel, when the capture is read. `warn` hears
-    what the camera could not be set to, and which frames contradict the others. Raises
-    InputError, DeviceError, SessionError, and whatever `progress` raises; nothing is kept then.
+    what the camera could not be set to, and which frames contradict the others. Raises InputError, DeviceError,
+    SessionError, and whatever `progress` raises before the capture is saved; nothing is kept then.
     """
     if exposure_ms is not None and exposures_ms:
         raise InputError("one exposure and several were asked for: give either")
@@ -75,8 +75,11 @@ def capture(
         purpose = "pose" if role == "calibration" else "scan"
         shown = str(target) if target is not None and role == "calibration" else None
         saved = keep(store, name, role, sequence, taken, source=devices.name, purpose=purpose, board=shown, force=force)
-        for sentence in keep_residuals(store, name):
-            warn(f"{name}: {sentence}")
+        try:
+            for sentence in keep_residuals(store, name):
+                warn(f"{name}: {sentence}")
+        except SlviewerError as error:  # it is saved, and can be looked at later
+            warn(f"{name} is saved, and its frames could not be checked: {error}")
     progress(1.0, "captured")
     return saved
 

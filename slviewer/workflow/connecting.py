@@ -51,4 +51,6 @@ def _looked(driver: Driver) -> DriverView:
             connected = tuple(driver.found())
         except SlviewerError as error:
             trouble = str(error)
+        except Exception as error:  # a maker's library that is broken must not hide the other drivers' devices
+            trouble = f"{error} ({type(error).__name__})"
     return DriverView(driver.name, driver.what, offers, connected, driver.needs, driver.missing, trouble)

@@ -22,7 +22,7 @@ def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
 
 @contextmanager
 def opened_or_made(session: Path | str) -> Iterator[Session]:
-    """The session, open for writing; one that had to be made goes again if nothing could be saved in it."""
+    """The session, open for writing; one that had to be made goes again if nothing was saved in it."""
     folder = Path(session).expanduser().absolute()
     fresh, parent_fresh = not is_session(folder), not folder.exists()
     store = Session.open_or_create(folder)
@@ -30,7 +30,7 @@ def opened_or_made(session: Path | str) -> Iterator[Session]:
         with store:
             yield store
     except BaseException:
-        if fresh:
+        if fresh and not store.capture_names():
             for entry in folder.iterdir():
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
             if parent_fresh:

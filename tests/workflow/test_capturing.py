@@ -186,3 +186,36 @@ def test_devices_says_what_is_connected_and_what_is_missing(run: Run, monkeypatc
     ):
         assert line in text
     assert "never" not in text
+
+
+def test_a_capture_that_is_saved_outlives_the_look_at_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from slviewer.workflow import capturing
+
+    def interrupted(*_: object) -> list[str]:
+        raise KeyboardInterrupt
+
+    def refused(*_: object) -> list[str]:
+        raise SessionError("the disk is full: free some space")
+
+    monkeypatch.setattr(capturing, "keep_residuals", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        capture(tmp_path / "fresh", "a", {"driver": "simulated", "scale": 0.1})
+    monkeypatch.setattr(capturing, "keep_residuals", refused)
+    said: list[str] = []
+    capture(tmp_path / "fresh", "b", {"driver": "simulated", "scale": 0.1}, warn=said.append)
+    assert said == ["b is saved, and its frames could not be checked: the disk is full: free some space"]
+    with Session.open(tmp_path / "fresh") as store:
+        assert [len(shot.frames) for shot in store.captures()] == [32, 32]
+
+
+def test_a_driver_that_fails_in_its_own_way_hides_no_other(monkeypatch: pytest.MonkeyPatch):
+    from slviewer.workflow import connecting
+
+    def broken() -> list[str]:
+        raise ImportError("libGenApi.so cannot be opened")
+
+    there = [Driver("broken", "a camera", found=broken), Driver("whole", "a camera", found=lambda: ["source 0: one"])]
+    monkeypatch.setattr(connecting, "available", lambda: there)
+    first, second = connecting.list_drivers()
+    assert "libGenApi.so" in first.trouble and first.connected is None
+    assert second.connected == ("source 0: one",)
