@@ -11,6 +11,7 @@ import numpy as np
 
 from slviewer.calibration.board_plane import BoardPlane
 from slviewer.calibration.local_fit import local_values
+from slviewer.calibration.samples import Samples, block_samples
 from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
@@ -19,7 +20,7 @@ from slviewer.geometry.splines import Surface, fit_surface
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
-READING = 2
+READING = 3
 """How poses are read; what a session keeps of another reading is read anew."""
 SAMPLES = 30_000
 """Pixels that one smoothing fit takes; more change the result by less than the noise."""
@@ -57,7 +58,8 @@ class Observation:
     each captured axis; ``region`` says where they hold: the board's outline where measured phase lies close by.
     ``slopes`` (n, 2, 2): how the projector's coordinates change a camera px along u and v at each feature. Circles of
     ``radius_mm`` are at the centroids of their images, which ``calibration.centres`` corrects; 0: at their centres.
-    ``marked``: the board's mark was seen, so that its numbering is the board's own.
+    ``marked``: the board's mark was seen, so that its numbering is the board's own. ``samples``: the phase at some
+    thousands of bright places of the board, not smoothed; None in an observation made before there were any.
     """
 
     name: str
@@ -72,6 +74,7 @@ class Observation:
     slopes: np.ndarray | None = field(default=None, repr=False)
     radius_mm: float = 0.0
     marked: bool = False
+    samples: Samples | None = field(default=None, repr=False)
 
     @property
     def region(self) -> np.ndarray:
@@ -99,6 +102,8 @@ class Observation:
         }
         if self.slopes is not None:
             arrays["slopes"] = self.slopes
+        if self.samples is not None:
+            arrays |= {f"samples_{name}": values for name, values in vars(self.samples).items()}
         for axis, surface in self.surfaces.items():
             trend = surface.trend if isinstance(surface, Surface) else surface
             arrays |= {
@@ -135,6 +140,9 @@ class Observation:
             arrays.get("slopes"),
             float(arrays["radius_mm"]) if "radius_mm" in arrays else 0.0,
             bool(arrays["marked"]) if "marked" in arrays else False,
+            Samples(*(arrays[f"samples_{name}"] for name in Samples.__annotations__))
+            if "samples_camera" in arrays
+            else None,
         )
 
 
@@ -189,6 +197,7 @@ def observe(
         slopes=slopes,
         radius_mm=detection.radius_mm,
         marked=detection.marked,
+        samples=block_samples(phases, bright, AXES),
     )
 
 
