@@ -16,6 +16,7 @@ from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import available, load_stereo, save_imported_stereo
 from slviewer.workflow.opening import opened_or_made
+from slviewer.workflow.trust import keep_residuals
 
 Role = Literal["calibration", "scan"]
 Size = str | tuple[int, int]
@@ -126,6 +127,10 @@ def _save(found: Imports, session: Path | str, role: Role, force: bool, progress
 
     with opened_or_made(session) as store:
         saved = store.save_captures(read(), role, force=force)
+        for capture in saved:
+            progress(1.0, f"looking at {capture.name}")
+            for sentence in keep_residuals(store, capture.name):
+                warn(f"{capture.name}: {sentence}")
     progress(1.0, "imported")
     return [capture.name for capture in saved]
 

@@ -15,6 +15,7 @@ from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import best, load_model, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
+from slviewer.workflow.trust import told
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ def merge(
         warn_if_stale(store, warn)
         clouds = {}
         for i, (shot, frames, phases) in enumerate(decoded(store, names)):
+            for sentence in told(store, shot.name, frames):
+                warn(f"{shot.name}: {sentence}")
             progress(0.5 * i / len(names), f"reconstructing {shot.name}")
             clouds[shot.name] = reconstruct_phases(fitted, phases, texture=capture_texture(shot, frames))
     registering = part(progress, 0.5, 0.9)

@@ -21,6 +21,7 @@ from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, best, load_models, load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
+from slviewer.workflow.trust import told
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ def reconstruct(
         shot = store.load_capture(capture)
         progress(0.1, "reading frames")
         frames = shot.stack()
+        for sentence in told(store, capture, frames):
+            warn(f"{capture}: {sentence}")
         progress(0.3, "decoding")
         phases = decode_capture(shot, frames)
         texture = capture_texture(shot, frames)

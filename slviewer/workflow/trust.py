@@ -31,6 +31,15 @@ def keep_residuals(session: Session, name: str) -> list[str]:
     return warnings_of(found)
 
 
+def told(session: Session, name: str, frames: np.ndarray) -> list[str]:
+    """What must be told of a capture with these `frames`: as it was kept, else as it is found now."""
+    result = f"trust/{name}"
+    if session.state_of(result) != "fresh":
+        return capture_warnings(session.load_capture(name).sequence, frames)
+    axes = session.load_result(result)[0]["axes"]
+    return _shortened([suspect["sentence"] for axis in axes for suspect in axis["suspects"]])
+
+
 def capture_warnings(sequence: PatternSequence, stack: np.ndarray) -> list[str]:
     """One sentence for each frame of a capture (n, h, w) that contradicts the others; none for a sound one."""
     return warnings_of(residuals(sequence, stack))
@@ -38,7 +47,11 @@ def capture_warnings(sequence: PatternSequence, stack: np.ndarray) -> list[str]:
 
 def warnings_of(found: list[FrameResiduals]) -> list[str]:
     """The same, from what `residuals` found."""
-    sentences = list(dict.fromkeys(s.sentence for axis in found for s in axis.suspects))
+    return _shortened([s.sentence for axis in found for s in axis.suspects])
+
+
+def _shortened(sentences: list[str]) -> list[str]:
+    sentences = list(dict.fromkeys(sentences))
     if len(sentences) > _MOST:
         more = len(sentences) - _MOST + 1
         sentences = [

@@ -17,6 +17,7 @@ from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import load_models, load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.reconstructing import board_region, lit, reconstruct_models
+from slviewer.workflow.trust import told
 
 Shape = Literal["plane", "sphere"]
 
@@ -88,6 +89,8 @@ def verify(
         warn_if_stale(store, warn)
         reach = depth_range or load_stereo(store).depth_range_mm
         for i, (shot, frames, phases) in enumerate(decoded(store, captures)):
+            for sentence in told(store, shot.name, frames):
+                warn(f"{shot.name}: {sentence}")
             progress(i / len(captures), f"measuring {shot.name}")
             clouds = reconstruct_models(chosen, phases, axis)
             region: np.ndarray | None = None

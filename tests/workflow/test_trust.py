@@ -9,8 +9,9 @@ from slviewer.devices.imperfect import Imperfections, imperfect
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
+from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.workflow.trust import capture_warnings, described, residuals, warnings_of
+from slviewer.workflow.trust import capture_warnings, described, keep_residuals, residuals, told, warnings_of
 
 
 def taken(sequence_of=p18, gamma=1.0, thing="board", seed=0, **wrong):
@@ -53,3 +54,12 @@ def test_residuals_are_kept_as_plain_values():
     assert len(plain[0]["frames"]) == 18 and plain[0]["suspects"][0]["frame"] == 6
     assert all(0.8 < frame["sigmas"] < 1.3 for frame in plain[1]["frames"])
     assert warnings_of(found) == capture_warnings(sequence, stack)
+
+
+def test_what_was_kept_is_told_again(tmp_path):
+    sequence, stack = taken(lag=1)
+    with Session.create(tmp_path / "session") as session:
+        session.save_capture("part", "scan", sequence, stack, source="a test")
+        found = told(session, "part", stack)
+        assert any("on the camera is one image behind the projector" in sentence for sentence in found)
+        assert keep_residuals(session, "part") == found == told(session, "part", stack[:0])
