@@ -187,8 +187,8 @@ def run(
     channel = Channel()
     with Operator(set_up=partial(set_up, channel=channel)) as operator:
         _granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
-        begun = operator.wait_for(lambda s: s.session is not None, 60.0)
-        if rig or begun is None or begun.rig.state == "none":
+        remembered = operator.session is not None and operator.session.decision("rig")
+        if rig or not remembered:  # one that is remembered and not connected now is not given up for the simulated one
             _granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
         app = App(operator, host, port, channel=channel)
         try:

@@ -60,7 +60,8 @@ class RigCheck:
         better = found.exposure_ms if found else None
         if better is not None:
             change(self._better, label=f"Set the exposure to {better:.3g} ms")
-        change(self._better, visible=better is not None and better != rig.exposure_ms)
+        unlike = better is not None and (rig.exposure_ms is None or abs(better / rig.exposure_ms - 1) > 0.02)
+        change(self._better, visible=unlike)  # a camera takes the nearest that it has
         if found is not self._drawn:
             self._drawn = found
             self._found.set(checks_table(found) if found else "")

@@ -38,6 +38,8 @@ class RigChoice:
         self._follows = Follows(self._choice)
         self._choice.on_update(stage.safely_with(self._choose))
         self._says = Words(gui)
+        self._again = gui.add_button("Try this rig again", icon=viser.Icon.REFRESH, visible=False)
+        self._again.on_click(stage.safely(self._try_again))
         with gui.add_folder("Devices", visible=False) as self._devices:
             self._cameras = _by_words([d for d in available() if d.camera])
             self._projectors = _by_words([d for d in available() if d.projector])
@@ -75,6 +77,7 @@ class RigChoice:
         preset = self._presets.get(self._choice.value)
         what = "" if preset is None else block(toned(preset.problem or preset.what, "dim"))
         self._says.set(what + _described(rig))
+        change(self._again, visible=rig.state == "lost")
         self._draw_folders()
         change(self._keeping, visible=rig.state == "open" and not rig.simulated)
         self._needs_page = rig.page
@@ -109,6 +112,11 @@ class RigChoice:
             self._stage.operator.choose_rig(SIMULATED[chosen])
         elif chosen in self._presets and chosen != _REPLAY:
             self._stage.operator.choose_rig(self._presets[chosen].choice)
+
+    def _try_again(self) -> None:
+        choice = self._stage.operator.snapshot().rig.choice
+        if choice is not None:
+            self._stage.operator.choose_rig(choice)
 
     def _draw_folders(self) -> None:
         change(self._devices, visible=self._choice.value == _OWN)

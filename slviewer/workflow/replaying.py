@@ -35,6 +35,11 @@ class Reel:
         """The patterns of the capture that is played."""
         return self._recording.played[1]
 
+    @property
+    def has_dark(self) -> bool:
+        """Whether that capture holds a dark frame."""
+        return any(frame.kind == "black" for frame in self.sequence.frames)
+
     def wind_on(self) -> None:
         """Play the next capture; the first after the last. Raises InputError where it is not of the same rig."""
         self._at = (self._at + 1) % len(self.names)

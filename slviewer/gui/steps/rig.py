@@ -47,16 +47,12 @@ class Panel:
         self._rig.draw(snapshot)
         self._check.draw(snapshot)
         rig = snapshot.rig
+        self._draw_exposure(rig)
         if rig == self._drawn:
             return
         open_now = rig.state == "open"
         for handle in (self._exposure, self._light):
             change(handle, disabled=not open_now)
-        if rig.exposure_ms is not None and time.monotonic() - self._touched > _SETTLES_S:
-            if rig.exposure_ms > self._exposure.max:
-                self._exposure.max = _round_up(rig.exposure_ms)
-            if abs(self._exposure.value - rig.exposure_ms) > 0.005:
-                change(self._exposure, value=round(rig.exposure_ms, 2))
         shows = next((words for words, light in LIGHTS.items() if light == rig.light), None)
         if shows is not None:
             self._light_follows.tell(shows)
@@ -65,8 +61,16 @@ class Panel:
             self._histogram.set("")
         self._drawn = rig
 
+    def _draw_exposure(self, rig: RigView) -> None:
+        if rig.exposure_ms is not None and time.monotonic() - self._touched > _SETTLES_S:
+            if rig.exposure_ms > self._exposure.max:
+                self._exposure.max = _round_up(rig.exposure_ms)
+            if abs(self._exposure.value - rig.exposure_ms) > 0.005:
+                change(self._exposure, value=round(rig.exposure_ms, 2))
+
     def draw_preview(self, preview: PreviewView) -> None:
-        """What the camera sees."""
+        """What the camera sees, and what it was set to, once nobody drags that any more."""
+        self._draw_exposure(self._stage.operator.snapshot().rig)
         self._picture.set(drawn_preview(preview), legend(preview, light_words(preview)))
         self._histogram.set(histogram_chart(preview))
 

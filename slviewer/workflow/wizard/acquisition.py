@@ -86,11 +86,17 @@ class Acquisition:
         self._buffer: np.ndarray | None = None
 
     def use(self, rig: Rig | None, settings: CameraSettings | None = None) -> None:
-        """Take another rig, with these settings (its own where None), and close the one before; None: no rig."""
+        """Take another rig, with these settings (its own where None), in white light; None: no rig.
+
+        What runs with the one before is cancelled, what waits is not taken, and it is closed.
+        """
         with self._condition:
             self._wanted, self._settings = rig, settings
+            given_up = [request.name for request in self._requests]
             self._requests.clear()
-            self._view = RigView(light=self._light[0])
+            self._cancel = self._view.capture is not None
+            self._light = ("white", None)  # a pattern is made for one projector
+            self._view = RigView(light="white", capture=self._view.capture)
             if rig is not None:
                 self._view = replace(
                     self._view, state="opening", name=rig.name, camera=rig.camera.size, projector=rig.projector.size
@@ -99,6 +105,8 @@ class Acquisition:
                 self._thread = threading.Thread(target=self._serve, name="slviewer acquisition", daemon=True)
                 self._thread.start()
             self._condition.notify_all()
+        for name in given_up:
+            self._notices.tell("info", f"{name}: not taken, another rig was chosen")
         self._changed()
 
     def apply(self, settings: CameraSettings) -> None:
@@ -227,7 +235,7 @@ class Acquisition:
         self._next_try = time.monotonic() + RETRY_S
         self._rig.open()
         self._is_open, self._applied, self._lit = True, None, None
-        self._prepare()
+        self._preview()  # devices that open and then do not answer are not well
         back = self.view().fault
         self._say(state="open", fault="")
         if back:
@@ -242,8 +250,9 @@ class Acquisition:
             taken = self._rig.camera.settings() if settings is None else self._rig.camera.apply(settings)
             self._applied = settings
             if settings is None:
+                self._applied = taken
                 with self._condition:
-                    self._applied = self._settings = taken
+                    self._settings = self._settings or taken  # somebody may have set it meanwhile
             notes = tuple(getattr(self._rig.camera, "notes", ()))  # of drivers that keep some
             self._say(exposure_ms=taken.exposure_ms, gain=taken.gain, notes=notes)
         if light != self._lit:
@@ -279,7 +288,9 @@ class Acquisition:
         except SlviewerError as error:  # the disk refused, or the patterns: the devices are well
             self._notices.tell("error", f"{request.name}: {error}")
         finally:
-            self._say(capture=None)
+            with self._condition:
+                self._view = replace(self._view, capture=None)  # whichever rig is wanted by now
+            self._changed()
 
     def _take(self, request: CaptureRequest) -> None:
         assert self._rig is not None
@@ -337,7 +348,10 @@ class Acquisition:
     def _close_devices(self) -> None:
         if self._rig is not None and self._is_open:
             self._is_open = False
-            self._rig.close()
+            try:
+                self._rig.close()
+            except Exception as error:  # no device may end the thread that could open it again
+                words_for("closing the rig", error)
 
     def _say(self, **changes: object) -> None:
         with self._condition:

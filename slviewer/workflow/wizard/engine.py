@@ -54,6 +54,7 @@ class Engine:
         self.bench: Bench | None = None
         self.preflight: Preflight | None = None  # of the rig in use
         self._choice: Choice | None = None
+        self._rig_fault = ""  # why the chosen rig could not even be set up
         self._reader: Reader | None = None
         self._session_view: SessionView | None = None
         self._unreadable = 0
@@ -99,7 +100,7 @@ class Engine:
     def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
         """Open another session, with `rig`, else the one that it remembers, else the one in use.
 
-        Jobs of the session before are cancelled.
+        Jobs of the session before are cancelled. Where the remembered rig is not connected, the session opens without.
         """
         with self.lock:
             if not self.acquisition.idle:
@@ -112,26 +113,49 @@ class Engine:
             self._reader, self._session_view, self._queued = Reader(store), None, set()
             if before is not None:
                 before.close()
-            choice = rig or store.decision("rig")
-            if choice and choice != self._choice:
+            try:
+                self._use_rig_of(store, rig)
+            finally:
+                self.board_changed()
+
+    def _use_rig_of(self, store: Session, rig: Choice | None) -> None:
+        choice = rig or store.decision("rig")
+        if choice and choice != self._choice:
+            try:
                 self.use_rig(choice)
-            elif self._choice is not None:
-                store.decide("rig", dict(self._choice))
-            self.board_changed()
+            except SlviewerError as error:
+                if rig:
+                    raise
+                self._choice, self.bench, self.preview, self.preflight = dict(choice), None, None, None
+                self._rig_fault = str(error)
+                self.acquisition.use(None)
+                self.notices.fail("Choosing the rig", error)
+        elif self._choice is not None:
+            store.decide("rig", dict(self._choice))
+            if exposure := store.decision("exposure"):
+                self.acquisition.apply(CameraSettings(**exposure))
 
     def use_rig(self, choice: Choice) -> None:
-        """Use other devices from now on, with the exposure that the session remembers for them."""
+        """Use other devices from now on; chosen once more, with the delay that was measured unless the choice has one,
+        and with the exposure that the session remembers for them.
+        """
         with self.lock:
             store = self.session
+            known = dict((store.decision("rig") if store is not None else None) or {})
+            same = {**known, "settle_ms": None} == {**choice, "settle_ms": None}
+            if same and "settle_ms" in known and "settle_ms" not in choice:
+                choice = {**choice, "settle_ms": known["settle_ms"]}
             bench = self._set_up(choice, self._board())
-            if store is not None and store.decision("rig") != dict(choice):
+            if store is not None and known != dict(choice):
                 store.decide("rig", dict(choice))
+            if store is not None and not same:
                 store.decide("exposure", None)  # that of another camera says nothing
                 store.decide("exposures", None)
                 store.decide("levels", None)
             exposure = store.decision("exposure") if store is not None else None
             exposure = exposure or {key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)}
             self._choice, self.bench, self.preview, self.preflight = dict(choice), bench, None, None
+            self._rig_fault = ""
             self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
 
     def set_delay(self, settle_ms: float) -> None:
@@ -141,7 +165,8 @@ class Engine:
                 return
             self._choice = {**self._choice, "settle_ms": settle_ms}
             self.acquisition.set_delay(settle_ms)
-            self.store.decide("rig", dict(self._choice))
+            if self.session is not None:
+                self.session.decide("rig", dict(self._choice))
 
     def save_rig(self, name: str, what: str) -> None:
         """Keep the rig in use, with its exposure, as one of the session's own."""
@@ -266,6 +291,8 @@ class Engine:
         session = self._session_view if reader is not None else None
         space = self.space(reader.frames_of_a_pose(rig) if reader is not None else None)
         choice = self._choice
+        if self._rig_fault:
+            rig = replace(rig, state="lost", fault=self._rig_fault)
         rig = replace(
             rig,
             simulated=bench is not None and bench.world is not None,

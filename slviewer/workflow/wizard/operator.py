@@ -145,12 +145,21 @@ class Operator:
 
     @_request("Setting the exposure")
     def set_exposure(self, exposure_ms: float | None = None, gain: float | None = None) -> None:
-        """Set exposure time and gain; None leaves one as it is. The snapshot tells what the camera really took."""
-        now = self._engine.acquisition.view()
+        """Set exposure time and gain; None leaves one as it is. The snapshot tells what the camera really took.
+
+        Where captures are taken in several exposures, these become longer or shorter with it.
+        """
+        now, session = self._engine.acquisition.view(), self.session
         settings = CameraSettings(exposure_ms or now.exposure_ms, gain or now.gain)
         self._engine.acquisition.apply(settings)
-        if self.session is not None:
-            self.session.decide("exposure", {"exposure_ms": settings.exposure_ms, "gain": settings.gain})
+        if session is None:
+            return
+        with self._engine.lock:  # a slider that is dragged asks from several threads
+            before = (session.decision("exposure") or {}).get("exposure_ms") or now.exposure_ms
+            session.decide("exposure", {"exposure_ms": settings.exposure_ms, "gain": settings.gain})
+            several = self._engine.reader.exposures_ms()
+            if several and exposure_ms and before:  # they are multiples of it
+                session.decide("exposures", check_exposures([each * exposure_ms / before for each in several]))
 
     @_request("Setting the exposures")
     def set_exposures(self, exposures_ms: Sequence[float]) -> None:
@@ -161,11 +170,15 @@ class Operator:
     def check_rig(self) -> None:
         """Run the preflight, some 10 s; the snapshot tells what it found, and the delay that it measured is heeded."""
         engine = self._engine
+        bench = engine.bench
 
         def done(found: Preflight) -> None:
-            engine.preflight = found
-            if found.settle_ms is not None:
-                engine.set_delay(found.settle_ms)
+            with engine.lock:
+                if engine.bench is not bench:  # another rig was chosen meanwhile
+                    return
+                engine.preflight = found
+                if found.settle_ms is not None:
+                    engine.set_delay(found.settle_ms)
             level, words = _CHECKED[found.verdict]
             engine.notices.tell(level, words)
 
@@ -189,6 +202,9 @@ class Operator:
         """What the projector shows between captures: "white", "grey", "dark", or "pattern" to focus by."""
         if light not in (*LIGHTS, "pattern"):
             raise InputError(f"there is no light {light!r}: choose {', '.join(LIGHTS)} or pattern")
+        bench = self._engine.bench
+        if light == "dark" and bench is not None and bench.reel is not None and not bench.reel.has_dark:
+            raise InputError("the recording holds no dark frame: choose another light")
         self._engine.acquisition.shine(light, sequence_for_poses(self._engine) if light == "pattern" else None)
 
     # target, patterns, world

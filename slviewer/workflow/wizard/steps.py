@@ -73,7 +73,9 @@ def _no_session(facts: Facts) -> str:
 
 def _devices(facts: Facts) -> Iterator[str]:
     """What stands in the way of a capture."""
-    if facts.rig.state == "lost":
+    if facts.rig.state == "lost" and facts.rig.camera is None:
+        yield f"The rig cannot be used: {facts.rig.fault}. Try it again in the step Rig, or choose another."
+    elif facts.rig.state == "lost":
         yield f"The rig is lost: {facts.rig.fault}. It is tried again every two seconds."
     if facts.space is not None and not facts.space.enough:
         needs = megabytes(facts.space.capture_bytes or 0)

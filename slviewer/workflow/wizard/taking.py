@@ -91,6 +91,8 @@ def _take(
         follow()
         engine.teller.changed(session=True)
         if bench is not None and bench.reel is not None:
+            if engine.acquisition.view().light in ("dark", "pattern"):  # which the next one may not hold
+                engine.acquisition.shine("white")
             bench.reel.wind_on()
 
     engine.acquisition.capture(CaptureRequest(name, sequence, save, saved, exposures))

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -158,3 +159,47 @@ def test_what_the_camera_could_not_be_set_to_is_seen(bench: Bench) -> None:
     bench.rig.camera.notes = ("its gain cannot be set",)  # type: ignore[attr-defined]
     bench.open()
     assert bench.acquisition.view().notes == ("its gain cannot be set",)
+
+
+def test_another_rig_ends_what_the_one_before_was_doing(bench: Bench) -> None:
+    began, done = threading.Event(), []
+
+    def task(rig, progress) -> None:
+        while True:
+            progress(0.1, "measuring")
+            began.set()
+            time.sleep(0.01)
+
+    bench.open()
+    bench.acquisition.shine("dark")
+    bench.acquisition.run("Checking the rig", task, done.append)
+    assert began.wait(5)
+    bench.acquisition.capture(bench.request("waits"))
+    other = replace(bench.rig, name="another")
+    bench.acquisition.use(other)
+    assert not bench.acquisition.idle  # not before the task has ended: nobody may close what it saves into
+    bench.until(lambda: bench.acquisition.idle and bench.acquisition.view().state == "open")
+    assert (bench.acquisition.view().name, bench.acquisition.view().light) == ("another", "white")
+    assert not done and not bench.saved
+    assert sorted(bench.texts) == ["Checking the rig: cancelled", "waits: not taken, another rig was chosen"]
+
+
+def test_a_camera_that_opens_and_gives_no_picture_is_told_of_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.open()
+    gone, opened = [True], []
+    grab, opens = bench.rig.camera.grab, bench.rig.camera.open
+
+    def no_picture(out: np.ndarray) -> None:
+        if gone:
+            raise DeviceError("the camera gave no frame: check its trigger")
+        grab(out)
+
+    monkeypatch.setattr(bench.rig.camera, "grab", no_picture)
+    monkeypatch.setattr(bench.rig.camera, "open", lambda: (opened.append(1), opens()))
+    bench.until(lambda: len(opened) > 3)
+    assert bench.texts == ["the camera gave no frame: check its trigger"]
+    gone.clear()
+    bench.until(lambda: bench.acquisition.view().state == "open")
+    assert bench.texts[1:] == ["the rig answers again"]
