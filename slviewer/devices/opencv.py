@@ -31,6 +31,9 @@ from slviewer.errors import DeviceError, InputError
 SETTLING = 3
 """Pictures that a webcam takes until an exposure that was set is the one that they have."""
 
+_IN_USE: dict[int | str, "OpenCVCamera"] = {}
+"""Who has which source open in this process: most cannot be opened a second time to ask for their size."""
+
 
 @dataclass(frozen=True)
 class Controls:
@@ -62,6 +65,8 @@ class OpenCVCamera(Openable):
         channel: Channel = "green",
     ) -> None:
         super().__init__(described(source))
+        known = _IN_USE.get(source)
+        self._source, size = source, size or (known.size if known is not None else None)
         self._connect = partial(connect, source, size)
         self._controls, self._channel = controls or Controls(), channel
         self._reader: Reader | None = None
@@ -86,6 +91,7 @@ class OpenCVCamera(Openable):
             self._next, self._read = self._checked(self._reader.first()), 0
             self._said = {}
             self._reader.do(self._prepare)
+            _IN_USE[self._source] = self
         except BaseException:
             self.close()
             raise
@@ -94,6 +100,8 @@ class OpenCVCamera(Openable):
         """Give it back, if need be when it returns from a call in which it hangs."""
         if self._reader is not None:
             self._reader.close()
+        if _IN_USE.get(self._source) is self:
+            del _IN_USE[self._source]
         super().close()
 
     def grab(self, out: np.ndarray) -> None:
@@ -204,7 +212,8 @@ def opencv_camera(
 ) -> OpenCVCamera:
     """The webcam of that number, or what is at a path or an address.
 
-    `size` is (width, height) px, which a webcam is switched to; without it, the source must answer now to tell its own.
+    `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use, or the source must
+    answer now to tell its own.
     Raises InputError for options that are none, DeviceError for a source that does not answer.
     """
     if isinstance(source, str) and source.isdecimal():

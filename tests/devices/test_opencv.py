@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from mjpeg import network_camera
+from mjpeg import NetworkCamera, network_camera
 
 from slviewer.devices.capture import take
 from slviewer.devices.drivers import driver
@@ -264,3 +264,48 @@ def test_webcams_are_listed_by_their_names(tmp_path):
     lines = listed(tmp_path)
     assert [line.split(",")[0] for line in lines] == ["source 0: HD Webcam", "source 10: Arducam"]
     assert listed(tmp_path / "none") == [] and isinstance(driver("opencv").found(), list)
+
+
+class _OneAtATime(NetworkCamera):
+    """A camera that serves nobody else while somebody looks, as webcams do."""
+
+    busy = False
+
+    def verify_request(self, *_: object) -> bool:
+        return not self.busy
+
+    def finish_request(self, *who: object) -> None:
+        self.busy = True
+        try:
+            super().finish_request(*who)  # type: ignore[arg-type]
+        finally:
+            self.busy = False
+
+
+def test_a_camera_in_use_is_chosen_once_more_and_taken_over():
+    server = _OneAtATime(np.full(SIZE[::-1], 100, np.uint8), FPS)
+    try:
+        first = opencv_camera(server.url)
+        assert until(lambda: not server.busy)
+        with opened(first):
+            second = opencv_camera(server.url)
+            assert second.size == SIZE
+            with pytest.raises(DeviceError, match="does not answer"):
+                second.open()
+            assert opencv_camera(server.url).size == SIZE  # the first one has it still
+        assert until(lambda: not server.busy)
+        with opened(second):
+            assert abs(int(grabbed(second).mean()) - 100) < 5
+        server.die()
+        with pytest.raises(DeviceError, match="does not answer"):
+            opencv_camera(server.url)
+    finally:
+        if not server.dead:
+            server.die()
+
+
+def until(condition, timeout_s: float = 3.0) -> bool:
+    end = time.monotonic() + timeout_s
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
+    return bool(condition())
