@@ -1,0 +1,198 @@
+"""Is a saved calibration still good? One capture of its board answers.
+
+What is looked at is the projector's place relative to the camera: a turn about its own centre, and a shift of that
+centre. Flatness would not show it: a projector turned by 0.1 mrad measures flat boards as flat as before, and bends
+space by 700 ppm. A turn or shift along the epipolar lines makes the board seem larger or smaller than it is; one across
+them moves the pattern off its epipolar lines.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.stats import f as fisher
+
+from slviewer.calibration.drift.floor import Answer, Reference
+from slviewer.calibration.drift.view import View
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+
+FALSE_ALARMS = 1e-4
+"""How often a projector that has not moved may be said to have: it is asked before every day's work."""
+BOARD_PPM = 5.0
+"""How much the board itself may have grown since: half a kelvin of steel."""
+MISFIT = 3.0
+"""What no movement explains may be so many times what it was in the calibration's worst pose."""
+TURN_MRAD, SHIFT_MM = 0.05, 0.010
+"""Changes that must be seen."""
+Verdict = Literal["still good", "recalibrate"]
+_MOVES = (
+    ("turn about its x axis (nod)", "rows", "y"),
+    ("turn about its y axis (pan)", "columns", "x"),
+    ("turn about its optical axis (roll)", "rows", "y"),
+    ("shift along its x axis", "columns", "x"),
+    ("shift along its y axis", "rows", "y"),
+    ("shift along its optical axis", "rows and columns", "y"),
+)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What one capture of the board says of a calibration; sigma is one standard deviation.
+
+    ``turn_mrad``, ``shift_mm``: (3) each, about and along the projector's own axes. ``chance`` that a projector which
+    has not moved seems to have moved as much. ``seen_alone``: the size of each of the six from which on it would be
+    noticed 19 times of 20 if it were the only one.
+    """
+
+    capture: str
+    axes: tuple[Axis, ...]
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    turn_mrad: tuple[float, ...]
+    turn_sigma_mrad: tuple[float, ...]
+    shift_mm: tuple[float, ...]
+    shift_sigma_mm: tuple[float, ...]
+    baseline_mm: float
+    baseline_sigma_mm: float
+    scale_ppm: float
+    scale_sigma_ppm: float
+    across_px: float | None
+    across_sigma_px: float | None
+    misfit_px: float
+    chance: float
+    seen_alone: tuple[float, ...]
+    unseen: tuple[str, ...]
+
+    def text(self) -> str:
+        """For people: the verdict first, then what it rests on."""
+        answer = self.verdict if not self.reasons else f"{self.verdict}, because {'; '.join(self.reasons)}"
+        across = (
+            "off its epipolar lines: not known from one axis"
+            if self.across_px is None
+            else f"off its epipolar lines by {self.across_px:+.4f} +- {self.across_sigma_px:.4f} px"
+        )
+        shifts, shift_sigmas = ([1e3 * s for s in three] for three in (self.shift_mm, self.shift_sigma_mm))
+        lines = [
+            f"{self.capture}: {answer}",
+            f"  the board seems {self.scale_ppm:+.0f} +- {self.scale_sigma_ppm:.0f} ppm larger than it is; {across}",
+            f"  projector turned by {_three(self.turn_mrad, self.turn_sigma_mrad, '.3f')} mrad about its x, y, z",
+            f"  and shifted by {_three(shifts, shift_sigmas, '.0f')} um; baseline {1e3 * self.baseline_mm:+.0f} +- {1e3 * self.baseline_sigma_mm:.0f} um",
+            "  a pan and a shift along x look nearly alike, as do a nod and a shift along y: their sum is known far "
+            "better than each",
+            "  seen if it is the only change: turns from "
+            + ", ".join(f"{s:.4f}" for s in self.seen_alone[:3])
+            + " mrad, shifts from "
+            + ", ".join(f"{1e3 * s:.1f}" for s in self.seen_alone[3:])
+            + " um",
+        ]
+        return "\n".join(lines + [f"  not seen: {what}" for what in self.unseen])
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Drift":
+        """The inverse of ``to_dict``."""
+        plain: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in values.items()}
+        return cls(**plain)
+
+
+def check_drift(reference: Reference, view: View) -> Drift:
+    """The verdict on a calibration from one later view of its board.
+
+    Raises InputError where the view shows no axis that the calibration has.
+    """
+    if not view.axes:
+        raise InputError(f"{view.name}: no axis of the pattern could be read on the board: light the whole board")
+    found = reference.ask(view)
+    own = reference.answers
+    growth = BOARD_PPM * 1e-6
+    C = found.covariance(reference.sigmas) + growth**2 * np.outer(found.by_growth, found.by_growth)
+    information = np.linalg.inv(C)
+    about = float(found.change @ information @ found.change)
+    degrees = 6 * len(own) - 3  # the floor is itself an estimate, from so many numbers
+    chance = float(fisher.sf(about / 6, 6, degrees))
+    limit = 6 * float(fisher.isf(FALSE_ALARMS, 6, degrees))
+    scale_sigma = float(np.hypot(np.sqrt(np.mean([a.scale**2 for a in own])), growth))
+    two = np.isfinite(found.across_px)
+    across_sigma = float(np.sqrt(np.nanmean([a.across_px**2 for a in own]))) if two else None
+    along = np.concatenate([np.zeros(3), reference.rig.t / np.linalg.norm(reference.rig.t)])
+    reasons = []
+    worst = max(a.misfit_px for a in own)
+    if found.misfit_px > MISFIT * worst:
+        reasons.append(
+            f"the board lies {found.misfit_px:.3f} px off what any movement of the projector explains (in the poses of "
+            f"the calibration {worst:.3f} px at most): was a lens refocused, the board moved, or is it another one?"
+        )
+    elif about > limit:
+        reasons.append(_explained(found, information, about, along))
+        if abs(found.scale) > 3 * scale_sigma:
+            reasons.append(
+                f"the board seems {1e6 * found.scale:+.0f} ppm larger than it is (+- {1e6 * scale_sigma:.0f})"
+            )
+        if across_sigma is not None and abs(found.across_px) > 4 * across_sigma:
+            reasons.append(f"the pattern lies {found.across_px:+.4f} px off its epipolar lines (+- {across_sigma:.4f})")
+    sigmas = np.sqrt(np.diag(C))
+    seen_alone = (np.sqrt(limit) + 1.645) / np.sqrt(np.diag(information)) * np.array([1e3] * 3 + [1.0] * 3)
+    return Drift(
+        capture=view.name,
+        axes=view.axes,
+        verdict="recalibrate" if reasons else "still good",
+        reasons=tuple(reasons),
+        turn_mrad=_plain(1e3 * found.change[:3]),
+        turn_sigma_mrad=_plain(1e3 * sigmas[:3]),
+        shift_mm=_plain(found.change[3:]),
+        shift_sigma_mm=_plain(sigmas[3:]),
+        baseline_mm=float(along @ found.change),
+        baseline_sigma_mm=float(np.sqrt(along @ C @ along)),
+        scale_ppm=1e6 * found.scale,
+        scale_sigma_ppm=1e6 * scale_sigma,
+        across_px=float(found.across_px) if two else None,
+        across_sigma_px=across_sigma,
+        misfit_px=found.misfit_px,
+        chance=chance,
+        seen_alone=_plain(seen_alone),
+        unseen=(*_unseen(seen_alone, view.axes), "camera and projector that moved together: that changes nothing"),
+    )
+
+
+def _explained(found: Answer, information: np.ndarray, about: float, along: np.ndarray) -> str:
+    """The single movements that explain the change nearly as well as any, with their sizes."""
+    moves = np.vstack([np.eye(6), along])  # (7, 6); a longer baseline is the last
+    names = [*(name for name, _, _ in _MOVES), "change of the baseline"]
+    curvature = np.einsum("ij,jk,ik->i", moves, information, moves)
+    sizes, sigmas = moves @ information @ found.change / curvature, curvature**-0.5
+    share = sizes**2 * curvature / about
+    words = []
+    for i in np.argsort(-share):
+        if share[i] > 0.9 * share.max():
+            form, unit = (".4f", "mrad") if i < 3 else (".1f", "um")
+            words.append(f"a {names[i]} by {1e3 * sizes[i]:+{form}} +- {1e3 * sigmas[i]:{form}} {unit}")
+    return f"the projector has moved, as by {' or '.join(words)} ({100 * share.max():.0f} % of what is seen)"
+
+
+def _unseen(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str]:
+    limits = [TURN_MRAD] * 3 + [SHIFT_MM] * 3
+    told = []
+    for i, ((move, lines, axis), limit) in enumerate(zip(_MOVES, limits, strict=True)):
+        if seen_alone[i] > limit:
+            size = f"{seen_alone[i]:.2f} mrad" if i < 3 else f"{1e3 * seen_alone[i]:.0f} um"
+            why = (
+                f"it moves the pattern's {lines}, and the capture holds axis {axes[0]} alone"
+                if len(axes) == 1 and axis not in axes
+                else f"at this pose it moves the pattern by too little; {'capture both axes, or ' * (len(axes) < 2)}"
+                "bring the board nearer and tilt it"
+            )
+            told.append(f"a {move} of less than {size}: {why}")
+    return told
+
+
+def _three(values: Sequence[float], sigmas: Sequence[float], form: str) -> str:
+    return ", ".join(f"{value:+{form}} +- {sigma:{form}}" for value, sigma in zip(values, sigmas, strict=True))
+
+
+def _plain(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)

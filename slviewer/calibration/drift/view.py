@@ -1,0 +1,202 @@
+"""One view of the board, made linear: what the board's pose, the projector's place and the lenses' errors do to it.
+
+A view is a calibration pose or a later capture of the same board: its features in the camera, and the projector's
+coordinates at a grid of the board's pixels. All that is looked for is small (tenths of a pixel), so that derivatives at
+the calibration and at the pose that the camera sees are enough.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import scipy.sparse as sp
+
+from slviewer.calibration.observe import AXES, Observation
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.rig import StereoRig
+
+SAMPLES = 1000
+"""Pixels of the board at which the projector's coordinates are compared; the smoothed phase holds no more."""
+CELLS_PER_WIDTH = 12
+"""Spline cells across an image, for what a lens does beyond Brown's model: waves of a third of the width and longer."""
+KINDS = ("camera", "x", "y")
+"""What is observed: features in the camera, projector columns, projector rows."""
+STEPS = np.array([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])
+"""rad and mm: half the steps of the derivatives, by which pixels move by a tenth."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """``camera`` (n, 2) px of board ``points`` (n, 3) mm; ``pixels`` (m, 2) px of the board in the camera, and the
+    ``projector`` coordinates (m, 2) px there, a column of NaN for an axis that was not captured."""
+
+    name: str
+    points: np.ndarray
+    camera: np.ndarray
+    pixels: np.ndarray
+    projector: np.ndarray
+
+    @classmethod
+    def of(cls, observation: Observation) -> "View":
+        """The view that an observation of the board holds."""
+        u0, v0, _, _ = observation.box
+        v, u = np.nonzero(observation.region)
+        if not len(v):
+            raise InputError(f"{observation.name}: no pixel of the board carries a readable pattern: light the board")
+        step = max(1, int(np.sqrt(len(v) / SAMPLES)))
+        on_grid = (u % step == 0) & (v % step == 0)
+        pixels = np.stack([u[on_grid] + u0, v[on_grid] + v0], 1).astype(float)
+        projector = np.full((len(pixels), 2), np.nan)
+        for axis, surface in observation.surfaces.items():
+            phase = surface.evaluate(pixels[:, 0], pixels[:, 1])
+            projector[:, AXES.index(axis)] = phase * observation.periods_px[axis] / (2 * np.pi)
+        return cls(observation.name, observation.points, observation.camera, pixels, projector)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The axes along which the projector's coordinates are known."""
+        return tuple(axis for i, axis in enumerate(AXES) if np.isfinite(self.projector[:, i]).any())
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A cubic B-spline displacement field over an image of ``size`` px: ``cells`` (across, down)."""
+
+    size: tuple[int, int]
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        return CELLS_PER_WIDTH, max(1, round(CELLS_PER_WIDTH * self.size[1] / self.size[0]))
+
+    @property
+    def unknowns(self) -> int:
+        """Coefficients of one of its two components."""
+        return (self.cells[0] + 3) * (self.cells[1] + 3)
+
+    def basis(self, pixels: np.ndarray) -> sp.csr_array:
+        """(n, unknowns): how the coefficients act at pixels (n, 2)."""
+        (i, wu), (j, wv) = (_cubic((pixels[:, k] + 0.5) * self.cells[k] / self.size[k], self.cells[k]) for k in (0, 1))
+        columns = (j[:, None] + np.arange(4))[:, :, None] * (self.cells[0] + 3) + (i[:, None] + np.arange(4))[:, None]
+        values = wv[:, :, None] * wu[:, None]
+        rows = np.repeat(np.arange(len(pixels)), 16)
+        return sp.csr_array((values.ravel(), (rows, columns.ravel())), (len(pixels), self.unknowns))
+
+    @cached_property
+    def roughness(self) -> sp.csr_array:
+        """Squared second differences of one component's coefficients."""
+        across, down = (n + 3 for n in self.cells)
+
+        def difference(n: int) -> sp.csr_array:
+            return sp.csr_array(sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)))
+
+        u, v = sp.kron(sp.eye(down), difference(across)), sp.kron(difference(down), sp.eye(across))
+        return sp.csr_array(u.T @ u + v.T @ v)
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A view's equations ``residuals = pose a + change b + shared c``, a row an observed number (px).
+
+    ``kinds`` (k,): the index into KINDS of each row. ``pose`` (k, 6): the board's; ``change`` (k, 6): the projector's
+    rotation about its own centre (rad, about its own axes) and its shift (mm); ``scale`` (k,): the board's relative
+    growth; ``shared``: (k, unknowns) lens errors of both devices, as ``LensErrors`` orders them. ``across`` (k,): each
+    projector row's share in the direction across the epipolar lines.
+    """
+
+    name: str
+    kinds: np.ndarray
+    residuals: np.ndarray
+    pose: np.ndarray
+    change: np.ndarray
+    scale: np.ndarray
+    shared: sp.csr_array
+    across: np.ndarray
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(k,) bool: the rows that were measured."""
+        return np.asarray(np.isfinite(self.residuals) & np.isfinite(self.change).all(1))
+
+
+def linear(rig: StereoRig, view: View) -> Linear:
+    """The equations of a view, at the pose that the camera alone gives."""
+    T = _pose(rig, view)
+    middle = view.points.mean(0)
+
+    def model(at: np.ndarray, moved: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        R = cv2.Rodrigues(at[:3])[0] @ T[:3, :3]
+        t = T[:3, 3] + at[3:6]
+        rays = np.concatenate([rig.camera.undistort(view.pixels + moved), np.ones((len(view.pixels), 1))], 1)
+        on_board = rays * ((R[:, 2] @ t) / (rays @ R[:, 2]))[:, None]
+        turned = rig.to_projector(on_board) @ cv2.Rodrigues(at[6:9])[0].T + at[9:12]
+        points = middle + (view.points - middle) * (1 + at[12])
+        return rig.camera.project(points @ R.T + t), rig.projector.project(turned)
+
+    steps = np.diag(np.r_[STEPS, STEPS, 1e-4])
+    columns = [_flat(*(a - b for a, b in zip(model(s), model(-s), strict=True))) / (2 * s.sum()) for s in steps]
+    features, samples = model(np.zeros(13))
+    J = np.stack(
+        [(model(np.zeros(13), 0.1 * e)[1] - model(np.zeros(13), -0.1 * e)[1]) / 0.2 for e in np.eye(2)], 2
+    )  # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
+    camera, projector = Field(rig.camera.size), Field(rig.projector.size)
+    on_features, at_pixels = camera.basis(view.camera), camera.basis(view.pixels)
+    on_samples = projector.basis(np.nan_to_num(samples))
+    n, m = len(view.camera), len(view.pixels)
+
+    def moved_by(row: int) -> list[sp.csr_array]:
+        return [-sp.csr_array(sp.diags(np.nan_to_num(J[:, row, k])) @ at_pixels) for k in (0, 1)]
+
+    nothing = sp.csr_array((n, projector.unknowns)), sp.csr_array((m, projector.unknowns))
+    interleaved = [sp.csr_array(sp.kron(on_features, np.eye(2)[:, k : k + 1])) for k in (0, 1)]
+    twice = sp.csr_array((2 * n, projector.unknowns))
+    shared = sp.csr_array(
+        sp.vstack(
+            [
+                sp.hstack([*interleaved, twice, twice]),
+                sp.hstack([*moved_by(0), on_samples, nothing[1]]),
+                sp.hstack([*moved_by(1), nothing[1], on_samples]),
+            ]
+        )
+    )
+    towards = np.stack([columns[3 + k][2 * n :].reshape(2, m).T for k in range(3)], 2) @ T[:3, 2]  # along the normal
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    return Linear(
+        view.name,
+        np.repeat([0, 1, 2], [2 * n, m, m]),
+        _flat(view.camera - features, view.projector - samples),
+        np.stack(columns[:6], 1),
+        np.stack(columns[6:12], 1),
+        columns[12],
+        shared,
+        np.concatenate([np.zeros(2 * n), -towards[:, 1], towards[:, 0]]),
+    )
+
+
+def _flat(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
+    """Values in the order of KINDS: all of the camera's, the projector's columns, its rows."""
+    return np.concatenate([camera.ravel(), projector[:, 0], projector[:, 1]])
+
+
+def _cubic(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Each place's cell (n,), clipped to the image, and its four cubic B-spline weights (n, 4)."""
+    x = np.clip(x, 0.0, cells)
+    cell = np.minimum(x.astype(np.int64), cells - 1)
+    f = x - cell
+    g = 1.0 - f
+    return cell, np.stack([g**3, 3 * f**3 - 6 * f**2 + 4, 3 * g**3 - 6 * g**2 + 4, f**3], 1) / 6.0
+
+
+def _pose(rig: StereoRig, view: View) -> np.ndarray:
+    """(4, 4) T_camera_board from the camera alone."""
+    rays = rig.camera.undistort(view.camera)
+    try:
+        found, turn, shift = cv2.solvePnP(view.points, rays[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
+    except cv2.error:
+        found = False
+    if not found:
+        raise InputError(f"{view.name}: no pose of the board fits its features: is it the calibration's board?")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+    return T
