@@ -28,14 +28,26 @@ def capture(
     used again once its device answers. The projector is left showing the last frame.
     """
     rig.projector.load(sequence)
-    n, (width, height) = len(sequence.frames), rig.camera.size
+    out = _room(rig, len(sequence.frames), out)
+    _shoot(rig, len(sequence.frames), out, progress)
+    return out
+
+
+def _room(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
+    """`out`, if `n` frames of the rig's camera fit it, or a new array for them. Raises InputError."""
+    width, height = rig.camera.size
     if out is None:
-        out = np.empty((n, height, width), rig.camera.dtype)
+        return np.empty((n, height, width), rig.camera.dtype)
     if out.shape != (n, height, width) or out.dtype != rig.camera.dtype:
         raise InputError(
             f"the {n} frames of {rig.camera.name} need {(n, height, width)} {rig.camera.dtype}, "
             f"got {out.shape} {out.dtype}: make the array by the camera's size"
         )
+    return out
+
+
+def _shoot(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, int], None] | None) -> None:
+    """Show and grab the `n` frames that are loaded."""
     if progress is not None:
         progress(0, n)
     for k in range(n):
@@ -49,7 +61,6 @@ def capture(
             raise DeviceError(f"the capture ended at frame {k + 1} of {n}, nothing is kept of it: {error}") from error
         if progress is not None:
             progress(k + 1, n)
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +92,9 @@ def take(
         frames = capture(rig, sequence, out, progress)
         return Taken(frames, rig.camera.settings(), (), _colours(rig))
     wanted = check_exposures(exposures_ms)
-    n, (width, height) = len(sequence.frames), rig.camera.size
-    if out is None:
-        out = np.empty((n * len(wanted), height, width), rig.camera.dtype)
+    n = len(sequence.frames)
+    out = _room(rig, n * len(wanted), out)
+    rig.projector.load(sequence)  # once: a projector that is lost between two exposures must not be taken for the same
     before, taken = rig.camera.settings(), []
     try:
         for e, exposure in enumerate(wanted):
@@ -93,7 +104,7 @@ def take(
                     f"{rig.camera.name} took {taken[e]:g} ms when it was asked for {exposure:g} ms: "
                     "choose exposures that it can tell apart, or a single one"
                 )
-            capture(rig, sequence, out[e * n : (e + 1) * n], _counting(progress, e * n, len(out)))
+            _shoot(rig, n, out[e * n : (e + 1) * n], _counting(progress, e * n, len(out)))
     finally:
         with contextlib.suppress(DeviceError):  # one that is lost tells so itself
             rig.camera.apply(before)

@@ -74,7 +74,7 @@ class OpenCVCamera(Openable):
         self._next: np.ndarray | None = None  # the video's picture that was read to learn its size
         self._read, self._unsettled = 0, 0
         self._said: dict[str, str] = {}
-        self.size = size or self._probed()
+        self.size: tuple[int, int] = size or self._probed()
 
     @property
     def notes(self) -> tuple[str, ...]:

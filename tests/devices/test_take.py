@@ -1,13 +1,17 @@
 """Captures in several exposures and in colour, on devices that work and on those that do not."""
 
+import msgspec
 import numpy as np
 import pytest
 from colour_camera import ColouredCamera, coloured
 
+from slviewer.devices.browser import BrowserProjector
 from slviewer.devices.capture import capture, colour_texture, take
+from slviewer.devices.channel import Channel
 from slviewer.devices.faults import breakable
-from slviewer.devices.protocols import CameraSettings, ColourCamera
+from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.devices.replay import replay
+from slviewer.devices.screen import Screen
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import Cancelled, DeviceError, InputError
@@ -100,3 +104,38 @@ def test_a_colour_camera_brings_its_colours_home():
         assert taken.texture is None and taken.frames.any()  # the frames are whole
     with rig().opened() as grey:
         assert colour_texture(grey) is None
+
+
+class _Page:
+    """A projector page that says at once that it has done what it was asked."""
+
+    def __init__(self, channel: Channel, size: tuple[int, int]) -> None:
+        shown = Screen(1.0, size, size, size, True, True, True, 1.0)
+        hello = {"op": "hello", "window": "a", "take": False, "screen": shown}
+        self._channel, self.asked = channel, []
+        self._page = channel.connect(msgspec.json.encode(hello), self._receive)
+
+    def _receive(self, message: bytes | None) -> None:
+        if message is None:
+            return
+        header = msgspec.json.decode(message[4 : 4 + int.from_bytes(message[:4], "little")])
+        self.asked.append(header["op"])
+        if "number" in header and self._page is not None:
+            self._channel.received(self._page, msgspec.json.encode({"op": "done", "number": header["number"]}))
+
+
+def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():
+    channel, camera = Channel(), rig().camera
+    first = _Page(channel, SEQUENCE.projector)
+    with Rig("r", camera, BrowserProjector(channel, SEQUENCE.projector)).opened() as one:
+        assert len(take(one, SEQUENCE, (0.5, 4.0)).frames) == 2 * N
+        assert first.asked.count("load") == 1 and first.asked.count("show") == 2 * (N + 1)
+
+        def reload(done: int, _: int) -> None:
+            if done == N:
+                _Page(channel, SEQUENCE.projector)
+
+        with pytest.raises(DeviceError, match="was reloaded, or connected anew"):
+            take(one, SEQUENCE, (0.5, 4.0), progress=reload)
+        with pytest.raises(InputError, match="make the array by the camera's size"):
+            take(one, SEQUENCE, (0.5, 4.0), out=np.empty((N, 120, 160), np.uint8))
