@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.anchored import AnchoredModel, calibrate_anchored
 from slviewer.calibration.centres import calibrate_centred
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
@@ -14,7 +15,7 @@ from slviewer.errors import CalibrationRejected, InputError
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import save_pixelwise, save_stereo
+from slviewer.workflow.models import save_anchored, save_pixelwise, save_stereo
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.poses import judge_all
 
@@ -25,6 +26,7 @@ class CalibrationResult:
 
     stereo: StereoModel
     pixelwise: PixelwiseModel | None
+    anchored: AnchoredModel | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``calibrate --json``."""
@@ -45,6 +47,8 @@ class CalibrationResult:
                 "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.axes[0]),
                 "axes": {axis: self.pixelwise.median_rms_mm(axis) for axis in self.pixelwise.axes},
             }
+        if self.anchored is not None:
+            models["anchored"] = {"axes": {axis: self.anchored.median_rms_px(axis) for axis in self.anchored.axes}}
         return {
             "models": models,
             "poses_used": list(self.stereo.poses),
@@ -79,6 +83,12 @@ class CalibrationResult:
                     f"in {np.median(fit.poses[fitted]):.0f} poses (median); "
                     f"fit RMS z {fit_rms['z']:.3f}, x {fit_rms['x']:.3f}, y {fit_rms['y']:.3f} mm (median)"
                 )
+        if self.anchored is not None:
+            lines += [
+                f"anchored {axis}: corrections of {np.sqrt(c.prior[0, 0]):.3f} px (standard deviation at mid depth), "
+                f"fit RMS {self.anchored.median_rms_px(axis):.4f} px (median)"
+                for axis, c in self.anchored.corrections.items()
+            ]
         return "\n".join(lines)
 
 
@@ -94,8 +104,9 @@ def calibrate(
 ) -> CalibrationResult:
     """Calibrate from the session's captures of role calibration, and save the models in the session.
 
-    ``pixelwise`` is fitted on top of ``stereo``, which is always made. A pose that cannot be used is left out with the
-    reason; CalibrationRejected when what is left cannot determine the rig, and then the session stays as it was.
+    ``pixelwise`` and ``anchored`` are fitted on top of ``stereo``, which is always made. A pose that cannot be used is
+    left out with the reason; CalibrationRejected when what is left cannot determine the rig, and then the session stays
+    as it was.
     """
     board = Board.parse(target)
     step_2 = Smoothing(smoothing, degree)
@@ -127,14 +138,24 @@ def calibrate(
                 if len(models) == 1:
                     raise
                 warn(f"no pixel-wise model: {error}")
+        anchored = None
+        if "anchored" in models:
+            try:
+                anchored = calibrate_anchored(observations, stereo)
+            except CalibrationRejected as error:
+                if len(models) == 1:
+                    raise
+                warn(f"no anchored model: {error}")
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
         save_stereo(store, stereo, inputs, settings)
         if pixelwise is not None:
             save_pixelwise(store, pixelwise, inputs, settings)
+        if anchored is not None:
+            save_anchored(store, anchored, inputs, settings)
         progress(1.0, "calibrated")
-    return CalibrationResult(stereo, pixelwise)
+    return CalibrationResult(stereo, pixelwise, anchored)
 
 
 def _observe_all(

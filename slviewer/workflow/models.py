@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.anchored import AnchoredModel
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
@@ -13,9 +14,9 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.session.store import Session
 from slviewer.workflow.feedback import Warn
 
-Model = StereoModel | PixelwiseModel
+Model = StereoModel | PixelwiseModel | AnchoredModel
 
-MODELS = ("stereo", "pixelwise")
+MODELS = ("stereo", "pixelwise", "anchored")
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
 
@@ -32,6 +33,12 @@ def save_pixelwise(
     """Replace the session's pixelwise calibration."""
     meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
     store.save_result("calibration/pixelwise", meta, model.to_arrays())
+
+
+def save_anchored(store: Session, model: AnchoredModel, inputs: Mapping[str, str], settings: Mapping[str, Any]) -> None:
+    """Replace the session's anchored calibration."""
+    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
+    store.save_result("calibration/anchored", meta, model.to_arrays())
 
 
 def available(store: Session) -> tuple[str, ...]:
@@ -88,7 +95,9 @@ def load_model(store: Session, name: str) -> Model:
         )
     if name == "stereo":
         return load_stereo(store)
-    meta, arrays = store.load_result("calibration/pixelwise")
+    meta, arrays = store.load_result(f"calibration/{name}")
+    if name == "anchored":
+        return AnchoredModel.restored(meta["model"], arrays)
     return PixelwiseModel.restored(meta["model"], arrays)
 
 
