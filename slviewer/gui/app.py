@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 import webbrowser
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,7 @@ class App:
         self._closing = True
         self._changed.set()
         self._unsubscribe()
+        self._turns.shutdown(wait=False, cancel_futures=True)
         self._thread.join(5.0)
         self.server.stop()
 
@@ -77,6 +79,7 @@ class App:
         page.initial_camera.fov = FIELD_OF_VIEW
         page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
         self._closing = False
+        self._turns = ThreadPoolExecutor(1, "slviewer requests")
         self._changed = threading.Event()
         self._offers: dict[Path, str] = {}
         self._folder: Path | None = None
@@ -91,6 +94,7 @@ class App:
             escape,
             self._go,
             self._failed,
+            self._turns,
             self._page_standing,
         )
         snapshot = operator.snapshot()

@@ -1,6 +1,8 @@
 """What a step's panel is, and what it is given: where to draw, whom to ask, and how to hear of failures."""
 
 from collections.abc import Callable
+from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -22,7 +24,8 @@ class Stage:
     `gui` builds inputs, `scene` draws in 3D, `eyes` turns the browsers' views, `operator` takes requests. `offer(path)`
     gives the address at which a file of the session is downloaded; `tell(level, text)` shows a notification in every
     browser; `escape(text)` makes text that was typed or read harmless inside HTML and Markdown. `go(key)` brings
-    another step to the front. `projector_page()` says where the projector page stands; None where none is served.
+    another step to the front. `turns` does one callback after the other. `projector_page()` says where the projector
+    page stands; None where none is served.
     """
 
     gui: viser.GuiApi
@@ -34,30 +37,32 @@ class Stage:
     escape: Callable[[str], str]
     go: Callable[[str], None]
     failed: Callable[[BaseException], None]
+    turns: Executor
     projector_page: Callable[[], Standing | None] = lambda: None
 
-    def safely(self, do: Callable[[], Any]) -> Callable[[Any], None]:
+    def safely(self, do: Callable[[], Any], *, at_once: bool = False) -> Callable[[Any], None]:
         """A callback for viser that calls `do()`; whatever it raises becomes a notification in plain words.
 
-        ``button.on_click(stage.safely(lambda: stage.operator.calibrate()))``. `do` sends a request and returns: viser
-        runs callbacks in a small pool of threads, so one that computes would keep others waiting.
+        ``button.on_click(stage.safely(lambda: stage.operator.calibrate()))``. Viser calls back from a pool of threads,
+        one event beside the other: here they take their turns, so that the board is placed before it is captured by
+        whoever clicks fast. `at_once`: for what must not wait, as cancelling.
         """
 
-        def callback(_event: Any) -> None:
+        def call() -> None:
             try:
                 do()
             except Exception as error:
                 self.failed(error)
 
-        return callback
+        return (lambda _event: call()) if at_once else (lambda _event: self._queue(call))
 
     def safely_with(self, do: Callable[[Any], Any]) -> Callable[[Any], None]:
         """The same for a callback that needs viser's event, as those of gizmos and of the scene do."""
+        return lambda event: self.safely(lambda: do(event))(event)
 
-        def callback(event: Any) -> None:
-            self.safely(lambda: do(event))(event)
-
-        return callback
+    def _queue(self, call: Callable[[], None]) -> None:
+        with suppress(RuntimeError):  # the wizard ends
+            self.turns.submit(call)
 
 
 class Panel(Protocol):

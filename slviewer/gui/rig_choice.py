@@ -108,10 +108,19 @@ class RigChoice:
             return
         chosen = self._choice.value
         self._draw_folders()
+        operator, preset = self._stage.operator, self._presets.get(chosen)
         if chosen in SIMULATED:
-            self._stage.operator.choose_rig(SIMULATED[chosen])
-        elif chosen in self._presets and chosen != _REPLAY:
-            self._stage.operator.choose_rig(self._presets[chosen].choice)
+            granted = operator.choose_rig(SIMULATED[chosen])
+        elif preset is None or chosen == _REPLAY:
+            return
+        elif preset.problem:
+            granted = False
+            operator.tell("error", f"{chosen} cannot be used here: {preset.problem}")
+        else:
+            granted = operator.choose_rig(preset.choice)
+        if not granted:  # so that it says what is used, and the other can be chosen again
+            self._choice.value = self._chosen(operator.snapshot().rig)
+            self._draw_folders()
 
     def _try_again(self) -> None:
         choice = self._stage.operator.snapshot().rig.choice

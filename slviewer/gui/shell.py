@@ -73,7 +73,7 @@ class Shell:
             self._step_buttons[step.key] = button
         gui.add_divider()
         self._autopilot = gui.add_button("Autopilot", icon=viser.Icon.PLAYER_PLAY, color="teal", visible=False)
-        self._autopilot.on_click(stage.safely(self._toggle_autopilot))
+        self._autopilot.on_click(stage.safely(self._toggle_autopilot, at_once=True))
         self._autopilot_says = Words(gui)
         with gui.add_folder("Session", expand_by_default=True):
             self._session_says = Words(gui)
@@ -95,7 +95,7 @@ class Shell:
             self._wrong = Words(gui)
             self._job_says = Words(gui)
             self._cancel = gui.add_button("Cancel", icon=viser.Icon.PLAYER_STOP, color="red", visible=False)
-            self._cancel.on_click(stage.safely(stage.operator.cancel))
+            self._cancel.on_click(stage.safely(stage.operator.cancel, at_once=True))
             self._next = gui.add_button("Continue", icon=viser.Icon.ARROW_RIGHT, color="green", visible=False)
             self._next.on_click(stage.safely(self._continue))
             self._folders: dict[str, viser.GuiFolderHandle] = {}

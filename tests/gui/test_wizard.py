@@ -257,7 +257,7 @@ def test_a_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser
         for name in ("pose_01", "pose_02"):
             capture_pose(page, name)
         button(page, "Capture pose").click()
-        page.get_by_text("Capturing pose_03: frame").wait_for()
+        page.get_by_text("Capturing pose_03: frame").first.wait_for()
     finally:
         program.kill()
     page.context.close()

@@ -89,8 +89,10 @@ class Panel:
             self._stage.operator.set_exposure(now * _STOP if direction == "Brighter" else now / _STOP)
 
     def _shine(self, event: Any) -> None:
-        if event.client is not None:
-            self._stage.operator.shine(LIGHTS[self._light.value])
+        operator = self._stage.operator
+        if event.client is not None and not operator.shine(LIGHTS[self._light.value]):
+            now = operator.snapshot().rig.light
+            self._light.value = next(words for words, light in LIGHTS.items() if light == now)
 
 
 def _round_up(exposure_ms: float) -> float:
