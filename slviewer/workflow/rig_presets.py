@@ -86,7 +86,7 @@ def check_choice(choice: Choice, where: str) -> None:
         if (
             isinstance(value, bool)
             or not isinstance(value, int | float)
-            or value < 0
+            or not 0 <= value < float("inf")
             or (not value and key != _NUMBERS[0])
         ):
             raise InputError(f"{where}: {key} = {value!r} is no number above 0: mend it")

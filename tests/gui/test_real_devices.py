@@ -14,6 +14,7 @@ from slviewer.devices.channel import Channel
 from slviewer.fringe.decode import decode
 from slviewer.gui.app import App
 from slviewer.session.store import Session
+from slviewer.workflow.rig_presets import save_rig
 from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.rigs import set_up
 from slviewer.workflow.wizard.snapshot import Snapshot
@@ -96,3 +97,18 @@ def coordinates(folder: Path) -> None:
         assert np.mean(np.abs(off) < 0.5) >= 0.999  # NaN counts as wrong
         assert 0.0005 < np.sqrt(np.nanmean(off**2)) < 0.1 and abs(np.nanmean(off)) < 0.02
     assert capture.texture is not None and capture.texture.shape == (*SCREEN[::-1], 3)
+
+
+def test_a_rig_that_is_refused_leaves_the_one_in_use(opened: Opened, operator: Operator, tmp_path: Path) -> None:
+    page = opened.page
+    assert operator.session is not None
+    camera = {"driver": "opencv", "source": str(tmp_path / "no.avi")}
+    save_rig(operator.session, "gone", {"camera": camera, "projector": {"driver": "browser", "size": [640, 480]}})
+    assert operator.set_hands_free(False)  # anything that has the session read anew
+    button(page, "1. Rig").click()
+    for _ in range(2):  # it can be tried again
+        choose(page, "Rig", "gone")
+        expect(page.get_by_text("no.avi does not exist").first).to_be_visible()
+        expect(field(page, "Rig")).to_have_value("Simulated, quarter resolution")
+    assert sum("does not exist" in notice.text for notice in operator.snapshot().notices) == 2
+    assert operator.snapshot().rig.state == "open"

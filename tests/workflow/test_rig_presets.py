@@ -79,6 +79,8 @@ def test_a_choice_as_toml_is_the_same_choice():
     [
         ({"settle": 40}, "unknown key 'settle'"),
         ({"settle_ms": "40"}, "settle_ms = '40' is no number"),
+        ({"settle_ms": float("inf")}, "settle_ms = inf is no number"),
+        ({"focal_px": float("nan")}, "focal_px = nan is no number"),
         ({"exposure_ms": 0}, "exposure_ms = 0 is no number above 0"),
         ({"gain": True}, "gain = True is no number"),
         ({"name": 3}, "name = 3 is no text"),

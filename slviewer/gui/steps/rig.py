@@ -92,7 +92,7 @@ class Panel:
         operator = self._stage.operator
         if event.client is not None and not operator.shine(LIGHTS[self._light.value]):
             now = operator.snapshot().rig.light
-            self._light.value = next(words for words, light in LIGHTS.items() if light == now)
+            change(self._light, value=next(words for words, light in LIGHTS.items() if light == now))
 
 
 def _round_up(exposure_ms: float) -> float:

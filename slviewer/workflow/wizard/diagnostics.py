@@ -1,10 +1,14 @@
-"""What helps to find out why something went wrong elsewhere: versions, settings, logs, small previews; no frames."""
+"""What helps to find out why something went wrong elsewhere: versions, settings, logs, small previews.
+
+No frames, and no passwords, which may stand in the addresses of cameras.
+"""
 
 import importlib.metadata
 import json
 import logging
 import os
 import platform
+import re
 import sys
 import zipfile
 from collections import deque
@@ -22,6 +26,7 @@ from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.snapshot import PreviewView, Snapshot
 
 LINES = 4000
+_PASSWORD = re.compile(r"(?<=://)[^/\s\"'@]+(?=@)")
 PACKAGES = ("numpy", "opencv-python-headless", "numba", "scipy", "zarr", "open3d-cpu", "open3d", "viser", "trimesh")
 
 
@@ -55,11 +60,11 @@ def write_bundle(
     with delivered(session, name, report) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
         report(0.1, "versions and settings")
         bundle.writestr("versions.json", to_json(_versions()))
-        bundle.writestr("state.json", to_json(_state(snapshot)))
-        bundle.writestr("log.txt", "\n".join(log.lines) + "\n")
+        bundle.writestr("state.json", _without_passwords(to_json(_state(snapshot)).decode()))
+        bundle.writestr("log.txt", _without_passwords("\n".join(log.lines) + "\n"))
         for file in ("session.json", "decisions.json"):
             if (session.folder / file).is_file():
-                bundle.write(session.folder / file, f"session/{file}")
+                bundle.writestr(f"session/{file}", _without_passwords((session.folder / file).read_text("utf-8")))
         report(0.4, "captures and results")
         for capture in session.captures():
             described = {key: value for key, value in capture.meta.items() if key != "sequence"}
@@ -76,6 +81,10 @@ def write_bundle(
             bundle.writestr("previews/now.jpg", bytes(cv2.imencode(".jpg", preview.image)[1]))
     report(1.0, "collected")
     return name
+
+
+def _without_passwords(text: str) -> str:
+    return _PASSWORD.sub("…", text)
 
 
 def _versions() -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """What the operator decides of a rig: several exposures, a name, and what its choice says of its camera."""
 
+import logging
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -115,3 +117,17 @@ def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(operator: Oper
     now = operator.wait_for(lambda s: s.rig.name == "replay" and s.rig.state != "opening", 10.0)
     assert now is not None and now.rig.state == "open", now and now.rig.fault
     assert not operator.shine("dark") and "no dark frame" in last(operator.settle())
+
+
+def test_a_diagnostic_bundle_tells_no_password(tmp_path: Path) -> None:
+    with Operator(tmp_path / "session") as operator:
+        assert operator.session is not None
+        camera = {"driver": "opencv", "source": "rtsp://somebody:s3cret@camera.local/1", "size": [8, 8]}
+        operator.session.decide("rig", {"camera": camera, "projector": {"driver": "browser", "size": [8, 8]}})
+        logging.getLogger("slviewer").info("rtsp://somebody:s3cret@camera.local/1 is slow")
+        assert operator.diagnostic_bundle()
+        operator.settle()
+        with zipfile.ZipFile(next(operator.session.exports.glob("*.zip"))) as bundle:
+            texts = {name: bundle.read(name).decode() for name in bundle.namelist() if name.endswith(("json", "txt"))}
+    assert not any("s3cret" in text for text in texts.values())
+    assert "rtsp://…@camera.local/1" in texts["log.txt"] and "camera.local" in texts["session/decisions.json"]
