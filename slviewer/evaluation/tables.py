@@ -23,9 +23,9 @@ def rows(comparisons: Mapping[str, Comparison], *, letter: bool = False) -> list
 
     RMS and noise floor of each model in mm, for spheres the radius; ``ratio`` is the first model's RMS over the last's
     (in the last row, the ratio of the means). ``letter`` adds the Letter's figures of the pose whose number ends the
-    capture's name (``plane_03``, ``sphere_3``), stereo and pixelwise.
+    capture's name (``plane_03``, ``sphere_3``), stereo and pixelwise, and takes the ratio over pixelwise's RMS too.
     """
-    table = [_row(name, comparison) for name, comparison in comparisons.items()]
+    table = [_row(name, comparison, letter) for name, comparison in comparisons.items()]
     if letter:
         for row, comparison in zip(table, comparisons.values(), strict=True):
             row.update(_letter_figures(row["capture"], comparison.shape))
@@ -34,7 +34,7 @@ def rows(comparisons: Mapping[str, Comparison], *, letter: bool = False) -> list
     return table
 
 
-def _row(name: str, comparison: Comparison) -> Row:
+def _row(name: str, comparison: Comparison, letter: bool) -> Row:
     row: Row = {"capture": name}
     if comparison.incidence is not None:
         row["R1/R2/R3 %"] = "/".join(f"{share:.1f}".removesuffix(".0") for share in comparison.incidence.values())
@@ -46,10 +46,15 @@ def _row(name: str, comparison: Comparison) -> Row:
         if np.isfinite(comparison.coverage[model]):
             row[f"{model} coverage %"] = 100.0 * comparison.coverage[model]
         row[f"{model} set aside %"] = 100.0 * result.set_aside_share
-    rms = [result.rms_mm for result in comparison.results.values()]
-    if len(rms) > 1:
-        row["ratio"] = rms[0] / rms[-1]
+    models = list(comparison.results)
+    if len(models) > 1:
+        row["ratio"] = row[f"{models[0]} mm"] / row[f"{_rival(models, letter)} mm"]
     return row
+
+
+def _rival(models: list[str], letter: bool) -> str:
+    """The model that the first one's RMS is divided by."""
+    return "pixelwise" if letter and "pixelwise" in models else models[-1]
 
 
 def _letter_figures(capture: str, shape: str) -> Row:
@@ -82,7 +87,7 @@ def _means(table: list[Row], comparisons: Mapping[str, Comparison], letter: bool
             row[title] = float(np.mean(values))
     models = list(next(iter(comparisons.values())).results)
     if len(models) > 1:
-        row["ratio"] = row[f"{models[0]} mm"] / row[f"{models[-1]} mm"]
+        row["ratio"] = row[f"{models[0]} mm"] / row[f"{_rival(models, letter)} mm"]
     if letter:
         plane = next(iter(comparisons.values())).shape == "plane"
         radii = None if plane else (TABLE_2_RADIUS_MM[0][0], TABLE_2_RADIUS_MM[1][0])

@@ -15,7 +15,7 @@ from slviewer.evaluation.render import render
 from slviewer.evaluation.tables import rows
 from slviewer.workflow.merging import Merge
 
-MODELS = ("stereo", "pixelwise")
+MODELS = ("stereo", "pixelwise", "anchored")
 
 
 @dataclass(frozen=True)
