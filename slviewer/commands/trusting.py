@@ -20,3 +20,27 @@ def check(session: Positional[Path], capture: Positional[str], json: Path | None
     result = workflow.check(session, capture, **ui())
     write_json(json, result.to_json())
     print(result.text())
+
+
+@deferred
+def accept(
+    session: Positional[Path],
+    artefact: Path,
+    model: ModelName | None = None,
+    still: tuple[str, ...] = (),
+    apply_scale: bool = False,
+    json: Path | None = None,
+) -> None:
+    """Test a calibration with a ball bar, a sphere or a plane that has a certificate, against the operator's limits.
+
+    Args:
+        session: Session folder.
+        artefact: TOML file with what the certificate says, the captures that show the artefact, and the limits.
+        model: Which calibration to test; by default the best one available.
+        still: Captures (ten) of one still object, for the repeatability.
+        apply_scale: Record the scale that is found as a correction.
+        json: Write the result to this file too.
+    """
+    result = workflow.accept(session, artefact, model=model, still=still, apply_scale_found=apply_scale, **ui())
+    write_json(json, result.to_json())
+    print(result.text())

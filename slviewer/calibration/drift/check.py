@@ -78,7 +78,8 @@ class Drift:
             f"{self.capture}: {answer}",
             f"  the board seems {self.scale_ppm:+.0f} +- {self.scale_sigma_ppm:.0f} ppm larger than it is; {across}",
             f"  projector turned by {_three(self.turn_mrad, self.turn_sigma_mrad, '.3f')} mrad about its x, y, z",
-            f"  and shifted by {_three(shifts, shift_sigmas, '.0f')} um; baseline {1e3 * self.baseline_mm:+.0f} +- {1e3 * self.baseline_sigma_mm:.0f} um",
+            f"  and shifted by {_three(shifts, shift_sigmas, '.0f')} um;"
+            f" baseline {1e3 * self.baseline_mm:+.0f} +- {1e3 * self.baseline_sigma_mm:.0f} um",
             "  a pan and a shift along x look nearly alike, as do a nod and a shift along y: their sum is known far "
             "better than each",
             "  seen if it is the only change: turns from "

@@ -35,8 +35,9 @@ class Answer:
     """How far the projector seems to have moved in one view: ``change`` (6,) rad and mm, as ``Linear`` orders it.
 
     ``spreads``: by kind (6, 6), its covariance for errors of 1 px in every observation; ``by_growth`` (6,): what it
-    would be if only the board grew, relative to that. ``scale`` is how much larger than it is the board seems, ``across_px``
-    how far off its epipolar lines it seems on average (NaN with one axis), ``misfit_px`` what no change explains, RMS.
+    would be if only the board grew, relative to that. ``scale`` is how much larger than it is the board seems,
+    ``across_px`` how far off its epipolar lines on average (NaN with one axis), ``misfit_px`` the RMS that no change
+    explains.
     """
 
     name: str

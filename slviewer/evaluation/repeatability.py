@@ -1,0 +1,81 @@
+"""How well a measurement repeats itself, which says nothing of how true it is."""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+
+CAPTURES = 10
+LEAST_CAPTURES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Repeatability:
+    """The spread of depth at each pixel over captures of a still object, mm.
+
+    ``sigma_map`` (h, w) float32, NaN where not every capture measured; ``sigma_mm`` its median, ``sigma_95_mm`` what 95
+    % of the pixels stay below; ``predicted_mm`` the median of what the captures' noise predicts; ``wandering_mm`` how
+    far the mean depth moved from the lowest to the highest capture: warming up, not noise.
+    """
+
+    captures: int
+    pixels: int
+    sigma_mm: float
+    sigma_95_mm: float
+    predicted_mm: float
+    wandering_mm: float
+    sigma_map: np.ndarray
+
+    def text(self) -> str:
+        """For people."""
+        few = "" if self.captures >= CAPTURES else f" ({CAPTURES} are better)"
+        return (
+            f"repeatability over {self.captures} captures of a still object{few}: depth repeats to "
+            f"{self.sigma_mm:.4f} mm (median of {self.pixels} pixels; 95 % of them below {self.sigma_95_mm:.4f}); the "
+            f"noise predicts {self.predicted_mm:.4f} mm; the mean depth wandered by {self.wandering_mm:.4f} mm. "
+            "It says nothing of accuracy."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able, without the map."""
+        return {name: value for name, value in asdict(self).items() if name != "sigma_map"}
+
+
+def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> Repeatability:
+    """From (z, sigma_z) of each capture, (h, w) mm, NaN where invalid; one at a time, so that any number can be taken.
+
+    Raises InputError for fewer than three captures, captures of different size, and for no pixel that all measured.
+    """
+    count, means = 0, list[np.ndarray]()
+    for z, sigma_z in measured:
+        z = np.asarray(z, np.float64)
+        if count == 0:
+            first, mean, squares, noise = z, np.zeros_like(z), np.zeros_like(z), np.zeros_like(z)
+        elif z.shape != first.shape:
+            raise InputError(f"captures of {first.shape} and {z.shape} pixels are no repetition of one another")
+        count += 1
+        change = z - first  # small, so that squares keep their digits
+        step = change - mean
+        mean = mean + step / count
+        squares = squares + step * (change - mean)
+        noise = noise + np.asarray(sigma_z, np.float64) ** 2
+        means.append(change.astype(np.float32))
+    if count < LEAST_CAPTURES:
+        raise InputError(f"{count} captures show no repeatability: take {CAPTURES} of the same still object")
+    always = np.isfinite(squares)
+    if not always.any():
+        raise InputError("no pixel was measured in every capture: leave the object where it is, and in view")
+    sigma = np.sqrt(squares / (count - 1))
+    levels = [float(change[always].mean()) for change in means]
+    return Repeatability(
+        count,
+        int(np.count_nonzero(always)),
+        float(np.median(sigma[always])),
+        float(np.percentile(sigma[always], 95)),
+        float(np.nanmedian(np.sqrt(noise[always] / count))),
+        max(levels) - min(levels),
+        sigma.astype(np.float32),
+    )

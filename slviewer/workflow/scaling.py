@@ -1,0 +1,59 @@
+"""A scale that an acceptance test found and the operator applied: what later clouds are multiplied by."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from slviewer.evaluation.acceptance.result import Acceptance
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.session.store import Session
+
+
+def correction(store: Session, model: str) -> dict[str, Any] | None:
+    """What was applied to a calibration, as ``apply_scale`` recorded it; None where it was made anew."""
+    name = f"scale/{model}"
+    return store.load_result(name, only=())[0] if store.state_of(name) == "fresh" else None
+
+
+def scale_factor(store: Session, model: str) -> float:
+    """What a calibration's clouds are multiplied by: 1 where no correction was applied."""
+    applied = correction(store, model)
+    return 1.0 if applied is None else float(applied["factor"])
+
+
+def scaled(cloud: Cloud, factor: float) -> Cloud:
+    """The cloud, larger by a factor, its noise with it."""
+    if factor == 1.0:
+        return cloud
+    return replace(
+        cloud,
+        points=cloud.points * np.float32(factor),
+        sigma_z=cloud.sigma_z * np.float32(factor),
+        texture=cloud.texture,
+    )
+
+
+def apply_scale(store: Session, found: Acceptance) -> float:
+    """Record that the calibration's clouds are to be corrected by the scale that a test found; returns the new factor.
+
+    A correction that was in force during the test stays in it.
+    """
+    assert found.scale is not None
+    before = scale_factor(store, found.model)
+    factor = before / (1 + 1e-6 * found.scale.ppm)
+    calibration = f"calibration/{found.model}"
+    meta = {
+        "factor": factor,
+        "ppm": found.scale.ppm,
+        "U_ppm": found.scale.U_ppm,
+        "before": before,
+        "artefact": found.artefact.name,
+        "certificate": found.artefact.certificate,
+        "captures": [position.capture for position in found.positions],
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "inputs": store.input_hashes(calibration),
+    }
+    store.save_result(f"scale/{found.model}", meta, {})
+    return factor
