@@ -50,7 +50,7 @@ def intersect(rays, origin, axes, rotation, bounds, shape):
 
 
 @kernel()
-def _albedo(x, y, bounds, kind, pitch, cells, circles, radius, white, dark):
+def _albedo(x, y, bounds, kind, pitch, cells, circles, radius, mark, white, dark):
     """What is printed at one point: 0 beside the plate."""
     px, py = x - bounds[0], y - bounds[1]
     if not (0 <= px <= bounds[2] and 0 <= py <= bounds[3]):
@@ -60,7 +60,9 @@ def _albedo(x, y, bounds, kind, pitch, cells, circles, radius, white, dark):
         column = min(int(4 * px / pitch), cells.shape[1] - 1)
         nearest = cells[row, column]
         dx, dy = x - circles[nearest, 0], y - circles[nearest, 1]
-        return dark if dx * dx + dy * dy < radius * radius else white
+        mx, my = x - mark[0], y - mark[1]
+        inside = dx * dx + dy * dy < radius * radius or mx * mx + my * my < mark[2] * mark[2]
+        return dark if inside else white
     if kind == 2:
         column, row = math.floor(x / pitch), math.floor(y / pitch)
         inside = -1 <= column < cells[0, 0] and -1 <= row < cells[0, 1]
@@ -69,10 +71,11 @@ def _albedo(x, y, bounds, kind, pitch, cells, circles, radius, white, dark):
 
 
 @kernel(parallel=True)
-def coverage(xy, bounds, kind, pitch, cells, circles, radius, white, dark):
+def coverage(xy, bounds, kind, pitch, cells, circles, radius, mark, white, dark):
     """Mean albedo (h, w) float32 of each pixel; `xy` (h, w, 2) are the board coordinates of the pixels' centres.
 
-    kind: 0 blank, 1 circles (`cells` names the nearest circle for each quarter pitch), 2 chessboard (`cells` holds its
+    kind: 0 blank, 1 circles (`cells` names the nearest circle for each quarter pitch; `mark` (3,) is one more, x, y and
+    radius, 0 for none), 2 chessboard (`cells` holds its
     inner corners). A pixel whose centre and corners agree is taken as uniform; others are sampled 8x8 times.
     """
     h, w = xy.shape[:2]
@@ -86,13 +89,13 @@ def coverage(xy, bounds, kind, pitch, cells, circles, radius, white, dark):
             uy = (xy[i, right, 1] - xy[i, left, 1]) / (right - left)
             vx = (xy[down, j, 0] - xy[up, j, 0]) / (down - up)
             vy = (xy[down, j, 1] - xy[up, j, 1]) / (down - up)
-            centre = _albedo(x, y, bounds, kind, pitch, cells, circles, radius, white, dark)
+            centre = _albedo(x, y, bounds, kind, pitch, cells, circles, radius, mark, white, dark)
             uniform = True
             for a in (-0.5, 0.5):
                 for b in (-0.5, 0.5):
                     corner = _albedo(
                         x + a * ux + b * vx, y + a * uy + b * vy,
-                        bounds, kind, pitch, cells, circles, radius, white, dark,
+                        bounds, kind, pitch, cells, circles, radius, mark, white, dark,
                     )  # fmt: skip
                     uniform = uniform and corner == centre
             if uniform:
@@ -105,7 +108,7 @@ def coverage(xy, bounds, kind, pitch, cells, circles, radius, white, dark):
                     b = (n + 0.5) / _SUBSAMPLES - 0.5
                     total += _albedo(
                         x + a * ux + b * vx, y + a * uy + b * vy,
-                        bounds, kind, pitch, cells, circles, radius, white, dark,
+                        bounds, kind, pitch, cells, circles, radius, mark, white, dark,
                     )  # fmt: skip
             out[i, j] = total / (_SUBSAMPLES * _SUBSAMPLES)
     return out

@@ -9,6 +9,7 @@ from slviewer.errors import InputError
 from slviewer.simulation.board_kernels import coverage, intersect
 from slviewer.simulation.scenes import Surface
 from slviewer.target.board import Board
+from slviewer.target.mark import Mark, mark_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,8 @@ class BoardScene:
     """A white plate at `pose`, printed with `board`'s features, or blank if `board` is None.
 
     The plate reaches from `corner` to `corner + size` (x, y) in the board's frame, where the first feature is the
-    origin; `misplacement` (n, 2) mm is what has been added to the printed circles. Circles are `diameter_mm` wide.
+    origin; `misplacement` (n, 2) mm is what has been added to the printed circles. Circles are `diameter_mm` wide;
+    `mark` is the dot that tells the first one.
     """
 
     pose: Pose
@@ -61,6 +63,7 @@ class BoardScene:
     diameter_mm: float = 0.0
     white: float = 0.85
     dark: float = 0.09
+    mark: Mark | None = None
 
     @cached_property
     def features(self) -> np.ndarray:
@@ -88,9 +91,9 @@ class BoardScene:
             kind, pitch, cells = 2, self.board.pitch_mm, np.array([[self.board.columns, self.board.rows]], np.int32)
         else:
             kind, pitch, cells = 1, self.board.pitch_mm, self._cells
-        albedo = coverage(
-            xy, bounds, kind, pitch, cells, self.features[:, :2].copy(), self.diameter_mm / 2, self.white, self.dark
-        )
+        mark = np.array([self.mark.x, self.mark.y, self.mark.radius]) if self.mark else np.zeros(3)
+        circles = self.features[:, :2].copy()
+        albedo = coverage(xy, bounds, kind, pitch, cells, circles, self.diameter_mm / 2, mark, self.white, self.dark)
         outside = albedo == 0
         points[outside], normals[outside] = np.nan, np.nan
         return Surface(points, normals, albedo)
@@ -119,11 +122,13 @@ def printed_board(
     seed: int = 0,
     margin_mm: float | None = None,
     diameter_mm: float | None = None,
+    marked: bool = False,
 ) -> BoardScene:
     """`board` printed on a plate with `margin_mm` around its outermost features (default 1.5 pitches).
 
     `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a pitch wide unless
-    `diameter_mm` says otherwise. Raises `InputError` for ChArUco boards, which the simulation does not print.
+    `diameter_mm` says otherwise; `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco boards,
+    which the simulation does not print.
     """
     if board.kind == "charuco":
         raise InputError("the simulation does not print ChArUco boards: use circles, acircles or a chessboard")
@@ -138,8 +143,9 @@ def printed_board(
     if board.kind == "chessboard":
         misplacement *= 0  # its corners share edges, so that they cannot move one by one
     return BoardScene(
-        pose, board, (float(low[0]), float(low[1])), (float(size[0]), float(size[1])), shape, misplacement, diameter
-    )
+        pose, board, (float(low[0]), float(low[1])), (float(size[0]), float(size[1])), shape, misplacement, diameter,
+        mark=mark_of(board) if marked else None,
+    )  # fmt: skip
 
 
 def blank_board(pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: Shape = FLAT) -> BoardScene:

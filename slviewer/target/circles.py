@@ -11,6 +11,7 @@ from slviewer.target.board import Board
 from slviewer.target.centroid import refine_centres
 from slviewer.target.images import SEARCH_PX, BoardImage, advice, resized
 from slviewer.target.lattice import Lattice, grow_lattices, lay_pattern
+from slviewer.target.mark import marked_numbering
 from slviewer.target.numbering import check_grid, upright
 from slviewer.target.planar import fit_homography, jacobians
 
@@ -37,17 +38,20 @@ class _Seen:
         return len(self.lattice.nodes)
 
 
-def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float]:
-    """((n, 2) float64 px of every circle, their radius in mm); raises DetectionError with how many were seen."""
+def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float, bool]:
+    """((n, 2) float64 px of every circle, their radius in mm, whether the board's mark was seen); raises DetectionError
+    with how many circles were."""
     most: _Seen | None = None
     for seen in _attempts(board, image.grey):
         numberings = lay_pattern(board, seen.lattice)
         if numberings:
             _refuse_larger(board, seen.lattice, numberings)
-            blobs = seen.blobs.chosen(upright(board, seen.blobs.centres, numberings))
+            marked = marked_numbering(board, image.deep, seen.blobs.centres, numberings)
+            order = upright(board, seen.blobs.centres, numberings) if marked is None else marked
+            blobs = seen.blobs.chosen(order)
             _refuse_misshapen(board, blobs)
             pixels = _centres(board, image, blobs)
-            return pixels, _radius(board, blobs)
+            return pixels, _radius(board, blobs), marked is not None
         if most is None or len(seen) > len(most):
             most = seen
     raise DetectionError(_not_found(board, image, most))

@@ -33,9 +33,10 @@ class Detection:
 def detect(board: Board, image: np.ndarray) -> Detection:
     """The board's features in an image (h, w), or (h, w, 3) RGB, uint8 or uint16.
 
-    The numbering's x axis turns clockwise into its y axis in the image, always; which of a symmetric board's
-    numberings is taken, ``slviewer.target.numbering`` says. Raises DetectionError, whose message says what was seen
-    and what to do, rather than return a grid with a feature missing, misplaced or shifted.
+    The numbering's x axis turns clockwise into its y axis in the image, always. A symmetric board is numbered from its
+    mark (``slviewer.target.mark``); where none is seen, ``slviewer.target.numbering`` says which numbering is taken.
+    Raises DetectionError, whose message says what was seen and what to do, rather than return a grid with a feature
+    missing, misplaced or shifted.
     """
     board_image = BoardImage.of(image)
     if board.kind == "charuco":
@@ -44,8 +45,8 @@ def detect(board: Board, image: np.ndarray) -> Detection:
     ids = np.arange(len(board.points))
     if board.kind == "chessboard":
         return Detection(detect_chessboard(board, board_image), ids)
-    pixels, radius = detect_circles(board, board_image)
-    return Detection(pixels, ids, radius)
+    pixels, radius, marked = detect_circles(board, board_image)
+    return Detection(pixels, ids, radius, marked)
 
 
 def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,11 +1,11 @@
 """Which way round a board is numbered, and whether the numbered grid is one that a flat board can show.
 
-A board that looks the same turned by 180 degrees (symmetric circles, asymmetric circles with an even number of rows,
-chessboards whose columns + rows are even) is numbered with its x axis to the right in the image: of the two numberings,
-the one whose x axis points more along (2, 1) px, right and a little down. So an upright board counts from its top-left
-feature, a board whose rows run vertically counts from the top right, and neither changes when the board rolls by
-60 degrees clockwise or 25 degrees the other way. A board that looks the same turned by 90 degrees takes, of its four
-numberings, the one whose x axis points most to the right.
+Where no mark tells (``slviewer.target.mark``), a board that looks the same turned by 180 degrees (symmetric circles,
+asymmetric circles with an even number of rows, chessboards whose columns + rows are even) is numbered with its x axis
+to the right in the image: of the two numberings, the one whose x axis points more along (2, 1) px, right and a little
+down. So an upright board counts from its top-left feature, a board whose rows run vertically counts from the top right,
+and neither changes when the board rolls by 60 degrees clockwise or 25 degrees the other way. A board that looks the
+same turned by 90 degrees takes, of its four numberings, the one whose x axis points most to the right.
 """
 
 import numpy as np

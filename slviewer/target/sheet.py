@@ -9,6 +9,7 @@ from slviewer.errors import InputError
 from slviewer.target.board import Board
 from slviewer.target.charuco import opencv_board
 from slviewer.target.drawing import LARGEST_PDF_MM, Drawing
+from slviewer.target.mark import PLACE, QUIET, RADIUS, mark_of, neighbours_mm
 
 CIRCLE_SHARE = 0.5
 """Diameter of a printed circle over the distance to its nearest neighbour."""
@@ -19,8 +20,9 @@ FOOT_MM = 12.0
 def write_sheet(board: Board, path: Path | str, margin_mm: float | None = None) -> None:
     """Write a board as a .pdf or .svg page of the board's size, with a scale bar to check the print by.
 
-    ``margin_mm`` is the paper left around the board: by default half a pitch, and 10 mm or more. The page's right and
-    down are the board's x and y. Raises InputError for other suffixes, for pages that PDF cannot hold, and where the
+    ``margin_mm`` is the paper left around the board: by default what the mark of a board of circles needs, or half a
+    square, and 10 mm or more; in a margin that is too narrow there is no mark. The page's right and down are the
+    board's x and y. Raises InputError for other suffixes, for pages that PDF cannot hold, and where the
     file cannot be written.
     """
     path = Path(path)
@@ -42,17 +44,21 @@ def write_sheet(board: Board, path: Path | str, margin_mm: float | None = None) 
 
 def draw(board: Board, margin_mm: float | None = None) -> Drawing:
     """The board on its page."""
-    margin = max(10.0, board.pitch_mm / 2) if margin_mm is None else margin_mm
+    mark = mark_of(board)
+    radius = CIRCLE_SHARE / 2 * neighbours_mm(board)
+    room = (PLACE + RADIUS + QUIET) * neighbours_mm(board) - radius if mark else board.pitch_mm / 2
+    margin = max(10.0, room) if margin_mm is None else margin_mm
     if not margin >= 0:
         raise InputError(f"a margin of {margin} mm is not possible: give 0 or more")
-    radius = CIRCLE_SHARE / 2 * board.pitch_mm * (2**0.5 if board.kind == "acircles" else 1)
-    beyond = radius if board.kind in ("circles", "acircles") else board.pitch_mm
+    beyond = radius if mark else board.pitch_mm
     first = np.array([margin + beyond, margin + beyond])
     extent = np.ptp(board.points[:, :2], axis=0) + 2 * (margin + beyond)
     width, bottom = max(float(extent[0]), 40.0), float(extent[1])
     drawing = Drawing(width, bottom + FOOT_MM)
-    if board.kind in ("circles", "acircles"):
+    if mark:
         drawing.circles = [(x, y, radius) for x, y in (board.points[:, :2] + first).tolist()]
+        if margin >= room:
+            drawing.circles.append((first[0] + mark.x, first[1] + mark.y, mark.radius))
     else:
         drawing.rectangles = [(x + first[0], y + first[1], w, h) for x, y, w, h in _squares(board)]
     _add_foot(board, drawing, bottom)

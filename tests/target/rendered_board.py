@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from slviewer.target.board import Board
+from slviewer.target.mark import mark_of
 
 
 @dataclass(frozen=True)
@@ -13,8 +14,9 @@ class View:
     """How a board is seen.
 
     ``fill`` is the width or height of the board over the image's; ``tilt`` deg about an axis at ``axis`` deg in the
-    image; ``roll`` deg clockwise in the image; ``shift`` px; ``k1`` radial distortion in normalised coordinates;
-    ``shade`` the ratio of brightest to darkest light; ``hide`` a rectangle of the board in mm that shows paper.
+    image; ``roll`` deg clockwise in the image; ``shift`` px; ``marked`` a dot beside the first circle; ``k1`` radial
+    distortion in normalised coordinates; ``shade`` the ratio of brightest to darkest light; ``hide`` a rectangle of the
+    board in mm that shows paper.
     """
 
     size: tuple[int, int] = (640, 480)
@@ -31,6 +33,7 @@ class View:
     ink: float = 0.08
     diameter: float = 0.5
     inverted: bool = False
+    marked: bool = False
     sheet: float = 1.3
     hide: tuple[float, float, float, float] | None = None
     supersample: int = 8
@@ -103,6 +106,9 @@ class View:
 
     def albedo(self, board: Board, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         dark = dark_parts(board, x, y, self.diameter)
+        mark = mark_of(board)
+        if self.marked and mark is not None:
+            dark |= (x - mark.x) ** 2 + (y - mark.y) ** 2 < mark.radius**2
         if self.hide is not None:
             dark &= ~((x > self.hide[0]) & (y > self.hide[1]) & (x < self.hide[2]) & (y < self.hide[3]))
         margin = self.sheet * board.pitch_mm

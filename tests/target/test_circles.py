@@ -112,6 +112,46 @@ def test_a_symmetric_board_starts_where_the_rule_says(notation: str, roll: float
     assert sorted(apart.argmin(1)) == list(range(len(pixels))) and apart.min(1).max() < 0.5
 
 
+@pytest.mark.parametrize("notation", ["circles:9x7:20", "acircles:5x8:20", "circles:6x6:20", "acircles:4x9:20"])
+@pytest.mark.parametrize("roll", [0, 70, 130, 180, 250, 330])
+def test_a_marked_board_starts_at_its_mark(notation: str, roll: float) -> None:
+    board, view = Board.parse(notation), replace(SMALL, roll=roll, tilt=20, fill=0.6, shade=2, noise=1, marked=True)
+    detection = detect(board, view.render(board))
+    assert detection.marked
+    assert rms(detection.pixels - view.truth(board)) < 0.15
+    plain = detect(board, replace(view, marked=False).render(board))
+    assert not plain.marked
+    apart = np.linalg.norm(detection.pixels[:, None] - plain.pixels[None], axis=2).min(1)
+    assert np.sqrt((apart**2).mean()) < 0.02, "the dot does not pull its neighbour"
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        replace(SMALL, blur=2.0, roll=180, fill=0.6),
+        replace(SMALL, inverted=True, roll=180, fill=0.6, noise=2),
+        replace(SMALL, roll=180, tilt=45, axis=40, shade=6, fill=0.6),
+        replace(SMALL, roll=170, fill=0.35, noise=1),
+        replace(SMALL, roll=190, k1=0.4, tilt=20, fill=0.8),
+        replace(SMALL, roll=180, diameter=0.3, noise=3, fill=0.6),
+        replace(SMALL, roll=180, diameter=0.7, noise=3, fill=0.6),
+    ],
+)
+def test_the_mark_is_seen_whatever_the_view(view: View) -> None:
+    detection = detect(BOARD, replace(view, marked=True).render(BOARD))
+    assert detection.marked and rms(detection.pixels - view.truth(BOARD)) < 0.5
+    assert not detect(BOARD, view.render(BOARD)).marked
+
+
+def test_dirt_like_a_mark_at_both_ends_tells_nothing() -> None:
+    view = replace(SMALL, marked=True, fill=0.6)
+    image = view.render(BOARD)
+    both = np.minimum(image, np.rot90(image, 2))
+    detection = detect(BOARD, both)
+    assert not detection.marked
+    assert rms(detection.pixels - view.truth(BOARD)) < 0.1
+
+
 @pytest.mark.parametrize("roll", [0, 90, 145, 180, 270])
 def test_an_odd_asymmetric_board_is_numbered_by_its_own_pattern(roll: float) -> None:
     board, view = Board.parse("acircles:4x9:20"), replace(SMALL, roll=roll, tilt=20, fill=0.65)

@@ -12,6 +12,7 @@ from slviewer.errors import InputError
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 from slviewer.target.drawing import Drawing
+from slviewer.target.mark import mark_of
 from slviewer.target.sheet import draw, write_sheet
 
 NOTATIONS = ["circles:5x4:9", "acircles:4x5:20", "chessboard:6x5:12.345", "charuco:6x5:20"]
@@ -75,7 +76,18 @@ def test_distances_are_exact_to_a_micrometre(notation: str, suffix: str, tmp_pat
     np.testing.assert_allclose(rectangles, wanted.rectangles, atol=1e-3)
     assert notation in path.read_text() and "print at 100 %" in path.read_text()
     if board.kind in ("circles", "acircles"):
-        np.testing.assert_allclose(circles[:, :2] - circles[0, :2], board.points[:, :2], atol=1e-3)
+        grid, dot = circles[:-1], circles[-1] - [*circles[0, :2], 0]
+        np.testing.assert_allclose(grid[:, :2] - grid[0, :2], board.points[:, :2], atol=1e-3)
+        mark = mark_of(board)
+        assert mark is not None
+        np.testing.assert_allclose(dot, (mark.x, mark.y, mark.radius), atol=1e-3)
+
+
+def test_a_narrow_margin_has_no_mark_and_a_wide_one_leaves_paper_around_it() -> None:
+    board = Board.parse("circles:5x4:40")
+    assert len(draw(board, margin_mm=20.0).circles) == 20
+    x, y, r = draw(board).circles[-1]
+    assert len(draw(board).circles) == 21 and min(x, y) - r >= r
 
 
 def test_circles_are_half_the_distance_between_neighbours() -> None:
@@ -113,6 +125,10 @@ def test_a_printed_board_is_found_with_its_numbers(notation: str) -> None:
     corner = drawing.circles[0][:2] if drawing.circles else (10 + board.pitch_mm,) * 2
     expected = (board.points[:, :2] + corner) * 4 - 0.5
     np.testing.assert_array_equal(detection.ids, np.arange(len(board.points)))
+    assert detection.marked == ("circles" in notation)
+    turned = detect(board, np.rot90(rasterised(drawing), 2)).pixels  # the rule alone would count from the other end
+    if detection.marked:
+        np.testing.assert_allclose(turned, np.array(rasterised(drawing).shape[::-1]) - 1 - expected, atol=0.15)
     np.testing.assert_allclose(detection.pixels, expected, atol=0.15)
 
 
