@@ -1,0 +1,272 @@
+"""The adjustment's exact inversion, made fast: a rational function of each pixel, and a coarse grid of what it lacks.
+
+Along a camera ray depth is nearly a rational function of the projector's coordinate s, the Letter's eq. 9: that through
+three exact points of each pixel, ``z0 = (c0 + c1 s)/(1 + c2 s)``, is some hundredths of a millimetre off. The remainder
+varies slowly, and a grid over (u, v, z0) holds it.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from os import cpu_count
+
+import numpy as np
+from numba import prange
+from scipy.ndimage import binary_erosion
+
+from slviewer.calibration.splined.fields import image_of, ray_of
+from slviewer.calibration.splined.unknowns import Arrangement
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.jit import kernel
+
+CELLS_ACROSS = 100
+"""Of the grid, over the image's width: 16 px of 1600."""
+DEPTHS = 65
+MOST_CORRECTED = 0.02
+"""Of the depths between: beyond, the coordinate hardly moves with depth, or turns back, and measures none."""
+LEAST_MOVED = 0.005
+"""px a mm: a coordinate that moves less with depth measures no depth; the noise of a pixel would be many mm."""
+MARGIN = 0.25
+"""Of the projector's size: how far beyond its image the lens model is still followed along a ray."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compiled:
+    """One axis. ``coefficients`` (3, h, w) float32 for the coordinate less ``centre`` px; ``grid`` (nv, nu, nz) float32
+    mm, ``step`` px and (far - near)/(nz - 1) mm apart from pixel (0, 0) and ``near``; ``held`` is ``grid`` with NaN
+    where camera or projector cells were never lit. NaN where a ray meets the projector at no depth, or where
+    depth hardly moves the coordinate."""
+
+    coefficients: np.ndarray
+    centre: float
+    grid: np.ndarray
+    held: np.ndarray
+    step: int
+    near: float
+    far: float
+
+    def depth(self, phase: np.ndarray, px_per_rad: float, rays: np.ndarray, supported: bool) -> np.ndarray:
+        """(h, w, 3) float32 mm from absolute phase (h, w) float32; NaN where invalid or beyond near and far."""
+        out = np.empty((*phase.shape, 3), np.float32)
+        grid = self.held if supported else self.grid
+        numbers = np.array(
+            [px_per_rad, self.centre, self.near, (grid.shape[2] - 1) / (self.far - self.near)], np.float32
+        )
+        _evaluate(np.ascontiguousarray(phase, np.float32), numbers, self.coefficients, rays, grid, self.step, out)
+        return out
+
+    def depth_per_px(self, phase: np.ndarray, px_per_rad: float) -> np.ndarray:
+        """(h, w) float32 mm: |dz/ds| of the rational function at a phase map (h, w)."""
+        c0, c1, c2 = self.coefficients
+        s = phase * np.float32(px_per_rad) - np.float32(self.centre)
+        return np.asarray(np.abs(c1 - c0 * c2) / (1 + c2 * s) ** 2)
+
+
+def pixel_rays(rig: Arrangement) -> np.ndarray:
+    """(2, h, w) float64: the undistorted normalised point that each camera pixel sees."""
+    width, height = (int(n) for n in rig.camera.size)
+    rays = np.empty((2, height, width))
+    _by_rows(height, lambda rows: _rays(rig.camera, rows, rays))
+    return rays
+
+
+def compile_axis(
+    rig: Arrangement, axis: Axis, rays: np.ndarray, depths: tuple[float, float], lit: tuple[np.ndarray, np.ndarray]
+) -> Compiled:
+    """The fast form of one axis between two ``depths`` mm; ``lit``: the camera's and the projector's cells (rows,
+    columns) bool that target poses lit."""
+    near, far = depths
+    row = 0 if axis == "x" else 1
+    width, height = (int(n) for n in rig.camera.size)
+    centre = (float(rig.projector.size[row]) - 1) / 2
+    coefficients = np.empty((3, height, width), np.float32)
+    _by_rows(height, lambda rows: _rational(rig, row, centre, near, far, rays, rows, coefficients))
+    step = max(2, -(-width // CELLS_ACROSS))
+    shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
+    grid, known = np.full(shape, np.nan, np.float32), np.zeros(shape, np.bool_)
+    _by_rows(shape[0], lambda rows: _corrections(rig, row, centre, near, far, step, *lit, rows, grid, known))
+    # a pixel needs its eight nodes: growing the known by one node gives each pixel about its own answer
+    unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
+    held = np.where(unknown, np.float32(np.nan), grid)
+    return Compiled(coefficients, centre, grid, held, step, near, far)
+
+
+def _by_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
+    lanes = max(1, min(cpu_count() or 1, rows))
+    with ThreadPoolExecutor(lanes) as threads:
+        list(threads.map(lambda lane: work(np.arange(lane, rows, lanes)), range(lanes)))
+
+
+@kernel()
+def _rays(camera, rows, rays):
+    basis = np.zeros((4, 4))
+    for v in rows:
+        for u in range(rays.shape[2]):
+            rays[0, v, u], rays[1, v, u] = ray_of(camera, float(u), float(v), basis)
+
+
+@kernel()
+def _coordinates(rig, x, y, z, basis):
+    """Where the projector sees (x z, y z, z); NaN far outside its image."""
+    X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
+    X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
+    X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
+    if not X2 > 0.0:
+        return np.nan, np.nan
+    u, v = image_of(rig.projector, X0 / X2, X1 / X2, basis)
+    width, height = rig.projector.size[0], rig.projector.size[1]
+    if -MARGIN * width <= u <= (1.0 + MARGIN) * width and -MARGIN * height <= v <= (1.0 + MARGIN) * height:
+        return u, v
+    return np.nan, np.nan
+
+
+@kernel()
+def _reach(rig, x, y, near, far, basis):
+    """The depths between ``near`` and ``far`` at which a ray is near the projector's image; NaN if there are none."""
+    first = last = np.nan
+    for k in range(33):
+        z = near + (far - near) * k / 32.0
+        u, _ = _coordinates(rig, x, y, z, basis)
+        if np.isfinite(u):
+            if not np.isfinite(first):
+                first = z
+            last = z
+        elif np.isfinite(first):
+            break
+    for outward in range(2):  # to the edge itself, so that neighbouring pixels agree
+        inside = first if outward == 0 else last
+        limit = near if outward == 0 else far
+        if not np.isfinite(inside) or inside == limit:
+            continue
+        outside = inside + (limit - inside) / abs(limit - inside) * (far - near) / 32.0
+        for _ in range(20):
+            middle = 0.5 * (inside + outside)
+            if np.isfinite(_coordinates(rig, x, y, middle, basis)[0]):
+                inside = middle
+            else:
+                outside = middle
+        if outward == 0:
+            first = inside
+        else:
+            last = inside
+    return first, last
+
+
+@kernel()
+def _through_three(rig, row, centre, x, y, near, far, basis):
+    """(c0, c1, c2, first depth, last depth) of one ray."""
+    first, last = near, far
+    if np.isnan(_coordinates(rig, x, y, near, basis)[0]) or np.isnan(_coordinates(rig, x, y, far, basis)[0]):
+        first, last = _reach(rig, x, y, near, far, basis)
+        if not last - first > 1e-3 * (far - near):
+            return np.nan, np.nan, np.nan, np.nan, np.nan
+    # nodes of Chebyshev's polynomial in 1/z, in which the coordinate is nearly linear
+    z0 = z1 = z2 = s0 = s1 = s2 = 0.0
+    a, b = 1.0 / last, 1.0 / first
+    for k in range(3):
+        z = 1.0 / (0.5 * (a + b) + 0.433 * (b - a) * (k - 1))
+        found = _coordinates(rig, x, y, z, basis)
+        s = found[row] - centre
+        if k == 0:
+            z0, s0 = z, s
+        elif k == 1:
+            z1, s1 = z, s
+        else:
+            z2, s2 = z, s
+    # c0 + c1 s - c2 s z = z at the three, less the first
+    m00, m01, r0 = s1 - s0, s0 * z0 - s1 * z1, z1 - z0
+    m10, m11, r1 = s2 - s0, s0 * z0 - s2 * z2, z2 - z0
+    determinant = m00 * m11 - m01 * m10
+    if not (abs(determinant) > 0.0 and abs(s2 - s0) > LEAST_MOVED * abs(z2 - z0)):
+        return np.nan, np.nan, np.nan, np.nan, np.nan
+    c1 = (r0 * m11 - m01 * r1) / determinant
+    c2 = (m00 * r1 - r0 * m10) / determinant
+    return z0 - c1 * s0 + c2 * s0 * z0, c1, c2, first, last
+
+
+@kernel()
+def _rational(rig, row, centre, near, far, rays, rows, coefficients):
+    basis = np.zeros((4, 4))
+    for v in rows:
+        for u in range(rays.shape[2]):
+            c0, c1, c2, _, _ = _through_three(rig, row, centre, rays[0, v, u], rays[1, v, u], near, far, basis)
+            coefficients[0, v, u], coefficients[1, v, u], coefficients[2, v, u] = c0, c1, c2
+
+
+@kernel()
+def _is_lit(lit, u, v, size):
+    """Whether the cell of a pixel was lit; none is outside the image."""
+    if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
+        return False
+    column = min(int((u + 0.5) / size[0] * lit.shape[1]), lit.shape[1] - 1)
+    return lit[min(int((v + 0.5) / size[1] * lit.shape[0]), lit.shape[0] - 1), column]
+
+
+@kernel()
+def _corrections(rig, row, centre, near, far, step, camera_lit, projector_lit, rows, grid, known):
+    """What the exact depth has beyond the rational function's at the grid's nodes, and which of them poses support."""
+    basis = np.zeros((4, 4))
+    for j in rows:
+        for i in range(grid.shape[1]):
+            u, v = float(i * step), float(j * step)
+            x, y = ray_of(rig.camera, u, v, basis)
+            c0, c1, c2, first, last = _through_three(rig, row, centre, x, y, near, far, basis)
+            if np.isnan(c0):
+                continue
+            # the last nodes may lie past the image's edge, and stand for it
+            edge_u, edge_v = min(u, rig.camera.size[0] - 1.0), min(v, rig.camera.size[1] - 1.0)
+            seen = _is_lit(camera_lit, edge_u, edge_v, rig.camera.size)
+            for k in range(grid.shape[2]):
+                target = near + (far - near) * k / (grid.shape[2] - 1.0)
+                z = min(max(target, first), last)
+                pu, pv, change = np.nan, np.nan, np.inf
+                for _ in range(12):
+                    pu, pv = _coordinates(rig, x, y, z, basis)
+                    s = (pu if row == 0 else pv) - centre
+                    change = target - (c0 + c1 * s) / (1.0 + c2 * s)
+                    z = min(max(z + change, first), last)
+                    if not abs(change) > 1e-6:
+                        break
+                s = (pu if row == 0 else pv) - centre
+                correction = z - (c0 + c1 * s) / (1.0 + c2 * s)
+                settled = abs(change) < 1e-3 or z in (first, last)
+                if settled and abs(correction) < MOST_CORRECTED * (last - first):
+                    grid[j, i, k] = correction
+                    known[j, i, k] = seen and _is_lit(projector_lit, pu, pv, rig.projector.size)
+
+
+@kernel(parallel=True)
+def _evaluate(phase, numbers, c, rays, grid, step, out):
+    """Three passes a row: those without look-ups run in the processor's wide registers. Unsigned indices are taken as
+    they are, where signed ones would be tested for counting from the end."""
+    px_per_rad, centre, near, per_mm = numbers[0], numbers[1], numbers[2], numbers[3]
+    one, none, zero = np.float32(1.0), np.float32(np.nan), np.float32(0.0)
+    width, depths, next_one = phase.shape[1], np.uint32(grid.shape[2]), np.uint32(1)
+    deepest, per_step = np.float32(grid.shape[2] - 1.0001), np.float32(1.0 / step)
+    for v in prange(phase.shape[0]):
+        j = v // step
+        down = np.float32(v - j * step) * per_step
+        above, below = grid[j].ravel(), grid[j + 1].ravel()
+        table = np.empty(above.size, np.float32)  # the grid at this row
+        for i in range(above.size):
+            table[i] = above[i] + down * (below[i] - above[i])
+        z, cell, rest = np.empty(width, np.float32), np.empty(width, np.int32), np.empty(width, np.float32)
+        for u in range(width):
+            s = phase[v, u] * px_per_rad - centre
+            rational = (c[0, v, u] + c[1, v, u] * s) / (one + c[2, v, u] * s)
+            depth = (rational - near) * per_mm
+            measured = (depth >= zero) & (depth <= deepest)
+            depth = depth if measured else zero
+            k = np.int32(depth)
+            z[u], cell[u], rest[u] = rational if measured else none, k, depth - np.float32(k)
+        for i in range(grid.shape[1] - 1):
+            first = i * step
+            for q in range(min(step, width - first)):
+                here = np.uint32(first + q)
+                at = np.uint32(i) * depths + np.uint32(cell[here])
+                right, deep = np.float32(q) * per_step, rest[here]
+                a = table[at] + deep * (table[at + next_one] - table[at])
+                b = table[at + depths] + deep * (table[at + depths + next_one] - table[at + depths])
+                z[here] += a + right * (b - a)
+        for u in range(width):
+            out[v, u, 0], out[v, u, 1], out[v, u, 2] = rays[0, v, u] * z[u], rays[1, v, u] * z[u], z[u]

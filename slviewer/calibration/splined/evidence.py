@@ -1,0 +1,98 @@
+"""How much each observation and each prior counts: estimated from the residuals, never taken from constants."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.calibration.splined.normal import Data
+
+TUKEY = 4.685
+"""Sigmas beyond which an observation says nothing: 95 % efficient on normal residuals."""
+LEAST_SIGMA_PX = 1e-4
+PROBES = 24
+"""Random vectors that estimate a trace: to a percent of it."""
+STRENGTHS = (1e-1, 1e6)
+"""Bounds of a prior's strength, 1/px^2: a field of px and no prior, or no field."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations px: of a feature's coordinate in the camera, and what a sample's x and y scatter by beyond
+    their own predicted noise."""
+
+    camera_px: float
+    excess_px: tuple[float, float]
+
+    def sigmas(self, sample_sigma: np.ndarray) -> np.ndarray:
+        """(m, 2) px: of samples whose predicted noise is (m, 2)."""
+        return np.sqrt(sample_sigma**2 + np.square(self.excess_px))
+
+
+def measured_noise(features: np.ndarray, samples: np.ndarray, sample_sigma: np.ndarray) -> Noise:
+    """From residuals (n, 2) of features and (m, 2) of samples, robustly; what is NaN does not count."""
+    camera = 1.4826 * float(np.nanmedian(np.abs(features)))
+    excess = [_excess(samples[:, k], sample_sigma[:, k]) for k in range(2)]
+    return Noise(max(camera, LEAST_SIGMA_PX), (excess[0], excess[1]))
+
+
+def _excess(residuals: np.ndarray, sigma: np.ndarray) -> float:
+    """What, added to the predicted noise, makes the residuals' robust standard deviation 1."""
+    read = np.isfinite(residuals) & np.isfinite(sigma)
+    if not read.any():
+        return LEAST_SIGMA_PX
+    r, variance = np.abs(residuals[read]), sigma[read] ** 2
+    low, high = LEAST_SIGMA_PX, max(3.0 * float(np.median(r)), LEAST_SIGMA_PX)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        too_wide = 1.4826 * np.median(r / np.sqrt(variance + middle**2)) > 1.0
+        low, high = (middle, high) if too_wide else (low, middle)
+    return high
+
+
+def robust_weights(
+    features: np.ndarray, samples: np.ndarray, sample_sigma: np.ndarray, noise: Noise
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 2) and (m, 2) 1/px^2: one over the variance, times Tukey's biweight of both coordinates of one place."""
+    sigma = noise.sigmas(sample_sigma)
+    weights = []
+    for r, s in ((features, np.full_like(features, noise.camera_px)), (samples, sigma)):
+        scaled = np.minimum(np.abs(np.nan_to_num(r / s, nan=0.0)) / TUKEY, 1.0)
+        trust = np.prod((1.0 - scaled**2) ** 2, axis=1, keepdims=True)
+        weights.append(np.where(np.isfinite(r / s), trust / s**2, 0.0))
+    return weights[0], weights[1]
+
+
+def pose_trust(weights: tuple[np.ndarray, np.ndarray], sigmas: tuple[np.ndarray, np.ndarray], data: Data) -> np.ndarray:
+    """(poses, 2): the mean of Tukey's biweight over each pose's features, and over its samples."""
+    trust = []
+    for w, s, start in zip(weights, sigmas, (data.feature_from, data.sample_from), strict=True):
+        each = np.nanmax(np.where(np.isfinite(s), w * s**2, 0.0), axis=1)
+        total = np.concatenate([[0.0], np.cumsum(each)])
+        trust.append((total[start[1:]] - total[start[:-1]]) / np.maximum(np.diff(start), 1))
+    return np.stack(trust, axis=1)
+
+
+def better_strength(
+    strength: float,
+    form: np.ndarray,
+    field: np.ndarray,
+    first: int,
+    solve: Callable[[np.ndarray], np.ndarray],
+    size: int,
+) -> float:
+    """A prior's strength that makes the observations likelier (MacKay's fixed point).
+
+    The prior is exp(-strength/2 c'Fc) for each component c of ``field`` (2, n), F = ``form`` (n, n); the coefficients
+    stand at ``first`` in the vector of ``size`` unknowns, and ``solve`` applies the inverse of its normal matrix.
+    """
+    components, n = field.shape
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (components, n, PROBES))
+    right = np.zeros((size, PROBES))
+    right[first : first + components * n] = signs.reshape(-1, PROBES)
+    spread = solve(right)[first : first + components * n].reshape(signs.shape)
+    pulled = form @ signs
+    trace = float(np.sum(spread * pulled)) / PROBES
+    determined = max(components * n - strength * trace, 1.0)
+    energy = float(np.sum(field * (field @ form)))
+    return float(np.clip(determined / max(energy, 1e-12), *STRENGTHS))

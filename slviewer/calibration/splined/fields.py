@@ -1,0 +1,135 @@
+"""Displacements over an image as uniform cubic B-splines: what a lens does that Brown's polynomial cannot express.
+
+A point that pinhole and Brown put at pixel p is seen at p + W(p). ``coefficients`` (2, ny + 3, nx + 3) px hold W for
+ny x nx equal cells of the image, from its outer edge (-0.5) on; beyond the image W stays what it is at the edge.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from slviewer.geometry.brown import brown, unbrown
+from slviewer.geometry.jit import kernel
+
+CELLS_ACROSS = 26
+"""Of any image: half a wavelength of the finest distortion that matters holds two or three cells."""
+RIDGE = 0.05
+"""Of the squared coefficients, relative to their squared second differences: without data, W is nothing."""
+
+
+class Device(NamedTuple):
+    """A camera or projector in the compiled kernels: a ``Lens``'s ten ``numbers``, its field's ``coefficients``, and
+    the image's ``size`` (2,) float64 px."""
+
+    numbers: np.ndarray
+    coefficients: np.ndarray
+    size: np.ndarray
+
+
+def cells_for(size: tuple[int, int]) -> tuple[int, int]:
+    """Cells (across, down) of an image of ``size``: square ones where pixels are."""
+    return CELLS_ACROSS, int(np.clip(round(CELLS_ACROSS * size[1] / size[0]), 6, 2 * CELLS_ACROSS))
+
+
+def no_displacement(size: tuple[int, int]) -> np.ndarray:
+    """Coefficients of W = 0."""
+    across, down = cells_for(size)
+    return np.zeros((2, down + 3, across + 3))
+
+
+def roughness(coefficients: np.ndarray) -> np.ndarray:
+    """(n, n): the prior's quadratic form of one component's n coefficients, second differences and a small ridge."""
+    rows, columns = coefficients.shape[1:]
+    first = [sp.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
+    second = [sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)) for n in (columns, rows)]
+    uu = sp.kron(sp.eye(rows), second[0])
+    vv = sp.kron(second[1], sp.eye(columns))
+    uv = sp.kron(first[1], first[0])
+    form = uu.T @ uu + 2.0 * uv.T @ uv + vv.T @ vv + RIDGE * sp.eye(rows * columns)
+    return np.asarray(form.toarray())
+
+
+@kernel()
+def spline_basis(position, length, cells, weights, slopes):
+    """The cell of a position px, with the four splines' values and slopes a px there."""
+    x = (position + 0.5) * cells / length
+    rate = cells / length
+    if not x > 0.0:
+        x, rate = 0.0, 0.0
+    elif x > cells:
+        x, rate = float(cells), 0.0
+    cell = min(int(x), cells - 1)
+    f = x - cell
+    g = 1.0 - f
+    weights[0] = g * g * g / 6.0
+    weights[1] = (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0
+    weights[2] = (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0
+    weights[3] = f * f * f / 6.0
+    slopes[0] = -0.5 * g * g * rate
+    slopes[1] = (1.5 * f * f - 2.0 * f) * rate
+    slopes[2] = (2.0 * g - 1.5 * g * g) * rate
+    slopes[3] = 0.5 * f * f * rate
+    return cell
+
+
+@kernel()
+def displacement(device, u, v, basis):
+    """(du, dv, their slopes ddu/du, ddu/dv, ddv/du, ddv/dv, first column, first row) of W at a pixel.
+
+    ``basis`` (4, 4) is filled with the values and slopes of the splines across, then down.
+    """
+    c = device.coefficients
+    i = spline_basis(u, device.size[0], c.shape[2] - 3, basis[0], basis[1])
+    j = spline_basis(v, device.size[1], c.shape[1] - 3, basis[2], basis[3])
+    du = dv = duu = duv = dvu = dvv = 0.0
+    for a in range(4):
+        su = sv = tu = tv = 0.0
+        for b in range(4):
+            cu, cv = c[0, j + a, i + b], c[1, j + a, i + b]
+            su += basis[0, b] * cu
+            sv += basis[0, b] * cv
+            tu += basis[1, b] * cu
+            tv += basis[1, b] * cv
+        du += basis[2, a] * su
+        dv += basis[2, a] * sv
+        duu += basis[2, a] * tu
+        dvu += basis[2, a] * tv
+        duv += basis[3, a] * su
+        dvv += basis[3, a] * sv
+    return du, dv, duu, duv, dvu, dvv, i, j
+
+
+@kernel()
+def undisplaced(device, u, v, basis):
+    """The pixel (u, v) less the displacement that brought it there: q with q + W(q) = (u, v)."""
+    x, y = u, v
+    for _ in range(20):
+        du, dv, duu, duv, dvu, dvv, _, _ = displacement(device, x, y, basis)
+        eu, ev = u - x - du, v - y - dv
+        determinant = (1.0 + duu) * (1.0 + dvv) - duv * dvu
+        x += ((1.0 + dvv) * eu - duv * ev) / determinant
+        y += ((1.0 + duu) * ev - dvu * eu) / determinant
+        if abs(eu) + abs(ev) < 1e-7:  # the step just taken squares this
+            break
+    return x, y
+
+
+@kernel()
+def image_of(device, x, y, basis):
+    """The pixel of an undistorted normalised point, without derivatives; NaN past the fold of Brown's polynomial."""
+    k = device.numbers
+    if not x * x + y * y < k[9]:
+        return np.nan, np.nan
+    xd, yd, _, _, _ = brown(x, y, k)
+    u, v = k[0] * xd + k[2], k[1] * yd + k[3]
+    du, dv, _, _, _, _, _, _ = displacement(device, u, v, basis)
+    return u + du, v + dv
+
+
+@kernel()
+def ray_of(device, u, v, basis):
+    """The undistorted normalised point seen at a pixel, without derivatives; NaN where the inversion fails."""
+    k = device.numbers
+    x, y = undisplaced(device, u, v, basis)
+    return unbrown((x - k[2]) / k[0], (y - k[3]) / k[1], k)

@@ -1,0 +1,128 @@
+"""What the joint adjustment found, and how sure it is of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import solve_triangular
+
+from slviewer.calibration.splined.evidence import Noise
+from slviewer.calibration.splined.fields import Device
+from slviewer.calibration.splined.posterior import point_rows
+from slviewer.calibration.splined.unknowns import Arrangement, State
+from slviewer.fringe.sequence import Axis
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """One pose: RMS px of its features in the camera and of its samples in the projector (outliers set aside), and how
+    far each is trusted, 0 ... 1; undisturbed ones reach 0.8."""
+
+    camera_rms_px: float
+    projector_rms_px: float
+    camera_trust: float
+    projector_trust: float
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """The unknowns of ``poses``, and their information.
+
+    ``points`` (f, 3) mm: the board's features, whose offsets the state has. ``strengths`` 1/px^2: of the camera's and
+    the projector's prior. ``left_out``: poses set aside, with the reason. ``camera_poses`` and ``projector_poses``:
+    how many poses lit each cell of the fields (rows, columns).
+
+    ``factor`` (n, n) lower triangular: factor @ factor.T is the information (inverse covariance, 1/px^2 and so on) of
+    the rig's n unknowns in the order of ``Layout`` from ``rig`` on, with poses and board marginalised out.
+    """
+
+    state: State
+    poses: tuple[str, ...]
+    points: np.ndarray
+    noise: Noise
+    strengths: tuple[float, float]
+    fits: Mapping[str, PoseFit]
+    left_out: Mapping[str, str]
+    depth_range_mm: tuple[float, float]
+    camera_poses: np.ndarray
+    projector_poses: np.ndarray
+    factor: np.ndarray
+    steps: int
+
+    def point_jacobian(self, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> sp.csr_matrix:
+        """(3 n, unknowns) mm a unit: how the points measured at camera ``pixels`` (n, 2) and depths ``z`` (n,) from the
+        phase of one axis answer to the rig's unknowns; x, y, z of the first point, then of the next. NaN where the
+        projector cannot see the point.
+        """
+        return point_rows(self.state, axis, pixels, z)
+
+    def whitened(self, jacobian: sp.csr_matrix | np.ndarray) -> np.ndarray:
+        """(unknowns, m) Y with Y.T @ Y the covariance of what has ``jacobian`` (m, unknowns) by the rig's unknowns."""
+        dense = jacobian if isinstance(jacobian, np.ndarray) else jacobian.toarray()
+        right = np.asarray(dense, self.factor.dtype).T
+        return np.asarray(solve_triangular(self.factor, right, lower=True, check_finite=False))
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is not an array, JSON-able."""
+        return {
+            "poses": list(self.poses),
+            "noise": {"camera_px": self.noise.camera_px, "excess_px": list(self.noise.excess_px)},
+            "strengths": list(self.strengths),
+            "fits": {name: vars(fit) for name, fit in self.fits.items()},
+            "left_out": dict(self.left_out),
+            "depth_range_mm": list(self.depth_range_mm),
+            "steps": self.steps,
+        }
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Flat named arrays, for saving; the factor packed, in float32."""
+        rig = self.state.rig
+        arrays = {
+            f"{name}_{key}": value
+            for name, device in (("camera", rig.camera), ("projector", rig.projector))
+            for key, value in device._asdict().items()
+        }
+        return arrays | {
+            "R": rig.R,
+            "t": rig.t,
+            "R_board": self.state.R_board,
+            "t_board": self.state.t_board,
+            "heights": self.state.heights,
+            "offsets": self.state.offsets,
+            "points": self.points,
+            "camera_poses": self.camera_poses,
+            "projector_poses": self.projector_poses,
+            "factor": self.factor[np.tril_indices(len(self.factor))].astype(np.float32),
+        }
+
+    @classmethod
+    def restored(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Bundle":
+        """The inverse of ``to_dict`` and ``to_arrays``."""
+        devices = [
+            Device(*(np.ascontiguousarray(arrays[f"{name}_{key}"]) for key in Device._fields))
+            for name in ("camera", "projector")
+        ]
+        a = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+        rig = Arrangement(devices[0], devices[1], a["R"], a["t"])
+        state = State(rig, a["R_board"], a["t_board"], a["heights"], a["offsets"])
+        layout = state.layout
+        n = layout.size - layout.rig
+        factor = np.zeros((n, n), np.float32)
+        factor[np.tril_indices(n)] = a["factor"]
+        excess, strengths, depths = data["noise"]["excess_px"], data["strengths"], data["depth_range_mm"]
+        return cls(
+            state=state,
+            poses=tuple(data["poses"]),
+            points=a["points"],
+            noise=Noise(data["noise"]["camera_px"], (excess[0], excess[1])),
+            strengths=(strengths[0], strengths[1]),
+            fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
+            left_out=data["left_out"],
+            depth_range_mm=(depths[0], depths[1]),
+            camera_poses=a["camera_poses"],
+            projector_poses=a["projector_poses"],
+            factor=factor,
+            steps=data["steps"],
+        )

@@ -1,0 +1,200 @@
+"""What the unknowns predict, with analytic derivatives: features in the camera, and the projector's coordinates of what
+a camera pixel sees on the board.
+
+Derivatives follow the vector of ``unknowns``, with a small dense row for pose (6), height (12), offset (2) and rig
+(24), and for each field the splines' values at one place, from which a row's entries are products.
+"""
+
+import numpy as np
+
+from slviewer.calibration.splined.board_shape import height_at
+from slviewer.calibration.splined.fields import displacement, undisplaced
+from slviewer.geometry.brown import brown, unbrown
+from slviewer.geometry.jit import kernel
+
+POSE, HEIGHT, OFFSET, CAMERA, PROJECTOR, TURN, SHIFT, DENSE = 0, 6, 18, 20, 29, 38, 41, 44
+"""Where each group begins in a dense row, and the row's length."""
+
+
+@kernel()
+def seen_by(device, X, basis, by_point, by_lens):
+    """(u, v, first column, first row of the field's cell) of a point X (3,) in the device's frame.
+
+    Fills ``by_point`` (2, 3) and ``by_lens`` (2, 9); the derivative by the field's coefficients is ``basis``'s product.
+    """
+    k = device.numbers
+    inverse = 1.0 / X[2]
+    x, y = X[0] * inverse, X[1] * inverse
+    if not (X[2] > 0.0 and x * x + y * y < k[9]):
+        return np.nan, np.nan, 0, 0
+    xd, yd, dxx, dxy, dyy = brown(x, y, k)
+    u, v = k[0] * xd + k[2], k[1] * yd + k[3]
+    du, dv, duu, duv, dvu, dvv, i, j = displacement(device, u, v, basis)
+    r2 = x * x + y * y
+    # d(u, v before displacement) by x, y; and by the lens's numbers
+    ux, uy, vx, vy = k[0] * dxx, k[0] * dxy, k[1] * dxy, k[1] * dyy
+    for c in range(9):
+        by_lens[0, c] = 0.0
+        by_lens[1, c] = 0.0
+    by_lens[0, 0], by_lens[1, 1], by_lens[0, 2], by_lens[1, 3] = xd, yd, 1.0, 1.0
+    power = r2
+    for c in (4, 5, 8):
+        by_lens[0, c], by_lens[1, c] = k[0] * x * power, k[1] * y * power
+        power *= r2
+    by_lens[0, 6], by_lens[1, 6] = k[0] * 2.0 * x * y, k[1] * (r2 + 2.0 * y * y)
+    by_lens[0, 7], by_lens[1, 7] = k[0] * (r2 + 2.0 * x * x), k[1] * 2.0 * x * y
+    by_point[0, 0], by_point[0, 1] = ux * inverse, uy * inverse
+    by_point[1, 0], by_point[1, 1] = vx * inverse, vy * inverse
+    by_point[0, 2] = -(ux * x + uy * y) * inverse
+    by_point[1, 2] = -(vx * x + vy * y) * inverse
+    for row in (by_point, by_lens):
+        for c in range(row.shape[1]):
+            a, b = row[0, c], row[1, c]
+            row[0, c] = (1.0 + duu) * a + duv * b
+            row[1, c] = dvu * a + (1.0 + dvv) * b
+    return u + du, v + dv, i, j
+
+
+@kernel()
+def looking(device, u, v, basis, by_lens, by_field):
+    """(x, y, first column, first row): the undistorted normalised point that a camera pixel sees.
+
+    Fills ``by_lens`` (2, 9), and ``by_field`` (2, 2): by a displacement along u and v where the field is evaluated.
+    """
+    k = device.numbers
+    qu, qv = undisplaced(device, u, v, basis)
+    xd, yd = (qu - k[2]) / k[0], (qv - k[3]) / k[1]
+    x, y = unbrown(xd, yd, k)
+    if not np.isfinite(x):
+        return np.nan, np.nan, 0, 0
+    _, _, duu, duv, dvu, dvv, i, j = displacement(device, qu, qv, basis)
+    _, _, dxx, dxy, dyy = brown(x, y, k)
+    determinant = dxx * dyy - dxy * dxy
+    ixx, ixy, iyy = dyy / determinant, -dxy / determinant, dxx / determinant
+    r2 = x * x + y * y
+    # right-hand sides: d(xd, yd), less d(Brown) by its own coefficients
+    for c in range(9):
+        a = b = 0.0
+        if c == 0:
+            a = -xd / k[0]
+        elif c == 1:
+            b = -yd / k[1]
+        elif c == 2:
+            a = -1.0 / k[0]
+        elif c == 3:
+            b = -1.0 / k[1]
+        elif c == 4:
+            a, b = -x * r2, -y * r2
+        elif c == 5:
+            a, b = -x * r2 * r2, -y * r2 * r2
+        elif c == 6:
+            a, b = -2.0 * x * y, -(r2 + 2.0 * y * y)
+        elif c == 7:
+            a, b = -(r2 + 2.0 * x * x), -2.0 * x * y
+        else:
+            a, b = -x * r2 * r2 * r2, -y * r2 * r2 * r2
+        by_lens[0, c] = ixx * a + ixy * b
+        by_lens[1, c] = ixy * a + iyy * b
+    # q + W(q) = pixel: dq = -(1 + dW)^-1 dW's coefficients
+    scale = -1.0 / ((1.0 + duu) * (1.0 + dvv) - duv * dvu)
+    quu, quv, qvu, qvv = scale * (1.0 + dvv), -scale * duv, -scale * dvu, scale * (1.0 + duu)
+    for c in range(2):
+        a = (quu if c == 0 else quv) / k[0]
+        b = (qvu if c == 0 else qvv) / k[1]
+        by_field[0, c] = ixx * a + ixy * b
+        by_field[1, c] = ixy * a + iyy * b
+    return x, y, i, j
+
+
+@kernel()
+def feature_row(rig, R, t, heights, frame, point, offset, work, row):
+    """(u, v, first column, first row): where the camera sees a feature of the board at pose (R, t).
+
+    Fills ``row`` (2, 44), and in ``work.camera_basis`` the splines.
+    """
+    x, y = point[0] + offset[0], point[1] + offset[1]
+    z, zx, zy = height_at(x, y, frame, heights, work.terms)
+    L = work.local
+    X = work.point
+    for a in range(3):
+        L[a] = R[a, 0] * x + R[a, 1] * y + R[a, 2] * z
+        X[a] = L[a] + t[a]
+    u, v, i, j = seen_by(rig.camera, X, work.camera_basis, work.by_point, work.by_lens)
+    row[:] = 0.0
+    if not np.isfinite(u):
+        return u, v, i, j
+    for k in range(2):
+        m0, m1, m2 = work.by_point[k, 0], work.by_point[k, 1], work.by_point[k, 2]
+        # a turn w moves the point by w x L
+        row[k, POSE] = m2 * L[1] - m1 * L[2]
+        row[k, POSE + 1] = m0 * L[2] - m2 * L[0]
+        row[k, POSE + 2] = m1 * L[0] - m0 * L[1]
+        row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = m0, m1, m2
+        along = m0 * R[0, 2] + m1 * R[1, 2] + m2 * R[2, 2]
+        for c in range(heights.shape[0]):
+            row[k, HEIGHT + c] = along * work.terms[0, c]
+        row[k, OFFSET] = m0 * R[0, 0] + m1 * R[1, 0] + m2 * R[2, 0] + along * zx
+        row[k, OFFSET + 1] = m0 * R[0, 1] + m1 * R[1, 1] + m2 * R[2, 1] + along * zy
+        for c in range(9):
+            row[k, CAMERA + c] = work.by_lens[k, c]
+    return u, v, i, j
+
+
+@kernel()
+def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
+    """(u_p, v_p, then first column and row in the camera's field, and in the projector's): where the projector lights
+    what camera pixel (u, v) sees of the board at pose (R, t).
+
+    Fills ``row`` (2, 44), ``by_field`` (2, 2) by the camera's displacement, and both bases of ``work``.
+    """
+    row[:] = 0.0
+    x, y, ci, cj = looking(rig.camera, u, v, work.camera_basis, work.ray_by_lens, work.ray_by_field)
+    facing = R[0, 2] * x + R[1, 2] * y + R[2, 2]
+    if not (np.isfinite(x) and facing != 0.0):
+        return np.nan, np.nan, ci, cj, 0, 0
+    s = (R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2]) / facing
+    Y, N = work.local, work.normal
+    for _ in range(4):  # onto the bent surface: the bow is a thousandth of the distance, so this squares fast
+        Y[0], Y[1], Y[2] = s * x - t[0], s * y - t[1], s - t[2]
+        bx = R[0, 0] * Y[0] + R[1, 0] * Y[1] + R[2, 0] * Y[2]
+        by = R[0, 1] * Y[0] + R[1, 1] * Y[1] + R[2, 1] * Y[2]
+        bz = R[0, 2] * Y[0] + R[1, 2] * Y[1] + R[2, 2] * Y[2]
+        z, zx, zy = height_at(bx, by, frame, heights, work.terms)
+        for a in range(3):
+            N[a] = R[a, 2] - R[a, 0] * zx - R[a, 1] * zy
+        facing = N[0] * x + N[1] * y + N[2]
+        error = bz - z
+        s -= error / facing
+        if abs(error) < 1e-10:
+            break
+    # point s (x, y, 1), moved along the ray by the surface's motion, and across it by the ray's
+    X, V = work.point, work.turned
+    for a in range(3):
+        V[a] = s * (rig.R[a, 0] * x + rig.R[a, 1] * y + rig.R[a, 2])
+        X[a] = V[a] + rig.t[a]
+    pu, pv, pi, pj = seen_by(rig.projector, X, work.projector_basis, work.by_point, work.by_lens)
+    if not np.isfinite(pu):
+        return np.nan, np.nan, ci, cj, pi, pj
+    for k in range(2):
+        p0, p1, p2 = work.by_point[k, 0], work.by_point[k, 1], work.by_point[k, 2]
+        row[k, TURN] = p2 * V[1] - p1 * V[2]
+        row[k, TURN + 1] = p0 * V[2] - p2 * V[0]
+        row[k, TURN + 2] = p1 * V[0] - p0 * V[1]
+        row[k, SHIFT], row[k, SHIFT + 1], row[k, SHIFT + 2] = p0, p1, p2
+        m0 = p0 * rig.R[0, 0] + p1 * rig.R[1, 0] + p2 * rig.R[2, 0]
+        m1 = p0 * rig.R[0, 1] + p1 * rig.R[1, 1] + p2 * rig.R[2, 1]
+        m2 = p0 * rig.R[0, 2] + p1 * rig.R[1, 2] + p2 * rig.R[2, 2]
+        along = (m0 * x + m1 * y + m2) / facing
+        row[k, POSE] = along * (Y[1] * N[2] - Y[2] * N[1])
+        row[k, POSE + 1] = along * (Y[2] * N[0] - Y[0] * N[2])
+        row[k, POSE + 2] = along * (Y[0] * N[1] - Y[1] * N[0])
+        row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = along * N[0], along * N[1], along * N[2]
+        for c in range(heights.shape[0]):
+            row[k, HEIGHT + c] = along * work.terms[0, c]
+        ex, ey = s * (m0 - along * N[0]), s * (m1 - along * N[1])
+        for c in range(9):
+            row[k, CAMERA + c] = ex * work.ray_by_lens[0, c] + ey * work.ray_by_lens[1, c]
+            row[k, PROJECTOR + c] = work.by_lens[k, c]
+        for c in range(2):
+            by_field[k, c] = ex * work.ray_by_field[0, c] + ey * work.ray_by_field[1, c]
+    return pu, pv, ci, cj, pi, pj

@@ -1,0 +1,142 @@
+"""What the adjustment estimates, and where each unknown stands in its vector."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from slviewer.calibration.splined.board_shape import TERMS
+from slviewer.calibration.splined.fields import Device, no_displacement
+from slviewer.calibration.stereo import StereoModel
+from slviewer.geometry.brown import fold_radius_squared
+from slviewer.geometry.lens import Lens
+
+LENS = 9
+"""fx fy cx cy k1 k2 p1 p2 k3."""
+RIG = 2 * LENS + 6
+"""Both lenses, then rotation and translation."""
+
+
+class Arrangement(NamedTuple):
+    """Camera, projector, and X_p = R X_c + t, for the compiled kernels."""
+
+    camera: Device
+    projector: Device
+    R: np.ndarray
+    t: np.ndarray
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Order of the unknowns: poses (6 each), height, offsets (2 each), then the rig: both lenses (9 each), rotation and
+    translation, the camera's field and the projector's (u's coefficients, then v's).
+
+    What is the rig's stands last, so that the last block of a Cholesky factor is the rig's own information with all
+    else marginalised out.
+    """
+
+    poses: int
+    features: int
+    camera_knots: int
+    projector_knots: int
+
+    @property
+    def height(self) -> int:
+        return 6 * self.poses
+
+    @property
+    def offsets(self) -> int:
+        return self.height + TERMS
+
+    @property
+    def rig(self) -> int:
+        return self.offsets + 2 * self.features
+
+    @property
+    def camera_field(self) -> int:
+        return self.rig + RIG
+
+    @property
+    def projector_field(self) -> int:
+        return self.camera_field + 2 * self.camera_knots
+
+    @property
+    def size(self) -> int:
+        return self.projector_field + 2 * self.projector_knots
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The unknowns' values. ``R_board`` (p, 3, 3), ``t_board`` (p, 3): board to camera; ``heights`` (12,) and
+    ``offsets`` (f, 2) mm: the board's shape."""
+
+    rig: Arrangement
+    R_board: np.ndarray
+    t_board: np.ndarray
+    heights: np.ndarray
+    offsets: np.ndarray
+
+    @classmethod
+    def start(cls, stereo: StereoModel, poses: list[str], features: int) -> "State":
+        """Where a stereo calibration leaves off: no displacement, a flat board."""
+        rig = stereo.rig
+        devices = [
+            Device(lens.parameters, no_displacement(lens.size), np.array(lens.size, float))
+            for lens in (rig.camera, rig.projector)
+        ]
+        T = np.array([stereo.poses[name] for name in poses])
+        return cls(
+            Arrangement(devices[0], devices[1], rig.R.copy(), rig.t.copy()),
+            np.ascontiguousarray(T[:, :3, :3]),
+            np.ascontiguousarray(T[:, :3, 3]),
+            np.zeros(TERMS),
+            np.zeros((features, 2)),
+        )
+
+    @property
+    def layout(self) -> Layout:
+        knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
+        return Layout(len(self.t_board), len(self.offsets), knots[0], knots[1])
+
+    def moved(self, step: np.ndarray) -> "State":
+        """The state after a step in the vector's order; rotations turn from the left by small rotation vectors."""
+        at = self.layout
+        pose = step[: at.height].reshape(-1, 6)
+        rig, s = self.rig, step[at.rig :]
+        fields = np.split(step[at.camera_field :], [2 * at.camera_knots])
+        return replace(
+            self,
+            rig=Arrangement(
+                _moved(rig.camera, s[:LENS], fields[0]),
+                _moved(rig.projector, s[LENS : 2 * LENS], fields[1]),
+                turned(rig.R, s[2 * LENS : 2 * LENS + 3]),
+                rig.t + s[2 * LENS + 3 : RIG],
+            ),
+            R_board=np.array([turned(R, w) for R, w in zip(self.R_board, pose[:, :3], strict=True)]),
+            t_board=self.t_board + pose[:, 3:],
+            heights=self.heights + step[at.height : at.offsets],
+            offsets=self.offsets + step[at.offsets : at.rig].reshape(-1, 2),
+        )
+
+
+def lens_of(device: Device) -> Lens:
+    """The pinhole and Brown part of a device."""
+    fx, fy, cx, cy, *D = device.numbers[:LENS]
+    size = int(device.size[0]), int(device.size[1])
+    return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
+
+
+def turned(R: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """(3, 3): R turned from the left, and a rotation to rounding still."""
+    u, _, v = np.linalg.svd(cv2.Rodrigues(np.ascontiguousarray(vector))[0] @ R)
+    return np.asarray(u @ v)
+
+
+def _moved(device: Device, numbers: np.ndarray, coefficients: np.ndarray) -> Device:
+    k = device.numbers[:LENS] + numbers
+    return Device(
+        np.append(k, fold_radius_squared(k[4:])),
+        device.coefficients + coefficients.reshape(device.coefficients.shape),
+        device.size,
+    )
