@@ -56,7 +56,7 @@ class Budget:
         without = f", WITHOUT {' and '.join(self.unknown)}" if self.unknown else ""
         return "\n".join(
             [
-                f"uncertainty of a length of {self.length_mm:.0f} mm between two fitted centres:",
+                f"uncertainty of a length of {self.length_mm:.0f} mm:",
                 render(table),
                 f"U = {self.U_mm:.4f} mm (k = 2){without}",
             ]

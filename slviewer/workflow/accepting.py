@@ -140,7 +140,7 @@ def read_artefact(path: Path | str) -> Artefact:
 
 def _captures(store: Session, thing: Artefact) -> dict[str, str]:
     """{capture: position}; a capture's own name where a pattern stands for several."""
-    found = {}
+    found: dict[str, str] = {}
     for position, pattern in thing.positions.items():
         names = [name for name in store.capture_names() if fnmatchcase(name, pattern)]
         if not names:
@@ -160,7 +160,7 @@ def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) 
     errors = np.array([f.error_mm for p in test.positions for f in p.figures if f.property == name])
     noise = float(np.sqrt(np.mean([p.noise_mm**2 for p in test.positions])))
     scatter = None if len(errors) < 2 else float(np.sqrt(max(errors.var(ddof=1) - noise**2, 0.0)))
-    left = 0.0 if applied is not None else abs(scale.ppm)
+    left = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0  # known, and left in
     board = mm * 1e-6 * float(np.hypot(scale.u_ppm, left))
     warmth = mm * 1e-6 * thing.expansion.ppm_per_kelvin * thing.temperature.U_kelvin / 2
     drift, since = None, "no drift check of this calibration: run `slviewer check`"
@@ -174,7 +174,7 @@ def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) 
             Contribution("phase noise", noise, "A", "the scatter of the points about their fits"),
             Contribution("calibration", scatter, "A", f"the errors' scatter over {len(errors)} places"),
             Contribution(
-                "board scale", board, "B", "this test's scale" + ("" if applied is not None else ", not corrected")
+                "board scale", board, "B", "this test's scale" + (", which was left uncorrected" if left else "")
             ),
             Contribution("temperature", warmth, "B", f"{thing.expansion.ppm_per_kelvin:g} ppm/K of the artefact"),
             Contribution("drift", drift, "B", since),

@@ -1,0 +1,93 @@
+"""The drift check against rigs whose projector has moved by a known amount, or not at all."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated_views import BOARD, moved, poses, seen
+
+from slviewer.calibration.drift.check import Drift, check_drift
+from slviewer.calibration.drift.floor import LEAST_POSES, refer
+from slviewer.calibration.drift.view import View
+from slviewer.calibration.stereo import calibrate_stereo
+from slviewer.errors import InputError
+from slviewer.simulation.rig import letter
+
+RIG = letter(0.5, seed=3)
+LATER = poses(RIG, 20, seed=77)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    observations = [seen(RIG, pose, f"pose_{i}") for i, pose in enumerate(poses(RIG, 20, seed=3))]
+    model = calibrate_stereo(observations, RIG.projector.size, str(BOARD))
+    return refer(model.rig, [View.of(o) for o in observations if o.name in model.poses])
+
+
+def checked(reference, rig, i, name="later", **how) -> Drift:
+    return check_drift(reference, View.of(seen(rig, LATER[i], f"{name}_{i}", **how)))
+
+
+def test_an_unmoved_rig_raises_no_alarm(reference):
+    found = [checked(reference, RIG, i) for i in range(20)]
+    assert [d.verdict for d in found] == ["still good"] * 20
+    assert sum(d.chance < 0.05 for d in found) <= 4  # chance is what it says
+    assert np.mean([d.chance for d in found]) == pytest.approx(0.5, abs=0.25)
+
+
+@pytest.mark.parametrize(
+    ("what", "how"),
+    [
+        ("nod", {"turn_mrad": (0.05, 0, 0)}),
+        ("pan", {"turn_mrad": (0, 0.05, 0)}),
+        ("roll", {"turn_mrad": (0, 0, 0.05)}),
+        ("baseline", {"baseline_mm": 0.010}),
+    ],
+)
+def test_small_movements_are_seen_in_19_of_20(reference, what, how):
+    rig = moved(RIG, **how)
+    found = [checked(reference, rig, i, what) for i in range(20)]
+    assert sum(d.verdict == "recalibrate" for d in found) >= 19
+    assert all(what in d.reasons[0] for d in found if d.reasons)
+
+
+def test_what_is_said_of_a_movement_is_right(reference):
+    pan = checked(reference, moved(RIG, (0, 0.2, 0)), 1)
+    assert pan.turn_mrad[1] == pytest.approx(0.2, abs=4 * pan.turn_sigma_mrad[1])
+    assert 500 < abs(pan.scale_ppm) < 1000 and pan.scale_sigma_ppm < 30
+    nod = checked(reference, moved(RIG, (0.2, 0, 0)), 1)
+    assert abs(nod.across_px) == pytest.approx(0.2e-3 * 2800, rel=0.05)
+    assert abs(nod.scale_ppm) < 300
+    longer = checked(reference, moved(RIG, baseline_mm=0.2), 1)
+    assert longer.baseline_mm == pytest.approx(0.2, abs=4 * longer.baseline_sigma_mm)
+    assert longer.scale_ppm == pytest.approx(-1e6 * 0.2 / 180, rel=0.1)
+
+
+def test_one_axis_says_what_it_cannot_see(reference):
+    still = checked(reference, RIG, 2, axes=("x",))
+    assert still.verdict == "still good" and still.across_px is None
+    assert any("nod" in sentence and "axis x alone" in sentence for sentence in still.unseen)
+    assert not any("pan" in sentence for sentence in still.unseen)
+    assert checked(reference, moved(RIG, (0, 0.05, 0)), 2, axes=("x",)).verdict == "recalibrate"
+    assert checked(reference, moved(RIG, (0.05, 0, 0)), 2, axes=("x",)).verdict == "still good"
+
+
+def test_a_refocused_lens_is_no_movement(reference):
+    fx, fy = RIG.projector.focal_px
+    k1, *others = RIG.projector.brown
+    other = replace(RIG, projector=replace(RIG.projector, focal_px=(fx, fy * 1.002), brown=(k1 + 0.05, *others)))
+    found = checked(reference, other, 3)
+    assert found.verdict == "recalibrate" and "refocused" in found.reasons[0]
+
+
+def test_an_answer_survives_json(reference):
+    found = checked(reference, moved(RIG, (0.05, 0.05, 0)), 4)
+    assert Drift.from_dict(json.loads(json.dumps(found.to_dict()))) == found
+    assert "recalibrate, because" in found.text()
+
+
+def test_too_few_poses_set_no_floor(reference):
+    views = [View.of(seen(RIG, pose, "few")) for pose in LATER[: LEAST_POSES - 1]]
+    with pytest.raises(InputError, match=f"{LEAST_POSES} are needed"):
+        refer(reference.rig, views)
