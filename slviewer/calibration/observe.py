@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.board_plane import BoardPlane
+from slviewer.calibration.edges import bright_pixels
 from slviewer.calibration.local_fit import local_values
 from slviewer.calibration.samples import Samples, block_samples
 from slviewer.errors import DetectionError, InputError
@@ -20,12 +21,10 @@ from slviewer.geometry.splines import Surface, fit_surface
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
-READING = 3
+READING = 4
 """How poses are read; what a session keeps of another reading is read anew."""
 SAMPLES = 30_000
 """Pixels that one smoothing fit takes; more change the result by less than the noise."""
-LEAST_CLEAR = 0.25
-"""Share of the bright pixels within half a pitch that must lie clear of contrast edges, or edges are approached."""
 AXES: tuple[Axis, ...] = ("x", "y")
 CELLS_PER_WIDTH = 14
 """Spline cells across the image: half the wavelength of the finest lens distortion worth keeping, and no finer."""
@@ -211,32 +210,6 @@ def pitch_px(board: Board, detection: Detection) -> np.ndarray:
         ahead, behind = (cv2.perspectiveTransform((points + s)[None], H)[0] for s in (step, -step))
         lengths.append(np.linalg.norm(ahead - behind, axis=1))
     return np.minimum(*lengths)
-
-
-def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarray:
-    """(h, w) bool: valid pixels of the board's bright parts, clear of the contrast edges.
-
-    Across an edge the camera's PSF mixes a dark and a bright phase; dark parts carry little light. Bright means more
-    than half of the modulation found within a pitch. How clear depends on what there is: between the squares and the
-    markers of a ChArUco board run strips of a few pixels.
-    """
-    modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
-    shrink = max(1, int(pitch // 12))
-    small = cv2.blur(modulation, (shrink, shrink))[::shrink, ::shrink] if shrink > 1 else modulation
-    reach = 2 * int(np.ceil(0.7 * pitch / shrink)) + 1
-    crest = cv2.dilate(small, np.ones((reach, reach), np.uint8))
-    crest = cv2.resize(crest, modulation.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    bright = (modulation > 0.5 * crest) & (modulation > 0)
-    dark = cv2.morphologyEx(  # a lone pixel lost to noise is no edge
-        (~bright).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
-    )
-    clear = np.zeros_like(bright)
-    window = (2 * int(pitch / 2) + 1,) * 2
-    around = cv2.blur(bright.astype(np.float32), window)
-    for margin in range(int(np.clip(pitch / 12, 1, 3)), 0, -1):
-        few = cv2.blur(clear.astype(np.float32), window) < LEAST_CLEAR * around
-        clear |= few & bright & (cv2.dilate(dark, np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)) == 0)
-    return clear
 
 
 def _projector_pixels(
