@@ -24,18 +24,20 @@ def calibrate_centred(
     projector_size: tuple[int, int],
     board: str = "",
     left_out: Mapping[str, str] | None = None,
+    *,
+    strict: bool = True,
 ) -> tuple[StereoModel, list[Observation]]:
     """``calibrate_stereo`` from the circles' centroids, then once more from their centres; and the poses it used,
     centred.
 
     Raises what ``calibrate_stereo`` does.
     """
-    stereo = calibrate_stereo(observations, projector_size, board, left_out)
+    stereo = calibrate_stereo(observations, projector_size, board, left_out, strict=strict)
     used = [o for o in observations if o.name in stereo.poses]
     corrected = centred(used, stereo)
     if all(new is old for new, old in zip(corrected, used, strict=True)):
         return stereo, used
-    stereo = calibrate_stereo(corrected, projector_size, board, stereo.left_out)
+    stereo = calibrate_stereo(corrected, projector_size, board, stereo.left_out, strict=strict)
     return stereo, [o for o in corrected if o.name in stereo.poses]
 
 

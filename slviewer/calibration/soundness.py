@@ -24,6 +24,16 @@ def check_enough(used: Sequence[Observation], left_out: Mapping[str, str]) -> No
 
 def check_tilts(used: Sequence[Observation]) -> None:
     """Parallel boards share their vanishing line and say nothing of the focal length."""
+    spread = nominal_tilt_spread_deg(used)
+    if spread < MIN_TILT_SPREAD_DEG:
+        raise CalibrationRejected(
+            f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees): "
+            "tilt the board by 15 to 30 degrees, in different directions"
+        )
+
+
+def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
+    """The largest angle between two boards, as a lens of a usual focal length would see them; 0 for less than two."""
     normals = []
     for o in used:
         width, height = o.size
@@ -33,13 +43,10 @@ def check_tilts(used: Sequence[Observation]) -> None:
         nominal = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
         normal = nominal.T @ line
         normals.append(normal / np.linalg.norm(normal) * np.sign(normal[2] or 1))
+    if len(normals) < 2:
+        return 0.0
     cosines = np.clip(np.array(normals) @ np.array(normals).T, -1, 1)
-    spread = float(np.degrees(np.arccos(cosines.min())))
-    if spread < MIN_TILT_SPREAD_DEG:
-        raise CalibrationRejected(
-            f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees): "
-            "tilt the board by 15 to 30 degrees, in different directions"
-        )
+    return float(np.degrees(np.arccos(cosines.min())))
 
 
 def check_handedness(used: Sequence[Observation]) -> None:

@@ -105,12 +105,15 @@ def calibrate_stereo(
     projector_size: tuple[int, int],
     board: str = "",
     left_out: Mapping[str, str] | None = None,
+    *,
+    strict: bool = True,
 ) -> StereoModel:
     """Pinhole and Brown (k1 k2 p1 p2 k3) for both devices, and their relative pose, from board features.
 
     Features beyond 6 robust sigma, and poses most of whose features are, are set aside and named. Raises
     CalibrationRejected where the poses cannot determine the devices: too few, all parallel, or features that
-    contradict the model.
+    contradict the model. Not ``strict``: a solution to look into and not to use, whatever it contradicts; raises only
+    where there is none.
     """
     left_out = dict(left_out or {})
     kept: dict[str, np.ndarray] = {}
@@ -127,8 +130,9 @@ def calibrate_stereo(
             kept[observation.name] = usable
     used = [o for o in observations if o.name in kept]
     check_enough(used, left_out)
-    check_handedness(used)
-    check_tilts(used)
+    if strict:
+        check_handedness(used)
+        check_tilts(used)
 
     for _ in range(4):
         solution = _Solution.fit(used, [kept[o.name] for o in used], projector_size)
@@ -144,7 +148,10 @@ def calibrate_stereo(
                 )
                 used = [o for o in used if o.name != name]
         check_enough(used, left_out)
-    return solution.model(used, kept, board, left_out)
+    model = solution.model(used, kept, board, left_out)
+    if strict:
+        _check_agreement(model)
+    return model
 
 
 @dataclass(frozen=True)
@@ -244,15 +251,7 @@ class _Solution:
         every = np.concatenate(list(residuals.values()))
         rms = {"camera": _rms_px(every[:, :2]), "projector": _rms_px(every[:, 2:])}
         rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
-        if rms["stereo"] > MAX_REPROJECTION_PX:
-            raise CalibrationRejected(
-                f"the reprojection error is {rms['stereo']:.1f} px (camera {rms['camera']:.1f}, projector "
-                f"{rms['projector']:.1f}), above {MAX_REPROJECTION_PX:g}: check the target's notation, the projector's "
-                "size, the fringe period, and that x and y are not exchanged"
-            )
         z = np.concatenate(depths)
-        if z.min() <= 0:
-            raise CalibrationRejected("the solution puts the board behind the camera: check the target's notation")
         return StereoModel(
             rig=self.rig,
             board=board,
@@ -266,6 +265,18 @@ class _Solution:
             features_set_aside=int(sum((~k).sum() for name, k in kept.items() if name in poses)),
             residuals_px=residuals,
         )
+
+
+def _check_agreement(model: StereoModel) -> None:
+    rms = model.reprojection_rms_px
+    if rms["stereo"] > MAX_REPROJECTION_PX:
+        raise CalibrationRejected(
+            f"the reprojection error is {rms['stereo']:.1f} px (camera {rms['camera']:.1f}, projector "
+            f"{rms['projector']:.1f}), above {MAX_REPROJECTION_PX:g}: check the target's notation, the projector's "
+            "size, the fringe period, and that x and y are not exchanged"
+        )
+    if model.depth_range_mm is not None and model.depth_range_mm[0] <= 0:
+        raise CalibrationRejected("the solution puts the board behind the camera: check the target's notation")
 
 
 def _rms_px(residuals: np.ndarray) -> float:

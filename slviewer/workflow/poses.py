@@ -1,19 +1,22 @@
 """What each target pose says, computed once and kept in the session beside the frames it came from."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slviewer.calibration.diagnosis.evidence import PoseEvidence
 from slviewer.calibration.observe import READING, Observation, Smoothing, observe
-from slviewer.errors import DetectionError, InputError
+from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.target.detect import detect
+from slviewer.target.detect import Detection, detect
 from slviewer.workflow.decoding import capture_texture, check_projector, decoded
+from slviewer.workflow.evidence import examine as examine_frames
+from slviewer.workflow.evidence import keep_evidence, known_evidence
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,7 @@ class Judged:
     name: str
     observation: Observation | None
     refused: str = ""
+    evidence: PoseEvidence | None = None
 
 
 def judge(
@@ -32,17 +36,27 @@ def judge(
     phases: dict[Axis, PhaseMap],
     board: Board,
     smoothing: Smoothing,
+    examine: bool = False,
 ) -> Judged:
     """Detect the board and read the pose, and keep what was found in the session.
 
-    Raises InputError where the codes contradict the projector's size: that is no fault of one pose.
+    ``examine``: look at its frames too, for what may be wrong with them.
     """
-    check_projector(capture.name, capture.sequence, phases)
+    texture = capture_texture(capture, frames)
+    found: Detection | None = None
+    seen: Observation | None = None
+    refused = ""
     try:
-        found = detect(board, capture_texture(capture, frames))
-        judged = Judged(capture.name, observe(capture.name, board, found, phases, smoothing))
-    except DetectionError as error:
-        judged = Judged(capture.name, None, str(error))
+        found = detect(board, texture)
+        seen = observe(capture.name, board, found, phases, smoothing)
+        check_projector(capture.name, capture.sequence, phases)
+    except InputError as error:
+        refused = str(error).removeprefix(f"{capture.name}: ")
+    evidence = None
+    if examine:
+        evidence = examine_frames(capture.name, capture.sequence, frames, phases, board, texture, found, seen, refused)
+        keep_evidence(store, capture, board, evidence)
+    judged = Judged(capture.name, None if refused else seen, refused, evidence)
     meta = {
         "target": str(board),
         "smoothing": _settings(smoothing),
@@ -68,10 +82,13 @@ def known(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judg
     return Judged(name, Observation.from_arrays(name, store.load_result(result)[1]))
 
 
-def judge_all(store: Session, names: Sequence[str], board: Board, smoothing: Smoothing) -> Iterator[Judged]:
+def judge_all(
+    store: Session, names: Sequence[str], board: Board, smoothing: Smoothing, examine: bool = False
+) -> Iterator[Judged]:
     """Every pose in order; frames are read only where a pose is not known yet.
 
-    Raises InputError where poses come from cameras or projectors of different size.
+    ``examine``: each with the evidence of its frames. Raises InputError where poses come from cameras or projectors of
+    different size.
     """
     captures = [store.load_capture(name) for name in names]
     for capture in captures[1:]:
@@ -83,9 +100,13 @@ def judge_all(store: Session, names: Sequence[str], board: Board, smoothing: Smo
                 "calibrate poses of one rig at one resolution"
             )
     kept = {name: known(store, name, board, smoothing) for name in names}
+    if examine:
+        for name, judged in kept.items():
+            evidence = known_evidence(store, name, board)
+            kept[name] = replace(judged, evidence=evidence) if judged and evidence else None
     fresh = decoded(store, [name for name in names if kept[name] is None])
     for name in names:
-        yield kept[name] or judge(store, *next(fresh), board, smoothing)
+        yield kept[name] or judge(store, *next(fresh), board, smoothing, examine)
 
 
 def load_observations(store: Session, names: Sequence[str]) -> list[Observation]:

@@ -1,0 +1,207 @@
+"""Causes that lie in how poses were captured, or in how their frames are described."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from slviewer.calibration.diagnosis.evidence import Evidence
+from slviewer.calibration.diagnosis.frames import gamma_of
+from slviewer.calibration.diagnosis.poses import MOST, ORDER, frame_order, severity, was_refused, where
+from slviewer.calibration.diagnosis.verdict import Cause, Finding, Severity
+
+MAX_OUTSIDE = 0.01
+MAX_SATURATED = 0.12
+SPOILT_BY_SATURATION = 0.3
+MAX_GAMMA = 1.5
+PERIOD_OFF = 0.04
+PERIOD_SIGMAS = 4.0
+ASPECTS = (0.5, 1.0, 2.0)
+"""Of square pixels, and of the diamond pixels of some DMDs."""
+ASPECT_OFF = 0.05
+
+_ORDER_REMEDY: dict[Cause, str] = {
+    "frame-lag": "let the camera wait longer after each pattern (the preflight measures the delay), and capture again",
+    "missing-frame": "trigger the camera by the projector or wait longer for each frame, and capture again; of "
+    "imported frames, look for the file that is missing",
+    "frame-order": "run the preflight, and capture again",
+}
+
+
+def frame_faults(e: Evidence) -> Iterator[Finding]:
+    """Frames that lag, are lost or out of order, by what most explains them."""
+    orders = {pose.name: order for pose in e.poses if (order := frame_order(pose))}
+    for cause in ORDER:
+        names = tuple(name for name, order in orders.items() if order == cause)
+        if names:
+            mended = all(name in e.set_aside or was_refused(e, name) for name in names)
+            yield Finding(
+                cause, severity(e, names, mended), f"{where(e, names)} {ORDER[cause]}", _ORDER_REMEDY[cause], names
+            )
+
+
+def saturation(e: Evidence) -> Iterator[Finding]:
+    """Boards that clip."""
+    shares = {pose.name: max((a.saturated for a in pose.axes.values()), default=0.0) for pose in e.poses}
+    names = tuple(name for name, share in shares.items() if share > MAX_SATURATED)
+    if not names:
+        return
+    usual = float(np.median([shares[name] for name in names]))
+    severity: Severity = "doubtful" if len(names) > 0.25 * len(e.poses) else "note"
+    if len(names) >= MOST * len(e.poses) and (usual > SPOILT_BY_SATURATION or e.solution is None):
+        severity = "rejected"
+    yield Finding(
+        "saturation",
+        severity,
+        f"{where(e, names)} {100 * usual:.0f} % of the board's lit pixels are saturated",
+        "lower the exposure or the gain until white stays below the camera's full scale, and capture again",
+        names,
+    )
+
+
+def mirrored(e: Evidence) -> Iterator[Finding]:
+    """Axes exchanged or reversed: the projector sees a mirror image of what the camera sees."""
+    turns = [(pose.name, np.array(pose.turn)) for pose in e.poses if pose.turn is not None and not frame_order(pose)]
+    turned = [(name, turn) for name, turn in turns if np.linalg.det(turn) < 0]
+    if len(turned) <= MOST * len(turns):
+        return
+    mean = np.mean([turn / np.linalg.norm(turn, axis=1, keepdims=True) for _, turn in turned], axis=0)
+    names = tuple(name for name, _ in turned)
+    seen = (
+        f"in {len(turned)} of {len(turns)} poses the projector's coordinates are a mirror image of what the camera sees"
+    )
+    if mirror_kind(mean) == "axes-swapped":
+        yield Finding(
+            "axes-swapped",
+            "rejected",
+            f"{seen}, as if x and y were exchanged",
+            "exchange the x and y (V and H) frames in the description of the sequence, or in the projector",
+            names,
+        )
+    else:
+        axis = "x" if mean[0, 0] < 0 else "y"
+        across, mode = ("left and right", "rear or mirror") if axis == "x" else ("top and bottom", "flip")
+        yield Finding(
+            "axis-reversed",
+            "rejected",
+            f"{seen}, as if its {axis} axis were reversed ({across})",
+            f"switch off the projector's {mode} mode, or number its {'columns' if axis == 'x' else 'rows'} from the "
+            "other end",
+            names,
+        )
+
+
+def mirror_kind(turn: np.ndarray) -> Cause:
+    """Of a mirrored (2, 2) turn from camera to projector: which exchange leaves devices that stand upright."""
+    reversed_, swapped = abs(turn[0, 0]) + abs(turn[1, 1]), abs(turn[0, 1]) + abs(turn[1, 0])
+    return "axes-swapped" if swapped > reversed_ else "axis-reversed"
+
+
+def period(e: Evidence) -> Iterator[Finding]:
+    """A fringe period that is not the one described."""
+    if e.contradiction:
+        sentence, _, remedy = e.contradiction.partition(": ")
+        yield Finding("fringe-period", "rejected", sentence, remedy or "mend the sequence's description")
+        return
+    if any(mirrored(e)):  # whatever the code says, it is not of this axis, or from its other end
+        return
+    sound = [pose for pose in e.poses if not frame_order(pose)]
+    wrong = {}
+    for axis in ("x", "y"):
+        seen = np.array([p.axes[axis].period_seen_px for p in sound if axis in p.axes])
+        seen = seen[np.isfinite(seen)]
+        if len(seen) < 3:
+            continue
+        said = float(np.median([p.axes[axis].period_px for p in sound if axis in p.axes]))
+        middle = float(np.median(seen))
+        sigma = 1.4826 * 1.2533 * float(np.median(np.abs(seen - middle))) / np.sqrt(len(seen))
+        if abs(middle / said - 1) > PERIOD_OFF and abs(middle - said) > PERIOD_SIGMAS * sigma:
+            wrong[axis] = (said, middle)
+    if wrong:
+        both = " and ".join(
+            f"{axis}: {seen:.1f} px seen, {said:g} px described" for axis, (said, seen) in wrong.items()
+        )
+        yield Finding(
+            "fringe-period",
+            "rejected",
+            f"the fringes do not have the period that the sequence's description gives ({both}), by where the Gray "
+            "code's edges fall in them",
+            "correct period_px in the description, or project the patterns without scaling",
+        )
+    elif e.solution is not None and e.solution.aspect > 0:
+        ratio = min((e.solution.aspect / a for a in ASPECTS), key=lambda r: abs(np.log(r)))
+        if abs(ratio - 1) > ASPECT_OFF:
+            yield Finding(
+                "fringe-period",
+                "doubtful",
+                f"the projector's rows appear {e.solution.aspect:.2f} times as dense as its columns, as no pixels are",
+                "compare the fringe period of each axis with its description, and let the projector scale nothing",
+            )
+
+
+def outside(e: Evidence) -> Iterator[Finding]:
+    """Codes beyond the projector that neither another axis nor another period explains."""
+    names: list[str] = []
+    worst: dict[str, float] = {}
+    for pose in e.poses:
+        axes = {axis: a.outside for axis, a in pose.axes.items() if a.outside > MAX_OUTSIDE}
+        if axes and not frame_order(pose):
+            names.append(pose.name)
+            worst = {axis: max(share, worst.get(axis, 0.0)) for axis, share in axes.items()} | {
+                axis: share for axis, share in worst.items() if axis not in axes
+            }
+    if not names:
+        return
+    if any(mirrored(e)) or any(f.severity == "rejected" for f in period(e)):
+        return
+    width, height = e.projector
+    shares = ", ".join(
+        f"{100 * share:.0f} % of the {axis} codes lie beyond its {width if axis == 'x' else height} "
+        f"{'columns' if axis == 'x' else 'rows'}"
+        for axis, share in sorted(worst.items())
+    )
+    yield Finding(
+        "projector-size",
+        "rejected",
+        f"{where(e, tuple(names))} codes lie outside the projector ({shares})",
+        f"give the size of the projector that was used, instead of {width}x{height}, and check the fringe period",
+        tuple(names),
+    )
+
+
+def board_size(e: Evidence) -> Iterator[Finding]:
+    """A board of other columns and rows than those given, in most of the poses."""
+    kind, _, rest = e.board.partition(":")
+    seen = Counter(pose.grid for pose in e.poses if pose.grid is not None and pose.refused)
+    if kind != "circles" or not seen:
+        return
+    grid, count = seen.most_common(1)[0]
+    given = rest.split(":")[0]
+    if count < MOST * len(e.poses) or sorted(map(int, given.split("x"))) == sorted(grid):
+        return
+    yield Finding(
+        "board-size",
+        "rejected",
+        f"{count} of {len(e.poses)} poses show a board of {grid[0]}x{grid[1]} circles, and {given} was given",
+        f"give the board as circles:{grid[0]}x{grid[1]}:{rest.split(':', 1)[-1]}",
+        tuple(pose.name for pose in e.poses if pose.grid == grid),
+    )
+
+
+def gamma(e: Evidence) -> Iterator[Finding]:
+    """Light that does not grow evenly with the grey level."""
+    ratios = [a.harmonic for p in e.poses if not frame_order(p) for a in p.axes.values() if np.isfinite(a.harmonic)]
+    if not ratios:
+        return
+    exponent = gamma_of(float(np.median(ratios)))
+    if 1 / MAX_GAMMA < exponent < MAX_GAMMA:
+        return
+    steps = min(a.steps for p in e.poses for a in p.axes.values() if np.isfinite(a.harmonic))
+    yield Finding(
+        "gamma",
+        "doubtful",
+        f"the projector's light does not grow evenly with the grey level (gamma about {exponent:.1f}), which {steps} "
+        f"phase steps {'average out' if steps >= 8 else 'do not average out'}",
+        "set the projector's gamma to 1, or let the preflight make light linear"
+        + (", and keep to eight phase steps or more" if steps >= 8 else ", and take eight phase steps or more"),
+    )

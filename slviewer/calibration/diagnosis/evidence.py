@@ -1,0 +1,129 @@
+"""What is known of each pose, and of the calibration made from them, before anyone says what is wrong."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from slviewer.fringe.suspect import Suspect
+
+
+@dataclass(frozen=True)
+class AxisEvidence:
+    """What the frames of one axis say. NaN where they do not.
+
+    ``period_px`` as described; ``period_seen_px`` by where the Gray code's edges fall in the phase. ``outside``: share
+    of the readable pixels whose code lies beyond the projector. ``saturated``: share of the board's lit pixels (of all,
+    where no board was found) that clip. ``harmonic``: second harmonic over the fringe; ``steps`` of the finest phase
+    shift, 0 for Gray code alone.
+    """
+
+    period_px: float
+    steps: int
+    readable: float
+    outside: float
+    saturated: float
+    harmonic: float
+    period_seen_px: float
+
+
+@dataclass(frozen=True)
+class PoseEvidence:
+    """What one capture of the target says of itself.
+
+    ``refused``: why its board or its phase could not be read; empty where they could. ``grid``: columns and rows of the
+    circles that were seen, where the board that was given could not be laid over them. ``displaced``: how many frames
+    late (positive) or early the white frame came. ``moved_px``: by how much the features moved in the camera from the
+    frames of one axis to those of the other. ``numbering``: how the features are misnumbered, in words.
+    ``turn`` (2, 2): how the projector's coordinates change a camera pixel, in the mean over the board.
+    """
+
+    name: str
+    refused: str = ""
+    grid: tuple[int, int] | None = None
+    axes: Mapping[str, AxisEvidence] = field(default_factory=dict)
+    suspects: tuple[Suspect, ...] = ()
+    displaced: int = 0
+    moved_px: float = np.nan
+    numbering: str = ""
+    turn: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; NaN as None."""
+        data = asdict(self)
+        data["moved_px"] = _plain(self.moved_px)
+        data["axes"] = {name: {k: _plain(v) for k, v in axis.items()} for name, axis in data["axes"].items()}
+        return data
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> "PoseEvidence":
+        """The inverse of ``to_json``."""
+        return cls(
+            name=data["name"],
+            refused=data["refused"],
+            grid=None if data["grid"] is None else (data["grid"][0], data["grid"][1]),
+            axes={
+                name: AxisEvidence(**{k: np.nan if v is None else v for k, v in axis.items()})  # type: ignore[arg-type]
+                for name, axis in data["axes"].items()
+            },
+            suspects=tuple(Suspect(**suspect) for suspect in data["suspects"]),
+            displaced=data["displaced"],
+            moved_px=np.nan if data["moved_px"] is None else data["moved_px"],
+            numbering=data["numbering"],
+            turn=None if data["turn"] is None else (tuple(data["turn"][0]), tuple(data["turn"][1])),
+        )
+
+
+@dataclass(frozen=True)
+class Strayed:
+    """A pose that the fit left out: residuals in px, RMS, by the calibration that the others gave."""
+
+    camera_px: float
+    projector_px: float
+
+
+@dataclass(frozen=True)
+class SolutionEvidence:
+    """What the calibration made from the poses says of itself.
+
+    ``focal_sigma``: relative uncertainty of the focal lengths; ``tilt_spread_deg``: the largest angle between two
+    boards; ``empty_corners`` of the image, by name, that no pose reached and the projector lights; ``aspect`` fy / fx
+    of the projector; ``centre_off``: how far its principal point lies from the middle, in widths and heights.
+    """
+
+    used: tuple[str, ...]
+    strayed: Mapping[str, Strayed]
+    reprojection_px: float
+    usual_px: tuple[float, float]
+    focal_sigma: Mapping[str, float]
+    tilt_spread_deg: float
+    empty_corners: tuple[str, ...]
+    aspect: float
+    centre_off: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All of it. ``refusal``: why no calibration could be made, or why one that was made is none; empty otherwise.
+    ``contradiction``: why the sequence's description cannot be true. ``board`` in its notation. ``set_aside``: poses
+    kept out of the fit, and why. ``tilt_spread_deg``: roughly the largest angle between two boards, before any fit.
+    """
+
+    board: str
+    projector: tuple[int, int]
+    poses: tuple[PoseEvidence, ...]
+    set_aside: Mapping[str, str] = field(default_factory=dict)
+    refusal: str = ""
+    contradiction: str = ""
+    tilt_spread_deg: float = np.nan
+    solution: SolutionEvidence | None = None
+
+    @property
+    def usable(self) -> tuple[PoseEvidence, ...]:
+        """Poses whose board and phase were read."""
+        return tuple(pose for pose in self.poses if not pose.refused)
+
+
+def _plain(value: float) -> float | None:
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,188 @@
+"""What the frames of one capture say about the light, the patterns, and the order in which they were taken."""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from slviewer.calibration.diagnosis.evidence import AxisEvidence
+from slviewer.fringe.layout import Layout, layout, white_level
+from slviewer.fringe.noise import measure_noise
+from slviewer.fringe.origin import MIN_CONCENTRATION, MIN_EDGES, MIN_RISING
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phase_shift
+from slviewer.fringe.residual_sample import FEWEST, spread_rows
+from slviewer.fringe.sequence import Axis, PatternSequence
+
+ORIGIN_ROWS = 150
+"""Lines of the image along which the Gray code's edges are looked at."""
+LEAST_ORIGIN_PX = 0.2
+"""A Gray code that begins nearer to a column's middle says nothing of the period."""
+_PLACES = 4000  # in a turn, at which the code is thought to begin
+_TOP = 0.97  # of the edges that the best place explains
+_WHITE = 0.8  # of the brightest that a pixel was seen: a frame that reaches it nearly everywhere is white
+_NEARLY = 0.97
+_BRIGHT = 0.5  # of the brightest pixels: lit by the projector
+
+
+def axis_evidence(
+    sequence: PatternSequence, stack: np.ndarray, phase: PhaseMap, board: np.ndarray | None
+) -> AxisEvidence:
+    """What the frames of one axis say. ``board`` (h, w) bool: the pixels of the board, where it was found."""
+    valid, outside = phase.reason == Reason.VALID, phase.reason == Reason.OUTSIDE
+    where = np.ones(phase.reason.shape, bool) if board is None else board
+    lit = (phase.reason != Reason.DARK) & where
+    saturated = (phase.reason == Reason.SATURATED) & where
+    readable, seen = float(np.count_nonzero(valid | outside)), float(np.count_nonzero(lit))
+    return AxisEvidence(
+        period_px=phase.period_px,
+        steps=phase.steps,
+        readable=np.count_nonzero(valid & where) / max(1.0, seen),
+        outside=np.count_nonzero(outside) / max(1.0, readable),
+        saturated=np.count_nonzero(saturated) / max(1.0, seen),
+        harmonic=second_harmonic(sequence, stack, phase.axis),
+        period_seen_px=period_seen(sequence, stack, phase.axis),
+    )
+
+
+def second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
+    """The second harmonic of the finest fringe over the first, signed: positive where light grows ever faster with the
+    grey level, as gamma makes it. NaN where five steps or more do not show it, or too few pixels see fringes.
+    """
+    found = layout(sequence, axis)
+    if found.steps < 5:
+        return np.nan
+    indices = found.shifts[-1].indices
+    rows = spread_rows(*stack.shape[1:])
+    frames = np.stack([stack[i][rows].ravel() for i in indices])
+    white = white_level(stack, list(indices))
+    frames = frames[:, (frames.max(0) < white) & (frames.min(0) > 0)].astype(np.float32)
+    n = len(indices)
+    first, second = (
+        np.einsum(
+            "k,kp->p", np.exp(-2j * np.pi * m * np.arange(n) / n).astype(np.complex64) * np.float32(2 / n), frames
+        )
+        for m in (1, 2)
+    )
+    strength = np.abs(first)
+    seen = strength > max(8.0 * white / 255, 0.3 * float(np.quantile(strength, 0.95)) if strength.size else np.inf)
+    if np.count_nonzero(seen) < FEWEST:
+        return np.nan
+    first, second, strength = first[seen], second[seen], strength[seen]
+    along = np.real(second * np.conj(first / strength) ** 2)
+    return float(np.sum(along) / np.sum(strength))
+
+
+def period_seen(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
+    """px: the fringe period for which the Gray code would begin where the description says that it does.
+
+    The code's edges show at which phase it begins, and that place, in px, is known beforehand. NaN without a Gray code
+    beside a phase shift, where it begins too near to a column's middle, or where the frames are in no order.
+    """
+    found = layout(sequence, axis)
+    if not (found.shifts and found.gray) or abs(found.gray_origin_px) < LEAST_ORIGIN_PX:
+        return np.nan
+    size = stack.shape[2 if axis == "y" else 1]
+    step = max(1, size // ORIGIN_ROWS)
+    thin = np.ascontiguousarray(stack[:, :, ::step] if axis == "y" else stack[:, ::step])
+    begin = _code_begins(found, thin, white_level(stack, sequence.select(axis)))
+    turns = found.gray_origin_px / found.period_px
+    ratio = turns / begin if np.isfinite(begin) and abs(begin) > 1e-3 else np.nan
+    return float(found.period_px * ratio) if 0.1 < ratio < 10 else np.nan
+
+
+def _code_begins(found: Layout, stack: np.ndarray, white: float) -> float:
+    """Turns, -0.5 ... 0.5, of the phase at which each code begins; NaN where the edges do not agree.
+
+    An edge lies somewhere between the phases of two neighbouring pixels: the place that lies in the most of such
+    intervals is known better than any of them.
+    """
+    wrapped, modulation, background, _ = phase_shift(stack, found.shifts[0].indices, found.sign)
+    lit = modulation >= dark_limit(background, measure_noise(found, stack, white), white, dark_sigmas(found))
+    code, digit = np.zeros(lit.shape, np.int32), np.zeros(lit.shape, np.int32)
+    for i in [*found.gray] + ([] if found.complementary is None else [found.complementary]):
+        digit ^= bit_heights(found, stack, i, background) > 0
+        code = 2 * code + digit
+    first, second = (np.s_[:, :-1], np.s_[:, 1:]) if found.axis == "x" else (np.s_[:-1], np.s_[1:])
+    begins, lengths = [], []
+    for here, there in ((first, second), (second, first)):
+        edge = lit[here] & lit[there] & (code[there] == code[here] + 1)
+        below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
+        if found.complementary is not None:  # the cell that begins here is the second half of a period if odd
+            below = below - (code[there][edge] & 1) * np.pi
+            above = above - (code[there][edge] & 1) * np.pi
+        begins.append(below)
+        lengths.append(np.angle(np.exp(1j * (above - below))))
+    begin, length = np.concatenate(begins), np.concatenate(lengths)
+    if len(begin) < MIN_EDGES or np.mean(length > 0) < MIN_RISING:
+        return np.nan
+    begin, length = begin[length > 0], length[length > 0]
+    places = np.linspace(-np.pi, np.pi, _PLACES, endpoint=False)
+    start = np.mod((begin + np.pi) / (2 * np.pi), 1.0) * _PLACES
+    held = np.zeros(3 * _PLACES)
+    np.add.at(held, np.ceil(start).astype(int), 1.0)
+    np.add.at(held, np.floor(start + length / (2 * np.pi) * _PLACES).astype(int) + 1, -1.0)
+    count = np.cumsum(held).reshape(3, _PLACES).sum(0)
+    if count.max() < MIN_CONCENTRATION * len(begin):
+        return np.nan
+    best = np.exp(1j * places)[count > _TOP * count.max()]
+    return float(np.angle(best.mean()) / (2 * np.pi))
+
+
+def white_displaced(sequence: PatternSequence, stack: np.ndarray) -> int:
+    """By how many frames the white ones came late (positive) or early; 0 where they came in time, or cannot be told.
+
+    Only a white frame that was shown beside patterns tells: after it, whatever is shown may be white too.
+    """
+    rows = spread_rows(*stack.shape[1:])
+    frames = stack[:, rows].reshape(len(stack), -1)
+    brightest = frames.max(0)
+    lit = brightest > _BRIGHT * float(np.quantile(brightest, 0.98))
+    if np.count_nonzero(lit) < FEWEST:
+        return 0
+    frames, brightest = frames[:, lit], brightest[lit]
+    white = np.mean(frames >= _WHITE * brightest, axis=1) > _NEARLY
+    shown = [frame.kind in ("white", "texture") for frame in sequence.frames]
+    for i, should in enumerate(shown):
+        if not should:
+            continue
+        before, after = i - 1, i + 1
+        if before >= 0 and not shown[before] and white[before]:
+            return -1
+        if not white[i] and after < len(shown) and not shown[after] and white[after]:
+            return 1
+    return 0
+
+
+def moved_px(phases: Mapping[Axis, PhaseMap], pixels: np.ndarray, pitch: float) -> float:
+    """px by which features at ``pixels`` (n, 2) moved, in the median, between the frames of one axis and the other's.
+
+    ``pitch`` px is their distance. NaN where only one axis was captured, or the images cannot be compared.
+    """
+    if len(phases) < 2 or len(pixels) < 4:
+        return np.nan
+    images = [phase.background for phase in phases.values()]
+    top = max(1.0, *(float(np.percentile(image[::4, ::4], 99.5)) for image in images))
+    first, second = (cv2.convertScaleAbs(image, alpha=230 / top) for image in images)
+    window = 2 * int(np.clip(0.6 * pitch, 4, 30)) + 1
+    points = np.asarray(pixels, np.float32).reshape(-1, 1, 2)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, points, points.copy(), winSize=(window, window), maxLevel=3
+    )
+    shift = (moved - points).reshape(-1, 2)[np.asarray(found).ravel() > 0]
+    return float(np.median(np.linalg.norm(shift, axis=1))) if len(shift) >= 4 else np.nan
+
+
+def gamma_of(harmonic: float) -> float:
+    """The exponent whose power of a cosine has this ratio of second harmonic to first."""
+    return float((1 + 2 * harmonic) / (1 - harmonic))
+
+
+def mean_turn(camera: np.ndarray, projector: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """(2, 2): how the projector's pixels (n, 2) change with the camera's (n, 2), in the mean; None for too few."""
+    read = np.isfinite(camera).all(1) & np.isfinite(projector).all(1)
+    if np.count_nonzero(read) < 4:
+        return None
+    design = np.column_stack([camera[read], np.ones(np.count_nonzero(read))])
+    (a, b), (c, d) = np.linalg.lstsq(design, projector[read], rcond=None)[0][:2].T
+    return (float(a), float(b)), (float(c), float(d))

@@ -1,0 +1,114 @@
+"""What is wrong with single poses, and which must not be calibrated from."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
+from slviewer.calibration.diagnosis.verdict import Cause, Finding, Severity
+
+MOST = 0.5
+"""What is seen in so many of the poses is no accident of one."""
+MOVED_PX = (0.12, 0.3)
+"""A board that moved by less did not, by more did; in between, one that moved several times as much as it usually does.
+"""
+_UNUSUAL = 5.0
+_STRAYS = 4.0  # times the usual residual, beyond which a device disagrees
+
+ORDER: dict[Cause, str] = {
+    "frame-lag": "the camera is one image behind the projector",
+    "missing-frame": "a frame is missing, and those that follow came too early",
+    "frame-order": "frames show patterns that are not theirs",
+}
+"""The ways in which frames are out of order, in words."""
+
+
+def unfit(pose: PoseEvidence, most_moved_px: float) -> str:
+    """Why a pose whose board was read must not be calibrated from; empty where it may."""
+    order = frame_order(pose)
+    if order:
+        sentence = next((s.sentence for s in pose.suspects if s.fault not in ("light", "strange")), "")
+        return f"its frames are out of order ({sentence or ORDER[order]}): take the pose again"
+    if pose.moved_px > most_moved_px:
+        return (
+            f"the board moved by {pose.moved_px:.2f} px while it was captured: hold it still, and take the pose again"
+        )
+    if pose.numbering:
+        return f"its features are {pose.numbering}: uncover the whole board, and take the pose again"
+    return ""
+
+
+def most_moved_px(poses: Sequence[PoseEvidence]) -> float:
+    """By how much a board may seem to move that stood still, among these poses."""
+    moved = [pose.moved_px for pose in poses if np.isfinite(pose.moved_px)]
+    return float(np.clip(_UNUSUAL * np.median(moved), *MOVED_PX)) if moved else MOVED_PX[1]
+
+
+def frame_order(pose: PoseEvidence) -> Cause | None:
+    """How the frames of a pose are out of order, if they are."""
+    faults = Counter(s.fault for s in pose.suspects)
+    if pose.displaced > 0 or (faults["lag"] and pose.displaced >= 0):
+        return "frame-lag"
+    if pose.displaced < 0 or faults["dropped"]:
+        return "missing-frame"
+    return "frame-order" if faults["late"] + faults["early"] + faults["swapped"] else None
+
+
+def single_poses(e: Evidence) -> Iterator[Finding]:
+    """Poses that are misnumbered, moved, or disagree with the others."""
+    told: dict[Cause, dict[str, str]] = {"board-numbering": {}, "moved": {}, "outlier": {}}
+    most_moved = most_moved_px(e.poses)
+    for pose in e.poses:
+        if frame_order(pose):
+            continue
+        if pose.numbering:
+            told["board-numbering"][pose.name] = f"in {pose.name} the board's features are {pose.numbering}"
+        elif pose.moved_px > most_moved:
+            told["moved"][pose.name] = f"{pose.name}: the board moved by {pose.moved_px:.2f} px while it was captured"
+    for name, stray in e.solution.strayed.items() if e.solution else ():
+        if name in e.set_aside or any(name in poses for poses in told.values()):
+            continue
+        camera, projector = (_STRAYS * max(usual, 0.02) for usual in e.solution.usual_px) if e.solution else (0.0, 0.0)
+        if stray.camera_px < camera and stray.projector_px > projector:
+            told["moved"][name] = (
+                f"{name}: what the projector shows lies {min(stray.projector_px, 999):.1f} px from where the camera "
+                "sees the board: it moved while it was captured"
+            )
+        else:
+            told["outlier"][name] = (
+                f"{name} disagrees with the other poses by {min(stray.camera_px, 999):.1f} px in the camera and "
+                f"{min(stray.projector_px, 999):.1f} px in the projector"
+            )
+    for cause, poses in told.items():
+        if poses:
+            names = tuple(poses)
+            sentence = "; ".join(list(poses.values())[:3]) + (f"; and {len(poses) - 3} more" if len(poses) > 3 else "")
+            how = severity(e, names, mended=e.solution is not None)
+            yield Finding(cause, how, f"{sentence}; left out", _REMEDIES[cause], names)
+
+
+_REMEDIES: dict[Cause, str] = {
+    "board-numbering": "uncover the whole board, and take the pose again",
+    "moved": "hold the board still until all frames are taken, and take the pose again",
+    "outlier": "look at its picture, and take the pose again",
+}
+
+
+def severity(e: Evidence, names: tuple[str, ...], mended: bool) -> Severity:
+    """How bad it is that these poses are faulty; ``mended``: they do not count."""
+    if len(names) >= MOST * len(e.poses):
+        return "rejected"
+    return "note" if mended and len(names) <= 0.25 * len(e.poses) else "doubtful"
+
+
+def was_refused(e: Evidence, name: str) -> bool:
+    """Whether a pose could not be read."""
+    return any(pose.name == name and pose.refused for pose in e.poses)
+
+
+def where(e: Evidence, names: tuple[str, ...]) -> str:
+    """In which poses, in words."""
+    if len(names) == len(e.poses):
+        return "in every pose"
+    return f"in {names[0]}" if len(names) == 1 else f"in {len(names)} of {len(e.poses)} poses"

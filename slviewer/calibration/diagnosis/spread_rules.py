@@ -1,0 +1,77 @@
+"""Causes that lie in how the poses are spread: too few, all alike, or not everywhere."""
+
+from collections.abc import Iterator
+
+from slviewer.calibration.diagnosis.evidence import Evidence
+from slviewer.calibration.diagnosis.verdict import Finding
+from slviewer.calibration.soundness import MIN_POSES, MIN_TILT_SPREAD_DEG
+
+FEW_POSES = 6
+LITTLE_TILT_DEG = 12.0
+UNCERTAIN = 0.02
+HIGH_REPROJECTION_PX = 1.0
+
+
+def too_few(e: Evidence) -> Iterator[Finding]:
+    """Fewer poses than a calibration needs."""
+    count = len(e.solution.used) if e.solution else len([p for p in e.usable if p.name not in e.set_aside])
+    if count >= FEW_POSES:
+        return
+    refused = [f"{pose.name}: {pose.refused}" for pose in e.poses if pose.refused]
+    because = f" ({'; '.join(refused[:3])})" if refused else ""
+    yield Finding(
+        "too-few-poses",
+        "rejected" if count < MIN_POSES else "doubtful",
+        f"{count} usable pose{'s' * (count != 1)} of {len(e.poses)}{because}",
+        f"capture the board in more positions and tilts: {FEW_POSES} at least, and a dozen is better",
+    )
+
+
+def parallel(e: Evidence) -> Iterator[Finding]:
+    """Boards that are all tilted alike."""
+    solved = e.solution
+    spread = solved.tilt_spread_deg if solved else e.tilt_spread_deg
+    if not spread < LITTLE_TILT_DEG or len(e.usable) < MIN_POSES:
+        return
+    rejected = spread < MIN_TILT_SPREAD_DEG or solved is None or bool(e.refusal)
+    yield Finding(
+        "parallel-poses",
+        "rejected" if rejected else "doubtful",
+        f"all {len(solved.used if solved else e.usable)} poses are nearly parallel "
+        f"(tilts differ by {spread:.1f} degrees)",
+        "tilt the board by 15 to 30 degrees, in different directions",
+    )
+
+
+def corners(e: Evidence) -> Iterator[Finding]:
+    """Corners of the image that no pose reached."""
+    if e.solution is not None and e.solution.empty_corners:
+        corners = e.solution.empty_corners
+        where = " and ".join(corners) if len(corners) < 4 else "corners"
+        yield Finding(
+            "empty-corner",
+            "doubtful",
+            f"no pose reaches the {where} of the image, where lenses bend the most",
+            f"capture poses that reach into the {where}",
+        )
+
+
+def uncertain(e: Evidence) -> Iterator[Finding]:
+    """What the poses leave uncertain, or does not fit."""
+    if e.solution is None:
+        return
+    for device, share in e.solution.focal_sigma.items():
+        if share > UNCERTAIN:
+            yield Finding(
+                "uncertain",
+                "doubtful",
+                f"the poses leave the {device}'s focal length uncertain by {100 * share:.1f} %",
+                "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
+            )
+    if e.solution.reprojection_px > HIGH_REPROJECTION_PX and not e.refusal:
+        yield Finding(
+            "residuals",
+            "doubtful",
+            f"the reprojection error is {e.solution.reprojection_px:.1f} px",
+            "check that the board is flat, in focus and held still, and look at the poses with the largest residuals",
+        )
