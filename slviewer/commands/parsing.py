@@ -11,7 +11,7 @@ import tyro
 from slviewer import terminal
 
 Axis = Literal["x", "y"]
-ModelName = Literal["stereo", "pixelwise", "anchored"]
+ModelName = Literal["stereo", "pixelwise", "anchored", "splined"]
 Role = Literal["calibration", "scan"]
 
 

@@ -10,12 +10,13 @@ from slviewer.calibration.anchored import AnchoredModel, calibrate_anchored
 from slviewer.calibration.centres import calibrate_centred
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
+from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import save_anchored, save_pixelwise, save_stereo
+from slviewer.workflow.models import save_anchored, save_pixelwise, save_splined, save_stereo
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.poses import judge_all
 
@@ -27,6 +28,7 @@ class CalibrationResult:
     stereo: StereoModel
     pixelwise: PixelwiseModel | None
     anchored: AnchoredModel | None = None
+    splined: SplinedModel | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``calibrate --json``."""
@@ -49,6 +51,8 @@ class CalibrationResult:
             }
         if self.anchored is not None:
             models["anchored"] = {"axes": {axis: self.anchored.median_rms_px(axis) for axis in self.anchored.axes}}
+        if self.splined is not None:
+            models["splined"] = self.splined.bundle.summary()
         return {
             "models": models,
             "poses_used": list(self.stereo.poses),
@@ -89,6 +93,8 @@ class CalibrationResult:
                 f"fit RMS {self.anchored.median_rms_px(axis):.4f} px (median)"
                 for axis, c in self.anchored.corrections.items()
             ]
+        if self.splined is not None:
+            lines.append(self.splined.bundle.text())
         return "\n".join(lines)
 
 
@@ -104,7 +110,8 @@ def calibrate(
 ) -> CalibrationResult:
     """Calibrate from the session's captures of role calibration, and save the models in the session.
 
-    ``pixelwise`` and ``anchored`` are fitted on top of ``stereo``, which is always made. A pose that cannot be used is
+    ``pixelwise`` and ``anchored`` are fitted on top of ``stereo``, which is always made; ``splined`` starts from it. A
+    pose that cannot be used is
     left out with the reason; CalibrationRejected when what is left cannot determine the rig, and then the session stays
     as it was.
     """
@@ -146,6 +153,18 @@ def calibrate(
                 if len(models) == 1:
                     raise
                 warn(f"no anchored model: {error}")
+        splined = None
+        if "splined" in models:
+            adjusting = part(progress, 0.75, 0.97)
+            try:
+                splined = calibrate_splined(observations, stereo, lambda done: adjusting(done, "joint adjustment"))
+            except CalibrationRejected as error:
+                if len(models) == 1:
+                    raise
+                warn(f"no splined model: {error}")
+            else:
+                for name, why in splined.bundle.left_out.items():
+                    warn(f"{name} is left out of the splined model: it {why}")
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
@@ -154,8 +173,10 @@ def calibrate(
             save_pixelwise(store, pixelwise, inputs, settings)
         if anchored is not None:
             save_anchored(store, anchored, inputs, settings)
+        if splined is not None:
+            save_splined(store, splined, inputs, settings)
         progress(1.0, "calibrated")
-    return CalibrationResult(stereo, pixelwise, anchored)
+    return CalibrationResult(stereo, pixelwise, anchored, splined)
 
 
 def _observe_all(

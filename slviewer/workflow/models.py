@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.calibration.anchored import AnchoredModel
 from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
@@ -14,9 +15,9 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.session.store import Session
 from slviewer.workflow.feedback import Warn
 
-Model = StereoModel | PixelwiseModel | AnchoredModel
+Model = StereoModel | PixelwiseModel | AnchoredModel | SplinedModel
 
-MODELS = ("stereo", "pixelwise", "anchored")
+MODELS = ("stereo", "pixelwise", "anchored", "splined")
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
 
@@ -39,6 +40,12 @@ def save_anchored(store: Session, model: AnchoredModel, inputs: Mapping[str, str
     """Replace the session's anchored calibration."""
     meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
     store.save_result("calibration/anchored", meta, model.to_arrays())
+
+
+def save_splined(store: Session, model: SplinedModel, inputs: Mapping[str, str], settings: Mapping[str, Any]) -> None:
+    """Replace the session's splined calibration."""
+    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
+    store.save_result("calibration/splined", meta, model.to_arrays())
 
 
 def available(store: Session) -> tuple[str, ...]:
@@ -98,19 +105,19 @@ def load_model(store: Session, name: str) -> Model:
     meta, arrays = store.load_result(f"calibration/{name}")
     if name == "anchored":
         return AnchoredModel.restored(meta["model"], arrays)
+    if name == "splined":
+        return SplinedModel.restored(meta["model"], arrays)
     return PixelwiseModel.restored(meta["model"], arrays)
 
 
 def best(store: Session) -> str:
-    """The calibration to use where none is named: pixelwise if it had 8 poses or more, else stereo."""
+    """The calibration to use where none is named: splined or else pixelwise, if it had 8 poses or more; else stereo."""
     there = available(store)
     if not there:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    if (
-        "pixelwise" in there
-        and len(store.load_result("calibration/pixelwise", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE
-    ):
-        return "pixelwise"
+    for name in ("splined", "pixelwise"):
+        if name in there and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE:
+            return name
     return there[0]
 
 

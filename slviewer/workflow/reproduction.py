@@ -15,7 +15,7 @@ from slviewer.evaluation.render import render
 from slviewer.evaluation.tables import rows
 from slviewer.workflow.merging import Merge
 
-MODELS = ("stereo", "pixelwise", "anchored")
+MODELS = ("stereo", "pixelwise", "anchored", "splined")
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,12 @@ STRENGTHS = (1e-1, 1e6)
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations px: of a feature's coordinate in the camera, and what a sample's x and y scatter by beyond
-    their own predicted noise."""
+    """Standard deviations px: of a feature's coordinate in the camera; what a sample's x and y scatter by beyond their
+    own predicted noise; and what they scatter by in all (median)."""
 
     camera_px: float
     excess_px: tuple[float, float]
+    sample_px: tuple[float, float]
 
     def sigmas(self, sample_sigma: np.ndarray) -> np.ndarray:
         """(m, 2) px: of samples whose predicted noise is (m, 2)."""
@@ -33,7 +34,8 @@ def measured_noise(features: np.ndarray, samples: np.ndarray, sample_sigma: np.n
     """From residuals (n, 2) of features and (m, 2) of samples, robustly; what is NaN does not count."""
     camera = 1.4826 * float(np.nanmedian(np.abs(features)))
     excess = [_excess(samples[:, k], sample_sigma[:, k]) for k in range(2)]
-    return Noise(max(camera, LEAST_SIGMA_PX), (excess[0], excess[1]))
+    total = 1.4826 * np.nanmedian(np.abs(samples), axis=0)
+    return Noise(max(camera, LEAST_SIGMA_PX), (excess[0], excess[1]), (float(total[0]), float(total[1])))
 
 
 def _excess(residuals: np.ndarray, sigma: np.ndarray) -> float:

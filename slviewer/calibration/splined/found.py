@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solve_triangular
 
+from slviewer.calibration.splined.board_shape import board_frame, board_heights
 from slviewer.calibration.splined.evidence import Noise
 from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.posterior import point_rows
@@ -64,11 +65,49 @@ class Bundle:
         right = np.asarray(dense, self.factor.dtype).T
         return np.asarray(solve_triangular(self.factor, right, lower=True, check_finite=False))
 
+    def summary(self) -> dict[str, Any]:
+        """The figures that ``text`` tells, JSON-able."""
+        fields = {
+            device: float(np.sqrt(np.mean(part.coefficients[:, 1:-1, 1:-1] ** 2)))
+            for device, part in (("camera", self.state.rig.camera), ("projector", self.state.rig.projector))
+        }
+        height = board_heights(self.points, board_frame(self.points), self.state.heights)
+        return {
+            "steps": self.steps,
+            "noise_px": {"camera": self.noise.camera_px, "x": self.noise.sample_px[0], "y": self.noise.sample_px[1]},
+            "local_distortion_rms_px": fields,
+            "board_height_mm": [float(height.min()), float(height.max())],
+            "board_offsets_rms_mm": float(np.sqrt(np.mean(self.state.offsets**2))),
+            "cells_lit": {
+                "camera": float(np.mean(self.camera_poses > 0)),
+                "projector": float(np.mean(self.projector_poses > 0)),
+            },
+            "left_out": dict(self.left_out),
+        }
+
+    def text(self) -> str:
+        """For people."""
+        s = self.summary()
+        noise, local, lit = s["noise_px"], s["local_distortion_rms_px"], s["cells_lit"]
+        low, high = s["board_height_mm"]
+        return "\n".join(
+            [
+                f"splined: residuals camera {noise['camera']:.4f} px, projector x {noise['x']:.4f}, "
+                f"y {noise['y']:.4f} px (robust), after {s['steps']} steps",
+                f"  local distortion {local['camera']:.3f} px RMS in the camera, "
+                f"{local['projector']:.3f} px in the projector",
+                f"  board: height {low:+.4f} ... {high:+.4f} mm, features misplaced by "
+                f"{s['board_offsets_rms_mm']:.4f} mm RMS",
+                f"  lit by target poses: {100 * lit['camera']:.0f} % of the camera's cells, "
+                f"{100 * lit['projector']:.0f} % of the projector's",
+            ]
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """What is not an array, JSON-able."""
         return {
             "poses": list(self.poses),
-            "noise": {"camera_px": self.noise.camera_px, "excess_px": list(self.noise.excess_px)},
+            "noise": vars(self.noise),
             "strengths": list(self.strengths),
             "fits": {name: vars(fit) for name, fit in self.fits.items()},
             "left_out": dict(self.left_out),
@@ -111,12 +150,13 @@ class Bundle:
         n = layout.size - layout.rig
         factor = np.zeros((n, n), np.float32)
         factor[np.tril_indices(n)] = a["factor"]
-        excess, strengths, depths = data["noise"]["excess_px"], data["strengths"], data["depth_range_mm"]
+        strengths, depths, noise = data["strengths"], data["depth_range_mm"], data["noise"]
+        pairs = {key: (noise[key][0], noise[key][1]) for key in ("excess_px", "sample_px")}
         return cls(
             state=state,
             poses=tuple(data["poses"]),
             points=a["points"],
-            noise=Noise(data["noise"]["camera_px"], (excess[0], excess[1])),
+            noise=Noise(noise["camera_px"], **pairs),
             strengths=(strengths[0], strengths[1]),
             fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
             left_out=data["left_out"],
