@@ -21,7 +21,7 @@ from slviewer.session.store import Session
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.drifting import Checked, history
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import best, load_model, load_stereo, warn_if_stale
+from slviewer.workflow.models import best, check_accepted, load_model, load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.reconstructing import board_region
 from slviewer.workflow.scaling import apply_scale, scale_factor, scaled
@@ -80,6 +80,7 @@ def accept(
     """
     thing = read_artefact(artefact)
     with opened(session, write=True) as store:
+        check_accepted(store)
         name = model or best(store)
         chosen, factor = load_model(store, name), scale_factor(store, name)
         warn_if_stale(store, warn)

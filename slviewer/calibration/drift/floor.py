@@ -57,13 +57,14 @@ class Answer:
 class Reference:
     """A calibration as the drift check sees it.
 
-    ``shared`` are the coefficients of the arrangement's correction and the lens errors, ``sigmas`` px by kind what one
-    observation is worth, lens errors left over included; ``answers`` those of its own poses, each left out in turn.
+    ``shared`` are the coefficients of the arrangement's correction and the lens errors, with their ``covariance``;
+    ``sigmas`` px by kind what one observation is worth, lens errors left over included; ``answers`` those of its own
+    poses, each left out in turn.
     """
 
     rig: StereoRig
     shared: np.ndarray
-    factor: tuple[np.ndarray, bool]
+    covariance: np.ndarray
     sigmas: Mapping[str, float]
     answers: tuple[Answer, ...]
 
@@ -71,8 +72,8 @@ class Reference:
         """What a later view answers."""
         equations = linear(self.rig, view)
         known = _design(equations)
-        spread = np.einsum("ij,ji->i", known.toarray(), cho_solve(self.factor, known.T.toarray()))
-        return answer(equations, self.shared, self.sigmas, np.sqrt(np.maximum(spread, 0.0)) < UNSUPPORTED_PX)
+        variance = np.asarray(known.multiply(known @ self.covariance).sum(axis=1)).ravel()
+        return answer(equations, self.shared, self.sigmas, variance < UNSUPPORTED_PX**2)
 
 
 def refer(rig: StereoRig, views: Sequence[View]) -> Reference:
@@ -98,7 +99,8 @@ def refer(rig: StereoRig, views: Sequence[View]) -> Reference:
     for _ in range(2):  # what an observation is worth decides how much each has to say, and the other way round
         answers = tuple(answer(e, g, sigmas, e.usable) for e, g in zip(equations, others, strict=True))
         sigmas = _worth(answers, sigmas)
-    return Reference(rig, shared, factor, sigmas, answers)
+    covariance = cho_solve(factor, np.eye(len(shared)))
+    return Reference(rig, shared, covariance, sigmas, answers)
 
 
 def answer(e: Linear, shared: np.ndarray, sigmas: Mapping[str, float], supported: np.ndarray) -> Answer:

@@ -19,8 +19,8 @@ from slviewer.geometry.rig import StereoRig
 
 SAMPLES = 1000
 """Pixels of the board at which the projector's coordinates are compared; the smoothed phase holds no more."""
-CELLS_PER_WIDTH = 12
-"""Spline cells across an image, for what a lens does beyond Brown's model: waves of a third of the width and longer."""
+CELLS_PER_WIDTH = 16
+"""Spline cells across an image, for what a lens does beyond Brown's model: waves of a seventh of the width."""
 KINDS = ("camera", "x", "y")
 """What is observed: features in the camera, projector columns, projector rows."""
 STEPS = np.array([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])

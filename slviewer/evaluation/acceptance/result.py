@@ -87,16 +87,16 @@ class Acceptance:
                 row["R1/R2/R3 %"] = "/".join(f"{share:.0f}" for share in position.incidence.values())
             if self.artefact.kind == "plane":
                 flat = position.error(FLATNESS)
-                row |= {"flatness 95 %": flat.within_95_mm[1], "flatness 99.7 %": flat.within_997_mm[1]}
+                row |= {"flatness (95 %)": flat.within_95_mm[1], "flatness (99.7 %)": flat.within_997_mm[1]}
             else:
                 form, size = position.error(FORM), position.error(SIZE)
-                row |= {"form 95 %": form.within_95_mm[1], "form 99.7 %": form.within_997_mm[1]}
-                row |= {"size error": size.error_mm, "size +- 95 %": _half(size.within_95_mm)}
-                row["size +- 99.7 %"] = _half(size.within_997_mm)
+                row |= {"form (95 %)": form.within_95_mm[1], "form (99.7 %)": form.within_997_mm[1]}
+                row |= {"size error": size.error_mm, "size +- (95 %)": _half(size.within_95_mm)}
+                row["size +- (99.7 %)"] = _half(size.within_997_mm)
                 if self.artefact.spacing is not None:
                     spacing = position.error(SPACING)
-                    row |= {"spacing error": spacing.error_mm, "spacing +- 95 %": _half(spacing.within_95_mm)}
-                    row["spacing +- 99.7 %"] = _half(spacing.within_997_mm)
+                    row |= {"spacing error": spacing.error_mm, "spacing +- (95 %)": _half(spacing.within_95_mm)}
+                    row["spacing +- (99.7 %)"] = _half(spacing.within_997_mm)
             row |= {"RMS": max(position.rms_mm), "noise floor": max(position.floor_mm), "points": position.points}
             table.append(row)
         return table
