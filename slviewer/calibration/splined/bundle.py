@@ -129,7 +129,7 @@ def adjust(
         depth_range_mm=_depths(state, data, aside),
         camera_poses=camera_poses,
         projector_poses=projector_poses,
-        factor=np.tril(factor[layout.rig :, layout.rig :]),
+        packed_factor=_packed(factor[layout.rig :, layout.rig :]),
         steps=step,
     )
 
@@ -175,6 +175,10 @@ def _cholesky(A: np.ndarray) -> np.ndarray:
             "the poses leave the joint adjustment undetermined: capture the board in more positions and tilts"
         )
     return np.asarray(factor)
+
+
+def _packed(factor: np.ndarray) -> np.ndarray:
+    return np.asarray(factor[np.tri(len(factor), dtype=bool)], np.float32)
 
 
 def _inverse(factor: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:

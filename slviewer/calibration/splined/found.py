@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,7 @@ class Bundle:
     the projector's prior. ``left_out``: poses set aside, with the reason. ``camera_poses`` and ``projector_poses``:
     how many poses lit each cell of the fields (rows, columns).
 
-    ``factor`` (n, n) lower triangular: factor @ factor.T is the information (inverse covariance, 1/px^2 and so on) of
-    the rig's n unknowns in the order of ``Layout`` from ``rig`` on, with poses and board marginalised out.
+    ``packed_factor``: the lower triangle of ``factor``, row by row, float32.
     """
 
     state: State
@@ -49,8 +49,18 @@ class Bundle:
     depth_range_mm: tuple[float, float]
     camera_poses: np.ndarray
     projector_poses: np.ndarray
-    factor: np.ndarray
+    packed_factor: np.ndarray
     steps: int
+
+    @cached_property
+    def factor(self) -> np.ndarray:
+        """(n, n) float32, lower triangular: factor @ factor.T is the information (inverse covariance) of the rig's n
+        unknowns in the order of ``Layout`` from ``rig`` on, with poses and board marginalised out."""
+        layout = self.state.layout
+        n = layout.size - layout.rig
+        factor = np.zeros((n, n), np.float32)
+        factor[np.tri(n, dtype=bool)] = self.packed_factor
+        return factor
 
     def point_jacobian(self, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> sp.csr_matrix:
         """(3 n, unknowns) mm a unit: how the points measured at camera ``pixels`` (n, 2) and depths ``z`` (n,) from the
@@ -133,7 +143,7 @@ class Bundle:
             "points": self.points,
             "camera_poses": self.camera_poses,
             "projector_poses": self.projector_poses,
-            "factor": self.factor[np.tril_indices(len(self.factor))].astype(np.float32),
+            "factor": self.packed_factor,
         }
 
     @classmethod
@@ -146,10 +156,6 @@ class Bundle:
         a = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
         rig = Arrangement(devices[0], devices[1], a["R"], a["t"])
         state = State(rig, a["R_board"], a["t_board"], a["heights"], a["offsets"])
-        layout = state.layout
-        n = layout.size - layout.rig
-        factor = np.zeros((n, n), np.float32)
-        factor[np.tril_indices(n)] = a["factor"]
         strengths, depths, noise = data["strengths"], data["depth_range_mm"], data["noise"]
         pairs = {key: (noise[key][0], noise[key][1]) for key in ("excess_px", "sample_px")}
         return cls(
@@ -163,6 +169,6 @@ class Bundle:
             depth_range_mm=(depths[0], depths[1]),
             camera_poses=a["camera_poses"],
             projector_poses=a["projector_poses"],
-            factor=factor,
+            packed_factor=a["factor"],
             steps=data["steps"],
         )
