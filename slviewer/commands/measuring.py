@@ -42,6 +42,7 @@ def reconstruct(
     axis: Axis | None = None,
     out: Path | None = None,
     grid: Path | None = None,
+    accept_rejected: bool = False,
 ) -> None:
     """Reconstruct a capture as a cloud; a board pose also says how flat each model measures the board.
 
@@ -53,8 +54,13 @@ def reconstruct(
         out: PLY file; by default in the session's exports. That of a board pose holds the points inside the board's
             outline.
         grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as .npy.
+        accept_rejected: Use the calibration although its verdict rejects it.
     """
-    print(workflow.reconstruct(session, capture, model=model, axis=axis, out=out, grid=grid, **ui()).text())
+    print(
+        workflow.reconstruct(
+            session, capture, model=model, axis=axis, out=out, grid=grid, accept_rejected=accept_rejected, **ui()
+        ).text()
+    )
 
 
 @deferred
@@ -67,6 +73,7 @@ def verify(
     radius: float | None = None,
     axis: Axis | None = None,
     json: Path | None = None,
+    accept_rejected: bool = False,
 ) -> None:
     """Measure captures of a plane or a sphere with each model, and compare.
 
@@ -79,9 +86,18 @@ def verify(
         radius: Nominal radius of the sphere, mm: helps to find it; the fitted radius stays free.
         axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
         json: Write the result to this file too.
+        accept_rejected: Use the calibration although its verdict rejects it.
     """
     result = workflow.verify(
-        session, captures, shape, models=model, depth_range=range, radius=radius, axis=axis, **ui()
+        session,
+        captures,
+        shape,
+        models=model,
+        depth_range=range,
+        radius=radius,
+        axis=axis,
+        accept_rejected=accept_rejected,
+        **ui(),
     )
     write_json(json, result.to_json())
     print(result.text())
@@ -95,6 +111,7 @@ def merge(
     out: Path,
     model: ModelName | None = None,
     json: Path | None = None,
+    accept_rejected: bool = False,
 ) -> None:
     """Register scans to a reference scan by ICP, and merge them into one cloud.
 
@@ -105,7 +122,8 @@ def merge(
         out: PLY file.
         model: Which calibration to use; by default the best one available.
         json: Write the registrations to this file too.
+        accept_rejected: Use the calibration although its verdict rejects it.
     """
-    result = workflow.merge(session, captures, reference, out, model=model, **ui())
+    result = workflow.merge(session, captures, reference, out, model=model, accept_rejected=accept_rejected, **ui())
     write_json(json, result.to_json())
     print(result.text())

@@ -129,5 +129,5 @@ def _check_code(found: Layout) -> None:
     if 2 ** len(found.gray) < cells - 0.5:
         raise InputError(
             f"{where}: {len(found.gray)} Gray bits number {2 ** len(found.gray)} periods, and {found.extent} px hold "
-            f"{cells:.0f}: give the size of the projector that was used, or the missing bits"
+            f"{cells:.0f}: give the fringe period and the size of the projector that were used, or the missing bits"
         )

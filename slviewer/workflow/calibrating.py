@@ -1,24 +1,23 @@
 """From a session's target poses to calibrations."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from slviewer.calibration.anchored import AnchoredModel, calibrate_anchored
-from slviewer.calibration.centres import calibrate_centred
-from slviewer.calibration.observe import Observation, Smoothing
+from slviewer.calibration.diagnosis.verdict import Verdict
+from slviewer.calibration.observe import Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
-from slviewer.session.store import Session
 from slviewer.target.board import Board
+from slviewer.workflow.diagnosing import attempt, keep_rejected, rejected, save_verdict
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import save_anchored, save_pixelwise, save_splined, save_stereo
 from slviewer.workflow.opening import SessionLike, opened
-from slviewer.workflow.poses import judge_all
 
 
 @dataclass(frozen=True)
@@ -29,6 +28,7 @@ class CalibrationResult:
     pixelwise: PixelwiseModel | None
     anchored: AnchoredModel | None = None
     splined: SplinedModel | None = None
+    verdict: Verdict = field(default_factory=Verdict)
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``calibrate --json``."""
@@ -57,6 +57,7 @@ class CalibrationResult:
             "models": models,
             "poses_used": list(self.stereo.poses),
             "poses_left_out": dict(self.stereo.left_out),
+            "verdict": self.verdict.to_json(),
         }
 
     def text(self) -> str:
@@ -95,6 +96,7 @@ class CalibrationResult:
             ]
         if self.splined is not None:
             lines.append(self.splined.bundle.text())
+        lines.append(self.verdict.text())
         return "\n".join(lines)
 
 
@@ -111,9 +113,9 @@ def calibrate(
     """Calibrate from the session's captures of role calibration, and save the models in the session.
 
     ``pixelwise`` and ``anchored`` are fitted on top of ``stereo``, which is always made; ``splined`` starts from it. A
-    pose that cannot be used is
-    left out with the reason; CalibrationRejected when what is left cannot determine the rig, and then the session stays
-    as it was.
+    pose that cannot be used is left out with the reason. The verdict is saved beside the models. Raises
+    CalibrationRejected with its reason where it rejects them: then stereo alone is kept to look into, and used only
+    where that is insisted on; where none could be made at all, what the session held stays.
     """
     board = Board.parse(target)
     step_2 = Smoothing(smoothing, degree)
@@ -128,14 +130,22 @@ def calibrate(
         names = [name for name in names if name not in left_out]
         if not names:
             raise InputError("every target pose is excluded: include some again")
-        reading = part(progress, 0, 0.6)
-        observations = _observe_all(store, names, board, step_2, left_out, reading)
-        projector = store.load_capture(names[0]).sequence.projector
-        progress(0.6, "stereo calibration")
-        stereo, observations = calibrate_centred(observations, projector, str(board), left_out)
+        found = attempt(store, names, board, step_2, left_out, part(progress, 0, 0.65))
+        if found.stereo is None:
+            save_verdict(store, found.verdict, names)
+            raise rejected(found.verdict, kept=False)
+        stereo, observations = found.stereo, found.observations
+        settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
+        if found.verdict.level == "rejected":
+            keep_rejected(store, stereo, settings, found.verdict)
+            save_verdict(store, found.verdict, names)
+            raise rejected(found.verdict, kept=True)
         for name, why in stereo.left_out.items():
             if name not in excluded:
                 warn(f"{name} is left out: {why}")
+        for finding in found.verdict.findings:
+            if finding.severity == "doubtful":
+                warn(finding.text())
         pixelwise = None
         if "pixelwise" in models:
             fitting = part(progress, 0.7, 0.97)
@@ -167,31 +177,13 @@ def calibrate(
                     warn(f"{name} is left out of the splined model: it {why}")
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
-        settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
-        save_stereo(store, stereo, inputs, settings)
+        save_stereo(store, stereo, inputs, settings, found.verdict)
         if pixelwise is not None:
             save_pixelwise(store, pixelwise, inputs, settings)
         if anchored is not None:
             save_anchored(store, anchored, inputs, settings)
         if splined is not None:
             save_splined(store, splined, inputs, settings)
+        save_verdict(store, found.verdict, names)
         progress(1.0, "calibrated")
-    return CalibrationResult(stereo, pixelwise, anchored, splined)
-
-
-def _observe_all(
-    store: Session,
-    names: Sequence[str],
-    board: Board,
-    smoothing: Smoothing,
-    left_out: dict[str, str],
-    progress: Progress,
-) -> list[Observation]:
-    observations: list[Observation] = []
-    for i, judged in enumerate(judge_all(store, names, board, smoothing), 1):
-        progress(i / len(names), f"read {judged.name}")
-        if judged.observation is None:
-            left_out[judged.name] = judged.refused
-        else:
-            observations.append(judged.observation)
-    return observations
+    return CalibrationResult(stereo, pixelwise, anchored, splined, found.verdict)

@@ -16,7 +16,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 from slviewer.workflow.trust import residuals
 
-LOOK = 1
+LOOK = 2
 """How poses are examined; what a session keeps of another look is looked at anew."""
 
 
@@ -43,7 +43,9 @@ def examine(
         axes={axis: axis_evidence(sequence, frames, phase, on_board) for axis, phase in phases.items()},
         suspects=tuple(suspects[i] for i in sorted(suspects)),
         displaced=white_displaced(sequence, frames),
-        moved_px=np.nan if found is None else moved_px(phases, found.pixels, float(np.median(pitch_px(board, found)))),
+        moved_px=np.nan
+        if found is None
+        else moved_px(sequence, frames, found.pixels, float(np.median(pitch_px(board, found)))),
         turn=None if seen is None else mean_turn(seen.camera, seen.projector),
     )
 

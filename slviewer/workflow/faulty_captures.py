@@ -5,7 +5,7 @@ Target poses are rendered once, and spoilt afterwards where a fault allows it; a
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,26 +50,31 @@ class Bench:
     board: Board = BOARD
     count: int = POSES
     shape: Shape = field(default_factory=Shape)
+    _frames: dict[int, np.ndarray] = field(default_factory=dict, init=False, repr=False)
+    _looked: dict[int, Looked] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def sequence(self) -> PatternSequence:
         """Both axes of the Letter's sequence."""
         return p18(self.rig.projector.size)
 
-    @cache  # noqa: B019 (a bench lives as long as its cases)
+    @cached_property
     def poses(self) -> list[Pose]:
         """Target poses that reach the image's corners."""
         return target_poses(self.rig, self.board, self.count)
 
-    @cache  # noqa: B019
     def frames(self, i: int) -> np.ndarray:
-        """A clean capture of the i-th pose."""
-        return self.rendered(self.poses()[i], i)
+        """A clean capture of the i-th pose, kept to be spoilt."""
+        if i not in self._frames:
+            self._frames[i] = self.rendered(self.poses[i], i)
+        return self._frames[i]
 
-    @cache  # noqa: B019
     def looked(self, i: int) -> Looked:
         """The same, examined."""
-        return self.look(i, self.frames(i))
+        if i not in self._looked:
+            frames = self._frames.get(i)
+            self._looked[i] = self.look(i, self.rendered(self.poses[i], i) if frames is None else frames)
+        return self._looked[i]
 
     def rendered(self, pose: Pose, seed: int, exposure: float = 1.0, reverse: Axis | None = None) -> np.ndarray:
         """(n, h, w) uint8: a capture of the board at a pose, in so many times the usual light, with the patterns of one
@@ -167,7 +172,7 @@ def _moved(by_mm: Sequence[float], from_frame: int) -> Fault:
     """One pose whose board is elsewhere from one frame on."""
 
     def attempt(bench: Bench) -> Attempt:
-        pose, frames = bench.poses()[2], bench.frames(2).copy()
+        pose, frames = bench.poses[2], bench.frames(2).copy()
         frames[from_frame:] = bench.rendered(Pose(pose.R, pose.t + np.array(by_mm)), 2)[from_frame:]
         looked = bench.clean()
         looked[2] = bench.look(2, frames)
@@ -182,7 +187,7 @@ def _spoilt(spoil: Callable[[np.ndarray], np.ndarray], only: int | None = None) 
 
 def _rendered(**change: Any) -> Fault:
     def attempt(bench: Bench) -> Attempt:
-        return bench.attempt([bench.look(i, bench.rendered(pose, i, **change)) for i, pose in enumerate(bench.poses())])
+        return bench.attempt([bench.look(i, bench.rendered(pose, i, **change)) for i, pose in enumerate(bench.poses)])
 
     return attempt
 
@@ -191,7 +196,7 @@ def _gamma(gamma: float) -> Fault:
     def attempt(bench: Bench) -> Attempt:
         light = replace(bench.rig.light, gamma=gamma)
         curved = replace(bench, rig=replace(bench.rig, light=light))
-        return curved.attempt([curved.look(i, curved.rendered(pose, i)) for i, pose in enumerate(bench.poses())])
+        return curved.attempt([curved.look(i, curved.rendered(pose, i)) for i, pose in enumerate(bench.poses)])
 
     return attempt
 
@@ -203,7 +208,7 @@ def _parallel(tilt_deg: float, spread_deg: float) -> Fault:
         rng = np.random.default_rng(5)
         middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
         looked = []
-        for i, pose in enumerate(bench.poses()):
+        for i, pose in enumerate(bench.poses):
             R = rotation(np.radians([tilt_deg, 0, 0]) + np.radians(spread_deg) * rng.uniform(-1, 1, 3))
             place = 0.7 * (pose.to_camera(middle) * [1, 1, 0]) + [0, 0, pose.to_camera(middle)[2]]
             looked.append(bench.look(i, bench.rendered(Pose(R, place - R @ middle), i)))
@@ -217,7 +222,7 @@ def _without_corner(bench: Bench) -> Attempt:
     wide = replace(bench, count=MANY)
     width, height = bench.rig.camera.size
     looked = []
-    for i, pose in enumerate(wide.poses()):
+    for i, pose in enumerate(wide.poses):
         u, v = bench.rig.camera.project(pose.to_camera(bench.board.points)).T
         if np.mean((u > 0.78 * width) & (v < 0.3 * height)) == 0:
             looked.append(wide.look(i, wide.rendered(pose, i)))

@@ -1,7 +1,8 @@
 """What a session holds, in words."""
 
 from slviewer.session.capture import Capture
-from slviewer.workflow.models import available, best, load_stereo
+from slviewer.workflow.diagnosing import last_verdict
+from slviewer.workflow.models import available, load_stereo, preferred
 from slviewer.workflow.opening import SessionLike, opened
 
 
@@ -17,13 +18,16 @@ def inspect(session: SessionLike) -> str:
         for name in available(store):
             state = store.state_of(f"calibration/{name}")
             poses = store.load_result(f"calibration/{name}", only=())[0]["inputs"]
-            mark = ", the default" if name == best(store) else ""
+            mark = ", the default" if name == preferred(store) else ""
             made = f"from {len(poses)} poses" if poses else "made elsewhere"
             lines.append(f"calibration {name}: {made}, {state}{mark}")
             if name == "stereo":
                 rms = load_stereo(store).reprojection_rms_px
                 if rms:
                     lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms.items()))
+        verdict = last_verdict(store)
+        if verdict is not None:
+            lines.append(verdict.text())
         if not available(store):
             lines.append("no calibration yet: run `slviewer calibrate`")
     return "\n".join(lines)

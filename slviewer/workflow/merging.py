@@ -13,7 +13,7 @@ from slviewer.registration.merge import Merged
 from slviewer.registration.merge import merge as merge_clouds
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import best, load_model, warn_if_stale
+from slviewer.workflow.models import check_accepted, load_model, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.trust import told
 
@@ -57,6 +57,7 @@ def merge(
     out: Path | str,
     *,
     model: str | None = None,
+    accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Merge:
@@ -65,7 +66,8 @@ def merge(
     if len(names) < 2:
         raise UsageError(f"only {reference} was named: name the scans to merge with it")
     with opened(session) as store:
-        fitted = load_model(store, model or best(store))
+        check_accepted(store, accept_rejected)
+        fitted = load_model(store, model or preferred(store))
         warn_if_stale(store, warn)
         clouds = {}
         for i, (shot, frames, phases) in enumerate(decoded(store, names)):

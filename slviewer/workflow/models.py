@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.anchored import AnchoredModel
+from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import InputError
+from slviewer.errors import CalibrationRejected, InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.session.store import Session
@@ -18,13 +19,23 @@ from slviewer.workflow.feedback import Warn
 Model = StereoModel | PixelwiseModel | AnchoredModel | SplinedModel
 
 MODELS = ("stereo", "pixelwise", "anchored", "splined")
+VERDICT = "calibration/verdict"
+VALIDATION = "calibration/validation"
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
 
 
-def save_stereo(store: Session, model: StereoModel, inputs: Mapping[str, str], settings: Mapping[str, Any]) -> None:
-    """Replace the session's stereo calibration."""
+def save_stereo(
+    store: Session,
+    model: StereoModel,
+    inputs: Mapping[str, str],
+    settings: Mapping[str, Any],
+    verdict: Verdict | None = None,
+) -> None:
+    """Replace the session's stereo calibration; a verdict that rejects it stays with it."""
     meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
+    if verdict is not None:
+        meta["verdict"] = verdict.to_json()
     store.save_result("calibration/stereo", meta, {f"residuals_{n}": r for n, r in model.residuals_px.items()})
 
 
@@ -110,15 +121,48 @@ def load_model(store: Session, name: str) -> Model:
     return PixelwiseModel.restored(meta["model"], arrays)
 
 
-def best(store: Session) -> str:
-    """The calibration to use where none is named: splined or else pixelwise, if it had 8 poses or more; else stereo."""
+def best(store: Session, accept_rejected: bool = False) -> str:
+    """The calibration to use where none is named: see ``preferred``.
+
+    Raises CalibrationRejected, with the reason, for one that was rejected, unless that is accepted.
+    """
+    check_accepted(store, accept_rejected)
+    return preferred(store)
+
+
+def preferred(store: Session) -> str:
+    """The calibration that cross-validation recommends, where it was made for these; else splined or pixelwise, if it
+    had 8 poses or more; else stereo.
+    """
     there = available(store)
     if not there:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
+    if store.state_of(VALIDATION) == "fresh":
+        recommended = str(store.load_result(VALIDATION, only=())[0]["validation"]["recommended"])
+        if recommended in there:
+            return recommended
     for name in ("splined", "pixelwise"):
         if name in there and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE:
             return name
     return there[0]
+
+
+def rejection(store: Session) -> str:
+    """Why the session's calibration was rejected; empty where it was not, or was never judged."""
+    if "stereo" not in available(store):
+        return ""
+    judged = store.load_result("calibration/stereo", only=())[0].get("verdict")
+    verdict = Verdict.from_json(judged) if judged else Verdict()
+    return verdict.reason if verdict.level == "rejected" else ""
+
+
+def check_accepted(store: Session, accept_rejected: bool = False) -> None:
+    """Raise CalibrationRejected, with the reason, where the calibration was rejected and that is not accepted."""
+    reason = rejection(store)
+    if reason and not accept_rejected:
+        raise CalibrationRejected(
+            f"the calibration was rejected, and is not used unless you insist (--accept-rejected): {reason}"
+        )
 
 
 def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:

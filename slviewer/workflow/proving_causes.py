@@ -14,7 +14,7 @@ from slviewer.target.board import Board
 from slviewer.workflow.faulty_captures import BOARD, FAULTS, POSES, Bench
 from slviewer.workflow.feedback import Progress, unheard
 
-BOARDS = (BOARD, Board.parse("circles:14x11:13"), Board.parse("circles:17x13:11"), Board.parse("chessboard:13x9:14"))
+BOARDS = (BOARD, Board.parse("circles:14x11:13"), Board.parse("circles:17x13:11"), Board.parse("chessboard:10x7:18"))
 """That clean calibrations are made from in turn."""
 
 
@@ -106,7 +106,6 @@ def prove_causes(
     cases: list[Case] = []
     total = len(faults) + clean
     bench = Bench(letter(scale, seed), count=poses)
-    bench.clean()
     for name in faults:
         progress(len(cases) / total, name)
         cause, fault = FAULTS[name]

@@ -19,7 +19,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
 from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
-from slviewer.workflow.models import Model, best, load_models, load_stereo, warn_if_stale
+from slviewer.workflow.models import Model, check_accepted, load_models, load_stereo, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.trust import told
 
@@ -56,6 +56,7 @@ def reconstruct(
     axis: Axis | None = None,
     out: Path | str | None = None,
     grid: Path | str | None = None,
+    accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Reconstruction:
@@ -64,7 +65,8 @@ def reconstruct(
     The PLY of a board pose holds the points inside the board's outline; a scan's holds every point.
     """
     with opened(session) as store:
-        name = model or best(store)
+        check_accepted(store, accept_rejected)
+        name = model or preferred(store)
         warn_if_stale(store, warn)
         shot = store.load_capture(capture)
         progress(0.1, "reading frames")

@@ -14,7 +14,7 @@ from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
-from slviewer.workflow.models import load_models, load_stereo, warn_if_stale
+from slviewer.workflow.models import check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.reconstructing import board_region, lit, reconstruct_models
 from slviewer.workflow.trust import told
@@ -69,6 +69,7 @@ def verify(
     depth_range: tuple[float, float] | None = None,
     radius: float | None = None,
     axis: Axis | None = None,
+    accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Verification:
@@ -85,6 +86,7 @@ def verify(
         raise UsageError(f"a radius of {radius:g} mm is not possible: give a positive one")
     results: dict[str, Comparison] = {}
     with opened(session) as store:
+        check_accepted(store, accept_rejected)
         chosen = load_models(store, models)
         warn_if_stale(store, warn)
         reach = depth_range or load_stereo(store).depth_range_mm

@@ -63,7 +63,12 @@ def attempt_stereo(
         tilt_spread_deg=nominal_tilt_spread_deg(kept),
         solution=None if stereo is None else solution_evidence(kept, stereo),
     )
-    return Attempt(judged(evidence), evidence, stereo, tuple(used), stereo.left_out if stereo else out)
+    verdict = judged(evidence)
+    left_out = dict(stereo.left_out if stereo else out)
+    for finding in verdict.findings:  # which knows more of a pose than the fit that found it out
+        if finding.cause in ("moved", "outlier", "board-numbering") and len(finding.poses) == 1:
+            left_out |= {name: finding.text() for name in finding.poses if name in left_out and name not in out}
+    return Attempt(verdict, evidence, stereo, tuple(used), left_out)
 
 
 def _numbered(pose: PoseEvidence, board: Board, observations: Sequence[Observation]) -> PoseEvidence:

@@ -1,7 +1,5 @@
 """What the frames of one capture say about the light, the patterns, and the order in which they were taken."""
 
-from collections.abc import Mapping
-
 import cv2
 import numpy as np
 
@@ -154,16 +152,16 @@ def white_displaced(sequence: PatternSequence, stack: np.ndarray) -> int:
     return 0
 
 
-def moved_px(phases: Mapping[Axis, PhaseMap], pixels: np.ndarray, pitch: float) -> float:
+def moved_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, pitch: float) -> float:
     """px by which features at ``pixels`` (n, 2) moved, in the median, between the frames of one axis and the other's.
 
     ``pitch`` px is their distance. NaN where only one axis was captured, or the images cannot be compared.
     """
-    if len(phases) < 2 or len(pixels) < 4:
+    scenes = [image for axis in sequence.axes if (image := _scene(sequence, stack, axis)) is not None]
+    if len(scenes) < 2 or len(pixels) < 4:
         return np.nan
-    images = [phase.background for phase in phases.values()]
-    top = max(1.0, *(float(np.percentile(image[::4, ::4], 99.5)) for image in images))
-    first, second = (cv2.convertScaleAbs(image, alpha=230 / top) for image in images)
+    top = max(1.0, *(float(np.percentile(image[::4, ::4], 99.5)) for image in scenes))
+    first, second = (cv2.convertScaleAbs(image, alpha=230 / top) for image in scenes)
     window = 2 * int(np.clip(0.6 * pitch, 4, 30)) + 1
     points = np.asarray(pixels, np.float32).reshape(-1, 1, 2)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
@@ -171,6 +169,20 @@ def moved_px(phases: Mapping[Axis, PhaseMap], pixels: np.ndarray, pitch: float) 
     )
     shift = (moved - points).reshape(-1, 2)[np.asarray(found).ravel() > 0]
     return float(np.median(np.linalg.norm(shift, axis=1))) if len(shift) >= 4 else np.nan
+
+
+def _scene(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarray | None:
+    """(h, w) float32: the scene in even light, from the frames of one axis alone; None where they give none."""
+    found = layout(sequence, axis)
+    frames = list(found.shifts[-1].indices) if found.shifts else []
+    if not frames and found.inverse:
+        frames = [*found.gray, *found.inverse]
+    if not frames:
+        return None
+    total = np.zeros(stack.shape[1:], np.float32)
+    for i in frames:
+        total += stack[i]
+    return total / len(frames)
 
 
 def gamma_of(harmonic: float) -> float:

@@ -47,7 +47,8 @@ def corners(e: Evidence) -> Iterator[Finding]:
     """Corners of the image that no pose reached."""
     if e.solution is not None and e.solution.empty_corners:
         corners = e.solution.empty_corners
-        where = " and ".join(corners) if len(corners) < 4 else "corners"
+        *others, last = corners
+        where = f"{', '.join(others)} and {last}" if others else last
         yield Finding(
             "empty-corner",
             "doubtful",

@@ -17,7 +17,7 @@ from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.capturing import PATTERNS
-from slviewer.workflow.models import available, best, load_model, load_stereo
+from slviewer.workflow.models import available, load_model, load_stereo, preferred
 from slviewer.workflow.wizard.exporting import listed
 from slviewer.workflow.wizard.snapshot import (
     CalibrationView,
@@ -254,7 +254,7 @@ class Reader:
         rig = stereo.rig
         return stereo, CalibrationView(
             models=models,
-            best=best(session),
+            best=preferred(session),
             stale=self._stale(meta["inputs"], captures),
             target=stereo.board,
             poses=tuple(stereo.poses),

@@ -1,0 +1,227 @@
+"""How well each calibration measures target poses that it was not made from.
+
+A pose that is left out is measured from its smoothed phase, so that what remains is the calibration's error and hardly
+any camera noise. The board itself is the standard: how flat it comes out, how long, and how near its features lie to
+where they are on it when it is laid over them without stretching.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.observe import AXES, Observation
+from slviewer.errors import InputError
+from slviewer.evaluation.render import Row, render
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.shapes import fit_plane
+from slviewer.reconstruction.reconstruct import Model
+
+FOLDS = 5
+LEAST_POSES = 6
+"""Fewer poses cannot spare any."""
+LEAST_FEATURES = 12
+BETTER = 0.98
+"""A model must bring the error down to this share of a simpler one's to be recommended instead."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What one model makes of one pose that it was not made from.
+
+    ``plane_mm``: RMS distance of the board's pixels from their plane. ``board_mm``: RMS distance of the features from
+    the board laid over them, flatness, shape and scale included. ``scale_ppm``: how much too long the board's own
+    spacings come out. ``camera_px``, ``projector_px``: what ``board_mm`` amounts to in the images, RMS.
+    """
+
+    plane_mm: float
+    board_mm: float
+    scale_ppm: float
+    camera_px: float
+    projector_px: float
+    pixels: int
+    depth_mm: float
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """``poses``: {model: {pose: what it made of it}}, every model over the same pixels. ``folds``: poses left out
+    together. ``failed``: {model: why it could not be fitted to some fold}."""
+
+    poses: Mapping[str, Mapping[str, HeldOut]]
+    folds: tuple[tuple[str, ...], ...]
+    failed: Mapping[str, str]
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Those that could be judged, the simplest first."""
+        return tuple(self.poses)
+
+    def rms(self, model: str, figure: str) -> float:
+        """Root mean square over the poses of one figure of `HeldOut`."""
+        return float(np.sqrt(np.mean([getattr(pose, figure) ** 2 for pose in self.poses[model].values()])))
+
+    @property
+    def recommended(self) -> str:
+        """The model with the least error on boards that it was not made from, of nearly equal ones the simpler."""
+        chosen = self.models[0]
+        for model in self.models[1:]:
+            if self.rms(model, "board_mm") < BETTER * self.rms(chosen, "board_mm"):
+                chosen = model
+        return chosen
+
+    def text(self) -> str:
+        """For people: a line a model."""
+        table: list[Row] = [
+            {
+                "model": model,
+                "plane RMS mm": self.rms(model, "plane_mm"),
+                "board RMS mm": self.rms(model, "board_mm"),
+                "scale ppm": f"{self.rms(model, 'scale_ppm'):.0f}",
+                "camera px": self.rms(model, "camera_px"),
+                "projector px": self.rms(model, "projector_px"),
+            }
+            for model in self.models
+        ]
+        count = len(next(iter(self.poses.values())))
+        lines = [
+            f"{count} poses, each measured by calibrations made from the others ({len(self.folds)} folds):",
+            render(table),
+            f"recommended: {self.recommended}",
+        ]
+        return "\n".join([*lines, *(f"{model} is not judged: {why}" for model, why in self.failed.items())])
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        figures = ("plane_mm", "board_mm", "scale_ppm", "camera_px", "projector_px")
+        return {
+            "recommended": self.recommended,
+            "models": {model: {figure: self.rms(model, figure) for figure in figures} for model in self.models},
+            "poses": {m: {name: dict(vars(pose)) for name, pose in poses.items()} for m, poses in self.poses.items()},
+            "folds": [list(fold) for fold in self.folds],
+            "failed": dict(self.failed),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> "CrossValidation":
+        """The inverse of ``to_json``."""
+        poses = {m: {name: HeldOut(**pose) for name, pose in found.items()} for m, found in data["poses"].items()}
+        return cls(poses, tuple(tuple(fold) for fold in data["folds"]), data["failed"])
+
+
+def split(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tuple[str, ...], ...]:
+    """Poses dealt into folds in the order of their depths, so that each fold holds near and far ones.
+
+    Raises InputError for fewer than ``LEAST_POSES`` poses.
+    """
+    if len(depths_mm) < LEAST_POSES:
+        raise InputError(
+            f"{len(depths_mm)} target poses, and none can be spared of fewer than {LEAST_POSES}: capture more poses to "
+            "compare the models on poses that they were not made from"
+        )
+    if folds < 2:
+        raise InputError(f"{folds} folds leave no pose out of any calibration: use 2 or more")
+    ordered = sorted(depths_mm, key=lambda name: depths_mm[name])
+    count = min(folds, len(ordered))
+    return tuple(tuple(ordered[k::count]) for k in range(count))
+
+
+def smoothed_phases(observation: Observation) -> dict[Axis, PhaseMap]:
+    """Phase maps over the board alone, from the smoothed phase of a pose that was kept."""
+    width, height = observation.size
+    u0, v0, u1, v1 = observation.box
+    found: dict[Axis, PhaseMap] = {}
+    for axis in (a for a in AXES if a in observation.surfaces):
+        phase = np.full((height, width), np.nan, np.float32)
+        phase[v0:v1, u0:u1] = observation.smoothed_phase(axis)
+        lit = np.isfinite(phase).astype(np.float32)
+        reason = np.where(lit > 0, Reason.VALID, Reason.DARK).astype(np.uint8)
+        found[axis] = PhaseMap(
+            axis, observation.periods_px[axis], phase, np.full_like(phase, np.nan), lit, lit, reason, (1.0, 0.0), 18
+        )
+    return found
+
+
+def measure_held_out(
+    models: Mapping[str, Model], observation: Observation, axis: Axis, rig: StereoRig
+) -> dict[str, HeldOut]:
+    """What each model makes of a pose, all from the same axis and over the pixels and features that all of them
+    measure; empty where these are too few. ``rig`` turns millimetres into pixels.
+    """
+    phase = smoothed_phases(observation)[axis]
+    clouds = {name: np.asarray(model.points(phase)) for name, model in models.items()}
+    common = np.logical_and.reduce([np.isfinite(points[..., 2]) for points in clouds.values()])
+    features = {
+        name: _at(np.where(common[..., None], points, np.nan), observation.camera) for name, points in clouds.items()
+    }
+    read = np.logical_and.reduce([np.isfinite(X).all(1) for X in features.values()])
+    if np.count_nonzero(read) < LEAST_FEATURES:
+        return {}
+    board = observation.points[read]
+    found = {}
+    for name, points in clouds.items():
+        seen, X = points[common].astype(float), features[name][read]
+        placed, scale = _laid_over(board, X)
+        found[name] = HeldOut(
+            plane_mm=float(np.sqrt(np.mean(fit_plane(seen).distance(seen) ** 2))),
+            board_mm=_rms(X - placed),
+            scale_ppm=1e6 * (scale - 1),
+            camera_px=_rms(rig.camera.project(X) - rig.camera.project(placed)),
+            projector_px=_rms(rig.project(X) - rig.project(placed)),
+            pixels=len(seen),
+            depth_mm=float(X[:, 2].mean()),
+        )
+    return found
+
+
+def gathered(
+    names: Sequence[str],
+    measured: Sequence[Mapping[str, Mapping[str, HeldOut]]],
+    folds: tuple[tuple[str, ...], ...],
+    failed: Mapping[str, str],
+) -> CrossValidation:
+    """One result from what each fold measured, {pose: {model: ...}}; models in the order of ``names``.
+
+    Raises InputError where no model could be judged.
+    """
+    poses: dict[str, dict[str, HeldOut]] = {}
+    for model in (name for name in names if name not in failed):
+        by_pose = {pose: found[model] for fold in measured for pose, found in fold.items() if model in found}
+        if by_pose:
+            poses[model] = by_pose
+    if not poses:
+        why = "; ".join(f"{model}: {reason}" for model, reason in failed.items())
+        raise InputError(f"no model could be made without some of the poses ({why}): capture more poses")
+    return CrossValidation(poses, folds, dict(failed))
+
+
+def _at(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(n, 3): an organised cloud (h, w, 3) between its pixels, at (n, 2) px; NaN beside invalid ones."""
+    height, width = points.shape[:2]
+    found = np.full((len(pixels), 3), np.nan)
+    inside = (pixels >= 0).all(1) & (pixels[:, 0] < width - 1) & (pixels[:, 1] < height - 1)
+    u, v = pixels[inside].T
+    i, j = np.floor(v).astype(int), np.floor(u).astype(int)
+    b, a = (v - i)[:, None], (u - j)[:, None]
+    P = points.astype(float)
+    found[inside] = (1 - b) * ((1 - a) * P[i, j] + a * P[i, j + 1]) + b * ((1 - a) * P[i + 1, j] + a * P[i + 1, j + 1])
+    return found
+
+
+def _laid_over(board: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, float]:
+    """((n, 3) the board's points where they come nearest to the measured ones without stretching, and how much longer
+    the measured ones are)."""
+    p, q = board - board.mean(0), measured - measured.mean(0)
+    U, singular, Vt = np.linalg.svd(p.T @ q)
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ turn @ Vt
+    scale = float(np.sum(singular * np.diag(turn)) / np.sum(p**2))
+    return p @ R + measured.mean(0), scale
+
+
+def _rms(differences: np.ndarray) -> float:
+    """Root mean square length."""
+    return float(np.sqrt(np.mean(np.sum(differences**2, axis=1))))
