@@ -13,7 +13,7 @@ import tyro
 from slviewer import __version__, terminal
 from slviewer.commands.devices import capture, devices, preflight
 from slviewer.commands.importing import bring_in
-from slviewer.commands.measuring import calibrate, merge, reconstruct, verify
+from slviewer.commands.measuring import calibrate, merge, reconstruct, validate, verify
 from slviewer.commands.parsing import union
 from slviewer.commands.simulating import reproduce, simulate
 from slviewer.commands.telling import bench, inspect, patterns, report, target
@@ -27,6 +27,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "capture": capture,
     "import": bring_in,
     "calibrate": calibrate,
+    "validate": validate,
     "reconstruct": reconstruct,
     "verify": verify,
     "merge": merge,

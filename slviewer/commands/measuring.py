@@ -16,9 +16,12 @@ def calibrate(
     models: tuple[ModelName, ...] = ("stereo", "pixelwise"),
     smoothing: Literal["spline", "polynomial"] = "spline",
     degree: int = 5,
+    validate: bool = False,
     json: Path | None = None,
 ) -> None:
-    """Calibrate from the session's target poses.
+    """Calibrate from the session's target poses, and say whether the calibration is good, and if not, why.
+
+    One that is rejected ends with status 3; it is kept to look into, and not used.
 
     Args:
         session: Session folder.
@@ -27,9 +30,32 @@ def calibrate(
         models: Which models to fit.
         smoothing: How the Letter's step 2 smooths a board's phase; the spline keeps the local distortion.
         degree: Degree of the polynomial, with --smoothing polynomial.
+        validate: Also compare the models on poses that they were not made from, as `slviewer validate` does.
         json: Write the result to this file too.
     """
     result = workflow.calibrate(session, target, models=models, smoothing=smoothing, degree=degree, **ui())
+    data = result.to_json()
+    print(result.text())
+    if validate:
+        compared = workflow.validate(session, models=models, **ui())
+        data["validation"] = compared.to_json()
+        print(compared.text())
+    write_json(json, data)
+
+
+@deferred
+def validate(
+    session: Positional[Path], models: tuple[ModelName, ...] = (), folds: int = 5, json: Path | None = None
+) -> None:
+    """Measure target poses with calibrations made without them, and recommend the best model.
+
+    Args:
+        session: Session folder, calibrated.
+        models: Which models to compare; by default all there are. The recommended one is used where none is named.
+        folds: In how many parts the poses are left out, one after the other.
+        json: Write the result to this file too.
+    """
+    result = workflow.validate(session, models=models, folds=folds, **ui())
     write_json(json, result.to_json())
     print(result.text())
 

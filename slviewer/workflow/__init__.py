@@ -18,6 +18,7 @@ _HOMES = {
     "in_words": "checking",
     "summary": "inspecting",
     "calibrate": "calibrating",
+    "validate": "validating",
     "reconstruct": "reconstructing",
     "verify": "verifying",
     "merge": "merging",

@@ -9,10 +9,12 @@ from slviewer.target.images import SEARCH_PX, BoardImage, resized
 from slviewer.target.lattice import grow_lattices
 from slviewer.target.planar import to_image
 
-FITS = 0.12
-"""How far, in pitches, features may lie from their places on the board: lenses bend it less."""
-_BETTER = 0.25  # of what the numbering as given leaves, for another one to be believed
+MISPLACED = 0.8
+"""Features that lie so many pitches off their places on the board are numbered as others."""
+FITS = 0.25
+"""How far, in pitches, features of the right numbers may lie off; what a lens bends smoothly does not count."""
 _FULL = 0.9  # of the nodes within a lattice's extent, for it to be a whole grid
+_CLEAR = 0.25  # pitches within which features count while the board's plane and the lens's bend are sought
 
 
 def misnumbered(board: Board, points: np.ndarray, pixels: np.ndarray) -> str:
@@ -24,8 +26,8 @@ def misnumbered(board: Board, points: np.ndarray, pixels: np.ndarray) -> str:
     columns, rows = board.features
     off, mirrored = _misfit(points, pixels, board.pitch_mm)
     whole = len(points) == columns * rows and board.kind in ("circles", "chessboard")
-    if off < FITS:
-        return "transposed" if mirrored and whole else ""
+    if off < MISPLACED:
+        return "transposed or mirrored" if mirrored and whole else ""
     if not whole:
         return "mixed up"
     index = np.arange(columns * rows).reshape(rows, columns)
@@ -35,7 +37,7 @@ def misnumbered(board: Board, points: np.ndarray, pixels: np.ndarray) -> str:
         "shifted by a column": [np.roll(index, k, axis=1) for k in (1, -1, 2, -2)],
         "shifted": [np.roll(index.ravel(), k).reshape(rows, columns) for k in (1, -1)],
     }
-    best, least = "mixed up", max(_BETTER * off, FITS)
+    best, least = "mixed up", FITS
     for story, orders in stories.items():
         for order in orders:
             left, _ = _misfit(points, pixels[order.ravel()], board.pitch_mm)
@@ -68,14 +70,26 @@ def seen_grid(board: Board, image: np.ndarray) -> tuple[int, int] | None:
 
 
 def _misfit(points: np.ndarray, pixels: np.ndarray, pitch_mm: float) -> tuple[float, bool]:
-    """(pitches that the worst feature lies off the plane of the others, whether the plane is mirrored)."""
+    """(pitches that the worst features lie off the plane of the others, whether the plane is mirrored).
+
+    A cubic of the place on the board, which is how lenses bend it, is taken away first.
+    """
     board = np.asarray(points[:, :2], float) / pitch_mm
     scale = float(np.sqrt(np.ptp(pixels, axis=0).prod() / max(np.ptp(board, axis=0).prod(), 1e-9)))
-    H, _ = cv2.findHomography(board, np.asarray(pixels, float), cv2.RANSAC, 2 * FITS * max(scale, 1e-6))
+    H, near = cv2.findHomography(board, np.asarray(pixels, float), cv2.RANSAC, 2 * _CLEAR * max(scale, 1e-6))
     if H is None or abs(np.linalg.det(H)) < 1e-12:
         return np.inf, False
     H = H * np.sign(board.mean(0) @ H[2, :2] + H[2, 2])
     with np.errstate(divide="ignore", invalid="ignore"):
-        off = np.linalg.norm(pixels - to_image(H, board), axis=1) / max(scale, 1e-6)
-    worst = float(np.sort(np.nan_to_num(off, nan=np.inf))[-max(1, len(off) // 100)])
-    return worst, bool(np.linalg.det(H) < 0)
+        left = np.nan_to_num((pixels - to_image(H, board)) / max(scale, 1e-6), nan=1e6, posinf=1e6, neginf=-1e6)
+    x, y = (2 * (board - board.min(0)) / np.maximum(np.ptp(board, axis=0), 1e-9) - 1).T
+    terms = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
+    counts = np.asarray(near).ravel() > 0
+    for _ in range(3):
+        if np.count_nonzero(counts) < 2 * terms.shape[1]:
+            break
+        off = np.linalg.norm(left - terms @ np.linalg.lstsq(terms[counts], left[counts], rcond=None)[0], axis=1)
+        counts = off < max(_CLEAR, 3 * float(np.median(off[counts])))
+    else:
+        return float(np.sort(off)[-max(1, len(off) // 100)]), bool(np.linalg.det(H) < 0)
+    return float(np.sort(np.linalg.norm(left, axis=1))[-max(1, len(left) // 100)]), bool(np.linalg.det(H) < 0)
