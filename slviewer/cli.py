@@ -17,6 +17,7 @@ from slviewer.commands.measuring import calibrate, merge, reconstruct, validate,
 from slviewer.commands.parsing import union
 from slviewer.commands.simulating import reproduce, simulate
 from slviewer.commands.telling import bench, inspect, patterns, report, target
+from slviewer.commands.trusting import accept, check
 from slviewer.commands.wizard import wizard
 from slviewer.errors import Cancelled, SlviewerError
 
@@ -31,6 +32,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "reconstruct": reconstruct,
     "verify": verify,
     "merge": merge,
+    "check": check,
+    "accept": accept,
     "simulate": simulate,
     "reproduce": reproduce,
     "patterns": patterns,

@@ -22,6 +22,8 @@ _HOMES = {
     "reconstruct": "reconstructing",
     "verify": "verifying",
     "merge": "merging",
+    "check": "drifting",
+    "accept": "accepting",
     "simulate": "simulating",
     "reproduce": "reproducing",
     "patterns": "printing",
