@@ -135,9 +135,9 @@ def calibrate_stereo(
         check_tilts(used)
 
     for _ in range(4):
-        solution = _Solution.fit(used, [kept[o.name] for o in used], projector_size)
+        solution = _Solution.fit(used, [kept[o.name] for o in used], projector_size, strict)
         outliers = _outliers(solution, used, kept)
-        if not outliers:
+        if not (outliers and strict):  # what is looked into is all of it
             break
         for name, bad in outliers.items():
             kept[name] = kept[name] & ~bad
@@ -165,7 +165,7 @@ class _Solution:
 
     @classmethod
     def fit(
-        cls, used: Sequence[Observation], kept: Sequence[np.ndarray], projector_size: tuple[int, int]
+        cls, used: Sequence[Observation], kept: Sequence[np.ndarray], projector_size: tuple[int, int], strict: bool
     ) -> "_Solution":
         objects = [o.points[k].astype(np.float32) for o, k in zip(used, kept, strict=True)]
         cameras = [o.camera[k].astype(np.float32) for o, k in zip(used, kept, strict=True)]
@@ -185,7 +185,7 @@ class _Solution:
                 ) from error
             sigma[device] = float(np.max(deviations.ravel()[:2]))
             relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
-            if not np.isfinite(relative) or relative > MAX_FOCAL_SIGMA:
+            if strict and not relative < MAX_FOCAL_SIGMA:
                 raise CalibrationRejected(
                     f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f} %: "
                     "tilt the board by 15 to 30 degrees in different directions, and vary its distance"

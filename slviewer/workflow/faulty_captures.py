@@ -17,8 +17,8 @@ from slviewer.calibration.observe import Observation, observe
 from slviewer.errors import InputError
 from slviewer.fringe.decode import texture
 from slviewer.fringe.patterns import profile
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.presets import gray_bits, phase_steps
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.simulation.boards import Pose, Shape, printed_board
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
@@ -29,8 +29,11 @@ from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.evidence import examine
 
 BOARD = Board.parse("circles:21x16:9")
+PERIOD_PX, BITS = 18.0, 7
 POSES = 8
-MANY = 24
+EVERY = 5
+"""Poses that a fault of every one of them is put into; more would show the same."""
+MANY = 18
 """Poses from which those that reach a corner are taken away."""
 
 
@@ -50,18 +53,28 @@ class Bench:
     board: Board = BOARD
     count: int = POSES
     shape: Shape = field(default_factory=Shape)
+    steps: int = 18
     _frames: dict[int, np.ndarray] = field(default_factory=dict, init=False, repr=False)
     _looked: dict[int, Looked] = field(default_factory=dict, init=False, repr=False)
 
-    @property
+    @cached_property
     def sequence(self) -> PatternSequence:
-        """Both axes of the Letter's sequence."""
-        return p18(self.rig.projector.size)
+        """The Letter's, of so many phase steps: as many frames along x as along y."""
+        frames: list[Frame] = []
+        axes: tuple[Axis, ...] = ("x", "y")
+        for axis in axes:
+            frames += [*phase_steps(axis, self.steps, PERIOD_PX), *gray_bits(axis, BITS), Frame("texture")]
+        return PatternSequence(self.rig.projector.size, tuple(frames))
 
     @cached_property
     def poses(self) -> list[Pose]:
         """Target poses that reach the image's corners."""
         return target_poses(self.rig, self.board, self.count)
+
+    @property
+    def every(self) -> range:
+        """The poses that a fault of all of them is put into."""
+        return range(min(self.count, EVERY))
 
     def frames(self, i: int) -> np.ndarray:
         """A clean capture of the i-th pose, kept to be spoilt."""
@@ -121,7 +134,9 @@ class Bench:
 
     def spoilt(self, spoil: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> list[Looked]:
         """All captures, or only one of them, with their frames spoilt."""
-        return [self.look(i, spoil(self.frames(i))) if only in (None, i) else self.looked(i) for i in range(self.count)]
+        if only is None:
+            return [self.look(i, spoil(self.frames(i))) for i in self.every]
+        return [self.look(i, spoil(self.frames(i))) if only == i else self.looked(i) for i in range(self.count)]
 
 
 Fault = Callable[[Bench], Attempt]
@@ -136,7 +151,7 @@ def _described(**change: Any) -> Fault:
             for f in bench.sequence.frames
         )
         sequence = replace(bench.sequence, frames=frames)
-        return bench.attempt([bench.look(i, bench.frames(i), sequence) for i in range(bench.count)])
+        return bench.attempt([bench.look(i, bench.frames(i), sequence) for i in bench.every])
 
     return attempt
 
@@ -146,7 +161,7 @@ def _given(columns: int, rows: int) -> Fault:
 
     def attempt(bench: Bench) -> Attempt:
         board = replace(bench.board, columns=columns, rows=rows)
-        return bench.attempt([bench.look(i, bench.frames(i), board=board) for i in range(bench.count)], board)
+        return bench.attempt([bench.look(i, bench.frames(i), board=board) for i in bench.every], board)
 
     return attempt
 
@@ -168,11 +183,12 @@ def _renumbered(order: Callable[[np.ndarray], np.ndarray]) -> Fault:
     return attempt
 
 
-def _moved(by_mm: Sequence[float], from_frame: int) -> Fault:
-    """One pose whose board is elsewhere from one frame on."""
+def _moved(by_mm: Sequence[float], share: float) -> Fault:
+    """One pose whose board is elsewhere after this share of the frames."""
 
     def attempt(bench: Bench) -> Attempt:
         pose, frames = bench.poses[2], bench.frames(2).copy()
+        from_frame = round(share * len(frames))
         frames[from_frame:] = bench.rendered(Pose(pose.R, pose.t + np.array(by_mm)), 2)[from_frame:]
         looked = bench.clean()
         looked[2] = bench.look(2, frames)
@@ -187,7 +203,7 @@ def _spoilt(spoil: Callable[[np.ndarray], np.ndarray], only: int | None = None) 
 
 def _rendered(**change: Any) -> Fault:
     def attempt(bench: Bench) -> Attempt:
-        return bench.attempt([bench.look(i, bench.rendered(pose, i, **change)) for i, pose in enumerate(bench.poses)])
+        return bench.attempt([bench.look(i, bench.rendered(bench.poses[i], i, **change)) for i in bench.every])
 
     return attempt
 
@@ -196,7 +212,7 @@ def _gamma(gamma: float) -> Fault:
     def attempt(bench: Bench) -> Attempt:
         light = replace(bench.rig.light, gamma=gamma)
         curved = replace(bench, rig=replace(bench.rig, light=light))
-        return curved.attempt([curved.look(i, curved.rendered(pose, i)) for i, pose in enumerate(bench.poses)])
+        return curved.attempt([curved.look(i, curved.rendered(bench.poses[i], i)) for i in bench.every])
 
     return attempt
 
@@ -208,7 +224,8 @@ def _parallel(tilt_deg: float, spread_deg: float) -> Fault:
         rng = np.random.default_rng(5)
         middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
         looked = []
-        for i, pose in enumerate(bench.poses):
+        for i in bench.every:
+            pose = bench.poses[i]
             R = rotation(np.radians([tilt_deg, 0, 0]) + np.radians(spread_deg) * rng.uniform(-1, 1, 3))
             place = 0.7 * (pose.to_camera(middle) * [1, 1, 0]) + [0, 0, pose.to_camera(middle)[2]]
             looked.append(bench.look(i, bench.rendered(Pose(R, place - R @ middle), i)))
@@ -234,7 +251,8 @@ def _few(count: int) -> Fault:
 
 
 def _missing(frame: int) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda frames: np.concatenate([frames[:frame], frames[frame + 1 :], frames[-1:]])
+    """Without one frame, those that follow a place earlier, and what is shown at last once more."""
+    return lambda frames: np.concatenate([np.delete(frames, frame, axis=0), frames[-1:]])
 
 
 def _lagging(frames: np.ndarray) -> np.ndarray:
@@ -259,13 +277,13 @@ FAULTS: Mapping[str, tuple[Cause, Fault]] = {
     "board of 22x16 given": ("board-size", _given(22, 16)),
     "board transposed in one pose": ("board-numbering", _renumbered(lambda index: index.T)),
     "board shifted by a row in one pose": ("board-numbering", _renumbered(lambda index: np.roll(index, 1, axis=0))),
-    "one pose moved between the axes": ("moved", _moved((0.5, 0.2, 0.0), 26)),
-    "one pose moved among the frames of x": ("moved", _moved((1.0, -0.5, 0.5), 9)),
-    "one pose moved a little": ("moved", _moved((0.15, 0.0, 0.15), 26)),
+    "one pose moved between the axes": ("moved", _moved((0.5, 0.2, 0.0), 0.5)),
+    "one pose moved among the frames of x": ("moved", _moved((1.0, -0.5, 0.5), 0.18)),
+    "one pose moved a little": ("moved", _moved((0.15, 0.0, 0.15), 0.5)),
     "lag of one frame": ("frame-lag", _spoilt(_lagging)),
     "lag of one frame in one pose": ("frame-lag", _spoilt(_lagging, 3)),
     "fifth frame missing": ("missing-frame", _spoilt(_missing(4))),
-    "Gray bit missing": ("missing-frame", _spoilt(_missing(45))),
+    "Gray bit missing": ("missing-frame", _spoilt(_missing(-7))),
     "fifth frame missing in one pose": ("missing-frame", _spoilt(_missing(4), 3)),
     "overexposed": ("saturation", _rendered(exposure=1.8)),
     "much overexposed": ("saturation", _rendered(exposure=4.0)),

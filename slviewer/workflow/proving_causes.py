@@ -96,34 +96,36 @@ def prove_causes(
     faults: Sequence[str] = tuple(FAULTS),
     clean: int = 20,
     poses: int = POSES,
+    steps: int = 18,
     seed: int = 0,
     progress: Progress = unheard,
 ) -> Proof:
     """Every fault in turn, then ``clean`` calibrations of different rigs, poses and boards.
 
-    ``scale``: resolution of the camera, as a share of the Letter's.
+    ``scale``: resolution of the camera, as a share of the Letter's. ``poses`` of each rig, captured in so many phase
+    ``steps``.
     """
     cases: list[Case] = []
     total = len(faults) + clean
-    bench = Bench(letter(scale, seed), count=poses)
+    bench = Bench(letter(scale, seed), count=poses, steps=steps)
     for name in faults:
         progress(len(cases) / total, name)
         cause, fault = FAULTS[name]
         begun = perf_counter()
         attempt = fault(bench)
         cases.append(Case(name, cause, attempt, perf_counter() - begun))
-    for name, attempt, seconds in _clean(scale, clean, poses, seed):
+    for name, attempt, seconds in _clean(scale, clean, poses, steps, seed):
         cases.append(Case(name, None, attempt, seconds))
         progress(len(cases) / total, name)
     progress(1.0, "proven")
     return Proof(tuple(cases), scale)
 
 
-def _clean(scale: float, count: int, poses: int, seed: int) -> Iterator[tuple[str, Attempt, float]]:
+def _clean(scale: float, count: int, poses: int, steps: int, seed: int) -> Iterator[tuple[str, Attempt, float]]:
     for k in range(count):
         begun = perf_counter()
         board = BOARDS[k % len(BOARDS)]
-        bench = Bench(letter(scale, seed + 1 + k), board, poses + k % 5, Shape(misplaced_mm=0.01 * (k % 3)))
+        bench = Bench(letter(scale, seed + 1 + k), board, poses + k % 5, Shape(misplaced_mm=0.01 * (k % 3)), steps)
         yield (
             f"clean, seed {seed + 1 + k}, {board}, {bench.count} poses",
             bench.attempt(bench.clean()),

@@ -1,7 +1,10 @@
 """A stereo calibration that is judged: what may spoil it is kept out of the fit, and what came of it gets a verdict."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from slviewer.calibration.centres import calibrate_centred
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
@@ -45,15 +48,13 @@ def attempt_stereo(
     set_aside = _set_aside(poses, observations)
     kept = [o for o in observations if o.name not in set_aside]
     out = {**(left_out or {}), **set_aside}
-    refusal, stereo, used = "", None, list[Observation]()
+    refusal = ""
+    stereo: StereoModel | None
     try:
         stereo, used = calibrate_centred(kept, projector, str(board), out)
     except CalibrationRejected as error:
         refusal = str(error)
-        try:
-            stereo, used = calibrate_centred(kept, projector, str(board), out, strict=False)
-        except CalibrationRejected:
-            stereo, used = None, []
+        stereo, used = _whatever_there_is(kept, projector, board, out)
     evidence = Evidence(
         board=str(board),
         projector=projector,
@@ -69,6 +70,20 @@ def attempt_stereo(
         if finding.cause in ("moved", "outlier", "board-numbering") and len(finding.poses) == 1:
             left_out |= {name: finding.text() for name in finding.poses if name in left_out and name not in out}
     return Attempt(verdict, evidence, stereo, tuple(used), left_out)
+
+
+def _whatever_there_is(
+    observations: Sequence[Observation], projector: tuple[int, int], board: Board, left_out: Mapping[str, str]
+) -> tuple[StereoModel | None, list[Observation]]:
+    """A solution to look into, and the poses it used; none where it is no rig at all."""
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of boards that lie behind a device
+            stereo, used = calibrate_centred(observations, projector, str(board), left_out, strict=False)
+    except CalibrationRejected:
+        return None, []
+    seen = all(np.isfinite(px) for px in stereo.reprojection_rms_px.values())
+    return (stereo, used) if seen and stereo.depth_range_mm is not None else (None, [])
 
 
 def _numbered(pose: PoseEvidence, board: Board, observations: Sequence[Observation]) -> PoseEvidence:

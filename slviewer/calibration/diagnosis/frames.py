@@ -164,8 +164,10 @@ def moved_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, p
     first, second = (cv2.convertScaleAbs(image, alpha=230 / top) for image in scenes)
     window = 2 * int(np.clip(0.6 * pitch, 4, 30)) + 1
     points = np.asarray(pixels, np.float32).reshape(-1, 1, 2)
+    # Where circles are a few pixels apart, a coarser image of them is of other circles.
+    levels = int(np.clip(np.log2(max(pitch, 1.0) / 12), 0, 3))
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, points, points.copy(), winSize=(window, window), maxLevel=3
+        first, second, points, points.copy(), winSize=(window, window), maxLevel=levels
     )
     shift = (moved - points).reshape(-1, 2)[np.asarray(found).ravel() > 0]
     return float(np.median(np.linalg.norm(shift, axis=1))) if len(shift) >= 4 else np.nan

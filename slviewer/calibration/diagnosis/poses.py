@@ -10,6 +10,8 @@ from slviewer.calibration.diagnosis.verdict import Cause, Finding, Severity
 
 MOST = 0.5
 """What is seen in so many of the poses is no accident of one."""
+FEW_POSES = 6
+"""Fewer are too few to be sure of a calibration."""
 MOVED_PX = (0.12, 0.3)
 """A board that moved by less did not, by more did; in between, one that moved several times as much as it usually does.
 """
@@ -99,7 +101,8 @@ def severity(e: Evidence, names: tuple[str, ...], mended: bool) -> Severity:
     """How bad it is that these poses are faulty; ``mended``: they do not count."""
     if len(names) >= MOST * len(e.poses):
         return "rejected"
-    return "note" if mended and len(names) <= 0.25 * len(e.poses) else "doubtful"
+    left = len(e.solution.used) if e.solution else 0
+    return "note" if mended and left >= FEW_POSES and len(names) <= 0.25 * len(e.poses) else "doubtful"
 
 
 def was_refused(e: Evidence, name: str) -> bool:

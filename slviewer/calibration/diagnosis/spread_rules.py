@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 
 from slviewer.calibration.diagnosis.evidence import Evidence
+from slviewer.calibration.diagnosis.poses import FEW_POSES
 from slviewer.calibration.diagnosis.verdict import Finding
 from slviewer.calibration.soundness import MIN_POSES, MIN_TILT_SPREAD_DEG
+from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
 
-FEW_POSES = 6
 LITTLE_TILT_DEG = 12.0
 UNCERTAIN = 0.02
 HIGH_REPROJECTION_PX = 1.0
@@ -58,21 +59,22 @@ def corners(e: Evidence) -> Iterator[Finding]:
 
 
 def uncertain(e: Evidence) -> Iterator[Finding]:
-    """What the poses leave uncertain, or does not fit."""
+    """What the poses leave uncertain, or does not fit; of residuals so large, uncertainty is a consequence."""
     if e.solution is None:
         return
-    for device, share in e.solution.focal_sigma.items():
-        if share > UNCERTAIN:
-            yield Finding(
-                "uncertain",
-                "doubtful",
-                f"the poses leave the {device}'s focal length uncertain by {100 * share:.1f} %",
-                "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
-            )
-    if e.solution.reprojection_px > HIGH_REPROJECTION_PX and not e.refusal:
+    misfit = e.solution.reprojection_px > HIGH_REPROJECTION_PX
+    if misfit:
         yield Finding(
             "residuals",
-            "doubtful",
+            "rejected" if e.refusal else "doubtful",
             f"the reprojection error is {e.solution.reprojection_px:.1f} px",
             "check that the board is flat, in focus and held still, and look at the poses with the largest residuals",
         )
+    for device, share in e.solution.focal_sigma.items():
+        if not share < UNCERTAIN:
+            yield Finding(
+                "uncertain",
+                "doubtful" if misfit or share < MAX_FOCAL_SIGMA else "rejected",
+                f"the poses leave the {device}'s focal length uncertain by {100 * share:.1f} %",
+                "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
+            )

@@ -1,0 +1,183 @@
+"""Causes told from evidence, and a robust fit that one bad pose does not change."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
+
+from slviewer.calibration.diagnosis.attempt import Attempt, attempt_stereo
+from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
+from slviewer.calibration.diagnosis.frames import gamma_of, mean_turn
+from slviewer.calibration.diagnosis.numbering import misnumbered
+from slviewer.calibration.diagnosis.rules import judged
+from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
+from slviewer.calibration.observe import Observation
+from slviewer.fringe.suspect import Suspect
+from slviewer.geometry.triangulation import triangulate_pixels
+
+TRUE = rig()
+UPRIGHT = ((1.5, 0.1), (-0.1, 3.0))
+
+
+def axis(**change: float) -> AxisEvidence:
+    sound = AxisEvidence(18.0, 18, 1.0, 0.0, 0.0, 0.0, 18.0)
+    return dataclasses.replace(sound, **change)
+
+
+def pose(number: int, **change: object) -> PoseEvidence:
+    sound = PoseEvidence(f"pose_{number:02d}", axes={"x": axis(), "y": axis()}, moved_px=0.01, turn=UPRIGHT)
+    return dataclasses.replace(sound, **change)
+
+
+def causes(*poses: PoseEvidence, **more: object) -> tuple[str, ...]:
+    return judged(Evidence("circles:21x16:9", (912, 1140), poses, tilt_spread_deg=30.0, **more)).causes
+
+
+def observations(count: int = 20) -> list[Observation]:
+    return [observation(TRUE, T, f"pose_{k:02d}") for k, T in enumerate(board_poses(count))]
+
+
+def attempt(poses: list[Observation]) -> Attempt:
+    return attempt_stereo(poses, [PoseEvidence(o.name) for o in poses], PROJECTOR, BOARD)
+
+
+def plane_rms_mm(found: Attempt, poses: list[Observation]) -> float:
+    """Of the features of all poses, reconstructed from x: the mean over the poses."""
+    assert found.stereo is not None
+    rms = []
+    for o in poses:
+        X = triangulate_pixels(found.stereo.rig, o.camera, o.projector[:, 0], "x")
+        rms.append(np.linalg.svd(X - X.mean(0), full_matrices=False)[1][2] / np.sqrt(len(X)))
+    return float(np.mean(rms))
+
+
+def test_a_sound_calibration_is_good() -> None:
+    found = attempt(observations(8))
+    assert found.verdict == Verdict() and found.verdict.level == "good" and found.verdict.reason == ""
+    assert len(found.observations) == 8 and not found.left_out
+
+
+@pytest.mark.parametrize("order", ["transposed", "row", "mirrored", "noise", "bent", "moved"])
+def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None:
+    clean = observations()
+    base = attempt(clean)
+    index = np.arange(99).reshape(9, 11)
+    turns: dict[str, Callable[[], np.ndarray]] = {
+        "transposed": lambda: index.T,
+        "row": lambda: np.roll(index, 1, axis=0),
+        "mirrored": lambda: index[:, ::-1],
+    }
+    bad, poses = clean[4], observations()
+    if order in turns:
+        turned = turns[order]().ravel()
+        poses[4] = dataclasses.replace(bad, camera=bad.camera[turned], projector=bad.projector[turned])
+    elif order == "noise":
+        noise = np.random.default_rng(1).normal(0, 3, bad.camera.shape)
+        poses[4] = dataclasses.replace(bad, camera=bad.camera + noise)
+    elif order == "bent":
+        bent = np.outer((bad.points[:, 0] / 16 - 5) ** 2, [0.05, 0.0])
+        poses[4] = dataclasses.replace(bad, camera=bad.camera + bent)
+    else:
+        behind = board_poses(20)[4]
+        behind[2, 3] += 8.0
+        poses[4] = dataclasses.replace(bad, projector=observation(TRUE, behind, "pose_04").projector)
+    found = attempt(poses)
+    cause = {"noise": "outlier", "bent": "outlier", "moved": "moved"}.get(order, "board-numbering")
+    assert found.verdict.causes == (cause,) and found.verdict.findings[0].poses == ("pose_04",)
+    assert found.verdict.level == "good"  # it is left out
+    assert list(found.left_out) == ["pose_04"] and "pose" in found.left_out["pose_04"]
+    assert found.stereo is not None and base.stereo is not None
+    assert found.stereo.baseline_mm == pytest.approx(base.stereo.baseline_mm, rel=2e-3)
+    assert plane_rms_mm(found, clean) == pytest.approx(plane_rms_mm(base, clean), rel=0.02)
+
+
+def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> None:
+    bent = observations(6)
+    for k, o in enumerate(bent):
+        ripple = 6 * np.sin(np.arange(len(o.points)) * (2.0 + k))
+        bent[k] = dataclasses.replace(o, projector=o.projector + np.stack([ripple, -ripple], 1))
+    found = attempt(bent)
+    assert found.verdict.level == "rejected" and found.verdict.causes[0] == "residuals"
+    assert found.stereo is not None and found.stereo.reprojection_rms_px["stereo"] > 2
+    assert found.verdict.findings[0].sentence.startswith("the reprojection error is")
+    exchanged = [dataclasses.replace(o, projector=o.projector[:, ::-1]) for o in observations(6)]
+    evidence = [PoseEvidence(o.name, turn=mean_turn(o.camera, o.projector)) for o in exchanged]
+    found = attempt_stereo(exchanged, evidence, PROJECTOR, BOARD)
+    assert found.verdict.level == "rejected" and found.verdict.causes[0] == "axes-swapped"
+    assert found.stereo is None or np.isfinite(found.stereo.reprojection_rms_px["stereo"])
+
+
+@pytest.mark.parametrize(
+    ("turn", "cause", "word"),
+    [
+        (((0.1, 1.5), (3.0, -0.1)), "axes-swapped", "exchanged"),
+        (((-1.5, 0.1), (0.1, 3.0)), "axis-reversed", "x axis"),
+        (((1.5, 0.1), (0.1, -3.0)), "axis-reversed", "y axis"),
+    ],
+)
+def test_a_mirror_image_is_explained(turn: tuple, cause: str, word: str) -> None:
+    verdict = judged(Evidence("circles:21x16:9", (912, 1140), tuple(pose(k, turn=turn) for k in range(6))))
+    assert verdict.causes == (cause,) and verdict.level == "rejected" and word in verdict.reason
+
+
+def test_a_projector_upside_down_is_sound() -> None:
+    turned = tuple(pose(k, turn=((-1.5, 0.1), (-0.1, -3.0))) for k in range(8))
+    assert causes(*turned) == ()
+
+
+def test_the_root_cause_hides_its_consequences() -> None:
+    late = Suspect(0, "lag", "from frame 1 on the camera is one image behind the projector")
+    spoilt = {"refused": "no board", "suspects": (late,), "axes": {"x": axis(outside=0.3, period_seen_px=7.0)}}
+    assert causes(*(pose(k, **spoilt) for k in range(6)), refusal="0 usable poses") == ("frame-lag",)
+    # codes beyond the projector: of another size, or of other fringes
+    assert causes(*(pose(k, axes={"x": axis(outside=0.1)}, refused="codes") for k in range(6))) == ("projector-size",)
+    wrong = {"axes": {"x": axis(outside=0.1, period_px=20.0)}, "refused": "codes"}
+    assert causes(*(pose(k, **wrong) for k in range(6))) == ("fringe-period",)
+    # a board that is never found says why before it says that too few are left
+    assert causes(*(pose(k, refused="336 of 352", grid=(20, 16)) for k in range(6))) == ("board-size",)
+
+
+def test_a_frame_that_is_white_too_early_or_late_tells_which_way() -> None:
+    strange = (Suspect(50, "strange", "frame 51 does not fit the other bits"),)
+    assert causes(*(pose(k, suspects=strange, displaced=-1) for k in range(6)))[0] == "missing-frame"
+    assert causes(*(pose(k, suspects=strange, displaced=1) for k in range(6)))[0] == "frame-lag"
+    assert causes(*(pose(k, suspects=strange) for k in range(6))) == ()
+
+
+def test_gamma_from_its_harmonic() -> None:
+    phase = 2 * np.pi * np.arange(360) / 360
+    light = (0.5 + 0.5 * np.cos(phase)) ** 2.2
+    first, second = (np.mean(light * np.cos(m * phase)) for m in (1, 2))
+    assert gamma_of(second / first) == pytest.approx(2.2, abs=1e-6)
+    assert causes(*(pose(k, axes={"x": axis(harmonic=0.28)}) for k in range(8))) == ("gamma",)
+
+
+def test_features_numbered_otherwise_are_seen_through_any_lens() -> None:
+    seen = observations(1)[0]
+    assert misnumbered(BOARD, seen.points, seen.camera) == ""
+    r2 = np.sum(((seen.camera - 200) / 200) ** 2, axis=1, keepdims=True)
+    barrel = 200 + (seen.camera - 200) * (1 - 0.25 * r2)  # some 25 % at the rim
+    assert misnumbered(BOARD, seen.points, barrel) == ""
+    index = np.arange(99).reshape(9, 11)
+    for order, word in ((index.T, "transposed"), (np.roll(index, -1, 0), "row"), (np.roll(index, 1, 1), "column")):
+        assert word in misnumbered(BOARD, seen.points, barrel[order.ravel()])
+    shuffled = np.random.default_rng(3).permutation(99)
+    assert misnumbered(BOARD, seen.points, seen.camera[shuffled]) == "mixed up"
+
+
+def test_evidence_and_verdicts_survive_saving() -> None:
+    suspect = Suspect(3, "late", "frame 4 shows the pattern of frame 3")
+    kept = pose(1, suspects=(suspect,), grid=(21, 16), moved_px=np.nan)
+    again = PoseEvidence.from_json(json.loads(json.dumps(kept.to_json())))
+    assert np.isnan(again.moved_px)
+    assert dataclasses.replace(again, moved_px=0.0) == dataclasses.replace(kept, moved_px=0.0)
+    verdict = Verdict.of(
+        [Finding("gamma", "doubtful", "curved", "mend it"), Finding("moved", "rejected", "it", "hold it")]
+    )
+    assert verdict.causes == ("moved", "gamma") and verdict.level == "rejected"
+    assert Verdict.from_json(json.loads(json.dumps(verdict.to_json()))) == verdict
+    assert "rejected: it: hold it" in verdict.text()
+    assert len(set(CAUSES)) == len(CAUSES)
