@@ -1,0 +1,142 @@
+"""The working volume: where the rig is asked how sure it is, and what of its errors means anything there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.calibration.splined.fields import Device, image_of, ray_of
+from slviewer.calibration.splined.unknowns import Arrangement
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.jit import kernel
+
+REACH = (0.87, 1.13)
+"""Of the nearest and the farthest calibrated depth: in front of them (R1), inside (R2) and behind (R3), as the Letter
+measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Places that camera and projector both see: camera ``pixels`` (n, 2), depths ``z`` (n,) mm, ``points`` (n, 3) mm
+    in the camera's frame, and where the ``projector`` (n, 2) px sees them."""
+
+    pixels: np.ndarray
+    z: np.ndarray
+    points: np.ndarray
+    projector: np.ndarray
+
+    def supported(self, rig: Arrangement, camera_lit: np.ndarray, projector_lit: np.ndarray) -> np.ndarray:
+        """(n,) bool: those seen through cells (rows, columns) bool that target poses lit, in both devices."""
+        return _lit(rig.camera, self.pixels, camera_lit) & _lit(rig.projector, self.projector, projector_lit)
+
+
+def working_volume(
+    rig: Arrangement,
+    calibrated_mm: tuple[float, float],
+    reach: tuple[float, float] = REACH,
+    columns: int = 9,
+    rows: int = 7,
+    depths: int = 5,
+) -> Volume:
+    """What the projector sees of a regular grid: the whole image, its corners included, at depths evenly from
+    ``reach[0]`` of the nearest calibrated depth to ``reach[1]`` of the farthest.
+
+    Raises InputError where there is nothing: calibrated depths that are none, or no grid point that is seen.
+    """
+    near, far = reach[0] * calibrated_mm[0], reach[1] * calibrated_mm[1]
+    if not 0 < near < far:
+        raise InputError(f"calibrated depths {calibrated_mm} mm and a reach of {reach} leave no volume")
+    width, height = rig.camera.size
+    u, v, z = np.meshgrid(
+        np.linspace(0, width - 1, columns),
+        np.linspace(0, height - 1, rows),
+        np.linspace(near, far, depths),
+        indexing="ij",
+    )
+    found = volume_at(rig, np.column_stack([u.ravel(), v.ravel()]), z.ravel())
+    if not len(found.z):
+        raise InputError(f"camera and projector share nothing they both see at {near:.0f}-{far:.0f} mm")
+    return found
+
+
+def volume_at(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volume:
+    """Those of camera ``pixels`` (n, 2) at depths ``z`` (n,) mm that the projector's image holds."""
+    pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
+    points, projector = _looked(rig, pixels, z)
+    seen = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)  # False for NaN
+    return Volume(pixels[seen], z[seen], points[seen], projector[seen])
+
+
+def better_axis(rig: Arrangement, volume: Volume) -> Axis:
+    """The projector coordinate that depth moves more, in the median over the volume."""
+    _, later = _looked(rig, volume.pixels, 1.001 * volume.z)
+    across, down = np.nanmedian(np.abs(later - volume.projector), axis=0)
+    return "y" if down > across else "x"
+
+
+def motion_free(whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | None = None) -> np.ndarray:
+    """(m, 3 n): ``whitened`` (m, 3 n; x, y, z of the first of ``points`` (n, 3), then of the next) without the rigid
+    motion of the points, which no measurement of a shape sees.
+
+    The motion is that which fits the points best, or those of them that are ``fitted`` (n,) bool; it is taken from all.
+    A Jacobian by the unknowns is given transposed. Raises InputError where fewer than three points are fitted.
+    """
+    chosen = np.ones(len(points), bool) if fitted is None else np.asarray(fitted, bool)
+    if np.count_nonzero(chosen) < 3:
+        raise InputError(f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three")
+    motions = rigid_motions(points, points[chosen].mean(axis=0))
+    held = motions * np.repeat(chosen, 3)[:, None]
+    # (3 n, 6): weights of the points' errors in the best motion
+    weights = np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T.astype(whitened.dtype)
+    return np.asarray(whitened - (whitened @ weights) @ motions.T.astype(whitened.dtype))
+
+
+def rigid_motions(points: np.ndarray, about: np.ndarray) -> np.ndarray:
+    """(3 n, 6): how points (n, 3) move, three shifts by 1 and three small turns about a point, scaled alike."""
+    arms = (points - about) / max(float(np.sqrt(np.mean((points - about) ** 2))), 1e-12)
+    x, y, z = arms.T
+    nothing = np.zeros(len(points))
+    turns = np.stack(
+        [
+            np.stack([nothing, -z, y], axis=1),
+            np.stack([z, nothing, -x], axis=1),
+            np.stack([-y, x, nothing], axis=1),
+        ],
+        axis=2,
+    )
+    shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([shifts, turns], axis=2).reshape(-1, 6)
+
+
+def sigma_3d(whitened: np.ndarray) -> np.ndarray:
+    """(n,) mm: the standard deviation of each point, in all directions together, from its whitened factor (m, 3 n)."""
+    squares = np.einsum("mn,mn->n", whitened, whitened, dtype=np.float64)
+    return np.asarray(np.sqrt(squares.reshape(-1, 3).sum(axis=1)))
+
+
+def _looked(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    points, projector = np.empty((len(z), 3)), np.empty((len(z), 2))
+    _look(rig, pixels, z, points, projector)
+    return points, projector
+
+
+def _lit(device: Device, pixels: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    shape = np.array([lit.shape[1], lit.shape[0]])
+    cells = np.clip(((pixels + 0.5) / device.size * shape).astype(int), 0, shape - 1)
+    return np.asarray(lit[cells[:, 1], cells[:, 0]])
+
+
+@kernel()
+def _look(rig, pixels, depths, points, projector):
+    basis = np.zeros((4, 4))
+    for n in range(depths.shape[0]):
+        x, y = ray_of(rig.camera, pixels[n, 0], pixels[n, 1], basis)
+        z = depths[n]
+        points[n, 0], points[n, 1], points[n, 2] = x * z, y * z, z
+        X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
+        X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
+        X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
+        u = v = np.nan
+        if X2 > 0.0:  # False for NaN
+            u, v = image_of(rig.projector, X0 / X2, X1 / X2, basis)
+        projector[n, 0], projector[n, 1] = u, v
