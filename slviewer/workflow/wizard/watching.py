@@ -7,7 +7,7 @@ frames that come while they are busy replace one another, so that what is seen i
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import cv2
@@ -127,7 +127,7 @@ class Watcher:
         found, missing = find(watch.board, image)
         if found is not None and watch.board is not None:
             # centres of reduced pixels to those of the camera's
-            found = Detection((found.pixels + 0.5) / scale - 0.5, found.ids)
+            found = replace(found, pixels=(found.pixels + 0.5) / scale - 0.5)
             still = self._stillness.of(found.pixels, STILL_PX * image.shape[1] / scale, taken)
             board = board_seen(watch.board, found, still, watch.lens)
         else:
