@@ -8,24 +8,26 @@ from typing import Any
 from slviewer.errors import UsageError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.ply import write_ply
-from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_phases
 from slviewer.registration.merge import Merged
 from slviewer.registration.merge import merge as merge_clouds
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_model, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
+from slviewer.workflow.scaling import corrected_cloud, told_scale
 from slviewer.workflow.trust import told
 
 
 @dataclass(frozen=True)
 class Merge:
-    """A merged cloud, how its scans were registered, and the file it went to."""
+    """A merged cloud, how its scans were registered, and the file it went to. ``scale`` says, in words, what correction
+    of scale is in it."""
 
     merged: Merged
     clouds: Mapping[str, Cloud]
     reference: str
     out: Path
+    scale: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``merge --json``."""
@@ -47,6 +49,8 @@ class Merge:
             f"{name} -> {self.reference}: RMS {pair.rms_mm:.3f} mm, overlap {100 * pair.overlap:.0f} %"
             for name, pair in self.merged.pairs.items()
         ]
+        if self.scale:
+            lines.append(self.scale)
         return "\n".join([*lines, f"{len(self.merged.points)} points -> {self.out}"])
 
 
@@ -69,16 +73,16 @@ def merge(
         check_accepted(store, accept_rejected)
         fitted = load_model(store, model or preferred(store))
         warn_if_stale(store, warn)
-        clouds = {}
+        scale, clouds = told_scale(store, fitted.name), {}
         for i, (shot, frames, phases) in enumerate(decoded(store, names)):
             for sentence in told(store, shot.name, frames):
                 warn(f"{shot.name}: {sentence}")
             progress(0.5 * i / len(names), f"reconstructing {shot.name}")
-            clouds[shot.name] = reconstruct_phases(fitted, phases, texture=capture_texture(shot, frames))
+            clouds[shot.name] = corrected_cloud(store, fitted, phases, texture=capture_texture(shot, frames))
     registering = part(progress, 0.5, 0.9)
     merged = merge_clouds(clouds, reference, lambda done: registering(done, "registering"))
     progress(0.9, "writing")
     Path(out).parent.mkdir(parents=True, exist_ok=True)
     write_ply(Path(out), merged.points, colours=merged.colours, normals=merged.normals)
     progress(1.0, "merged")
-    return Merge(merged, clouds, reference, Path(out))
+    return Merge(merged, clouds, reference, Path(out), scale)

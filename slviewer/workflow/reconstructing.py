@@ -12,7 +12,6 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.ply import write_ply
-from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_phases
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -21,19 +20,21 @@ from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, check_accepted, load_models, load_stereo, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
+from slviewer.workflow.scaling import corrected_cloud, told_scale
 from slviewer.workflow.trust import told
 
 
 @dataclass(frozen=True)
 class Reconstruction:
     """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
-    measures the board."""
+    measures the board. ``scale`` says, in words, what correction of scale is in it."""
 
     cloud: Cloud
     phases: Mapping[Axis, PhaseMap]
     ply: Path
     points: int
     board: Comparison | None = None
+    scale: str = ""
 
     def text(self) -> str:
         """For people."""
@@ -43,6 +44,8 @@ class Reconstruction:
             f"{self.points} points by {cloud.model} from axis {cloud.axis}, z {np.percentile(z, 1):.0f}-"
             f"{np.percentile(z, 99):.0f} mm, predicted depth noise {np.median(sigma):.3f} mm -> {self.ply}"
         ]
+        if self.scale:
+            lines.append(self.scale)
         if self.board is not None:
             lines += ["inside the board's outline:", self.board.text()]
         return "\n".join(lines)
@@ -79,7 +82,7 @@ def reconstruct(
         is_pose = shot.role == "calibration"
         chosen = load_models(store, () if is_pose and model is None else (name,))
         progress(0.6, "reconstructing")
-        clouds = {n: reconstruct_phases(m, phases, axis=axis, texture=texture) for n, m in chosen.items()}
+        clouds = {n: corrected_cloud(store, m, phases, axis=axis, texture=texture) for n, m in chosen.items()}
         cloud = clouds[name]
         region = board_region(store, shot, texture, warn) if is_pose else None
         board = None
@@ -98,8 +101,9 @@ def reconstruct(
         write_ply(ply, cloud.points[keep], colours=texture[keep], scalars={"sigma_z": cloud.sigma_z[keep]})
         if grid is not None:
             write_grid(Path(grid), cloud.points)
+        scale = told_scale(store, name)
         progress(1.0, "reconstructed")
-    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board)
+    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale)
 
 
 def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
@@ -121,12 +125,12 @@ def lit(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndar
 
 
 def reconstruct_models(
-    chosen: Mapping[str, Model], phases: Mapping[Axis, PhaseMap], axis: Axis | None
+    store: Session, chosen: Mapping[str, Model], phases: Mapping[Axis, PhaseMap], axis: Axis | None
 ) -> dict[str, Cloud]:
     """One cloud a model, all from the same axis so that they can be compared pixel by pixel."""
     clouds: dict[str, Cloud] = {}
     for name, model in chosen.items():
-        clouds[name] = reconstruct_phases(model, phases, axis=axis)
+        clouds[name] = corrected_cloud(store, model, phases, axis=axis)
         axis = axis or clouds[name].axis
     return clouds
 

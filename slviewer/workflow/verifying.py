@@ -1,22 +1,25 @@
 """Measuring known shapes with each model, and comparing."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
 
+from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation.compare import Comparison, compare
 from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
+from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.reconstructing import board_region, lit, reconstruct_models
+from slviewer.workflow.scaling import told_scale
 from slviewer.workflow.trust import told
 
 Shape = Literal["plane", "sphere"]
@@ -24,9 +27,15 @@ Shape = Literal["plane", "sphere"]
 
 @dataclass(frozen=True)
 class Verification:
-    """The comparison of the models on each capture."""
+    """The comparison of the models on each capture.
+
+    ``masked``: {capture: {model: share of the shape's pixels that it leaves out because no target pose lit what they
+    look through}}, for models that do. ``scales``: {model: what correction of scale is in it, in words}.
+    """
 
     captures: Mapping[str, Comparison]
+    masked: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    scales: Mapping[str, str] = field(default_factory=dict)
 
     def centre_distances_mm(self) -> dict[tuple[str, str], dict[str, float]]:
         """{(capture, capture): {model: mm}}: distances between the spheres' centres; empty for planes."""
@@ -57,6 +66,14 @@ class Verification:
                 for (a, b), found in distances.items()
             ]
             blocks.append(f"distances between the centres:\n{render(table)}")
+        for name, shares in self.masked.items():
+            blocks += [
+                f"{name}: {model} leaves out {100 * share:.1f} % of the shape's pixels, which look where no target "
+                "pose was"
+                for model, share in shares.items()
+                if share > 0.005
+            ]
+        blocks += [f"{model}: {words}" for model, words in self.scales.items()]
         return "\n".join(blocks)
 
 
@@ -85,6 +102,7 @@ def verify(
     if radius is not None and not radius > 0:
         raise UsageError(f"a radius of {radius:g} mm is not possible: give a positive one")
     results: dict[str, Comparison] = {}
+    masked: dict[str, dict[str, float]] = {}
     with opened(session) as store:
         check_accepted(store, accept_rejected)
         chosen = load_models(store, models)
@@ -94,7 +112,7 @@ def verify(
             for sentence in told(store, shot.name, frames):
                 warn(f"{shot.name}: {sentence}")
             progress(i / len(captures), f"measuring {shot.name}")
-            clouds = reconstruct_models(chosen, phases, axis)
+            clouds = reconstruct_models(store, chosen, phases, axis)
             region: np.ndarray | None = None
             if shape == "plane" and shot.role == "calibration":
                 region = board_region(store, shot, capture_texture(shot, frames), warn)
@@ -105,5 +123,21 @@ def verify(
             for message in result.warnings:
                 warn(f"{shot.name}: {message}")
             results[shot.name] = result
+            axis_used = next(iter(clouds.values())).axis
+            masked[shot.name] = {
+                name: unsupported(model, phases[axis_used], result.region)
+                for name, model in chosen.items()
+                if isinstance(model, SplinedModel)
+            }
+        scales = {name: words for name in chosen if (words := told_scale(store, name))}
         progress(1.0, "measured")
-    return Verification(results)
+    return Verification(results, masked, scales)
+
+
+def unsupported(model: SplinedModel, phase: PhaseMap, region: np.ndarray | None = None) -> float:
+    """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are masked, because they
+    look through parts of camera or projector that no target pose lit."""
+    every = np.isfinite(model.points(phase, supported=False)[..., 2])
+    if region is not None:
+        every &= region
+    return float(1 - model.support(phase)[every].mean()) if every.any() else 0.0
