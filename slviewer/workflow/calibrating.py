@@ -1,8 +1,8 @@
 """From a session's target poses to calibrations."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,10 @@ from slviewer.workflow.diagnosing import attempt, keep_rejected, rejected, save_
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import save_anchored, save_pixelwise, save_splined, save_stereo
 from slviewer.workflow.opening import SessionLike, opened
+
+_LENGTH = {"pixelwise": 1.0, "anchored": 1.0, "splined": 2.0}
+"""How long each model takes, roughly, for the progress."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -146,35 +150,38 @@ def calibrate(
         for finding in found.verdict.findings:
             if finding.severity == "doubtful":
                 warn(finding.text())
-        pixelwise = None
+        wanted = [name for name in models if name != "stereo"]
+        longest = sum(_LENGTH[name] for name in wanted) or 1
+        begun, ended = 0.66, 0.66
+
+        def told(name: str, doing: str) -> Callable[[float], None]:
+            nonlocal begun, ended
+            begun, ended = ended, ended + 0.31 * _LENGTH[name] / longest
+            span = part(progress, begun, ended)
+            span(0.0, doing)
+            return lambda done: span(done, doing)
+
+        def tried(name: str, make: Callable[[], T]) -> T | None:
+            try:
+                return make()
+            except (CalibrationRejected, InputError) as error:
+                if len(models) == 1:
+                    raise
+                warn(f"no {'pixel-wise' if name == 'pixelwise' else name} model: {error}")
+                return None
+
+        pixelwise = anchored = splined = None
         if "pixelwise" in models:
-            fitting = part(progress, 0.7, 0.97)
-            try:
-                pixelwise = calibrate_pixelwise(observations, stereo, lambda done: fitting(done, "pixel-wise fit"))
-            except CalibrationRejected as error:
-                if len(models) == 1:
-                    raise
-                warn(f"no pixel-wise model: {error}")
-        anchored = None
+            fitting = told("pixelwise", "pixel-wise fit")
+            pixelwise = tried("pixelwise", lambda: calibrate_pixelwise(observations, stereo, fitting))
         if "anchored" in models:
-            try:
-                anchored = calibrate_anchored(observations, stereo)
-            except CalibrationRejected as error:
-                if len(models) == 1:
-                    raise
-                warn(f"no anchored model: {error}")
-        splined = None
+            correcting = told("anchored", "anchored fit")
+            anchored = tried("anchored", lambda: calibrate_anchored(observations, stereo, progress=correcting))
         if "splined" in models:
-            adjusting = part(progress, 0.75, 0.97)
-            try:
-                splined = calibrate_splined(observations, stereo, lambda done: adjusting(done, "joint adjustment"))
-            except CalibrationRejected as error:
-                if len(models) == 1:
-                    raise
-                warn(f"no splined model: {error}")
-            else:
-                for name, why in splined.bundle.left_out.items():
-                    warn(f"{name} is left out of the splined model: it {why}")
+            adjusting = told("splined", "joint adjustment")
+            splined = tried("splined", lambda: calibrate_splined(observations, stereo, adjusting))
+            for name, why in splined.bundle.left_out.items() if splined else ():
+                warn(f"{name} is left out of the splined model: it {why}")
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         save_stereo(store, stereo, inputs, settings, found.verdict)

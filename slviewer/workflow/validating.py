@@ -1,6 +1,7 @@
 """Each calibration measured on target poses that it was not made from."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -18,11 +19,11 @@ from slviewer.workflow.models import MODELS, VALIDATION, available, load_stereo,
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.poses import load_observations
 
-Fit = Callable[[Sequence[Observation], StereoModel], Model]
+Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], Model]
 FITS: dict[str, Fit] = {
-    "stereo": lambda observations, stereo: stereo,
+    "stereo": lambda observations, stereo, progress: stereo,
     "pixelwise": calibrate_pixelwise,
-    "anchored": calibrate_anchored,
+    "anchored": lambda observations, stereo, progress: calibrate_anchored(observations, stereo, progress=progress),
     "splined": calibrate_splined,
 }
 """How each model is made from the poses that stereo was made from."""
@@ -90,14 +91,20 @@ def cross_validate(
             ) from error
         fitted: dict[str, Model] = {}
         for i, name in enumerate(n for n in models if n not in failed):
-            report(i / (len(models) + 1), f"{name} without fold {k + 1} of {len(parts)}")
+            fitting = part(report, i / (len(models) + 1), (i + 1) / (len(models) + 1))
+            doing = f"{name} without fold {k + 1} of {len(parts)}"
+            fitting(0.0, doing)
             try:
-                fitted[name] = FITS[name](training, without)
+                fitted[name] = FITS[name](training, without, partial(_told, fitting, doing))
             except (CalibrationRejected, InputError) as error:
                 failed[name] = str(error)
         report(len(models) / (len(models) + 1), f"measuring fold {k + 1} of {len(parts)}")
         measured.append({o.name: measure_held_out(fitted, o, axis, stereo.rig) for o in observations if o.name in fold})
     return gathered(models, measured, parts, failed)
+
+
+def _told(progress: Progress, doing: str, share: float) -> None:
+    progress(share, doing)
 
 
 def _depths(observation: Observation, stereo: StereoModel) -> np.ndarray:
