@@ -21,8 +21,8 @@ from slviewer.geometry.shapes import fit_plane
 from slviewer.reconstruction.reconstruct import Model
 
 FOLDS = 5
-LEAST_POSES = 6
-"""Fewer poses cannot spare any."""
+LEAST_POSES = 5
+"""Fewer poses cannot spare any: a pixel-wise fit takes four."""
 LEAST_FEATURES = 12
 BETTER = 0.98
 """A model must bring the error down to this share of a simpler one's to be recommended instead."""
