@@ -146,13 +146,18 @@ def suggest(
         )
         here = _signature(T, board, have.range_mm)
         apart = min((float(np.linalg.norm(here - other)) for other in taken), default=1.0)
-        ranked.append((lacks + 0.2 * apart, T, third, tilt))
+        ranked.append((lacks + 0.2 * apart, T))
     if not ranked:
         raise InputError(f"the board {board} cannot be held so that the camera sees all of it: take a smaller board")
     ranked.sort(key=lambda entry: -entry[0])
-    _, T, third, tilt = ranked[skip % len(ranked)]
-    corners = outline_px(board, lens, T)
-    return Suggestion(T, corners, _sentence(third, tilt, corners.mean(0), lens.size))
+    return described(board, lens, ranked[skip % len(ranked)][1])
+
+
+def described(board: Board, lens: Lens, T_camera_board: np.ndarray) -> Suggestion:
+    """A pose as a suggestion: its outline and its words."""
+    corners = outline_px(board, lens, T_camera_board)
+    _, third, tilt = _classify(board, lens, T_camera_board, depth_range(board, lens))
+    return Suggestion(T_camera_board, corners, _sentence(third, tilt, corners.mean(0), lens.size))
 
 
 def projector_reach(

@@ -1,15 +1,24 @@
-"""Where the target has been and should be held next, from the poses of a session."""
+"""Where the target has been and should be held next, from the poses of a session.
+
+The first poses are spread by what they cover; from the third on the rig is known well enough to ask its information
+what it lacks most.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from slviewer.calibration.guidance.bench import GuidanceBench
+from slviewer.calibration.guidance.choosing import guide
+from slviewer.calibration.guidance.rough import rough_rig
 from slviewer.calibration.next_pose import (
     Coverage,
     Suggestion,
     approximate_pose,
     coverage,
+    depth_range,
+    described,
     estimated_lens,
     nominal_lens,
     projector_reach,
@@ -18,6 +27,7 @@ from slviewer.calibration.next_pose import (
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
 from slviewer.target.board import Board
 
 
@@ -30,14 +40,33 @@ class Features:
     projector: np.ndarray
 
 
+SIGMA_WANTED = 4e-5
+"""Of the middle depth, where the operator says nothing: below what a camera's noise does to a single point, so that
+more poses would hardly show in a scan."""
+LEAST_POSES = 8
+"""Before which none is enough: what is not as it should be shows in what poses have in common."""
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Poses as far as they are known, what they cover, and what should come next."""
+    """Poses as far as they are known, what they cover, and what should come next.
+
+    ``sigma_mm``: the 3D standard deviation that a calibration from these poses is predicted to have over the working
+    volume (RMS), None before the rig is known well enough; ``sigma_next_mm``: with the suggested pose besides.
+    ``wanted_mm``: what is asked for. ``enough``: it is reached, and no pose need follow.
+    """
 
     lens: Lens
     poses: Mapping[str, np.ndarray]
     coverage: Coverage
     suggestion: Suggestion | None
+    wanted_mm: float
+    sigma_mm: float | None = None
+    sigma_next_mm: float | None = None
+
+    @property
+    def enough(self) -> bool:
+        return self.sigma_mm is not None and self.sigma_mm <= self.wanted_mm and len(self.poses) >= LEAST_POSES
 
 
 def plan(
@@ -48,32 +77,62 @@ def plan(
     stereo: StereoModel | None,
     focal_px: float | None,
     refused: int,
+    wanted_mm: float | None = None,
 ) -> Plan:
     """The plan after poses with these `features`.
 
-    The lens is the calibrated one if there is a `stereo` calibration of this camera, else one of `focal_px`, else what
-    the poses tell. `refused`: so many suggestions were tried in vain and are passed over.
+    The rig is the calibrated one if there is a `stereo` calibration of this camera, else what the poses tell; the lens,
+    before they tell anything, is one of `focal_px`. `refused`: so many suggestions were tried in vain and are passed
+    over. `wanted_mm`: the 3D sigma that is to be reached; None: a share of the depth.
     """
-    calibrated = stereo is not None and stereo.rig.camera.size == camera
-    if stereo is not None and calibrated:
-        lens = stereo.rig.camera
+    seen = list(features.values())
+    known: tuple[StereoRig, dict[str, np.ndarray]] | None = None
+    if stereo is not None and stereo.rig.camera.size == camera:
+        known = stereo.rig, {name: T for name, T in stereo.poses.items() if name in features}
+    else:
+        rough = rough_rig(
+            [f.points for f in seen], [f.camera for f in seen], [f.projector for f in seen], (camera, projector)
+        )
+        if rough is not None:
+            known = rough[0], dict(zip(features, rough[1], strict=True))
+    if known is not None:
+        lens = known[0].camera
     elif focal_px is not None:
         lens = nominal_lens(camera, focal_px)
     else:
-        lens = estimated_lens([f.points for f in features.values()], [f.camera for f in features.values()], camera)
-    poses = {}
-    for name, seen in features.items():
-        known = stereo.poses.get(name) if stereo is not None and calibrated else None
-        T = approximate_pose(seen.points, seen.camera, lens) if known is None else known
+        lens = estimated_lens([f.points for f in seen], [f.camera for f in seen], camera)
+    poses = {} if known is None else dict(known[1])
+    for name, one in features.items():
+        T = poses[name] if name in poses else approximate_pose(one.points, one.camera, lens)
         if T is not None:
             poses[name] = T
+    poses = {name: poses[name] for name in features if name in poses}
+    wanted = SIGMA_WANTED * float(np.mean(depth_range(board, lens))) if wanted_mm is None else wanted_mm
+    covered = coverage(board, lens, list(poses.values()))
+    guidance = None
+    if known is not None:
+        guidance = guide(GuidanceBench(known[0], board), list(poses.values()))
+    if guidance is None:
+        return Plan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), wanted)
+    T = guidance.poses[refused % len(guidance.poses)]
+    next_mm = guidance.sigma_next_mm
+    return Plan(lens, poses, covered, described(board, lens, T), wanted, guidance.sigma_mm, next_mm)
+
+
+def _spread(
+    board: Board,
+    lens: Lens,
+    projector: tuple[int, int],
+    features: Mapping[str, Features],
+    poses: Mapping[str, np.ndarray],
+    refused: int,
+) -> Suggestion | None:
+    """What poses cover least, where little is known of the rig."""
     lit = None
     if poses:
         points = np.concatenate([features[n].points @ T[:3, :3].T + T[:3, 3] for n, T in poses.items()])
         lit = projector_reach(points, np.concatenate([features[n].projector for n in poses]), projector)
-    placed = list(poses.values())
     try:
-        suggestion = suggest(board, lens, placed, lit=lit, skip=refused)
+        return suggest(board, lens, list(poses.values()), lit=lit, skip=refused)
     except InputError:  # nothing fits: the operator's own poses decide
-        suggestion = None
-    return Plan(lens, poses, coverage(board, lens, placed), suggestion)
+        return None

@@ -1,0 +1,101 @@
+"""The pose that lowers the predicted sigma over the working volume most, among those that both devices would see."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+
+from slviewer.calibration.guidance.bench import GuidanceBench
+from slviewer.calibration.guidance.information import Information, Sight
+from slviewer.calibration.next_pose import depth_range
+
+DEPTHS = (0.0, 0.2, 0.45, 0.75, 1.1, 1.45)
+"""Where boards may be held, from nearest (0) over farthest (1) to beyond it, for the sake of what lies behind."""
+TILTS_DEG = ((0, 0), (16, 0), (-16, 0), (0, 16), (0, -16), (22, 22), (22, -22), (-22, 22), (-22, -22), (32, 0),
+             (-32, 0), (0, 32), (0, -32))  # fmt: skip
+"""About x and y."""
+TOWARDS = tuple((x, y) for x, y in product((-1.0, 0.0, 1.0), repeat=2))
+"""The image's corners, edges and middle: a board goes as far there as it stays in view."""
+_OFFSETS = 15  # places along each side that are tried
+TRIALS = 72
+"""Poses whose gain is computed, drawn from all; and near the best of them as many again as a sixth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Guidance:
+    """The best poses T_camera_board (k, 4, 4), the best first; the predicted 3D sigma mm (RMS over the volume) with the
+    poses had, and with the best one more."""
+
+    poses: np.ndarray
+    sigma_mm: float
+    sigma_next_mm: float
+
+
+def predicted_sigma(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> float:
+    """mm: the calibration's 3D sigma after ``poses`` T_camera_board (4, 4), root mean square over the volume."""
+    sight = Sight.of(bench, depth_range(bench.board, bench.stereo.camera))
+    return Information.of(bench, [bench.rows(T) for T in poses], sight).sigma_mm
+
+
+def guide(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> Guidance | None:
+    """What to capture after ``poses`` T_camera_board (4, 4); None where no pose is in view of both devices."""
+    candidates = candidate_poses(bench)
+    if not len(candidates):
+        return None
+    sight = Sight.of(bench, depth_range(bench.board, bench.stereo.camera))
+    information = Information.of(bench, [bench.rows(T) for T in poses], sight)
+    rng = np.random.default_rng(len(poses))
+    tried = rng.permutation(len(candidates))[:TRIALS]
+    gains = {int(i): information.gain(bench.rows(candidates[i])) for i in tried}
+    best = max(gains, key=lambda i: gains[i])
+    far = np.array([_apart(candidates[best], T) for T in candidates])
+    for i in np.argsort(far)[: TRIALS // 6]:
+        gains.setdefault(int(i), information.gain(bench.rows(candidates[i])))
+    order = sorted(gains, key=lambda i: -gains[i])
+    left = max(float(information.variances.mean()) - gains[order[0]], 0.0)
+    return Guidance(candidates[order], information.sigma_mm, float(np.sqrt(left)))
+
+
+def candidate_poses(bench: GuidanceBench) -> np.ndarray:
+    """(k, 4, 4): poses at several depths and tilts, each in the middle of what both devices see and as far towards its
+    corners and edges as keeps the board in view."""
+    camera, board = bench.stereo.camera, bench.board
+    near, far = depth_range(board, camera)
+    middle = (board.points.min(0) + board.points.max(0)) / 2
+    width, height = camera.size
+    steps = np.linspace(0, 1, _OFFSETS)
+    u, v = (a.ravel() for a in np.meshgrid(steps * (width - 1), steps * (height - 1)))
+    rays = np.column_stack(
+        [(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1], np.ones(u.size)]
+    )
+    places = 2 * np.column_stack([u / (width - 1), v / (height - 1)]) - 1
+    found = []
+    for share, tilt in product(DEPTHS, TILTS_DEG):
+        R = cv2.Rodrigues(np.radians(np.array([tilt[0], tilt[1], 0.0])))[0]
+        T = np.tile(np.eye(4), (len(rays), 1, 1))
+        T[:, :3, :3] = R
+        T[:, :3, 3] = (near + (far - near) * share) * rays - R @ middle
+        seen = bench.in_view(T)
+        if not seen.any():
+            continue
+        T, here = T[seen], places[seen]
+        centre = (here.min(0) + here.max(0)) / 2
+        picked = {
+            int(
+                np.argmax(here @ np.array(to) - 0.01 * (here**2).sum(1))
+                if any(to)
+                else np.argmin(((here - centre) ** 2).sum(1))
+            )
+            for to in TOWARDS
+        }
+        found.append(T[sorted(picked)])
+    return np.concatenate(found) if found else np.zeros((0, 4, 4))
+
+
+def _apart(one: np.ndarray, other: np.ndarray) -> float:
+    """How different two poses are: a tenth of the distance counts like 15 degrees."""
+    shift = float(np.linalg.norm(one[:3, 3] - other[:3, 3])) / (0.1 * one[2, 3])
+    turn = float(np.arccos(np.clip((np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2, -1, 1)))
+    return shift + turn / np.radians(15)
