@@ -24,9 +24,9 @@ from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.fringe.decode import texture
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import PatternSequence
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import Model, reconstruct
+from slviewer.reconstruction.reconstruct import Model
 from slviewer.simulation.boards import Shape
 from slviewer.simulation.perfect import PerfectModel
 from slviewer.simulation.plans import letter_plan
@@ -142,8 +142,8 @@ def measure_rig(case: Case, scale: float, poses: int, progress: Progress = unhea
     kept: dict[str, float] = {}
     for i, (name, scene) in enumerate(shapes.items()):
         progress(0.2 + 0.8 * (len(targets) + i) / total, f"{case.name}: {name}")
-        phases = decode_frames(name, only_x, Renderer(rig, scene).capture(only_x, numbers[name]))
-        found[name], kept[name] = scored(models, phases, covered, isinstance(scene, Spheres))
+        phase = decode_frames(name, only_x, Renderer(rig, scene).capture(only_x, numbers[name]))["x"]
+        found[name], kept[name] = scored(models, phase, covered, isinstance(scene, Spheres))
     measured = perf_counter()
     return RigFigures(
         case,
@@ -169,19 +169,19 @@ def covered_pixels(observations: Sequence[Observation]) -> np.ndarray:
 
 
 def scored(
-    models: Mapping[str, Model], phases: Mapping[Axis, PhaseMap], covered: np.ndarray, is_round: bool
+    models: Mapping[str, Model], phase: PhaseMap, covered: np.ndarray, is_round: bool
 ) -> tuple[Comparison, float]:
     """Every model's fit to one capture over the covered pixels, and the share of these that splined measures."""
     clouds = {}
     for name, model in models.items():
-        cloud = reconstruct(model, phases, axis="x")
-        points = np.where(covered[..., None], cloud.points, np.float32(np.nan))
-        clouds[name] = Cloud(points, cloud.axis, cloud.model, cloud.sigma_z)
+        points = model.points(phase)
+        sigma = model.sigma_z(phase, points)
+        clouds[name] = Cloud(np.where(covered[..., None], points, np.float32(np.nan)), phase.axis, name, sigma)
     judged = {name: clouds[name] for name in JUDGED}
     comparison = compare(
         "sphere" if is_round else "plane",
         judged,
-        phases["x"].lit,
+        phase.lit,
         depth_range=DEPTH_RANGE_MM,
         radius=SPHERE_RADIUS_MM if is_round else None,
     )
