@@ -13,9 +13,11 @@ class Cloud:
     """What one capture measured.
 
     ``points``: (h, w, 3) float32 mm in the camera's frame, NaN where invalid. ``axis``: the one that depth came from.
-    ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm, predicted from the capture's noise. ``texture``:
-    (h, w) grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's range (10, 12, 14
-    or 16 bits, whichever holds its brightest pixel).
+    ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm, predicted from the capture's noise.
+    ``sigma_calibration``: (h, w) float32 mm of z too, what the calibration leaves uncertain, rigid motion apart: the
+    same in every scan; None from a model that does not know. ``texture``: (h, w) grey or (h, w, 3) RGB, uint8, or None;
+    a 16-bit texture is scaled to 8 bits by the camera's range (10, 12, 14 or 16 bits, whichever holds its brightest
+    pixel).
     """
 
     points: np.ndarray
@@ -23,6 +25,7 @@ class Cloud:
     model: str
     sigma_z: np.ndarray
     texture: np.ndarray | None = None
+    sigma_calibration: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points, dtype=np.float32)
@@ -34,6 +37,11 @@ class Cloud:
             )
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "sigma_z", sigma_z)
+        if self.sigma_calibration is not None:
+            left = np.asarray(self.sigma_calibration, dtype=np.float32)
+            if left.shape != sigma_z.shape:
+                raise InputError(f"sigma_calibration of shape {left.shape} does not belong to {sigma_z.shape} pixels.")
+            object.__setattr__(self, "sigma_calibration", left)
         if self.texture is not None:
             object.__setattr__(self, "texture", _eight_bits(self.texture, points.shape[:2]))
 
@@ -46,6 +54,22 @@ class Cloud:
     def measured(self) -> np.ndarray:
         """(n, 3) float32 mm: the measured points, in the order of ``mask``."""
         return self.points[self.mask]
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(h, w) float32 mm: the standard deviation of z from noise and calibration together, NaN where invalid; from
+        noise alone where the calibration's part is not known. As a picture, the map of how sure the cloud is."""
+        if self.sigma_calibration is None:
+            return self.sigma_z
+        return np.asarray(np.hypot(self.sigma_z, self.sigma_calibration))
+
+    def sigmas(self, chosen: np.ndarray) -> dict[str, np.ndarray]:
+        """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them: ``sigma_noise``, and
+        where the model knows it ``sigma_calibration`` and ``sigma``, both together; mm of z."""
+        scalars = {"sigma_noise": self.sigma_z[chosen]}
+        if self.sigma_calibration is not None:
+            scalars |= {"sigma_calibration": self.sigma_calibration[chosen], "sigma": self.sigma[chosen]}
+        return scalars
 
     def colours(self) -> np.ndarray | None:
         """(n,) grey or (n, 3) RGB uint8 of the measured points, in the order of ``mask``; None without a texture."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numba
 import numpy as np
@@ -37,13 +37,21 @@ class Model(Protocol):
         """(h, w) mm: predicted standard deviation of depth."""
 
 
+@runtime_checkable
+class Sure(Protocol):
+    """A calibration that knows how far it may be off."""
+
+    def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
+        """(h, w) float32 mm: standard deviation of the depth of organised points that the calibration leaves."""
+
+
 def reconstruct(
     model: Model,
     phases: Mapping[Axis, PhaseMap],
     axis: Axis | None = None,
     texture: np.ndarray | None = None,
 ) -> Cloud:
-    """The organised cloud of a capture: points, predicted sigma_z and texture on the camera's grid.
+    """The organised cloud of a capture: points, predicted sigmas and texture on the camera's grid.
 
     ``phases``: the capture's absolute phase maps by axis. ``axis``: the one that depth is taken from; None chooses as
     ``choose_axis`` does. ``texture``: (h, w) or (h, w, 3), uint8 or uint16.
@@ -63,7 +71,8 @@ def reconstruct(
         measured = _measure_all(model, phases)
         axis = _best_axis(measured)
         points, sigma_z = measured[axis]
-    return Cloud(points, axis, model.name, sigma_z, texture)
+    left = model.sigma_calibration(axis, points) if isinstance(model, Sure) else None
+    return Cloud(points, axis, model.name, sigma_z, texture, left)
 
 
 def choose_axis(model: Model, phases: Mapping[Axis, PhaseMap]) -> Axis:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slviewer.errors import UsageError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.ply import write_ply
@@ -83,6 +85,8 @@ def merge(
     merged = merge_clouds(clouds, reference, lambda done: registering(done, "registering"))
     progress(0.9, "writing")
     Path(out).parent.mkdir(parents=True, exist_ok=True)
-    write_ply(Path(out), merged.points, colours=merged.colours, normals=merged.normals)
+    each = [cloud.sigmas(cloud.mask) for cloud in (clouds[name] for name in merged.names)]
+    scalars = {what: np.concatenate([sigmas[what] for sigmas in each]) for what in each[0]}
+    write_ply(Path(out), merged.points, colours=merged.colours, normals=merged.normals, scalars=scalars)
     progress(1.0, "merged")
     return Merge(merged, clouds, reference, Path(out), scale)

@@ -57,6 +57,7 @@ def scaled(cloud: Cloud, factor: float) -> Cloud:
         cloud,
         points=cloud.points * np.float32(factor),
         sigma_z=cloud.sigma_z * np.float32(factor),
+        sigma_calibration=None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor),
         texture=cloud.texture,
     )
 

@@ -13,6 +13,7 @@ from slviewer.calibration.splined.board_shape import board_frame, board_heights
 from slviewer.calibration.splined.evidence import Noise
 from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.posterior import point_rows
+from slviewer.calibration.splined.uncertainty import volume_sigma
 from slviewer.calibration.splined.unknowns import Arrangement, State
 from slviewer.fringe.sequence import Axis
 
@@ -75,6 +76,11 @@ class Bundle:
         right = np.asarray(dense, self.factor.dtype).T
         return np.asarray(solve_triangular(self.factor, right, lower=True, check_finite=False))
 
+    @cached_property
+    def sigma_volume(self) -> dict[str, Any]:
+        """How sure the rig is of its working volume, as ``uncertainty.volume_sigma`` says."""
+        return volume_sigma(self)
+
     def summary(self) -> dict[str, Any]:
         """The figures that ``text`` tells, JSON-able."""
         fields = {
@@ -92,6 +98,7 @@ class Bundle:
                 "camera": float(np.mean(self.camera_poses > 0)),
                 "projector": float(np.mean(self.projector_poses > 0)),
             },
+            "sigma_volume_mm": self.sigma_volume,
             "left_out": dict(self.left_out),
         }
 
@@ -100,6 +107,9 @@ class Bundle:
         s = self.summary()
         noise, local, lit = s["noise_px"], s["local_distortion_rms_px"], s["cells_lit"]
         low, high = s["board_height_mm"]
+        sure = s["sigma_volume_mm"]
+        near, far = sure["depths_mm"]
+        u, v, z = sure["worst_at"]
         return "\n".join(
             [
                 f"splined: residuals camera {noise['camera']:.4f} px, projector x {noise['x']:.4f}, "
@@ -110,6 +120,9 @@ class Bundle:
                 f"{s['board_offsets_rms_mm']:.4f} mm RMS",
                 f"  lit by target poses: {100 * lit['camera']:.0f} % of the camera's cells, "
                 f"{100 * lit['projector']:.0f} % of the projector's",
+                f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma): median "
+                f"{sure['median']:.4f} mm and 95 % below {sure['p95']:.4f} mm over the {100 * sure['supported']:.0f} % "
+                f"that the poses support; worst {sure['worst']:.3f} mm, at pixel ({u:.0f}, {v:.0f}) and {z:.0f} mm",
             ]
         )
 

@@ -10,6 +10,7 @@ import numpy as np
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.calibration.splined.bundle import Bundle, adjust
 from slviewer.calibration.splined.compiled import Compiled, compile_axis, pixel_rays
+from slviewer.calibration.splined.uncertainty import SigmaMap, sigma_map
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
@@ -59,6 +60,10 @@ class SplinedModel:
     def _compiled(self) -> dict[Axis, Compiled]:
         return {}
 
+    @cached_property
+    def _sigma_maps(self) -> dict[Axis, SigmaMap]:
+        return {}
+
     def compiled(self, axis: Axis) -> Compiled:
         """The fast form of one axis."""
         if axis not in self._compiled:
@@ -87,6 +92,17 @@ class SplinedModel:
         """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``; NaN where points are."""
         sigma = self.depth_per_rad(phase) * phase.sigma_phase
         return np.where(np.isfinite(points[..., 2]), sigma, np.nan).astype(np.float32)
+
+    def sigma_map(self, axis: Axis) -> SigmaMap:
+        """What the calibration leaves uncertain of depths through one axis, wherever points are measured."""
+        if axis not in self._sigma_maps:
+            self._sigma_maps[axis] = sigma_map(self.bundle, axis, *self.depths_mm)
+        return self._sigma_maps[axis]
+
+    def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
+        """(h, w) float32 mm: standard deviation of depth that the calibration leaves, rigid motion apart; NaN where the
+        organised points (h, w, 3) are. It is the same in every scan, and averages out in none."""
+        return self.sigma_map(axis).at(points)
 
     def to_dict(self) -> dict[str, Any]:
         """What is not an array, JSON-able."""

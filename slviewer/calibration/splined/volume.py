@@ -62,16 +62,52 @@ def working_volume(
 def volume_at(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volume:
     """Those of camera ``pixels`` (n, 2) at depths ``z`` (n,) mm that the projector's image holds."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
-    points, projector = _looked(rig, pixels, z)
+    points, projector = looked(rig, pixels, z)
     seen = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)  # False for NaN
     return Volume(pixels[seen], z[seen], points[seen], projector[seen])
 
 
+def looked(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) mm: what camera ``pixels`` (n, 2) float64 see at depths ``z`` (n,); (n, 2) px: where the projector has it,
+    inside its image or not. NaN where a lens has no answer."""
+    points, projector = np.empty((len(z), 3)), np.empty((len(z), 2))
+    _look(rig, pixels, z, points, projector)
+    return points, projector
+
+
 def better_axis(rig: Arrangement, volume: Volume) -> Axis:
     """The projector coordinate that depth moves more, in the median over the volume."""
-    _, later = _looked(rig, volume.pixels, 1.001 * volume.z)
+    _, later = looked(rig, volume.pixels, 1.001 * volume.z)
     across, down = np.nanmedian(np.abs(later - volume.projector), axis=0)
     return "y" if down > across else "x"
+
+
+@dataclass(frozen=True, eq=False)
+class BestMotion:
+    """The small rigid motion that fits errors of some points best: errors (3 n,) times ``weights`` (3 n, 6) are three
+    shifts, and three turns about ``centre`` times ``arm`` mm."""
+
+    weights: np.ndarray
+    centre: np.ndarray
+    arm: float
+
+    @classmethod
+    def of(cls, points: np.ndarray, fitted: np.ndarray | None = None) -> "BestMotion":
+        """For errors of ``points`` (n, 3), or of those that are ``fitted`` (n,) bool; the others weigh nothing.
+
+        Raises InputError where these are fewer than three.
+        """
+        chosen = np.ones(len(points), bool) if fitted is None else np.asarray(fitted, bool)
+        if np.count_nonzero(chosen) < 3:
+            raise InputError(f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three")
+        centre = points[chosen].mean(axis=0)
+        arm = max(float(np.sqrt(np.mean((points[chosen] - centre) ** 2))), 1e-12)
+        held = _motions(points, centre, arm) * np.repeat(chosen, 3)[:, None]
+        return cls(np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T, centre, arm)
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """(3 n, 6): how points (n, 3) move; x, y, z of the first, then of the next."""
+        return _motions(points, self.centre, self.arm)
 
 
 def motion_free(whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | None = None) -> np.ndarray:
@@ -81,31 +117,9 @@ def motion_free(whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | N
     The motion is that which fits the points best, or those of them that are ``fitted`` (n,) bool; it is taken from all.
     A Jacobian by the unknowns is given transposed. Raises InputError where fewer than three points are fitted.
     """
-    chosen = np.ones(len(points), bool) if fitted is None else np.asarray(fitted, bool)
-    if np.count_nonzero(chosen) < 3:
-        raise InputError(f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three")
-    motions = rigid_motions(points, points[chosen].mean(axis=0))
-    held = motions * np.repeat(chosen, 3)[:, None]
-    # (3 n, 6): weights of the points' errors in the best motion
-    weights = np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T.astype(whitened.dtype)
-    return np.asarray(whitened - (whitened @ weights) @ motions.T.astype(whitened.dtype))
-
-
-def rigid_motions(points: np.ndarray, about: np.ndarray) -> np.ndarray:
-    """(3 n, 6): how points (n, 3) move, three shifts by 1 and three small turns about a point, scaled alike."""
-    arms = (points - about) / max(float(np.sqrt(np.mean((points - about) ** 2))), 1e-12)
-    x, y, z = arms.T
-    nothing = np.zeros(len(points))
-    turns = np.stack(
-        [
-            np.stack([nothing, -z, y], axis=1),
-            np.stack([z, nothing, -x], axis=1),
-            np.stack([-y, x, nothing], axis=1),
-        ],
-        axis=2,
-    )
-    shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-    return np.concatenate([shifts, turns], axis=2).reshape(-1, 6)
+    motion = BestMotion.of(points, fitted)
+    weights, moved = motion.weights.astype(whitened.dtype), motion.at(points).astype(whitened.dtype)
+    return np.asarray(whitened - (whitened @ weights) @ moved.T)
 
 
 def sigma_3d(whitened: np.ndarray) -> np.ndarray:
@@ -114,10 +128,17 @@ def sigma_3d(whitened: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(squares.reshape(-1, 3).sum(axis=1)))
 
 
-def _looked(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    points, projector = np.empty((len(z), 3)), np.empty((len(z), 2))
-    _look(rig, pixels, z, points, projector)
-    return points, projector
+def _motions(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
+    x, y, z = ((points - centre) / arm).T
+    none, one = np.zeros(len(points)), np.ones(len(points))
+    along = np.array(
+        [
+            [one, none, none, none, z, -y],
+            [none, one, none, -z, none, x],
+            [none, none, one, y, -x, none],
+        ]
+    )
+    return np.asarray(along.transpose(2, 0, 1).reshape(-1, 6))
 
 
 def _lit(device: Device, pixels: np.ndarray, lit: np.ndarray) -> np.ndarray:

@@ -1,0 +1,135 @@
+"""How sure the calibration is of every place: standard deviations that no longer exposure and no second scan lessens.
+
+All of them are of what a rigid motion leaves: where the whole space lies in the camera's frame is thirty times less
+certain than its shape, and nothing that is measured with it depends on that.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import prange
+from scipy.ndimage import distance_transform_edt
+
+from slviewer.calibration.splined.volume import (
+    BestMotion,
+    Volume,
+    better_axis,
+    looked,
+    motion_free,
+    sigma_3d,
+    working_volume,
+)
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.jit import kernel
+
+if TYPE_CHECKING:
+    from slviewer.calibration.splined.found import Bundle
+
+NODES = (21, 16, 7)
+"""Of the map across, down, and in depth: support ends within a cell of the fields, and they have 26 across."""
+LEAST_FITTED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SigmaMap:
+    """One axis: ``nodes`` (nv, nu, nz) float32 mm, the standard deviation of z, evenly over the image and from ``near``
+    to ``far`` mm."""
+
+    nodes: np.ndarray
+    near: float
+    far: float
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """(h, w) float32 mm at the organised points (h, w, 3) of the whole image; NaN where they are.
+
+        Between nodes its logarithm is linear: it grows hundredfold where support ends.
+        """
+        out = np.empty(points.shape[:2], np.float32)
+        _interpolate(np.ascontiguousarray(points[..., 2], np.float32), np.log(self.nodes), self.near, self.far, out)
+        return out
+
+
+def sigma_map(bundle: "Bundle", axis: Axis, near: float, far: float) -> SigmaMap:
+    """What the calibration leaves uncertain of the depths measured through one axis: a second of work.
+
+    The rigid motion is that of the working volume's supported places. Where no pose looked, the fields' priors say how
+    far they may be off.
+    """
+    reference = working_volume(bundle.state.rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
+    motion = BestMotion.of(reference.points, _fitted(bundle, reference))
+    jacobian = bundle.point_jacobian(axis, reference.pixels, reference.z)
+    moved = bundle.whitened(jacobian) @ motion.weights.astype(np.float32)
+    width, height = (int(n) for n in bundle.state.rig.camera.size)
+    across, down, deep = NODES
+    v, u, z = np.meshgrid(
+        np.linspace(0, height - 1, down), np.linspace(0, width - 1, across), np.linspace(near, far, deep), indexing="ij"
+    )
+    pixels, nodes = np.column_stack([u.ravel(), v.ravel()]), z.ravel()
+    jacobian = bundle.point_jacobian(axis, pixels, nodes)[2::3]
+    jacobian.data[~np.isfinite(jacobian.data)] = 0.0
+    points, _ = looked(bundle.state.rig, pixels, nodes)
+    depths = bundle.whitened(jacobian) - moved @ motion.at(points)[2::3].astype(np.float32).T
+    sigma = np.sqrt(np.einsum("mn,mn->n", depths, depths))
+    unknown = np.isnan(sigma) | (abs(jacobian).sum(axis=1).A1 == 0)
+    sigma, unknown = sigma.reshape(u.shape), unknown.reshape(u.shape)
+    # a pixel that is measured may have a node beyond the projector's view beside it
+    nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    return SigmaMap(np.ascontiguousarray(sigma[tuple(nearest)], np.float32), near, far)
+
+
+def volume_sigma(bundle: "Bundle") -> dict[str, Any]:
+    """How sure points of the working volume are, in all directions together, before anything is scanned.
+
+    ``median``, ``p95`` mm over the places that target poses support; ``worst`` mm of all, and ``worst_at`` (u, v, z);
+    ``supported``: their share of what camera and projector both see; ``depths_mm``; the ``axis`` measured through.
+    """
+    rig = bundle.state.rig
+    volume = working_volume(rig, bundle.depth_range_mm)
+    axis = better_axis(rig, volume)
+    fitted = _fitted(bundle, volume)
+    whitened = bundle.whitened(bundle.point_jacobian(axis, volume.pixels, volume.z))
+    sigma = sigma_3d(motion_free(whitened, volume.points, fitted))
+    worst = int(np.argmax(sigma))
+    return {
+        "median": float(np.median(sigma[fitted])),
+        "p95": float(np.percentile(sigma[fitted], 95)),
+        "worst": float(sigma[worst]),
+        "worst_at": [*volume.pixels[worst].tolist(), float(volume.z[worst])],
+        "supported": float(np.mean(volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0))),
+        "depths_mm": [float(volume.z.min()), float(volume.z.max())],
+        "axis": axis,
+    }
+
+
+def _fitted(bundle: "Bundle", volume: Volume) -> np.ndarray:
+    """(n,) bool: the supported places; all, where these are too few to say how the space lies."""
+    supported = volume.supported(bundle.state.rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
+    return supported if np.count_nonzero(supported) >= LEAST_FITTED else np.ones(len(supported), bool)
+
+
+@kernel(parallel=True)
+def _interpolate(z, logs, near, far, out):
+    height, width = z.shape
+    down, across, deep = logs.shape
+    for v in prange(height):
+        y = v * (down - 1.0) / max(height - 1, 1)
+        j = min(int(y), down - 2)
+        fy = y - j
+        for u in range(width):
+            d = (z[v, u] - near) / (far - near) * (deep - 1.0)
+            if not np.isfinite(d):
+                out[v, u] = np.nan
+                continue
+            d = min(max(d, 0.0), deep - 1.0)
+            k = min(int(d), deep - 2)
+            fz = d - k
+            x = u * (across - 1.0) / max(width - 1, 1)
+            i = min(int(x), across - 2)
+            fx = x - i
+            total = 0.0
+            for b in range(2):
+                for a in range(2):
+                    share = (fy if b else 1.0 - fy) * (fx if a else 1.0 - fx)
+                    total += share * ((1.0 - fz) * logs[j + b, i + a, k] + fz * logs[j + b, i + a, k + 1])
+            out[v, u] = np.exp(total)
