@@ -11,6 +11,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
+from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.session.store import Session
@@ -131,20 +132,33 @@ def best(store: Session, accept_rejected: bool = False) -> str:
 
 
 def preferred(store: Session) -> str:
+    """The calibration that the operator has chosen, while there is one of that name; else the one ``recommended``."""
+    decided = store.decision("model")
+    return str(decided) if decided and decided in available(store) else recommended(store)
+
+
+def recommended(store: Session) -> str:
     """The calibration that cross-validation recommends, where it was made for these; else splined or pixelwise, if it
     had 8 poses or more; else stereo.
     """
     there = available(store)
     if not there:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    if store.state_of(VALIDATION) == "fresh":
-        recommended = str(store.load_result(VALIDATION, only=())[0]["validation"]["recommended"])
-        if recommended in there:
-            return recommended
+    compared = validation(store)
+    if compared is not None and compared.recommended in there:
+        return compared.recommended
     for name in ("splined", "pixelwise"):
         if name in there and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE:
             return name
     return there[0]
+
+
+def validation(store: Session) -> CrossValidation | None:
+    """How the session's calibrations compare on poses that they were not made from; None where nobody has compared
+    them as they are now."""
+    if store.state_of(VALIDATION) != "fresh":
+        return None
+    return CrossValidation.from_json(store.load_result(VALIDATION, only=())[0]["validation"])
 
 
 def rejection(store: Session) -> str:
@@ -163,6 +177,19 @@ def check_accepted(store: Session, accept_rejected: bool = False) -> None:
         raise CalibrationRejected(
             f"the calibration was rejected, and is not used unless you insist (--accept-rejected): {reason}"
         )
+
+
+def insist(store: Session, on: bool) -> None:
+    """Remember whether the calibration at hand is to be used although it was rejected; another one is asked anew."""
+    store.decide("use_anyway", store.input_hashes("calibration/stereo")["calibration/stereo"] if on else None)
+
+
+def insisted(store: Session) -> bool:
+    """Whether that was decided of the calibration at hand."""
+    decided = store.decision("use_anyway")
+    if not decided or "stereo" not in available(store):
+        return False
+    return bool(decided == store.input_hashes("calibration/stereo")["calibration/stereo"])
 
 
 def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:

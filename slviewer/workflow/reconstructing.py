@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import DetectionError, InputError
 from slviewer.evaluation.compare import Comparison, compare
 from slviewer.fringe.phase import PhaseMap
@@ -27,7 +28,9 @@ from slviewer.workflow.trust import told
 @dataclass(frozen=True)
 class Reconstruction:
     """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
-    measures the board. ``scale`` says, in words, what correction of scale is in it."""
+    measures the board. ``scale`` says, in words, what correction of scale is in it; ``masked`` is the share of the
+    pixels that were left out because no target pose lit what they look through, None for models that leave out none.
+    """
 
     cloud: Cloud
     phases: Mapping[Axis, PhaseMap]
@@ -35,6 +38,7 @@ class Reconstruction:
     points: int
     board: Comparison | None = None
     scale: str = ""
+    masked: float | None = None
 
     def text(self) -> str:
         """For people."""
@@ -46,6 +50,8 @@ class Reconstruction:
         ]
         if self.scale:
             lines.append(self.scale)
+        if self.masked is not None and self.masked > 0.005:
+            lines.append(f"{100 * self.masked:.1f} % of the pixels are masked: they look where no target pose was")
         if self.board is not None:
             lines += ["inside the board's outline:", self.board.text()]
         return "\n".join(lines)
@@ -101,9 +107,10 @@ def reconstruct(
         write_ply(ply, cloud.points[keep], colours=texture[keep], scalars={"sigma_z": cloud.sigma_z[keep]})
         if grid is not None:
             write_grid(Path(grid), cloud.points)
-        scale = told_scale(store, name)
+        scale, fitted = told_scale(store, name), chosen[name]
+        masked = unsupported(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
         progress(1.0, "reconstructed")
-    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale)
+    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked)
 
 
 def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
@@ -133,6 +140,15 @@ def reconstruct_models(
         clouds[name] = corrected_cloud(store, model, phases, axis=axis)
         axis = axis or clouds[name].axis
     return clouds
+
+
+def unsupported(model: SplinedModel, phase: PhaseMap, region: np.ndarray | None = None) -> float:
+    """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are masked, because they
+    look through parts of camera or projector that no target pose lit."""
+    every = np.isfinite(model.points(phase, supported=False)[..., 2])
+    if region is not None:
+        every &= region
+    return float(1 - model.support(phase)[every].mean()) if every.any() else 0.0
 
 
 def write_grid(path: Path, points: np.ndarray) -> None:

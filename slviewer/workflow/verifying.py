@@ -12,13 +12,12 @@ from slviewer.errors import InputError, UsageError
 from slviewer.evaluation.compare import Comparison, compare
 from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
-from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
-from slviewer.workflow.reconstructing import board_region, lit, reconstruct_models
+from slviewer.workflow.reconstructing import board_region, lit, reconstruct_models, unsupported
 from slviewer.workflow.scaling import told_scale
 from slviewer.workflow.trust import told
 
@@ -132,12 +131,3 @@ def verify(
         scales = {name: words for name in chosen if (words := told_scale(store, name))}
         progress(1.0, "measured")
     return Verification(results, masked, scales)
-
-
-def unsupported(model: SplinedModel, phase: PhaseMap, region: np.ndarray | None = None) -> float:
-    """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are masked, because they
-    look through parts of camera or projector that no target pose lit."""
-    every = np.isfinite(model.points(phase, supported=False)[..., 2])
-    if region is not None:
-        every &= region
-    return float(1 - model.support(phase)[every].mean()) if every.any() else 0.0

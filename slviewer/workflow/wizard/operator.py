@@ -5,7 +5,7 @@ computing is done by the worker, so that requests may come from any thread, a br
 """
 
 from collections.abc import Callable, Sequence
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -21,6 +21,7 @@ from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
 from slviewer.workflow.calibrating import CalibrationResult
 from slviewer.workflow.merging import Merge
+from slviewer.workflow.models import available, check_accepted, insist, insisted
 from slviewer.workflow.preflight.checks import Preflight, Verdict
 from slviewer.workflow.preflight.run import preflight
 from slviewer.workflow.verifying import Shape
@@ -329,12 +330,38 @@ class Operator:
         store, target = self._engine.store, self._engine.reader.target()
         if not target:
             raise InputError("choose the target first")
+        engine = self._engine
 
-        def sentence(result: CalibrationResult) -> str:
-            rms = result.stereo.reprojection_rms_px["stereo"]
-            return f"calibrated from {len(result.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
+        def done(result: CalibrationResult) -> None:
+            engine.notices.tell(*work.told_calibration(result))
+            engine.teller.changed(session=True)
 
-        self._submit("Calibrating", lambda r: work.make_calibration(store, target, r, self._warn), sentence)
+        def failed(error: BaseException) -> None:
+            engine.notices.fail("Calibrating", error)
+            engine.teller.changed(session=True)  # what was rejected is kept, to look into
+
+        engine.jobs.submit(
+            "Calibrating", lambda r: work.make_calibration(store, target, r, self._warn), done, failed=failed
+        )
+
+    @_request("Comparing the models")
+    def compare_models(self) -> None:
+        """Measure each target pose by calibrations made without it; the best model is then recommended, and used."""
+        compare = partial(work.compare_models, self._engine.store, warn=self._warn)
+        self._submit("Comparing the models", compare, work.told_comparison)
+
+    @_request("Choosing the model")
+    def choose_model(self, name: str) -> None:
+        """Use this model from now on; empty: the one that is recommended."""
+        store = self._engine.store
+        if name and name not in (there := available(store)):
+            raise InputError(f"the session holds no {name} calibration: choose one of {', '.join(there)}")
+        store.decide("model", name or None)
+
+    @_request("Using the rejected calibration")
+    def use_anyway(self, on: bool) -> None:
+        """Use the calibration at hand although it was rejected, or do so no more."""
+        insist(self._engine.store, on)
 
     @_request("Verifying")
     def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
@@ -394,6 +421,8 @@ class Operator:
         store, view = self._engine.store, self._engine.teller.now().session
         check_export(kind, file_format or FORMATS.get(kind, ("",))[0])
         chosen = file_format or FORMATS[kind][0]
+        if kind == "calibration":
+            check_accepted(store, insisted(store))
         if kind in ("cloud", "mesh"):
             store.load_capture(name)
         if kind == "merged mesh":

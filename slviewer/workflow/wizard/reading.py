@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import outline_px
 from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
@@ -17,17 +19,31 @@ from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.capturing import PATTERNS
-from slviewer.workflow.models import available, load_model, load_stereo, preferred
+from slviewer.workflow.diagnosing import last_verdict
+from slviewer.workflow.models import (
+    available,
+    insisted,
+    load_model,
+    load_stereo,
+    preferred,
+    recommended,
+    rejection,
+    validation,
+)
+from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.wizard.exporting import listed
 from slviewer.workflow.wizard.snapshot import (
     CalibrationView,
     CentreDistance,
+    ComparisonView,
     MergeView,
+    ModelFigures,
     PoseState,
     PoseView,
     RigView,
     ScanView,
     SessionView,
+    SplinedView,
     VerificationRow,
 )
 from slviewer.workflow.wizard.suggestion import Features, Plan, plan
@@ -106,7 +122,9 @@ class Reader:
                 if self._fresh(name, hashes):
                     hashes[name] = self._meta(name)["hash"]
         poses, planned = self._poses(captures, target, stereo, calibration, rig, focal_px)
-        rows, distances = self._verifications(captures, labels, hashes)
+        factors = {model: scale_factor(session, model) for model in calibration.models} if calibration else {}
+        rows, distances = self._verifications(captures, labels, hashes, factors)
+        verdict = last_verdict(session)
         merges = [name for name in self._results("merge/") if set(self._meta(name)["scans"]) <= set(captures)]
         return SessionView(
             folder=session.folder,
@@ -117,10 +135,12 @@ class Reader:
             coverage=None if planned is None else planned.coverage,
             suggestion=None if planned is None else planned.suggestion,
             calibration=calibration,
+            verdict=verdict,
+            verdict_of_calibration=self._is_of_calibration(verdict, stereo),
             verifications=rows,
             distances=distances,
-            scans=tuple(self._scan(c, labels, hashes) for c in captures.values() if c.role == "scan"),
-            merge=self._merge(merges[-1], hashes) if merges else None,
+            scans=tuple(self._scan(c, labels, hashes, factors) for c in captures.values() if c.role == "scan"),
+            merge=self._merge(merges[-1], hashes, factors) if merges else None,
             merges=len(merges),
             exports=listed(session),
             exposures_ms=self.exposures_ms(),
@@ -251,6 +271,9 @@ class Reader:
         if "pixelwise" in models:
             key = ("pixelwise", self._meta("calibration/pixelwise")["hash"])
             fit_rms = self._keep(key, lambda: _fit_rms(session))
+        splined = None
+        if "splined" in models:
+            splined = self._keep(("splined", self._meta("calibration/splined")["hash"]), lambda: _splined(session))
         rig = stereo.rig
         return stereo, CalibrationView(
             models=models,
@@ -271,7 +294,21 @@ class Reader:
             t=rig.t,
             focal_sigma_px=stereo.focal_sigma_px,
             fit_rms_mm=fit_rms,
+            recommended=recommended(session),
+            chosen=str(decided) if (decided := session.decision("model")) in models else "",
+            rejected=rejection(session),
+            insisted=insisted(session),
+            features_set_aside=stereo.features_set_aside,
+            splined=splined,
+            comparison=_comparison(session),
+            scales={model: words for model in models if (words := told_scale(session, model))},
         )
+
+    def _is_of_calibration(self, verdict: Verdict | None, stereo: StereoModel | None) -> bool:
+        if verdict is None or stereo is None:
+            return False
+        judged = self._meta("calibration/stereo").get("verdict")
+        return bool(judged == verdict.to_json())
 
     def _stale(self, inputs: Mapping[str, str], captures: Mapping[str, Capture]) -> str:
         excluded = self.session.excluded()
@@ -286,14 +323,18 @@ class Reader:
     # verifications, scans, merges
 
     def _verifications(
-        self, captures: Mapping[str, Capture], labels: Mapping[str, str], hashes: Mapping[str, str]
+        self,
+        captures: Mapping[str, Capture],
+        labels: Mapping[str, str],
+        hashes: Mapping[str, str],
+        factors: Mapping[str, float],
     ) -> tuple[tuple[VerificationRow, ...], tuple[CentreDistance, ...]]:
         rows, centres = [], {}
         for result in self._results("verify/"):
             name, meta = result.removeprefix("verify/"), self._meta(result)
             if name not in captures:
                 continue
-            stale = not self._fresh(result, hashes)
+            stale = not self._fresh(result, hashes, factors)
             for model, figures in meta["models"].items():
                 rows.append(
                     VerificationRow(
@@ -303,6 +344,7 @@ class Reader:
                         model=model,
                         incidence=meta["incidence"],
                         stale=stale,
+                        masked=meta.get("masked", {}).get(model),
                         **figures,
                     )
                 )
@@ -315,7 +357,9 @@ class Reader:
         ]
         return tuple(rows), tuple(distances)
 
-    def _scan(self, capture: Capture, labels: Mapping[str, str], hashes: Mapping[str, str]) -> ScanView:
+    def _scan(
+        self, capture: Capture, labels: Mapping[str, str], hashes: Mapping[str, str], factors: Mapping[str, float]
+    ) -> ScanView:
         result = f"clouds/{capture.name}"
         try:
             meta = self._meta(result)
@@ -327,15 +371,17 @@ class Reader:
             label=str(labels.get(capture.name, capture.name)),
             purpose=capture.meta.get("settings", {}).get("purpose", "scan"),
             created=str(capture.meta.get("created", "")),
-            cloud="absent" if meta is None else "fresh" if self._fresh(result, hashes) else "stale",
+            cloud="absent" if meta is None else "fresh" if self._fresh(result, hashes, factors) else "stale",
             model="" if meta is None else meta["model"],
             points=0 if meta is None else meta["points"],
             depth_mm=depths,
             noise_mm=None if meta is None else meta["noise_mm"],
+            masked=None if meta is None else meta.get("masked"),
+            scale="" if meta is None else meta.get("scale", ""),
             thumbnail=self._thumbnails.get(capture.hash, b""),
         )
 
-    def _merge(self, result: str, hashes: Mapping[str, str]) -> MergeView:
+    def _merge(self, result: str, hashes: Mapping[str, str], factors: Mapping[str, float]) -> MergeView:
         meta = self._meta(result)
         return MergeView(
             name=result.removeprefix("merge/"),
@@ -346,7 +392,7 @@ class Reader:
                 name: (pair["rms_mm"], pair["overlap"], np.array(pair["T_reference_scan"]))
                 for name, pair in meta["pairs"].items()
             },
-            stale=not self._fresh(result, hashes),
+            stale=not self._fresh(result, hashes, factors),
         )
 
     # files
@@ -357,9 +403,13 @@ class Reader:
     def _meta(self, result: str) -> dict[str, Any]:
         return self.session.load_result(result, only=())[0]
 
-    def _fresh(self, result: str, hashes: Mapping[str, str]) -> bool:
-        """Whether every input is there with the hash it had, and is fresh itself."""
-        return all(hashes.get(name) == used for name, used in self._meta(result).get("inputs", {}).items())
+    def _fresh(self, result: str, hashes: Mapping[str, str], factors: Mapping[str, float] | None = None) -> bool:
+        """Whether every input is there with the hash it had, and is fresh itself, and no scale was changed since."""
+        meta = self._meta(result)
+        scales = meta.get("scales", {}) if factors is not None else {}
+        return all(hashes.get(name) == used for name, used in meta.get("inputs", {}).items()) and all(
+            (factors or {}).get(model) == factor for model, factor in scales.items()
+        )
 
     def _keep(self, key: Any, make: Callable[[], Any]) -> Any:
         if key not in self._kept:
@@ -373,6 +423,31 @@ def _fit_rms(session: Session) -> dict[str, Mapping[str, float]]:
     model = load_model(session, "pixelwise")
     assert isinstance(model, PixelwiseModel)
     return {axis: model.median_rms_mm(axis) for axis in model.axes}
+
+
+def _splined(session: Session) -> SplinedView:
+    model = load_model(session, "splined")
+    assert isinstance(model, SplinedModel)
+    found, fits = model.bundle.summary(), model.bundle.fits
+    low, high = found["board_height_mm"]
+    return SplinedView(
+        noise_px=found["noise_px"],
+        local_px=found["local_distortion_rms_px"],
+        height_mm=(low, high),
+        misplaced_mm=found["board_offsets_rms_mm"],
+        lit=found["cells_lit"],
+        left_out=found["left_out"],
+        trust={name: (fit.camera_trust, fit.projector_trust) for name, fit in fits.items()},
+    )
+
+
+def _comparison(session: Session) -> ComparisonView | None:
+    found = validation(session)
+    if found is None:
+        return None
+    figures = ("plane_mm", "board_mm", "scale_ppm", "camera_px", "projector_px")
+    rows = (ModelFigures(model, *(found.rms(model, figure) for figure in figures)) for model in found.models)
+    return ComparisonView(tuple(rows), len(next(iter(found.poses.values()))), len(found.folds), found.failed)
 
 
 def _listed(names: list[str]) -> str:

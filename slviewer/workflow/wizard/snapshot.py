@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.geometry.lens import Lens
 from slviewer.workflow.preflight.checks import Preflight
@@ -92,12 +93,54 @@ class PoseView:
     thumbnail: bytes = field(repr=False)
 
 
+@dataclass(frozen=True)
+class SplinedView:
+    """What the joint adjustment found: residual noise px of the camera and along the projector's x and y, each device's
+    local distortion px RMS, the board's lowest and highest place and its features' misplacement in mm, and the shares
+    of both devices' cells that target poses lit. `left_out`: poses that contradict the others, with the reason; `trust`
+    of each pose in camera and projector, 0 ... 1.
+    """
+
+    noise_px: Mapping[str, float]
+    local_px: Mapping[str, float]
+    height_mm: tuple[float, float]
+    misplaced_mm: float
+    lit: Mapping[str, float]
+    left_out: Mapping[str, str]
+    trust: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class ModelFigures:
+    """One model on poses that it was not made from, RMS: as `evaluation.crossvalidation.HeldOut` has them."""
+
+    model: str
+    plane_mm: float
+    board_mm: float
+    scale_ppm: float
+    camera_px: float
+    projector_px: float
+
+
+@dataclass(frozen=True)
+class ComparisonView:
+    """The models compared on `poses` poses, each left out with its fold; `failed`: {model: why it is not judged}."""
+
+    models: tuple[ModelFigures, ...]
+    poses: int
+    folds: int
+    failed: Mapping[str, str]
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
     """The session's calibration; `stale` says in a sentence what changed since, empty where nothing did.
 
     `target` is empty for one made elsewhere.
     `fit_rms_mm`: {axis: {z, x, y: median mm}} of the pixel-wise fit, empty where there is none.
+    `best` is the model that is used, `recommended` the one that would be if the operator had not `chosen` (empty: he
+    has not). `rejected` says why it was, empty where it was not; `insisted`: it is used all the same.
+    `scales`: {model: what correction of scale was applied, in words}.
     """
 
     models: tuple[str, ...]
@@ -118,6 +161,19 @@ class CalibrationView:
     t: np.ndarray
     focal_sigma_px: Mapping[str, float]
     fit_rms_mm: Mapping[str, Mapping[str, float]]
+    recommended: str = ""
+    chosen: str = ""
+    rejected: str = ""
+    insisted: bool = False
+    features_set_aside: int = 0
+    splined: SplinedView | None = None
+    comparison: ComparisonView | None = None
+    scales: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def refused(self) -> str:
+        """Why later steps do not use it; empty where they do."""
+        return "" if self.insisted else self.rejected
 
 
 @dataclass(frozen=True)
@@ -136,6 +192,7 @@ class VerificationRow:
     coverage: float | None
     incidence: Mapping[str, float] | None  # percent in R1, R2, R3
     stale: bool
+    masked: float | None = None  # share of the shape that looks where no target pose was; None: the model masks nothing
 
 
 @dataclass(frozen=True)
@@ -163,6 +220,8 @@ class ScanView:
     depth_mm: tuple[float, float] | None
     noise_mm: float | None
     thumbnail: bytes = field(repr=False)
+    masked: float | None = None  # share of the pixels that look where no target pose was; None: nothing is masked so
+    scale: str = ""  # what correction of scale is in the cloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +290,8 @@ class SessionView:
     coverage: Coverage | None = None
     suggestion: Suggestion | None = None
     calibration: CalibrationView | None = None
+    verdict: Verdict | None = None  # on the last attempt to calibrate, also where nothing came of it
+    verdict_of_calibration: bool = True  # whether that attempt made `calibration`
     verifications: tuple[VerificationRow, ...] = ()
     distances: tuple[CentreDistance, ...] = ()
     scans: tuple[ScanView, ...] = ()

@@ -166,7 +166,7 @@ def _calibrate_blocked(facts: Facts) -> str:
 
 def _calibrate_done(facts: Facts) -> bool:
     calibration = facts.session.calibration if facts.session else None
-    return calibration is not None and not calibration.stale
+    return calibration is not None and not calibration.stale and not calibration.refused
 
 
 def _calibrate_now(facts: Facts) -> str:
@@ -175,6 +175,8 @@ def _calibrate_now(facts: Facts) -> str:
         return f"Calibrate from {facts.good_poses} poses."
     if calibration.stale:
         return f"Calibrate again from {facts.good_poses} poses."
+    if calibration.refused:
+        return "This calibration was rejected, and is kept to look into: mend what is named below, and calibrate again."
     stereo = calibration.reprojection_px.get("stereo")
     figure = (
         "made elsewhere" if stereo is None else f"reprojection RMS {stereo:.3f} px from {len(calibration.poses)} poses"
@@ -191,15 +193,21 @@ def _calibrate_wrong(facts: Facts) -> Iterator[str]:
             yield f"The calibration is out of date: {session.calibration.stale}."
         elif added := sum(pose.state == "good" for pose in session.poses):
             yield f"{added} good pose{'s' * (added != 1)} came after the calibration: calibrate again to use them."
-        for pose in session.poses:
-            if pose.state == "left out":
-                yield f"{pose.name} is left out: {pose.why}"
     if MIN_POSES <= facts.good_poses < POSES_FOR_PIXELWISE:
         yield f"With fewer than {POSES_FOR_PIXELWISE} poses only the stereo model is trusted: capture more."
 
 
-def _needs_calibration(facts: Facts) -> str:
+def _calibrated(facts: Facts) -> str:
     return _no_session(facts) or ("" if facts.calibrated else "Calibrate first.")
+
+
+def _needs_calibration(facts: Facts) -> str:
+    if why := _calibrated(facts):
+        return why
+    assert facts.session is not None and facts.session.calibration is not None
+    if reason := facts.session.calibration.refused:
+        return f"The calibration was rejected: {reason}. Calibrate again, or insist on it in the step Calibrate."
+    return ""
 
 
 def _capturing_wrong(facts: Facts) -> Iterator[str]:
@@ -297,7 +305,7 @@ STEPS = (
     Step(
         "export",
         "Export",
-        _needs_calibration,
+        _calibrated,
         lambda f: bool(f.session and f.session.exports),
         _export_now,
         _nothing,

@@ -13,6 +13,7 @@ All of them name their inputs, so that what has become stale is seen.
 import numpy as np
 
 from slviewer.calibration.observe import Smoothing
+from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.session.store import Session
@@ -20,12 +21,15 @@ from slviewer.target.board import Board
 from slviewer.workflow.calibrating import CalibrationResult, calibrate
 from slviewer.workflow.feedback import Warn
 from slviewer.workflow.merging import Merge, merge
-from slviewer.workflow.models import available, best
+from slviewer.workflow.models import POSES_FOR_PIXELWISE, available, best, insisted
 from slviewer.workflow.poses import Judged, judge_all
 from slviewer.workflow.reconstructing import reconstruct
+from slviewer.workflow.scaling import scale_factor
+from slviewer.workflow.validating import validate
 from slviewer.workflow.verifying import Shape, verify
 from slviewer.workflow.wizard.exporting import delivered
 from slviewer.workflow.wizard.jobs import Reporter
+from slviewer.workflow.wizard.snapshot import Level
 
 SMOOTHING = Smoothing()
 
@@ -37,15 +41,58 @@ def judge_pose(session: Session, name: str, board: Board, report: Reporter) -> J
 
 
 def make_calibration(session: Session, target: str, report: Reporter, warn: Warn) -> CalibrationResult:
-    """Calibrate both models from the poses that are not excluded."""
-    return calibrate(session.guarded(report.saving), target, progress=report, warn=warn)
+    """Calibrate every model that the poses which are not excluded allow; models of before do not outlive it."""
+    guarded = session.guarded(report.saving)
+    models = ["stereo", "pixelwise", *(name for name in available(session) if name == "anchored")]
+    if lacking := lacking_for_splined(session):
+        warn(f"no splined model: {lacking}")
+    else:
+        models.append("splined")
+    made = calibrate(guarded, target, models=models, progress=report, warn=warn)
+    for name in available(session):
+        if getattr(made, name) is None:
+            guarded.trash_result(f"calibration/{name}")
+    return made
+
+
+def told_calibration(made: CalibrationResult) -> tuple[Level, str]:
+    """How it went, in a sentence."""
+    rms = made.stereo.reprojection_rms_px["stereo"]
+    said = f"calibrated from {len(made.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
+    return ("good", said) if made.verdict.level == "good" else ("warning", f"{said}; doubtful: {made.verdict.reason}")
+
+
+def lacking_for_splined(session: Session) -> str:
+    """What the poses lack for the splined model, in words; empty where they allow it."""
+    excluded = session.excluded()
+    poses = [capture for capture in session.captures("calibration") if capture.name not in excluded]
+    both = sum(len(capture.sequence.axes) == 2 for capture in poses)
+    if both >= POSES_FOR_PIXELWISE:
+        return ""
+    needed = f"it needs {POSES_FOR_PIXELWISE} target poses with patterns along both axes"
+    if len(poses) < POSES_FOR_PIXELWISE:
+        return f"{needed}, and there are {both}: capture more"
+    return f"{needed}, and only {both} of {len(poses)} have them: choose patterns of both axes, and capture more"
+
+
+def compare_models(session: Session, report: Reporter, warn: Warn) -> CrossValidation:
+    """Measure each pose by calibrations made without it, model by model, and keep how they compare."""
+    return validate(session.guarded(report.saving), progress=report, warn=warn)
+
+
+def told_comparison(found: CrossValidation) -> str:
+    """How it went, in a sentence."""
+    figures = ", ".join(f"{model} {found.rms(model, 'board_mm'):.3f} mm" for model in found.models)
+    return f"boards that were left out come out wrong by {figures}: {found.recommended} is recommended"
 
 
 def make_cloud(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
     """Reconstruct a capture, keep its cloud, and put its PLY into the exports; returns how many points it has."""
-    model = model or best(session)
+    insist = insisted(session)
+    model = model or best(session, insist)
     with delivered(session, f"{name}_{model}.ply", report) as ply:
-        found = reconstruct(session, name, model=model, out=ply, progress=report.within(0, 0.9), warn=warn)
+        progress = report.within(0, 0.9)
+        found = reconstruct(session, name, model=model, out=ply, accept_rejected=insist, progress=progress, warn=warn)
         cloud, phase = found.cloud, found.phases[found.cloud.axis]
         z = cloud.points[..., 2][cloud.mask]
         near, far = np.percentile(z, [1, 99])
@@ -56,6 +103,9 @@ def make_cloud(session: Session, name: str, model: str | None, report: Reporter,
             "points": found.points,
             "depth_mm": [float(near), float(far)],
             "noise_mm": float(np.median(cloud.sigma_z[cloud.mask])),
+            "masked": found.masked,
+            "scale": found.scale,
+            "scales": {model: scale_factor(session, model)},
             "inputs": session.input_hashes(name, *calibrations),
         }
         assert cloud.texture is not None
@@ -79,11 +129,22 @@ def measure(
     rms = {}
     for i, name in enumerate(names):
         span = report.within(i / len(names), (i + 1) / len(names))
-        found = verify(session, [name], shape, radius=radius, progress=span.within(0, 0.5), warn=warn).captures[name]
+        measured = verify(
+            session,
+            [name],
+            shape,
+            radius=radius,
+            accept_rejected=insisted(session),
+            progress=span.within(0, 0.5),
+            warn=warn,
+        )
+        found = measured.captures[name]
         models = available(session)
         meta = {
             **found.to_dict(),
             "centres_mm": {m: r.sphere.centre for m, r in found.results.items() if isinstance(r, SphereResult)},
+            "masked": dict(measured.masked[name]),
+            "scales": {model: scale_factor(session, model) for model in models},
             "normals": {m: r.plane.normal for m, r in found.results.items() if isinstance(r, PlaneResult)},
             "inputs": session.input_hashes(name, *(f"calibration/{model}" for model in models)),
         }
@@ -100,9 +161,11 @@ def merge_scans(session: Session, names: list[str], reference: str, report: Repo
     """Register scans to a reference, and keep how they lie; the merged PLY goes into the exports."""
     done = [int(name.removeprefix("merge/")) for name in session.result_names() if name.startswith("merge/")]
     number = max(done, default=0) + 1
-    model = best(session)
+    insist = insisted(session)
+    model = best(session, insist)
     with delivered(session, f"merged_{number}.ply", report) as ply:
-        found = merge(session, names, reference, ply, model=model, progress=report.within(0, 0.97), warn=warn)
+        progress = report.within(0, 0.97)
+        found = merge(session, names, reference, ply, model=model, accept_rejected=insist, progress=progress, warn=warn)
         calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
         meta = {
             **found.to_json(),
@@ -110,6 +173,8 @@ def merge_scans(session: Session, names: list[str], reference: str, report: Repo
             "points": len(found.merged.points),
             "ply": f"merged_{number}.ply",
             "model": model,
+            "scale": found.scale,
+            "scales": {model: scale_factor(session, model)},
             "inputs": session.input_hashes(*found.merged.names, *calibrations),
         }
         session.guarded(report.saving).save_result(f"merge/{number}", meta, {})
