@@ -15,6 +15,7 @@ from slviewer.commands.devices import capture, devices, preflight
 from slviewer.commands.importing import bring_in
 from slviewer.commands.measuring import calibrate, merge, reconstruct, validate, verify
 from slviewer.commands.parsing import union
+from slviewer.commands.proving import prove
 from slviewer.commands.simulating import reproduce, simulate
 from slviewer.commands.telling import bench, inspect, patterns, report, target
 from slviewer.commands.trusting import accept, check
@@ -36,6 +37,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "accept": accept,
     "simulate": simulate,
     "reproduce": reproduce,
+    "prove": prove,
     "patterns": patterns,
     "target": target,
     "report": report,

@@ -26,6 +26,7 @@ _HOMES = {
     "accept": "accepting",
     "simulate": "simulating",
     "reproduce": "reproducing",
+    "prove": "proving",
     "patterns": "printing",
     "target": "printing",
     "report": "reporting",

@@ -5,9 +5,10 @@ from datetime import UTC, datetime
 from typing import Any
 
 from slviewer.calibration.drift.check import Drift, check_drift
-from slviewer.calibration.drift.floor import refer
+from slviewer.calibration.drift.floor import Reference, refer
 from slviewer.calibration.drift.view import View
 from slviewer.calibration.observe import Smoothing, observe
+from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -17,6 +18,8 @@ from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.poses import load_observations
+
+REFERENCE = "drift_reference"
 
 
 @dataclass(frozen=True)
@@ -93,8 +96,7 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
         board = Board.parse(stereo.board)
         observation = observe(capture, board, detect(board, capture_texture(shot, frames)), phases, _smoothing(store))
         progress(0.3, "what the calibration's own poses say")
-        own = [View.of(o) for o in load_observations(store, [name for name in stereo.poses if name != capture])]
-        drift = check_drift(refer(stereo.rig, own), View.of(observation))
+        drift = check_drift(_reference(store, stereo, capture), View.of(observation))
         progress(0.95, "saving")
         calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
         before = tuple(checked for checked in history(store) if checked.calibration == calibration)
@@ -104,6 +106,18 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
         store.save_result(f"drift/{number}", {"checked": found.to_json(), "inputs": inputs}, {})
         progress(1.0, "checked")
     return CheckResult(found, before)
+
+
+def _reference(store: Session, stereo: StereoModel, capture: str) -> Reference:
+    """What the calibration's poses but for the capture say; kept, for it takes many seconds and does not change."""
+    if store.state_of(REFERENCE) == "fresh" and capture not in stereo.poses:
+        return Reference.restored(stereo.rig, store.load_result(REFERENCE)[1])
+    poses = [name for name in stereo.poses if name != capture]
+    reference = refer(stereo.rig, [View.of(o) for o in load_observations(store, poses)])
+    if capture not in stereo.poses:
+        meta = {"inputs": store.input_hashes("calibration/stereo", *poses)}
+        store.save_result(REFERENCE, meta, reference.to_arrays())
+    return reference
 
 
 def history(store: Session) -> tuple[Checked, ...]:

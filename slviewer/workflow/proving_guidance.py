@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -138,10 +139,7 @@ def prove_guidance(
         bench = Bench(letter(scale, seed + k), BOARD, poses, steps=steps)
         targets = _targets(bench)
         for way in ways:
-
-            def told(share: float, words: str, done: int = len(outcomes), way: str = way) -> None:
-                progress((done + share) / total, f"rig {k + 1} of {rigs}, {way}: {words}")
-
+            told = partial(_tell, progress, len(outcomes) / total, 1 / total, f"rig {k + 1} of {rigs}, {way}")
             begun = perf_counter()
             observations, predicted = _guided(bench, told) if way == "guided" else (_drawn(bench, told), np.nan)
             told(0.9, "calibrating")
@@ -152,6 +150,10 @@ def prove_guidance(
             )
     progress(1.0, "proven")
     return GuidanceProof(tuple(outcomes), scale)
+
+
+def _tell(progress: Progress, done: float, share: float, which: str, of_it: float, words: str) -> None:
+    progress(done + share * of_it, f"{which}: {words}")
 
 
 def _drawn(bench: Bench, told: Progress) -> list[Observation]:

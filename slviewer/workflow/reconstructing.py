@@ -48,6 +48,12 @@ class Reconstruction:
             f"{self.points} points by {cloud.model} from axis {cloud.axis}, z {np.percentile(z, 1):.0f}-"
             f"{np.percentile(z, 99):.0f} mm, predicted depth noise {np.median(sigma):.3f} mm -> {self.ply}"
         ]
+        if cloud.sigma_calibration is not None:
+            left = cloud.sigma_calibration[cloud.mask]
+            lines.append(
+                f"the calibration leaves {np.median(left):.4f} mm of depth uncertain in the median, "
+                f"{np.percentile(left, 95):.4f} mm at 95 % (1 sigma)"
+            )
         if self.scale:
             lines.append(self.scale)
         if self.masked is not None and self.masked > 0.005:
@@ -104,7 +110,7 @@ def reconstruct(
         ply = Path(out) if out is not None else store.exports / f"{capture}_{name}.ply"
         progress(0.8, "writing")
         ply.parent.mkdir(parents=True, exist_ok=True)
-        write_ply(ply, cloud.points[keep], colours=texture[keep], scalars={"sigma_z": cloud.sigma_z[keep]})
+        write_ply(ply, cloud.points[keep], colours=texture[keep], scalars=cloud.sigmas(keep))
         if grid is not None:
             write_grid(Path(grid), cloud.points)
         scale, fitted = told_scale(store, name), chosen[name]

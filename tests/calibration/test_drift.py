@@ -8,7 +8,7 @@ import pytest
 from simulated_views import BOARD, moved, poses, seen
 
 from slviewer.calibration.drift.check import Drift, check_drift
-from slviewer.calibration.drift.floor import LEAST_POSES, refer
+from slviewer.calibration.drift.floor import LEAST_POSES, Reference, refer
 from slviewer.calibration.drift.view import View
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
@@ -23,7 +23,10 @@ FEW = 6  # of them where a movement is looked for: it is seen in every one
 def reference():
     observations = [seen(RIG, pose, f"pose_{i}") for i, pose in enumerate(poses(RIG, 20, seed=3))]
     model = calibrate_stereo(observations, RIG.projector.size, str(BOARD))
-    return refer(model.rig, [View.of(o) for o in observations if o.name in model.poses])
+    found = refer(model.rig, [View.of(o) for o in observations if o.name in model.poses])
+    kept = Reference.restored(model.rig, found.to_arrays())  # as a session keeps it
+    assert kept.sigmas == found.sigmas
+    return kept
 
 
 def checked(reference, rig, i, name="later", **how) -> Drift:

@@ -20,7 +20,7 @@ from slviewer.simulation.truth import rig_record
 from slviewer.target.board import Board
 from slviewer.workflow.accepting import accept
 from slviewer.workflow.calibrating import calibrate
-from slviewer.workflow.drifting import check, history
+from slviewer.workflow.drifting import REFERENCE, check, history
 from slviewer.workflow.models import load_stereo, save_imported_stereo
 from slviewer.workflow.scaling import scale_factor
 from slviewer.workflow.simulating import one_axis
@@ -112,7 +112,7 @@ def test_accept_names_what_is_missing(measured, tmp_path):
 def calibrated(tmp_path_factory) -> Path:
     """Ten poses, calibrated; later the board with the rig as it was, turned by 0.2 mrad, and along one axis alone."""
     folder = tmp_path_factory.mktemp("drift") / "session"
-    rig = letter(0.25, seed=5)
+    rig = letter(0.2, seed=5)
     turn = rotation(np.array([0.0, 2e-4, 0.0]))
     panned = replace(rig, R=turn @ rig.R, t=turn @ rig.t)
     both = p18(rig.projector.size)
@@ -143,6 +143,7 @@ def test_check_answers_and_remembers(calibrated):
     with Session.open(calibrated) as store:
         assert [c.drift.capture for c in history(store)] == ["same", "panned", "one_axis"]
         assert history(store)[1] == panned.found
+        assert store.state_of(REFERENCE) == "fresh"
     assert json.loads(json.dumps(single.to_json()))["before"][1]["verdict"] == "recalibrate"
 
 

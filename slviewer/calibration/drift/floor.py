@@ -75,6 +75,31 @@ class Reference:
         variance = np.asarray(known.multiply(known @ self.covariance).sum(axis=1)).ravel()
         return answer(equations, self.shared, self.sigmas, variance < UNSUPPORTED_PX**2)
 
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Flat named arrays, for saving."""
+        answers = self.answers
+        return {
+            "shared": self.shared,
+            "covariance": self.covariance,
+            "sigmas": np.array([self.sigmas[kind] for kind in KINDS]),
+            "names": np.array([a.name for a in answers]),
+            "changes": np.array([a.change for a in answers]),
+            "spreads": np.array([[a.spreads[kind] for kind in KINDS] for a in answers]),
+            "by_growth": np.array([a.by_growth for a in answers]),
+            "figures": np.array([(a.scale, a.across_px, a.misfit_px) for a in answers]),
+        }
+
+    @classmethod
+    def restored(cls, rig: StereoRig, arrays: Mapping[str, np.ndarray]) -> "Reference":
+        """The inverse of ``to_arrays``, of a calibration with this rig."""
+        each = zip(*(arrays[name] for name in ("names", "changes", "spreads", "by_growth", "figures")), strict=True)
+        answers = tuple(
+            Answer(str(name), change, dict(zip(KINDS, spreads, strict=True)), growth, *(float(f) for f in figures))
+            for name, change, spreads, growth, figures in each
+        )
+        sigmas = {kind: float(sigma) for kind, sigma in zip(KINDS, arrays["sigmas"], strict=True)}
+        return cls(rig, arrays["shared"], arrays["covariance"], sigmas, answers)
+
 
 def refer(rig: StereoRig, views: Sequence[View]) -> Reference:
     """Lens errors and floor from a calibration's own views. Raises InputError for fewer than LEAST_POSES."""

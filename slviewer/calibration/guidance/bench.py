@@ -81,25 +81,26 @@ class GuidanceBench:
         """Features that each of ``points`` stands for."""
         return len(self.board.points) / len(self.points)
 
-    def rows(self, T_camera_board: np.ndarray) -> np.ndarray:
-        """(rows, unknowns): what the board at a pose tells; see ``pose_rows``."""
-        pixels = self.pixels(T_camera_board)
+    def rows(self, T_camera_board: np.ndarray) -> list[np.ndarray]:
+        """(rows, unknowns) for each of the poses (k, 4, 4): what the board tells there; see ``pose_rows``."""
         width = self.stereo.camera.size[0], self.stereo.projector.size[0]
-        sigma = (
-            self.expected.feature * width[0] / np.sqrt(self.stands_for),
-            self.expected.sample * width[1] / np.sqrt(SAMPLES_READ / max(len(pixels), 1)),
-        )
-        return pose_rows(self.rig, self.layout, T_camera_board, self.points, self.frame, pixels, sigma)
+        feature = self.expected.feature * width[0] / np.sqrt(self.stands_for)
+        told = []
+        for T, pixels in zip(T_camera_board, self._pixels(T_camera_board), strict=True):
+            sample = self.expected.sample * width[1] / np.sqrt(SAMPLES_READ / max(len(pixels), 1))
+            told.append(pose_rows(self.rig, self.layout, T, self.points, self.frame, pixels, (feature, sample)))
+        return told
 
-    def pixels(self, T_camera_board: np.ndarray) -> np.ndarray:
-        """(m, 2): camera pixels at regular places of the board that camera and projector both see."""
+    def _pixels(self, T: np.ndarray) -> list[np.ndarray]:
+        """(m, 2) for each pose: camera pixels at regular places of the board that camera and projector both see."""
         outline = self.board.outline()
-        x, y = np.meshgrid(*(np.linspace(outline[0, k], outline[2, k], 2 * n + 1)[1::2] for k, n in enumerate(SAMPLES)))
+        middles = [(np.arange(n) + 0.5) / n for n in SAMPLES]
+        x, y = np.meshgrid(*(outline[0, k] + m * np.ptp(outline[:, k]) for k, m in enumerate(middles)))
         places = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-        points = places @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
+        points = np.einsum("kij,nj->kni", T[:, :3, :3], places) + T[:, None, :3, 3]
         pixels = self.stereo.camera.project(points)
-        seen = _inside(pixels, self.stereo.camera, 0.0) & _inside(self.stereo.project(points), self.stereo.projector, 0)
-        return np.asarray(pixels[seen])
+        seen = _inside(pixels, self.stereo.camera, 0) & _inside(self.stereo.project(points), self.stereo.projector, 0)
+        return [p[s] for p, s in zip(pixels, seen, strict=True)]
 
     def in_view(self, T: np.ndarray) -> np.ndarray:
         """(k,) bool: poses T (k, 4, 4) at which both devices see every feature, with some room around."""

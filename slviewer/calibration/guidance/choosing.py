@@ -19,8 +19,8 @@ TILTS_DEG = ((0, 0), (16, 0), (-16, 0), (0, 16), (0, -16), (22, 22), (22, -22), 
 TOWARDS = tuple((x, y) for x, y in product((-1.0, 0.0, 1.0), repeat=2))
 """The image's corners, edges and middle: a board goes as far there as it stays in view."""
 _OFFSETS = 15  # places along each side that are tried
-TRIALS = 72
-"""Poses whose gain is computed, drawn from all; and near the best of them as many again as a sixth."""
+TRIALS = 56
+"""Poses whose gain is computed, drawn from all; and near the best of them a fifth as many again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Guidance:
 def predicted_sigma(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> float:
     """mm: the calibration's 3D sigma after ``poses`` T_camera_board (4, 4), root mean square over the volume."""
     sight = Sight.of(bench, depth_range(bench.board, bench.stereo.camera))
-    return Information.of(bench, [bench.rows(T) for T in poses], sight).sigma_mm
+    return Information.of(bench, bench.rows(np.reshape(poses, (-1, 4, 4))), sight).sigma_mm
 
 
 def guide(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> Guidance | None:
@@ -45,14 +45,14 @@ def guide(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> Guidance | None:
     if not len(candidates):
         return None
     sight = Sight.of(bench, depth_range(bench.board, bench.stereo.camera))
-    information = Information.of(bench, [bench.rows(T) for T in poses], sight)
+    information = Information.of(bench, bench.rows(np.reshape(poses, (-1, 4, 4))), sight)
     rng = np.random.default_rng(len(poses))
     tried = rng.permutation(len(candidates))[:TRIALS]
-    gains = {int(i): information.gain(bench.rows(candidates[i])) for i in tried}
+    gains = dict(zip(tried.tolist(), map(information.gain, bench.rows(candidates[tried])), strict=True))
     best = max(gains, key=lambda i: gains[i])
-    far = np.array([_apart(candidates[best], T) for T in candidates])
-    for i in np.argsort(far)[: TRIALS // 6]:
-        gains.setdefault(int(i), information.gain(bench.rows(candidates[i])))
+    nearest = np.argsort([_apart(candidates[best], T) for T in candidates])[: TRIALS // 5]
+    more = [i for i in nearest.tolist() if i not in gains]
+    gains |= dict(zip(more, map(information.gain, bench.rows(candidates[more])), strict=True))
     order = sorted(gains, key=lambda i: -gains[i])
     left = max(float(information.variances.mean()) - gains[order[0]], 0.0)
     return Guidance(candidates[order], information.sigma_mm, float(np.sqrt(left)))
@@ -71,27 +71,24 @@ def candidate_poses(bench: GuidanceBench) -> np.ndarray:
         [(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1], np.ones(u.size)]
     )
     places = 2 * np.column_stack([u / (width - 1), v / (height - 1)]) - 1
+    held = list(product(DEPTHS, TILTS_DEG))
+    R = np.array([cv2.Rodrigues(np.radians(np.array([*tilt, 0.0])))[0] for _, tilt in held])
+    depths = near + (far - near) * np.array([share for share, _ in held])
+    T = np.tile(np.eye(4), (len(held), len(rays), 1, 1))
+    T[..., :3, :3] = R[:, None]
+    T[..., :3, 3] = depths[:, None, None] * rays - (R @ middle)[:, None]
     found = []
-    for share, tilt in product(DEPTHS, TILTS_DEG):
-        R = cv2.Rodrigues(np.radians(np.array([tilt[0], tilt[1], 0.0])))[0]
-        T = np.tile(np.eye(4), (len(rays), 1, 1))
-        T[:, :3, :3] = R
-        T[:, :3, 3] = (near + (far - near) * share) * rays - R @ middle
-        seen = bench.in_view(T)
-        if not seen.any():
-            continue
-        T, here = T[seen], places[seen]
-        centre = (here.min(0) + here.max(0)) / 2
-        picked = {
-            int(
-                np.argmax(here @ np.array(to) - 0.01 * (here**2).sum(1))
-                if any(to)
-                else np.argmin(((here - centre) ** 2).sum(1))
-            )
-            for to in TOWARDS
-        }
-        found.append(T[sorted(picked)])
+    for each, seen in zip(T, bench.in_view(T.reshape(-1, 4, 4)).reshape(T.shape[:2]), strict=True):
+        if seen.any():
+            found.append(each[seen][_spread(places[seen])])
     return np.concatenate(found) if found else np.zeros((0, 4, 4))
+
+
+def _spread(places: np.ndarray) -> list[int]:
+    """Which of the places (n, 2) lie farthest towards each of `TOWARDS`; the middle is theirs."""
+    inward = 0.01 * (places**2).sum(1)
+    off = ((places - (places.min(0) + places.max(0)) / 2) ** 2).sum(1)
+    return sorted({int(np.argmax(places @ np.array(to) - inward) if any(to) else np.argmin(off)) for to in TOWARDS})
 
 
 def _apart(one: np.ndarray, other: np.ndarray) -> float:

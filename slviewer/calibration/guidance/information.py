@@ -35,12 +35,11 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Of the poses had: the unknowns' ``covariance`` (n, n), and the points' ``variances`` (m,) mm^2, of which
-    ``trace`` is the mean."""
+    """Of the poses had: the unknowns' ``covariance`` (n, n), and the points' ``variances`` (m,) mm^2."""
 
     covariance: np.ndarray
-    spread: np.ndarray
     variances: np.ndarray
+    _both: np.ndarray
 
     @classmethod
     def of(cls, bench: GuidanceBench, rows: Sequence[np.ndarray], sight: Sight) -> "Information":
@@ -54,7 +53,7 @@ class Information:
         answer = covariance @ sight.jacobian.T
         variances = np.einsum("mn,nm->m", sight.jacobian, answer).reshape(-1, 3).sum(axis=1)
         spread = answer @ answer.T / len(variances)
-        return cls(covariance, spread, variances)
+        return cls(covariance, variances, np.hstack([covariance, spread]))
 
     @property
     def sigma_mm(self) -> float:
@@ -63,7 +62,7 @@ class Information:
 
     def gain(self, rows: np.ndarray) -> float:
         """mm^2 by which a pose that tells these rows lowers the mean variance over the volume."""
-        both = rows @ np.hstack([self.covariance, self.spread])
+        both = rows @ self._both
         n = len(self.covariance)
         inner = both[:, :n] @ rows.T
         inner[np.diag_indices(len(inner))] += 1.0

@@ -26,8 +26,9 @@ from slviewer.geometry.jit import kernel
 if TYPE_CHECKING:
     from slviewer.calibration.splined.found import Bundle
 
-NODES = (21, 16, 7)
-"""Of the map across, down, and in depth: support ends within a cell of the fields, and they have 26 across."""
+NODES = (21, 16, 11)
+"""Of the map across, down, and in depth: then what lies between is right within a tenth or two, and a map takes about a
+second."""
 LEAST_FITTED = 3
 
 
@@ -112,24 +113,23 @@ def _fitted(bundle: "Bundle", volume: Volume) -> np.ndarray:
 def _interpolate(z, logs, near, far, out):
     height, width = z.shape
     down, across, deep = logs.shape
+    per_mm, deepest = np.float32((deep - 1.0) / (far - near)), np.float32(deep - 1.0001)
+    start, zero = np.float32(near), np.float32(0.0)
+    per_column = np.float32((across - 1.0001) / max(width - 1, 1))
     for v in prange(height):
-        y = v * (down - 1.0) / max(height - 1, 1)
-        j = min(int(y), down - 2)
-        fy = y - j
+        y = v * (down - 1.0001) / max(height - 1, 1)
+        j = int(y)
+        rest = np.float32(y - j)
+        table = logs[j] + rest * (logs[j + 1] - logs[j])  # at this row
         for u in range(width):
-            d = (z[v, u] - near) / (far - near) * (deep - 1.0)
-            if not np.isfinite(d):
+            depth = (z[v, u] - start) * per_mm
+            x = np.float32(u) * per_column
+            if np.isnan(depth):
                 out[v, u] = np.nan
                 continue
-            d = min(max(d, 0.0), deep - 1.0)
-            k = min(int(d), deep - 2)
-            fz = d - k
-            x = u * (across - 1.0) / max(width - 1, 1)
-            i = min(int(x), across - 2)
-            fx = x - i
-            total = 0.0
-            for b in range(2):
-                for a in range(2):
-                    share = (fy if b else 1.0 - fy) * (fx if a else 1.0 - fx)
-                    total += share * ((1.0 - fz) * logs[j + b, i + a, k] + fz * logs[j + b, i + a, k + 1])
-            out[v, u] = np.exp(total)
+            depth = min(max(depth, zero), deepest)
+            k, i = int(depth), int(x)
+            fz, fx = depth - np.float32(k), x - np.float32(i)
+            left = table[i, k] + fz * (table[i, k + 1] - table[i, k])
+            right = table[i + 1, k] + fz * (table[i + 1, k + 1] - table[i + 1, k])
+            out[v, u] = np.exp(left + fx * (right - left))

@@ -116,6 +116,9 @@ def make_cloud(session: Session, name: str, model: str | None, report: Reporter,
             "modulation": phase.modulation,
             "texture": cloud.texture,
         }
+        if cloud.sigma_calibration is not None:
+            meta["sigma_calibration_mm"] = float(np.median(cloud.sigma_calibration[cloud.mask]))
+            arrays["sigma_calibration"] = cloud.sigma_calibration
         report(0.95, "saving")
         session.guarded(report.saving).save_result(f"clouds/{name}", meta, arrays)
     report(1.0, "reconstructed")
