@@ -1,0 +1,64 @@
+"""`slviewer prove`: what it runs, what it prints, and how it ends; the proofs themselves have tests of their own."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from slviewer.cli import main
+from slviewer.workflow import proving
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A proof that took no time."""
+
+    holds: bool
+
+    def text(self) -> str:
+        return "a table"
+
+    def to_json(self) -> dict[str, Any]:
+        return {"holds": self.holds}
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[float, int]]:
+    """Each proof that ran, with its scale and seed; causes are not named."""
+    ran: dict[str, tuple[float, int]] = {}
+
+    def stand_in(claim: str):
+        def run(scale, *, seed, progress):
+            ran[claim] = scale, seed
+            progress(1.0, "proven")
+            return Outcome(claim != "causes")
+
+        return run
+
+    for claim in proving.CLAIMS:
+        monkeypatch.setattr(proving, f"prove_{claim}", stand_in(claim))
+    return ran
+
+
+def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, capsys) -> None:
+    out = tmp_path / "figures.json"
+    assert main(["prove", "--json", str(out)]) == 1
+    said = capsys.readouterr()
+    assert asked == {claim: (1.0, 0) for claim in ("accuracy", "causes", "guidance", "uncertainty")}
+    assert said.out.count("a table") == 4 and said.out.count("pass  ") == 3
+    assert "FAIL  faults called by their names" in said.out and "not proven: causes:" in said.err
+    assert {claim: proof["holds"] for claim, proof in json.loads(out.read_text()).items()} == {
+        "accuracy": True,
+        "causes": False,
+        "guidance": True,
+        "uncertainty": True,
+    }
+
+
+def test_some_claims_at_reduced_scale(asked, capsys) -> None:
+    assert main(["prove", "--quick", "--only", "uncertainty", "accuracy", "--seed", "7"]) == 0
+    assert asked == {"accuracy": (proving.QUICK_SCALE, 7), "uncertainty": (proving.QUICK_SCALE, 7)}
+    said = capsys.readouterr()
+    assert "FAIL" not in said.out and said.err == ""
+    assert main(["prove", "--only", "everything"]) == 2
