@@ -1,6 +1,12 @@
 """What every room's tests may use."""
 
 import os
+
+# Workers share the cores: libraries that each take all of them wait for one another.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for library in ("OMP", "OPENBLAS", "NUMBA"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
 from collections.abc import Iterator
 from pathlib import Path
 
