@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
+from slviewer.calibration.splined.uncertainty import sigma_of
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.calibration.splined.volume import Volume, better_axis, looked, motion_free, sigma_3d, working_volume
 from slviewer.errors import CalibrationRejected
@@ -80,8 +81,8 @@ class UncertaintyProof:
             {
                 "rig": row["rig"],
                 "supported %": round(100 * row["supported"], 1),
-                "predicted mm": round(row["predicted"], 4),
-                "true mm": round(row["true"], 4),
+                "predicted um": round(1000 * row["predicted"], 1),
+                "true um": round(1000 * row["true"], 1),
                 "predicted / true": round(row["ratio"], 2),
                 "below 2 sigma %": round(100 * row["below_2_sigma"], 1),
                 "where no pose looked": round(row["ratio_elsewhere"], 2),
@@ -91,7 +92,8 @@ class UncertaintyProof:
         verdict = "lies" if self.holds else "does NOT lie"
         return (
             f"{render(table)}\npredicted over true 3D error, pooled over {len(self.rigs)} rigs of {self.poses} poses "
-            f"at scale {self.scale:g}: {self.ratio():.2f} {verdict} between {BAND[0]} and {BAND[1]}"
+            f"at scale {self.scale:g}: {self.ratio():.2f} {verdict} between {BAND[0]} and {BAND[1]}; "
+            f"where no pose looked {self.ratio(supported=False):.2f}"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -142,8 +144,7 @@ def compare_with_truth(name: str, model: SplinedModel, true: SimulatedRig) -> Ho
     known = np.isfinite(errors).all(axis=1)
     volume = Volume(*(each[known] for each in (volume.pixels, volume.z, volume.points, volume.projector)))
     supported = volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
-    whitened = bundle.whitened(bundle.point_jacobian(axis, volume.pixels, volume.z))
-    predicted = sigma_3d(motion_free(whitened, volume.points, supported))
+    predicted = sigma_of(bundle, axis, volume)
     missed = sigma_3d(motion_free(errors[known].reshape(1, -1), volume.points, supported))
     return Honesty(name, predicted, missed, supported)
 

@@ -2,6 +2,10 @@
 
 All of them are of what a rigid motion leaves: where the whole space lies in the camera's frame is thirty times less
 certain than its shape, and nothing that is measured with it depends on that.
+
+Where no target pose looked, the fields are what their priors make of their edges. A prior takes second differences for
+independent of each other; where a lens's are not, it errs by more than the prior says, and by how much more is seen in
+the fields' supported part: ``persistence``.
 """
 
 from dataclasses import dataclass
@@ -9,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import prange
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_erosion, distance_transform_edt, uniform_filter
 
+from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.volume import (
     BestMotion,
     Volume,
     better_axis,
+    is_lit,
     looked,
     motion_free,
     sigma_3d,
@@ -30,6 +36,8 @@ NODES = (21, 16, 11)
 """Of the map across, down, and in depth: then what lies between is right within a tenth or two, and a map takes about a
 second."""
 LEAST_FITTED = 3
+CARRIED = 3
+"""Cells: about how far beyond the supported ones the working volume goes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +62,14 @@ class SigmaMap:
 def sigma_map(bundle: "Bundle", axis: Axis, near: float, far: float) -> SigmaMap:
     """What the calibration leaves uncertain of the depths measured through one axis: a second of work.
 
-    The rigid motion is that of the working volume's supported places. Where no pose looked, the fields' priors say how
-    far they may be off.
+    The rigid motion is that of the working volume's supported places.
     """
-    reference = working_volume(bundle.state.rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
+    rig = bundle.state.rig
+    reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
     motion = BestMotion.of(reference.points, _fitted(bundle, reference))
     jacobian = bundle.point_jacobian(axis, reference.pixels, reference.z)
     moved = bundle.whitened(jacobian) @ motion.weights.astype(np.float32)
-    width, height = (int(n) for n in bundle.state.rig.camera.size)
+    width, height = (int(n) for n in rig.camera.size)
     across, down, deep = NODES
     v, u, z = np.meshgrid(
         np.linspace(0, height - 1, down), np.linspace(0, width - 1, across), np.linspace(near, far, deep), indexing="ij"
@@ -69,14 +77,53 @@ def sigma_map(bundle: "Bundle", axis: Axis, near: float, far: float) -> SigmaMap
     pixels, nodes = np.column_stack([u.ravel(), v.ravel()]), z.ravel()
     jacobian = bundle.point_jacobian(axis, pixels, nodes)[2::3]
     jacobian.data[~np.isfinite(jacobian.data)] = 0.0
-    points, _ = looked(bundle.state.rig, pixels, nodes)
-    depths = bundle.whitened(jacobian) - moved @ motion.at(points)[2::3].astype(np.float32).T
-    sigma = np.sqrt(np.einsum("mn,mn->n", depths, depths))
+    places = Volume(pixels, nodes, *looked(rig, pixels, nodes))
+    depths = bundle.whitened(jacobian) - moved @ motion.at(places.points)[2::3].astype(np.float32).T
+    sigma = np.sqrt(np.einsum("mn,mn->n", depths, depths)) * beyond(bundle, places)
     unknown = np.isnan(sigma) | (abs(jacobian).sum(axis=1).A1 == 0)
     sigma, unknown = sigma.reshape(u.shape), unknown.reshape(u.shape)
     # a pixel that is measured may have a node beyond the projector's view beside it
     nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
     return SigmaMap(np.ascontiguousarray(sigma[tuple(nearest)], np.float32), near, far)
+
+
+def sigma_of(bundle: "Bundle", axis: Axis, volume: Volume) -> np.ndarray:
+    """(n,) mm: standard deviation in all directions together of a volume's places, measured through one axis, without
+    the rigid motion of those that are supported."""
+    whitened = bundle.whitened(bundle.point_jacobian(axis, volume.pixels, volume.z))
+    sigma = sigma_3d(motion_free(whitened, volume.points, _fitted(bundle, volume)))
+    return np.asarray(sigma * beyond(bundle, volume))
+
+
+def beyond(bundle: "Bundle", places: Volume) -> np.ndarray:
+    """(n,): by how much the priors' standard deviations are too small: 1 where target poses looked; elsewhere the
+    persistence of the field, or fields, that none of them lit there."""
+    factor = np.ones(len(places.z))
+    rig = bundle.state.rig
+    for device, pixels, poses in (
+        (rig.camera, places.pixels, bundle.camera_poses),
+        (rig.projector, places.projector, bundle.projector_poses),
+    ):
+        factor = np.where(is_lit(device, pixels, poses > 0), factor, np.maximum(factor, persistence(device, poses > 0)))
+    return factor
+
+
+def persistence(device: Device, lit: np.ndarray) -> float:
+    """How much farther a field's second differences carry over some cells than if they were independent: the ratio of
+    their sums' standard deviations, over the cells (rows, columns) bool that poses lit; 1 or more."""
+    c = device.coefficients
+    corners = np.pad(lit, 1, mode="edge")
+    known = corners[:-1, :-1] & corners[1:, :-1] & corners[:-1, 1:] & corners[1:, 1:]
+    whole = binary_erosion(known, np.ones((CARRIED, CARRIED), bool))
+    if not whole.any():
+        return 1.0
+    middle = 2 * c[:, 1:-1, 1:-1]
+    across, down = c[:, 1:-1, :-2] - middle + c[:, 1:-1, 2:], c[:, :-2, 1:-1] - middle + c[:, 2:, 1:-1]
+    each, together = 0.0, 0.0
+    for differences in (*across, *down):
+        each += float(np.mean(differences[known] ** 2))
+        together += float(np.mean(uniform_filter(differences, CARRIED)[whole] ** 2)) * CARRIED**2
+    return max(1.0, float(np.sqrt(together / max(each, 1e-300))))
 
 
 def volume_sigma(bundle: "Bundle") -> dict[str, Any]:
@@ -89,8 +136,7 @@ def volume_sigma(bundle: "Bundle") -> dict[str, Any]:
     volume = working_volume(rig, bundle.depth_range_mm)
     axis = better_axis(rig, volume)
     fitted = _fitted(bundle, volume)
-    whitened = bundle.whitened(bundle.point_jacobian(axis, volume.pixels, volume.z))
-    sigma = sigma_3d(motion_free(whitened, volume.points, fitted))
+    sigma = sigma_of(bundle, axis, volume)
     worst = int(np.argmax(sigma))
     return {
         "median": float(np.median(sigma[fitted])),

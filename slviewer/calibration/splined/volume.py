@@ -27,7 +27,7 @@ class Volume:
 
     def supported(self, rig: Arrangement, camera_lit: np.ndarray, projector_lit: np.ndarray) -> np.ndarray:
         """(n,) bool: those seen through cells (rows, columns) bool that target poses lit, in both devices."""
-        return _lit(rig.camera, self.pixels, camera_lit) & _lit(rig.projector, self.projector, projector_lit)
+        return is_lit(rig.camera, self.pixels, camera_lit) & is_lit(rig.projector, self.projector, projector_lit)
 
 
 def working_volume(
@@ -73,6 +73,16 @@ def looked(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndar
     points, projector = np.empty((len(z), 3)), np.empty((len(z), 2))
     _look(rig, pixels, z, points, projector)
     return points, projector
+
+
+def is_lit(device: Device, pixels: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """(n,) bool: whether the cells of ``pixels`` (n, 2) are among those (rows, columns) bool that target poses lit;
+    beyond the image, those at its edge. False for NaN."""
+    shape = np.array([lit.shape[1], lit.shape[0]])
+    known = np.isfinite(pixels).all(axis=1)
+    place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
+    cells = np.clip(place, 0, shape - 1).astype(int)
+    return np.asarray(lit[cells[:, 1], cells[:, 0]] & known)
 
 
 def better_axis(rig: Arrangement, volume: Volume) -> Axis:
@@ -139,12 +149,6 @@ def _motions(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
         ]
     )
     return np.asarray(along.transpose(2, 0, 1).reshape(-1, 6))
-
-
-def _lit(device: Device, pixels: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    shape = np.array([lit.shape[1], lit.shape[0]])
-    cells = np.clip(((pixels + 0.5) / device.size * shape).astype(int), 0, shape - 1)
-    return np.asarray(lit[cells[:, 1], cells[:, 0]])
 
 
 @kernel()
