@@ -107,10 +107,9 @@ class GuidanceBench:
         margin = 0.25 * self.board.pitch_mm if self.board.kind in ("circles", "acircles") else None
         corners = self.board.outline(margin)
         points = np.einsum("kij,nj->kni", T[:, :3, :3], corners) + T[:, None, :3, 3]
-        return (
-            _inside(self.stereo.camera.project(points), self.stereo.camera, FREE).all(1)
-            & _inside(self.stereo.project(points), self.stereo.projector, FREE).all(1)
-        )  # fmt: skip
+        here, there = self.stereo.camera.project(points), self.stereo.project(points)
+        seen = _inside(here, self.stereo.camera, FREE) & _inside(there, self.stereo.projector, FREE)
+        return np.asarray(seen.all(1))
 
     def prior(self) -> np.ndarray:
         """(unknowns, unknowns): the information there is before any pose."""

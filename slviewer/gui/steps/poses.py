@@ -15,7 +15,7 @@ from slviewer.gui.scene import GHOST
 from slviewer.gui.undelete import Undelete
 from slviewer.gui.widgets import Html, Picture, Sound, Words, block, boxed, cell, thumbnail, toned
 from slviewer.target.board import Board
-from slviewer.workflow.wizard.snapshot import PoseView, PreviewView, Snapshot
+from slviewer.workflow.wizard.snapshot import Foreseen, PoseView, PreviewView, Snapshot
 
 LAYER, WORLD = "poses", "board"
 _DRAG_S = 0.15  # between two places that a dragged board is brought to
@@ -59,6 +59,14 @@ class Panel:
         self._hands_free.on_update(stage.safely_with(self._switch))
         how = "Hands-free captures by itself when the board is held still; the key C captures too."
         Words(gui).say(how, "dim")
+        self._foreseen = Words(gui)
+        self._wanted = gui.add_number(
+            "Sigma wanted, mm", 0.0, min=0.0, max=10.0, step=0.001,
+            hint="Poses are asked for until the calibration is predicted to be this sure of points; 0: what usually "
+            "suffices",
+        )  # fmt: skip
+        self._wants = Follows(self._wanted)
+        self._wanted.on_update(stage.safely_with(self._want))
         self._coverage = Words(gui)
         with gui.add_folder("Captured poses"):
             self._table = Words(gui)
@@ -87,6 +95,7 @@ class Panel:
         self._session = session
         poses = session.poses if session else ()
         self._coverage.set(coverage_chart(session.coverage) if session and session.coverage else "")
+        self._draw_foreseen(session.foreseen if session else None)
         self._draw_ghost(snapshot)
         self._sound_for(poses, snapshot.hands_free)
         latest = poses[-1].name if poses else ""
@@ -124,8 +133,22 @@ class Panel:
 
     # drawing
 
+    def _draw_foreseen(self, foreseen: Foreseen | None) -> None:
+        if foreseen is not None:
+            self._wants.tell(round(foreseen.wanted_mm, 3))
+        if foreseen is None or foreseen.sigma_mm is None:
+            self._foreseen.set("")
+            return
+        words = f"Predicted sigma {foreseen.sigma_mm:.3f} mm, wanted {foreseen.wanted_mm:.3f} mm"
+        if foreseen.enough:
+            self._foreseen.say(f"{words}: enough. Calibrate.", "good")
+        else:
+            then = "" if foreseen.next_mm is None else f"; {foreseen.next_mm:.3f} mm with the next pose"
+            self._foreseen.say(words + then, "info")
+
     def _draw_ghost(self, snapshot: Snapshot) -> None:
-        suggestion = snapshot.session.suggestion if snapshot.session else None
+        session = snapshot.session
+        suggestion = session.suggestion if session and not session.enough else None
         self._ghost_px = suggestion.outline_px if suggestion else None
         if suggestion is None or self._board is None:
             self._stage.scene.remove(LAYER, "suggestion")
@@ -207,6 +230,10 @@ class Panel:
             "Retake": operator.retake_pose,
             "Delete": operator.delete,
         }[what](name)
+
+    def _want(self, event: Any) -> None:
+        if event.client is not None:
+            self._stage.operator.want_sigma(float(self._wanted.value) or None)
 
     def _switch(self, event: Any) -> None:
         if event.client is not None:

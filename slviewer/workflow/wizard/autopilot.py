@@ -92,7 +92,7 @@ class Autopilot:
     def _calibrate(self) -> None:
         operator = self._operator
         tried = 0
-        while (good := _good_poses(self._settled())) < self._poses:
+        while (good := _good_poses(now := self._settled())) < self._poses and not (now.session and now.session.enough):
             tried += 1
             if tried > 2 * self._poses:
                 raise SlviewerError(f"only {good} of {tried} poses could be used: look at why the others were refused")

@@ -250,6 +250,8 @@ class Engine:
         target = reader.target()
         if reader.lacks_judgement(capture, target):
             judged = work.judge_pose(reader.session, capture.name, Board.parse(target), report)
+            bench = self.bench  # the next pose takes a second or two to choose: here, where nobody waits for it
+            reader.read(self.acquisition.view(), bench.focal_px if bench else None)
             if judged.observation is None:
                 self.notices.tell("warning", f"{capture.name} cannot be used: {judged.refused}")
             self.teller.changed(session=True)  # before what may wait
@@ -320,8 +322,11 @@ class Engine:
 
     def _read(self, reader: Reader, rig: RigView, bench: Bench | None) -> None:
         try:
-            self._session_view = reader.read(rig, bench.focal_px if bench else None)
+            before, self._session_view = self._session_view, reader.read(rig, bench.focal_px if bench else None)
             self._unreadable = 0
+            if self.hands_free.on and self._session_view.enough and not (before and before.enough):
+                self.hands_free.on = False
+                self.notices.tell("good", "the poses are enough for the accuracy wanted: hands-free has stopped")
         except (SlviewerError, OSError) as error:  # files were being changed, most likely: read them once more
             self._unreadable += 1
             if self._unreadable < _PATIENCE:

@@ -230,6 +230,13 @@ class Operator:
             raise InputError(f"no pattern sequence is called {name!r}: use {', '.join(PRESETS)}")
         self._engine.store.decide("patterns", name)
 
+    @_request("Setting the accuracy wanted")
+    def want_sigma(self, sigma_mm: float | None) -> None:
+        """Ask for poses until a calibration is predicted to be this sure of points, mm; None: what usually suffices."""
+        if sigma_mm is not None and not 0 < sigma_mm < 100:
+            raise InputError(f"a standard deviation of {sigma_mm:g} mm cannot be wanted: give one above 0 mm")
+        self._engine.store.decide("sigma_wanted_mm", sigma_mm)
+
     @_request("Placing")
     def place(self, thing: Thing, T_camera_thing: np.ndarray | None = None) -> None:
         """Put "board", "plane", "sphere" or "object" before the simulated rig, at T_camera_thing or where it was."""

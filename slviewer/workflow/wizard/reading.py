@@ -36,6 +36,7 @@ from slviewer.workflow.wizard.snapshot import (
     CalibrationView,
     CentreDistance,
     ComparisonView,
+    Foreseen,
     MergeView,
     ModelFigures,
     PoseState,
@@ -109,6 +110,11 @@ class Reader:
         """The exposures of every capture; empty: a single one, the camera's."""
         return tuple(float(exposure) for exposure in self.session.decision("exposures") or ())
 
+    def sigma_wanted_mm(self) -> float | None:
+        """The 3D sigma that poses are to reach, where the operator says so."""
+        decided = self.session.decision("sigma_wanted_mm")
+        return float(decided) if decided else None
+
     def read(self, rig: RigView, focal_px: float | None) -> SessionView:
         """The session now. `rig` tells sizes before there are poses; `focal_px` is its lens's nominal focal length."""
         session, target = self.session, self.target()
@@ -134,6 +140,7 @@ class Reader:
             lens=None if planned is None else planned.lens,
             coverage=None if planned is None else planned.coverage,
             suggestion=None if planned is None else planned.suggestion,
+            foreseen=None if planned is None else self._foreseen(planned),
             calibration=calibration,
             verdict=verdict,
             verdict_of_calibration=self._is_of_calibration(verdict, stereo),
@@ -195,6 +202,11 @@ class Reader:
                 lambda: plan(board, camera, projector, counted, stereo, focal_px, refused),
             )
         return self._views(captures, states, features, planned, calibration, target), planned
+
+    def _foreseen(self, planned: Plan) -> Foreseen:
+        decided = self.sigma_wanted_mm()
+        wanted = planned.usual_mm if decided is None else decided
+        return Foreseen(planned.sigma_mm, planned.sigma_next_mm, wanted, planned.reaches(wanted))
 
     def _state(
         self,

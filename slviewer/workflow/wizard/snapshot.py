@@ -278,6 +278,20 @@ class WorldView:
     turn_deg: float
 
 
+@dataclass(frozen=True)
+class Foreseen:
+    """The 3D standard deviation mm that a calibration from the poses so far is predicted to have over the working
+    volume; ``next_mm``: with the suggested pose besides. None before enough is known of the rig.
+
+    ``wanted_mm``: what the operator wants, or a default; ``enough``: it is reached, and no pose is asked for.
+    """
+
+    sigma_mm: float | None
+    next_mm: float | None
+    wanted_mm: float
+    enough: bool
+
+
 @dataclass(frozen=True, eq=False)
 class SessionView:
     """What the session's files say."""
@@ -289,6 +303,7 @@ class SessionView:
     lens: Lens | None = None  # calibrated, or a guess to place boards with; None before sizes are known
     coverage: Coverage | None = None
     suggestion: Suggestion | None = None
+    foreseen: Foreseen | None = None  # None before sizes are known
     calibration: CalibrationView | None = None
     verdict: Verdict | None = None  # on the last attempt to calibrate, also where nothing came of it
     verdict_of_calibration: bool = True  # whether that attempt made `calibration`
@@ -302,6 +317,11 @@ class SessionView:
     deleted_scans: tuple[str, ...] = ()
     linear: bool = False  # whether patterns pass the table of grey levels that makes the light proportional
     exposures_ms: tuple[float, ...] = ()  # of every capture; empty: a single one, the camera's
+
+    @property
+    def enough(self) -> bool:
+        """Whether the poses reach the accuracy wanted."""
+        return self.foreseen is not None and self.foreseen.enough
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,7 +128,8 @@ def _poses_done(facts: Facts) -> bool:
         facts.session is not None and facts.session.coverage is not None and facts.session.coverage.share > COVERED
     )
     # cells that the projector never reaches cannot be covered: many poses are enough too
-    enough = covered or facts.good_poses >= MANY_POSES or facts.rig.state == "none"
+    sure = facts.session is not None and facts.session.enough
+    enough = sure or covered or facts.good_poses >= MANY_POSES or facts.rig.state == "none"
     return facts.good_poses >= POSES_FOR_PIXELWISE and enough
 
 
@@ -137,6 +138,10 @@ def _poses_now(facts: Facts) -> str:
     if session is None:
         return "Hold the board before the rig."
     if _poses_done(facts):
+        foreseen = session.foreseen
+        if foreseen is not None and foreseen.enough:
+            reached = f"a predicted sigma of {foreseen.sigma_mm:.3f} mm, where {foreseen.wanted_mm:.3f} mm is wanted"
+            return f"{facts.good_poses} good poses reach {reached}: enough. Calibrate."
         return f"{facts.good_poses} good poses cover the view: calibrate, or add more."
     suggestion = f"{session.suggestion.sentence}, and capture" if session.suggestion else "Hold the board and capture"
     wanted = max(POSES_FOR_PIXELWISE, facts.good_poses + 1)

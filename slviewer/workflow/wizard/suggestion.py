@@ -40,9 +40,9 @@ class Features:
     projector: np.ndarray
 
 
-SIGMA_WANTED = 4e-5
-"""Of the middle depth, where the operator says nothing: below what a camera's noise does to a single point, so that
-more poses would hardly show in a scan."""
+USUAL_SIGMA = 4e-5
+"""Of the middle depth, wanted where nobody says: less than a camera's noise does to a single point, so that more poses
+would hardly show in a scan."""
 LEAST_POSES = 8
 """Before which none is enough: what is not as it should be shows in what poses have in common."""
 
@@ -53,20 +53,20 @@ class Plan:
 
     ``sigma_mm``: the 3D standard deviation that a calibration from these poses is predicted to have over the working
     volume (RMS), None before the rig is known well enough; ``sigma_next_mm``: with the suggested pose besides.
-    ``wanted_mm``: what is asked for. ``enough``: it is reached, and no pose need follow.
+    ``usual_mm``: what suffices where nobody says.
     """
 
     lens: Lens
     poses: Mapping[str, np.ndarray]
     coverage: Coverage
     suggestion: Suggestion | None
-    wanted_mm: float
+    usual_mm: float
     sigma_mm: float | None = None
     sigma_next_mm: float | None = None
 
-    @property
-    def enough(self) -> bool:
-        return self.sigma_mm is not None and self.sigma_mm <= self.wanted_mm and len(self.poses) >= LEAST_POSES
+    def reaches(self, wanted_mm: float) -> bool:
+        """Whether a sigma is reached, and no pose need follow."""
+        return self.sigma_mm is not None and self.sigma_mm <= wanted_mm and len(self.poses) >= LEAST_POSES
 
 
 def plan(
@@ -77,13 +77,12 @@ def plan(
     stereo: StereoModel | None,
     focal_px: float | None,
     refused: int,
-    wanted_mm: float | None = None,
 ) -> Plan:
     """The plan after poses with these `features`.
 
     The rig is the calibrated one if there is a `stereo` calibration of this camera, else what the poses tell; the lens,
     before they tell anything, is one of `focal_px`. `refused`: so many suggestions were tried in vain and are passed
-    over. `wanted_mm`: the 3D sigma that is to be reached; None: a share of the depth.
+    over.
     """
     seen = list(features.values())
     known: tuple[StereoRig, dict[str, np.ndarray]] | None = None
@@ -107,16 +106,16 @@ def plan(
         if T is not None:
             poses[name] = T
     poses = {name: poses[name] for name in features if name in poses}
-    wanted = SIGMA_WANTED * float(np.mean(depth_range(board, lens))) if wanted_mm is None else wanted_mm
+    usual = USUAL_SIGMA * float(np.mean(depth_range(board, lens)))
     covered = coverage(board, lens, list(poses.values()))
     guidance = None
     if known is not None:
         guidance = guide(GuidanceBench(known[0], board), list(poses.values()))
     if guidance is None:
-        return Plan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), wanted)
+        return Plan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
     T = guidance.poses[refused % len(guidance.poses)]
     next_mm = guidance.sigma_next_mm
-    return Plan(lens, poses, covered, described(board, lens, T), wanted, guidance.sigma_mm, next_mm)
+    return Plan(lens, poses, covered, described(board, lens, T), usual, guidance.sigma_mm, next_mm)
 
 
 def _spread(
