@@ -124,15 +124,17 @@ def error_limit(maps: list[np.ndarray]) -> float:
 
 def _layout(width: int, count: int, aspect: float) -> tuple[Any, Any, Any, int]:
     """Figure, the maps' axes, the histogram's, and the width of one map in CSS px."""
-    if width < 800:
-        map_width = int((width - 70) / count)
-        map_height = int(map_width * min(aspect, 1.4))
-        drawing = new_figure(width, map_height + 2 * TITLE_PX + 120)
-        grid = drawing.add_gridspec(2, count, height_ratios=(map_height, 120))
+    if width < 800:  # more than two maps in a row would be too small to read
+        across = min(count, 2)
+        rows = -(-count // across)
+        map_width = int((width - 70) / across)
+        map_height = int(map_width * min(aspect, 1.4)) + (TITLE_PX if rows > 1 else 0)
+        drawing = new_figure(width, rows * map_height + 2 * TITLE_PX + 120)
+        grid = drawing.add_gridspec(rows + 1, across, height_ratios=(*(map_height,) * rows, 120))
         return (
             drawing,
-            [drawing.add_subplot(grid[0, i]) for i in range(count)],
-            drawing.add_subplot(grid[1, :]),
+            [drawing.add_subplot(grid[i // across, i % across]) for i in range(count)],
+            drawing.add_subplot(grid[rows, :]),
             map_width,
         )
     map_width = int((width - 90) / (count + 1.1))

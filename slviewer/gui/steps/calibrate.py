@@ -6,11 +6,19 @@ from typing import Any
 import numpy as np
 import viser
 
-from slviewer.gui.inputs import Choice, change, titled
+from slviewer.gui.calibration_words import (
+    choice_words,
+    comparison_table,
+    named_poses,
+    set_aside_words,
+    splined_table,
+    verdict_words,
+)
+from slviewer.gui.inputs import Choice, Follows, change, titled
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened, spread
 from slviewer.gui.views import bring_button
-from slviewer.gui.widgets import Html, Words, block, boxed, cell, colours, table, toned
+from slviewer.gui.widgets import Html, Words, block, cell, colours, table, toned
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationView as Details
 from slviewer.report.data import DeviceParameters
@@ -24,6 +32,7 @@ from slviewer.workflow.wizard.snapshot import CalibrationView, PreviewView, Sess
 
 LAYER, BOARDS = "calibrate", "calibrated boards"
 DEVICES = ("camera", "projector")
+_MOST_NAMED = 6  # poses that a verdict names, as buttons: more do not fit one line or two
 
 
 class Panel:
@@ -41,12 +50,32 @@ class Panel:
         self._boards: tuple[Any, ...] = ()
         self._cloud: looking.ScanCloud | None = None
         self._details: tuple[tuple[Any, ...], Details] | None = None
+        self._chosen = ""  # the operator's model, as the session said last
 
     def build(self) -> None:
         gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
         self._calibrate = gui.add_button("Calibrate", icon=viser.Icon.TARGET)
         self._calibrate.on_click(safely(lambda: operator.calibrate()))
+        self._verdict = Words(gui)
+        self._anyway = gui.add_checkbox(
+            "Use it anyway", False, visible=False, hint="The session remembers it, for this calibration alone"
+        )
+        self._anyway_follows = Follows(self._anyway)
+        self._named = gui.add_button_group("Look at", ("–",), visible=False)
+        self._set_aside = Words(gui)
         self._summary = Words(gui)
+        with gui.add_folder("Models", visible=False) as self._models_folder:
+            self._choice_words = Words(gui)
+            self._use = Choice(gui, "Measure with", "The recommended model, or another one of your choice")
+            self._compare = gui.add_button(
+                "Compare models",
+                icon=viser.Icon.SCALE,
+                color="gray",
+                hint="Measures each pose by calibrations made without it: a minute or more; it can be cancelled",
+            )
+            self._compare.on_click(safely(lambda: operator.compare_models()))
+            self._comparison = Words(gui)
+            self._splined = Words(gui)
         with gui.add_folder("Reprojection error", visible=False) as self._poses_folder:
             self._bars = Plot(gui)
             self._pose = Choice(gui, "Pose")
@@ -67,6 +96,9 @@ class Panel:
             bring_button(self._stage, lambda: self._cloud.points if self._cloud else None)
             self._curve_words = Words(gui)
             self._curves = Plot(gui)
+        self._anyway.on_update(safely(self._toggle_anyway))
+        self._named.on_click(safely(self._look_at_named))
+        self._use.on_change(safely(self._choose_model))
         for choice in (self._pose, self._axis):
             choice.on_change(safely(self._refresh))
         for number in (self._device, self._column, self._row):
@@ -83,6 +115,8 @@ class Panel:
             change(self._calibrate, disabled=busy or step.state == "blocked")
             change(self._calibrate, label="Calibrate again" if calibration else "Calibrate")
             shown = calibration is not None
+            self._draw_verdict(session, calibration)
+            self._draw_models(calibration, busy)
             for folder, visible in (
                 (self._poses_folder, shown and bool(calibration and calibration.poses)),
                 (self._parameters_folder, shown),
@@ -104,6 +138,42 @@ class Panel:
                 change(self._column, value=max(int(u), 0))
                 change(self._row, value=max(int(v), 0))
             self._refresh()
+
+    def _draw_verdict(self, session: SessionView | None, calibration: CalibrationView | None) -> None:
+        verdict = session.verdict if session else None
+        of_calibration = bool(session and session.verdict_of_calibration)
+        if verdict is not None:
+            self._verdict.set(verdict_words(verdict, of_calibration, calibration))
+        elif calibration is not None and calibration.target:
+            self._verdict.say("This calibration was not judged yet: calibrate again for a verdict.", "plain")
+        else:
+            self._verdict.set("")
+        refusable = calibration is not None and bool(calibration.rejected)
+        change(self._anyway, visible=refusable)
+        self._anyway_follows.tell(bool(calibration and calibration.insisted))
+        drawn = calibration.pose_rms_px if calibration else {}
+        names = tuple(name for name in named_poses(verdict, calibration) if name in drawn)[:_MOST_NAMED]
+        if names and names != self._named.options:
+            self._named.options = names
+        change(self._named, visible=bool(names))
+        self._set_aside.set(set_aside_words(calibration) if calibration else "")
+
+    def _draw_models(self, calibration: CalibrationView | None, busy: bool) -> None:
+        several = calibration is not None and len(calibration.models) > 1 and bool(calibration.poses)
+        change(self._models_folder, visible=several)
+        if calibration is None or not several:
+            return
+        self._choice_words.set(choice_words(calibration))
+        options = [("", f"the recommended one: {calibration.recommended}")]
+        self._use.offer(options + [(model, model) for model in calibration.models], calibration.chosen)
+        if calibration.chosen != self._chosen:
+            self._chosen = calibration.chosen
+            self._use.choose(calibration.chosen)
+        change(self._compare, disabled=busy or bool(calibration.stale))
+        compared = calibration.comparison
+        change(self._compare, label="Compare models" if compared is None else "Compare models again")
+        self._comparison.set("" if compared is None else comparison_table(compared, calibration.best))
+        self._splined.set("" if calibration.splined is None else splined_table(calibration.splined))
 
     def draw_preview(self, preview: PreviewView) -> None:
         """This step needs no camera."""
@@ -167,6 +237,12 @@ class Panel:
             self._arrows.hide()
             return
         said = f"{name}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
+        if calibration.splined is not None and name in calibration.splined.trust:
+            camera, projector = calibration.splined.trust[name]
+            said += (
+                f" The joint adjustment trusts {100 * camera:.0f} % of its features and {100 * projector:.0f} % of its "
+                "phase; 80 % are usual."
+            )
         if excluded:
             self._pose_words.say(f"{said} It is excluded now: calibrate again to do without it.", "warning")
         else:
@@ -225,6 +301,21 @@ class Panel:
         self._curves.set(pixel_curves(curve, width=PLOT_PX))
 
     # requests
+
+    def _toggle_anyway(self) -> None:
+        session = self._snapshot.session if self._snapshot else None
+        calibration = session.calibration if session else None
+        if calibration is not None and calibration.rejected and self._anyway.value != calibration.insisted:
+            self._stage.operator.use_anyway(self._anyway.value)
+
+    def _choose_model(self) -> None:
+        if self._use.value != self._chosen:
+            self._chosen = self._use.value
+            self._stage.operator.choose_model(self._use.value)
+
+    def _look_at_named(self) -> None:
+        self._pose.choose(self._named.value)
+        self._refresh()
 
     def _toggle_pose(self) -> None:
         name = self._pose.value
@@ -297,11 +388,8 @@ def _summary(calibration: CalibrationView) -> Html:
     rows.append(("baseline", f"{calibration.baseline_mm:.2f} mm"))
     rows.append(("models", ", ".join(calibration.models)))
     rows.append(("used for scans", calibration.best))
-    said = table(("Calibration", ""), rows)
-    if calibration.left_out:
-        why = "; ".join(f"{name}: {reason}" for name, reason in calibration.left_out.items())
-        said = Html(said + boxed(f"Left out: {why}", "warning"))
-    return said
+    rows += [(model, words) for model, words in calibration.scales.items()]
+    return table(("Calibration", ""), rows)
 
 
 def _fits(calibration: CalibrationView) -> Html:

@@ -84,8 +84,9 @@ class Panel:
         self._what.offer(things)
         self._made = tuple(export.name for export in session.exports)
         self._clouds = {scan.name: (scan.points, scan.model) for scan in session.scans}
-        for button in (self._calibration, self._report):
-            change(button, disabled=busy or not ready)
+        refused = session.calibration is not None and bool(session.calibration.refused)
+        change(self._report, disabled=busy or not ready)
+        change(self._calibration, disabled=busy or not ready or refused)
         change(self._write, disabled=busy or not things)
         change(self._table, disabled=busy or not session.verifications)
         self._say()

@@ -14,7 +14,7 @@ from slviewer.gui.preview import drawn, legend, light_words
 from slviewer.gui.steps.verify import likely
 from slviewer.gui.undelete import Undelete
 from slviewer.gui.views import bring_button
-from slviewer.gui.widgets import Html, Picture, Words, block, cell, colour_bar, colours, table, thumbnail, toned
+from slviewer.gui.widgets import Html, Picture, Words, block, boxed, cell, colour_bar, colours, table, thumbnail, toned
 from slviewer.gui.world import Stand
 from slviewer.report.maps import error_limit
 from slviewer.workflow.wizard.looking import ScanCloud, scan_cloud
@@ -23,7 +23,9 @@ from slviewer.workflow.wizard.snapshot import PreviewView, ScanView, Snapshot
 LAYER = "scan"
 SMALL_PX = 380
 """Width of the live picture: the cloud matters more here."""
-COLOURS = ("texture", "depth", "modulation", "expected noise", "error")
+COLOURS = ("texture", "depth", "modulation", "expected noise", "uncertainty", "error")
+MUCH_MASKED = 0.2
+"""Share of a scan's pixels, masked because no target pose lit what they look through, that the operator is told of."""
 _STATES = {"absent": "not reconstructed yet", "fresh": "", "stale": "older calibration"}
 
 
@@ -192,6 +194,13 @@ def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
     if colour == "texture":
         texture = cloud.texture if cloud.texture.ndim == 3 else np.repeat(cloud.texture[..., None], 3, axis=2)
         return texture, Html("")
+    if colour == "uncertainty":
+        sure = uncertainty(cloud)
+        low, high = spread(sure)
+        said = "uncertainty of z (1 sigma), noise and calibration together"
+        if cloud.sigma_calibration is None:
+            said = f"uncertainty of z (1 sigma) from noise alone: {cloud.model} does not know its own part"
+        return colours(sure, low, high), colour_bar(f"{low:.3f} mm", f"{high:.3f} mm", "value", said)
     valid = np.isfinite(cloud.points[..., 2])
     values, unit, digits = {
         "depth": (cloud.points[..., 2], "mm", 1),
@@ -204,6 +213,12 @@ def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
     )
 
 
+def uncertainty(cloud: ScanCloud) -> np.ndarray:
+    """(h, w) mm: one standard deviation of z, of noise and calibration together as far as they are known."""
+    noise = np.where(np.isfinite(cloud.points[..., 2]), cloud.sigma_z, np.nan)
+    return noise if cloud.sigma_calibration is None else np.hypot(noise, cloud.sigma_calibration)
+
+
 def point_words(cloud: ScanCloud, u: int, v: int) -> Html:
     """All that is known of the point at pixel (u, v)."""
     x, y, z = cloud.points[v, u]
@@ -214,6 +229,9 @@ def point_words(cloud: ScanCloud, u: int, v: int) -> Html:
         ("modulation", f"{cloud.modulation[v, u]:.1f} grey levels"),
         ("expected noise of z", f"{cloud.sigma_z[v, u]:.3f} mm"),
     ]
+    if cloud.sigma_calibration is not None:
+        rows.append(("left uncertain by the calibration", f"{cloud.sigma_calibration[v, u]:.3f} mm"))
+        rows.append(("uncertainty of z (1 sigma)", f"{uncertainty(cloud)[v, u]:.3f} mm"))
     rows += [(f"error, {model}", f"{errors[v, u]:.3f} mm") for model, errors in cloud.errors.items()]
     return table(("Clicked point", ""), rows)
 
@@ -227,7 +245,13 @@ def scan_words(scan: ScanView) -> Html:
         rows.append(("depths", f"{scan.depth_mm[0]:.0f} to {scan.depth_mm[1]:.0f} mm"))
     if scan.noise_mm is not None:
         rows.append(("expected noise of z (median)", f"{scan.noise_mm:.3f} mm"))
+    if scan.masked is not None:
+        rows.append(("masked: look where no target pose was", f"{100 * scan.masked:.1f} % of the pixels"))
     said = table((titled(scan.name, scan.label), ""), rows)
+    if scan.masked is not None and scan.masked > MUCH_MASKED:
+        said = Html(said + boxed("Much is masked: capture target poses where this object stands.", "warning"))
+    if scan.scale:
+        said = Html(said + block(f"{scan.scale[:1].upper()}{scan.scale[1:]}."))
     if scan.cloud == "stale":
         said = Html(said + block(toned("Made with an older calibration: reconstruct it again.", "warning")))
     return said

@@ -31,6 +31,7 @@ LAYER = "verify"
 SMALL_PX = 300
 """Width of the live picture: here it only has to show that the plane or the sphere is in view."""
 TABLE = "verifications.csv"
+MUCH_MASKED = 0.2
 _SIGN = {"plane": "red is towards the camera", "sphere": "red is outwards"}
 
 
@@ -218,6 +219,10 @@ def result_words(rows: Sequence[VerificationRow]) -> Html:
     if rows[0].incidence is not None:
         shares = ", ".join(f"{region} {share:.0f} %" for region, share in rows[0].incidence.items())
         said = Html(said + block(f"Share of the {rows[0].shape} in the depth ranges: {shares}"))
+    for row in rows:
+        if row.masked and row.masked > 0.0005:
+            words = f"{row.model} masks {100 * row.masked:.1f} % of the {row.shape}: no target pose lit what they see."
+            said = Html(said + block(toned(words, "warning" if row.masked > MUCH_MASKED else "dim")))
     if any(row.stale for row in rows):
         said = Html(said + block(toned("Measured with an older calibration: measure it again.", "warning")))
     return said
@@ -226,7 +231,7 @@ def result_words(rows: Sequence[VerificationRow]) -> Html:
 def results_table(rows: Sequence[VerificationRow]) -> str:
     """Planes, then spheres: a line a capture, a column a model, the best in bold."""
     said = ""
-    for shape, titles in (("plane", ()), ("sphere", ("radius, mm",))):
+    for shape in ("plane", "sphere"):
         found = [row for row in rows if row.shape == shape]
         if not found:
             continue
@@ -245,14 +250,22 @@ def results_table(rows: Sequence[VerificationRow]) -> str:
                 text = "–" if row is None else f"{row.rms_mm:.3f}"
                 line.append(toned(text, "good" if row is best else "plain", bold=row is best))
             line.append(_mm(first.noise_floor_mm))
-            if titles:
-                line.append(" / ".join(_mm(mine[model].radius_mm, 2) for model in models if model in mine))
             lines.append(line)
         heads = [shape.capitalize(), "R1/R2/R3, %", *(f"{model}, mm" for model in models), "floor, mm"]
-        if titles:
-            heads.append(f"radius, mm ({' / '.join(models)})" if len(models) > 1 else "radius, mm")
         said += table(heads, lines)
+        if shape == "sphere":
+            said += _radii(found, models)
     return said
+
+
+def _radii(rows: Sequence[VerificationRow], models: Sequence[str]) -> str:
+    """The spheres' radii by each model."""
+    lines = []
+    for name in dict.fromkeys(row.capture for row in rows):
+        mine = {row.model: row for row in rows if row.capture == name}
+        label = next(iter(mine.values())).label
+        lines.append([label, *(_mm(mine[m].radius_mm if m in mine else None) for m in models)])
+    return table(["Radius of the sphere, mm", *models], lines)
 
 
 def distances_table(distances: Sequence[CentreDistance]) -> str:
