@@ -59,6 +59,7 @@ def test_a_rig_is_measured_from_its_images(proof: AccuracyProof) -> None:
     errors = rig.radius_mm[FLOOR]
     assert set(errors) == {"sphere_3", "sphere_4"} and 0 < max(map(abs, errors.values())) < 0.05
     assert 0 < abs(rig.spacing_mm[FLOOR]["sphere_3 - sphere_4"]) < 0.05
+    assert json.loads(json.dumps(proof.to_json()))["rigs"][0]["planes"]["plane_03"]["region"] == "R2"
 
 
 def test_the_perfect_instrument_errs_by_noise_alone() -> None:
