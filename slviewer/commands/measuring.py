@@ -13,7 +13,7 @@ from slviewer.commands.parsing import Axis, ModelName, deferred, ui, write_json
 def calibrate(
     session: Positional[Path],
     target: str,
-    models: tuple[ModelName, ...] = ("stereo", "pixelwise"),
+    models: tuple[ModelName, ...] = (),
     smoothing: Literal["spline", "polynomial"] = "spline",
     degree: int = 5,
     validate: bool = False,
@@ -27,7 +27,7 @@ def calibrate(
         session: Session folder.
         target: circles:21x16:9 (columns x rows : pitch mm), acircles:…, chessboard:9x7:75 (inner corners : square mm),
             charuco:….
-        models: Which models to fit.
+        models: Which models to fit; by default stereo, which is always made, the Letter's pixelwise, and splined.
         smoothing: How the Letter's step 2 smooths a board's phase; the spline keeps the local distortion.
         degree: Degree of the polynomial, with --smoothing polynomial.
         validate: Also compare the models on poses that they were not made from, as `slviewer validate` does.

@@ -1,14 +1,14 @@
 """From a session's target poses to calibrations."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
 from slviewer.calibration.anchored import AnchoredModel, calibrate_anchored
 from slviewer.calibration.diagnosis.verdict import Verdict
-from slviewer.calibration.observe import Smoothing
+from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
@@ -21,6 +21,7 @@ from slviewer.workflow.opening import SessionLike, opened
 
 _LENGTH = {"pixelwise": 1.0, "anchored": 1.0, "splined": 2.0}
 """How long each model takes, roughly, for the progress."""
+DEFAULT_MODELS = ("stereo", "pixelwise", "splined")
 T = TypeVar("T")
 
 
@@ -108,7 +109,7 @@ def calibrate(
     session: SessionLike,
     target: str,
     *,
-    models: Sequence[str] = ("stereo", "pixelwise"),
+    models: Sequence[str] = (),
     smoothing: str = "spline",
     degree: int = 5,
     progress: Progress = unheard,
@@ -116,12 +117,14 @@ def calibrate(
 ) -> CalibrationResult:
     """Calibrate from the session's captures of role calibration, and save the models in the session.
 
-    ``pixelwise`` and ``anchored`` are fitted on top of ``stereo``, which is always made; ``splined`` starts from it. A
-    pose that cannot be used is left out with the reason. The verdict is saved beside the models. Raises
-    CalibrationRejected with its reason where it rejects them: then stereo alone is kept to look into, and used only
-    where that is insisted on; where none could be made at all, what the session held stays.
+    ``models``: by default stereo, pixelwise and splined. ``stereo`` is always made; ``pixelwise`` and ``anchored`` are
+    fitted on top of it, and ``splined`` starts from it. A pose that cannot be used is left out with the reason. The
+    verdict is saved beside the models. Raises CalibrationRejected with its reason where it rejects them: then stereo
+    alone is kept to look into, and used only where that is insisted on; where none could be made at all, what the
+    session held stays.
     """
     board = Board.parse(target)
+    models = models or DEFAULT_MODELS
     step_2 = Smoothing(smoothing, degree)
     with opened(session, write=True) as store:
         excluded = store.excluded()
@@ -138,7 +141,7 @@ def calibrate(
         if found.stereo is None:
             save_verdict(store, found.verdict, names)
             raise rejected(found.verdict, kept=False)
-        stereo, observations = found.stereo, found.observations
+        stereo = found.stereo
         settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
         if found.verdict.level == "rejected":
             keep_rejected(store, stereo, settings, found.verdict)
@@ -150,47 +153,55 @@ def calibrate(
         for finding in found.verdict.findings:
             if finding.severity == "doubtful":
                 warn(finding.text())
-        wanted = [name for name in models if name != "stereo"]
-        longest = sum(_LENGTH[name] for name in wanted) or 1
-        begun, ended = 0.66, 0.66
-
-        def told(name: str, doing: str) -> Callable[[float], None]:
-            nonlocal begun, ended
-            begun, ended = ended, ended + 0.31 * _LENGTH[name] / longest
-            span = part(progress, begun, ended)
-            span(0.0, doing)
-            return lambda done: span(done, doing)
-
-        def tried(name: str, make: Callable[[], T]) -> T | None:
-            try:
-                return make()
-            except (CalibrationRejected, InputError) as error:
-                if len(models) == 1:
-                    raise
-                warn(f"no {'pixel-wise' if name == 'pixelwise' else name} model: {error}")
-                return None
-
-        pixelwise = anchored = splined = None
-        if "pixelwise" in models:
-            fitting = told("pixelwise", "pixel-wise fit")
-            pixelwise = tried("pixelwise", lambda: calibrate_pixelwise(observations, stereo, fitting))
-        if "anchored" in models:
-            correcting = told("anchored", "anchored fit")
-            anchored = tried("anchored", lambda: calibrate_anchored(observations, stereo, progress=correcting))
-        if "splined" in models:
-            adjusting = told("splined", "joint adjustment")
-            splined = tried("splined", lambda: calibrate_splined(observations, stereo, adjusting))
-            for name, why in splined.bundle.left_out.items() if splined else ():
-                warn(f"{name} is left out of the splined model: it {why}")
+        made = _made(models, stereo, found.observations, part(progress, 0.66, 0.97), warn)
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         save_stereo(store, stereo, inputs, settings, found.verdict)
-        if pixelwise is not None:
-            save_pixelwise(store, pixelwise, inputs, settings)
-        if anchored is not None:
-            save_anchored(store, anchored, inputs, settings)
-        if splined is not None:
-            save_splined(store, splined, inputs, settings)
+        if made.pixelwise is not None:
+            save_pixelwise(store, made.pixelwise, inputs, settings)
+        if made.anchored is not None:
+            save_anchored(store, made.anchored, inputs, settings)
+        if made.splined is not None:
+            save_splined(store, made.splined, inputs, settings)
         save_verdict(store, found.verdict, names)
         progress(1.0, "calibrated")
-    return CalibrationResult(stereo, pixelwise, anchored, splined, found.verdict)
+    return replace(made, verdict=found.verdict)
+
+
+def _made(
+    models: Sequence[str], stereo: StereoModel, observations: Sequence[Observation], progress: Progress, warn: Warn
+) -> CalibrationResult:
+    """The models that follow from stereo; what one of them lacks is told, and keeps none of the others."""
+    wanted = [name for name in models if name != "stereo"]
+    longest = sum(_LENGTH[name] for name in wanted) or 1
+    ended = 0.0
+
+    def told(name: str, doing: str) -> Callable[[float], None]:
+        nonlocal ended
+        begun, ended = ended, ended + _LENGTH[name] / longest
+        span = part(progress, begun, ended)
+        span(0.0, doing)
+        return lambda done: span(done, doing)
+
+    def tried(name: str, make: Callable[[], T]) -> T | None:
+        try:
+            return make()
+        except (CalibrationRejected, InputError) as error:
+            if len(models) == 1:
+                raise
+            warn(f"no {'pixel-wise' if name == 'pixelwise' else name} model: {error}")
+            return None
+
+    pixelwise = anchored = splined = None
+    if "pixelwise" in models:
+        fitting = told("pixelwise", "pixel-wise fit")
+        pixelwise = tried("pixelwise", lambda: calibrate_pixelwise(observations, stereo, fitting))
+    if "anchored" in models:
+        correcting = told("anchored", "anchored fit")
+        anchored = tried("anchored", lambda: calibrate_anchored(observations, stereo, progress=correcting))
+    if "splined" in models:
+        adjusting = told("splined", "joint adjustment")
+        splined = tried("splined", lambda: calibrate_splined(observations, stereo, adjusting))
+        for name, why in splined.bundle.left_out.items() if splined else ():
+            warn(f"{name} is left out of the splined model: it {why}")
+    return CalibrationResult(stereo, pixelwise, anchored, splined)
