@@ -17,7 +17,7 @@ def prove(
 ) -> None:
     """Prove on simulated rigs that results reach the noise floor, faults are named, and predicted errors are honest.
 
-    Ends with status 1 where something does not hold. At full size it takes hours.
+    Ends with status 1 where something does not hold. At full size it takes an hour or two on two cores.
 
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.

@@ -61,7 +61,7 @@ def prove(only: Sequence[Claim] = (), *, quick: bool = False, seed: int = 0, pro
     """Prove all claims, or ``only`` some; ``quick`` at a quarter of the camera's resolution. Another ``seed`` proves
     them on other rigs.
 
-    At full size it takes hours on two cores, most of them for rendering.
+    At full size it takes an hour or two on two cores, most of it for rendering.
     """
     scale = QUICK_SCALE if quick else 1.0
     work: Mapping[Claim, Callable[[Progress], Proof]] = {
