@@ -45,6 +45,7 @@ class Outcome:
     rms_mm: tuple[float, ...]
     floor_mm: tuple[float, ...]
     supported: tuple[float, ...]
+    unmeasured: int
     predicted_mm: float
     seconds: float
 
@@ -88,6 +89,7 @@ class GuidanceProof:
                 "over floor": o.over_floor,
                 "worst plane": float(np.max(np.divide(o.rms_mm, o.floor_mm))),
                 "supported %": 100 * o.share,
+                "not measured": o.unmeasured,
                 "s": round(o.seconds, 1),
             }
             for o in self.outcomes
@@ -113,6 +115,7 @@ class GuidanceProof:
                     "floor_mm": list(o.floor_mm),
                     "over_floor": o.over_floor,
                     "supported": list(o.supported),
+                    "unmeasured": o.unmeasured,
                     "predicted_sigma_mm": o.predicted_mm,
                 }
                 for o in self.outcomes
@@ -173,7 +176,7 @@ def _guided(bench: Bench, told: Progress) -> tuple[list[Observation], float]:
     seen: list[Observation] = []
     refused = 0
     while True:
-        features = {o.name: Features(o.points, o.camera, o.projector) for o in seen}
+        features = {o.name: _features(o) for o in seen}
         planned = plan(board, rig.camera.size, rig.projector.size, features, None, None, refused)
         if len(seen) == bench.count:
             return seen, np.nan if planned.sigma_mm is None else planned.sigma_mm
@@ -187,6 +190,11 @@ def _guided(bench: Bench, told: Progress) -> tuple[list[Observation], float]:
             refused += 1
         else:
             seen.append(observation)
+
+
+def _features(seen: Observation) -> Features:
+    noise = np.nan if seen.samples is None else float(np.nanmedian(seen.samples.sigma))
+    return Features(seen.points, seen.camera, seen.projector, noise)
 
 
 def _asked(rig: SimulatedRig, board: Board, outline_px: np.ndarray) -> np.ndarray:
@@ -250,16 +258,19 @@ def _exact(rig: SimulatedRig, scene: BoardScene, phase: PhaseMap, points: np.nda
 
 def _measured(
     model: SplinedModel, targets: Sequence[_Target]
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Plane RMS by the model and by the true rig, over the same lit pixels, and the share that poses support."""
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], int]:
+    """Plane RMS by the model and by the true rig, over the same lit pixels, the share that poses support, and the
+    pixels that the model does not measure at all."""
     rms, floor, supported = [], [], []
+    unmeasured = 0
     for target in targets:
         points = model.points(target.phase, supported=False)
         known = target.lit & np.isfinite(points[..., 2])
+        unmeasured += int(np.count_nonzero(target.lit & ~known))
         rms.append(_flatness(points[known]))
         floor.append(_flatness(target.exact[known]))
         supported.append(np.count_nonzero(model.support(target.phase) & target.lit) / np.count_nonzero(target.lit))
-    return tuple(rms), tuple(floor), tuple(supported)
+    return tuple(rms), tuple(floor), tuple(supported), unmeasured
 
 
 def _flatness(points: np.ndarray) -> float:

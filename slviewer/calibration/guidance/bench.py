@@ -1,6 +1,6 @@
 """The rig as guidance knows it: lenses without local distortion, on coarse knots, and what a board in it would show."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -39,9 +39,18 @@ class Expected:
     adjustment's own knots, for displacements in widths of the image.
     """
 
-    feature: float = 1.5e-5
-    sample: float = 2.0e-5
+    feature: float = 2.5e-5
+    sample: float = 1.5e-5
     strengths: tuple[float, float] = (4e8, 2e8)
+
+    def with_noise(self, samples: np.ndarray) -> "Expected":
+        """What is expected where samples' noise is known of some poses (n,), in widths of the projector's image; NaN:
+        not of this one. What makes phases noisy makes features so too; little noise of phases says nothing of them.
+        """
+        if not np.isfinite(samples).any():
+            return self
+        seen = float(np.nanmedian(samples))
+        return replace(self, sample=seen, feature=self.feature * max(seen / self.sample, 1.0))
 
 
 @dataclass(frozen=True, eq=False)

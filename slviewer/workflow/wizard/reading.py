@@ -265,8 +265,13 @@ class Reader:
 
     def _features(self, name: str, content_hash: str) -> Features:
         def load() -> Features:
-            arrays = self.session.load_result(f"poses/{name}", only=("points", "camera", "projector"))[1]
-            return Features(**arrays)
+            said = ("points", "camera", "projector")
+            try:
+                arrays = self.session.load_result(f"poses/{name}", only=(*said, "samples_sigma"))[1]
+            except InputError:  # read before samples were kept
+                arrays = self.session.load_result(f"poses/{name}", only=said)[1]
+            sigma = arrays.pop("samples_sigma", np.array([np.nan]))
+            return Features(**arrays, noise_px=float(np.nanmedian(sigma)))
 
         return self._keep(("features", content_hash), load)
 

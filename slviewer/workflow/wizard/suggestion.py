@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.calibration.guidance.bench import GuidanceBench
+from slviewer.calibration.guidance.bench import Expected, GuidanceBench
 from slviewer.calibration.guidance.choosing import guide
 from slviewer.calibration.guidance.rough import rough_rig
 from slviewer.calibration.next_pose import (
@@ -33,11 +33,13 @@ from slviewer.target.board import Board
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What a pose's observation says of its board: points (n, 3) mm, camera and projector (n, 2) px."""
+    """What a pose's observation says of its board: points (n, 3) mm, camera and projector (n, 2) px; and how noisy the
+    projector's coordinates of its bright places are, px (NaN: not known)."""
 
     points: np.ndarray
     camera: np.ndarray
     projector: np.ndarray
+    noise_px: float = np.nan
 
 
 USUAL_SIGMA = 4e-5
@@ -110,7 +112,8 @@ def plan(
     covered = coverage(board, lens, list(poses.values()))
     guidance = None
     if known is not None:
-        guidance = guide(GuidanceBench(known[0], board), list(poses.values()))
+        expected = Expected().with_noise(np.array([f.noise_px for f in seen]) / projector[0])
+        guidance = guide(GuidanceBench(known[0], board, expected), list(poses.values()))
     if guidance is None:
         return Plan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
     T = guidance.poses[refused % len(guidance.poses)]
