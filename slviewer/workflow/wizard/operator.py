@@ -20,7 +20,6 @@ from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
 from slviewer.workflow.calibrating import CalibrationResult
-from slviewer.workflow.merging import Merge
 from slviewer.workflow.models import available, check_accepted, insist, insisted
 from slviewer.workflow.preflight.checks import Preflight, Verdict
 from slviewer.workflow.preflight.run import preflight
@@ -375,14 +374,8 @@ class Operator:
         """Compare the models on captures of a plane or a sphere; `radius_mm`, roughly, helps to find a sphere."""
         store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
-
-        def sentence(rms: dict[str, dict[str, float]]) -> str:
-            measured = [
-                (name, ", ".join(f"{m} {mm:.3f} mm" for m, mm in models.items())) for name, models in rms.items()
-            ]
-            return "; ".join(f"{name}: RMS {figures}" for name, figures in measured)
-
-        self._submit("Verifying", lambda r: work.measure(store, chosen, shape, radius_mm, r, self._warn), sentence)
+        measure = partial(work.measure, store, chosen, shape, radius_mm, warn=self._warn)
+        self._submit("Verifying", measure, work.told_measures)
 
     @_request("Reconstructing")
     def reconstruct(self, name: str, model: str | None = None) -> None:
@@ -400,15 +393,8 @@ class Operator:
         """Register scans to a reference, and merge them; `undo_merge` takes it back."""
         store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
-
-        def sentence(found: Merge) -> str:
-            pairs = (
-                f"{name} RMS {pair.rms_mm:.3f} mm, overlap {100 * pair.overlap:.0f} %"
-                for name, pair in found.merged.pairs.items()
-            )
-            return f"merged on {reference}: {'; '.join(pairs)}"
-
-        self._submit("Merging", lambda r: work.merge_scans(store, chosen, reference, r, self._warn), sentence)
+        merge = partial(work.merge_scans, store, chosen, reference, warn=self._warn)
+        self._submit("Merging", merge, partial(work.told_merge, reference))
 
     @_request("Undoing the merge")
     def undo_merge(self) -> None:

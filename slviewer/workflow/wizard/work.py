@@ -160,6 +160,12 @@ def measure(
     return rms
 
 
+def told_measures(rms: dict[str, dict[str, float]]) -> str:
+    """What was measured, in a sentence."""
+    figures = {name: ", ".join(f"{m} {mm:.3f} mm" for m, mm in models.items()) for name, models in rms.items()}
+    return "; ".join(f"{name}: RMS {said}" for name, said in figures.items())
+
+
 def merge_scans(session: Session, names: list[str], reference: str, report: Reporter, warn: Warn) -> Merge:
     """Register scans to a reference, and keep how they lie; the merged PLY goes into the exports."""
     done = [int(name.removeprefix("merge/")) for name in session.result_names() if name.startswith("merge/")]
@@ -183,3 +189,9 @@ def merge_scans(session: Session, names: list[str], reference: str, report: Repo
         session.guarded(report.saving).save_result(f"merge/{number}", meta, {})
     report(1.0, "merged")
     return found
+
+
+def told_merge(reference: str, found: Merge) -> str:
+    """How well the scans lie on each other, in a sentence."""
+    pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in found.merged.pairs.items())
+    return f"merged on {reference}: {'; '.join(pairs)}"
