@@ -6,9 +6,13 @@ the order in which they are to be shown, the one to beat ("stereo") first.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+
+from slviewer.calibration.diagnosis.verdict import Verdict
+from slviewer.calibration.drift.check import Drift
+from slviewer.evaluation.crossvalidation import CrossValidation
 
 ByModel = Mapping[str, float]
 """One value a model, such as ``{"stereo": 0.198, "pixelwise": 0.076}``."""
@@ -220,11 +224,46 @@ class VerificationView:
     radius_mm: ByModel = field(default_factory=dict)
     true_radius_mm: float = float("nan")
     maps: ErrorMaps | None = None
+    masked: ByModel = field(default_factory=dict)  # share, 0 to 1, that looks where no target pose was
+
+
+@dataclass(frozen=True, eq=False)
+class ModelsView:
+    """The models of a session: the one that is ``used`` and the one ``recommended``; their ``comparison`` on poses left
+    out, None where nobody compared them; ``splined`` as ``Bundle.summary`` gives it, None where there is none;
+    ``scales``: {model: what correction of scale was applied, in words}."""
+
+    used: str
+    recommended: str
+    comparison: CrossValidation | None = None
+    splined: Mapping[str, Any] | None = None
+    scales: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class AcceptanceView:
+    """One acceptance test: ``found`` as ``accept --json`` gives it, ``time`` ISO 8601, UTC."""
+
+    found: Mapping[str, Any]
+    time: str
+    stale: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class DriftRow:
+    """One drift check; ``current``: of the calibration that the session holds now. ``time`` is ISO 8601, UTC."""
+
+    drift: Drift
+    time: str
+    current: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class SessionData:
-    """A session's captures, its calibrations, and what was measured with them."""
+    """A session's captures, its calibrations, and what was measured with them.
+
+    ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that made ``calibration``.
+    """
 
     name: str
     captures: Sequence[CaptureRow]
@@ -236,3 +275,8 @@ class SessionData:
     merged: CloudView | None = None
     pairs: Sequence[MergePair] = ()
     warnings: Sequence[str] = ()
+    verdict: Verdict | None = None
+    verdict_of_calibration: bool = True
+    models: ModelsView | None = None
+    acceptances: Sequence[AcceptanceView] = ()
+    drifts: Sequence[DriftRow] = ()

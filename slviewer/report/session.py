@@ -7,6 +7,13 @@ from slviewer.report.clouds import clouds, merged_cloud
 from slviewer.report.data import CalibrationView, DeviceParameters, SessionData, VerificationView
 from slviewer.report.maps import error_maps, rms_maps
 from slviewer.report.page import Cell, Column, Headline, Item, Mark, Notice, Section, Table
+from slviewer.report.quality import (
+    acceptance_section,
+    drift_section,
+    models_section,
+    verdict_headline,
+    verdict_section,
+)
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
 from slviewer.report.tables import (
     UNKNOWN,
@@ -38,7 +45,7 @@ def session_title(data: SessionData) -> tuple[str, str]:
 
 def session_headlines(data: SessionData) -> list[Headline]:
     """Poses used, reprojection error, fit, and the best flatness that was proven."""
-    headlines = []
+    headlines = [] if data.verdict is None else [verdict_headline(data.verdict)]
     calibration = data.calibration
     if calibration is not None:
         used = sum(row.state == "used" for row in data.captures)
@@ -82,12 +89,20 @@ def _proof(data: SessionData) -> list[Headline]:
 def session_sections(data: SessionData) -> list[Section]:
     """What to look at first, whatever of calibration, proofs and clouds the session holds, and its captures."""
     sections = _notices(data)
+    if data.verdict is not None:
+        sections.append(verdict_section(data.verdict, data.verdict_of_calibration))
     if data.calibration is not None:
         sections += [_reprojection(data.calibration), _parameters(data.calibration)]
+    if data.models is not None:
+        sections.append(models_section(data.models))
     if data.pixel_fits:
         sections.append(_pixel_fits(data))
     if data.verifications or data.spacings:
         sections.append(_verifications(data))
+    if data.acceptances:
+        sections.append(acceptance_section(data.acceptances))
+    if data.drifts:
+        sections.append(drift_section(data.drifts))
     if data.clouds or data.merged is not None:
         sections.append(_clouds(data))
     return [*sections, _captures(data)]
@@ -270,6 +285,8 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
         Column("set aside", "%"),
         Column("coverage", "%"),
     ]
+    masked = any(v.masked for v in found)
+    columns += [Column("masked", "%")] if masked else []
     rows: list[list[str | Cell]] = []
     for v in found:
         for i, model in enumerate(m for m in models if m in v.rms_mm):
@@ -288,11 +305,15 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
             row += [incidence_text(v.incidence) if not i else "", f"{v.points:,}" if not i else ""]
             row.append(Cell(share, "worse") if aside > SET_ASIDE_PERCENT else share)
             row.append(number(100 * v.coverage[model], 1) if model in v.coverage else UNKNOWN)
+            if masked:
+                row.append(number(100 * v.masked[model], 1) if model in v.masked else UNKNOWN)
             rows.append(row)
     notes = [
         "Set aside: points beyond 5 robust sigma, above 2 % the RMS does not speak for the shape. Coverage: measured "
         "pixels of those lit and modulated."
     ]
+    if masked:
+        notes.append("Masked: pixels that look through parts of camera or projector that no target pose lit.")
     return Table(columns, rows, caption, notes)
 
 

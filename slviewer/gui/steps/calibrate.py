@@ -249,9 +249,11 @@ class Panel:
             self._pose_words.say(said)
         made = fingerprint(calibration)
 
-        def arrows() -> Figure:
+        def arrows() -> Figure | None:
             details = self._detailed(made)
-            found, title = details.residuals[name], f"{name}, {device}"
+            found, title = details.residuals.get(name), f"{name}, {device}"
+            if found is None:
+                return None
             if device == "camera":
                 return residual_arrows(title, found.pixels, found.camera, details.camera.size)
             return residual_arrows(title, found.projector_pixels, found.projector, details.projector.size)
@@ -387,7 +389,7 @@ def _summary(calibration: CalibrationView) -> Html:
         rows.append(("calibrated depths (R2)", "{:.0f} to {:.0f} mm".format(*calibration.depth_range_mm)))
     rows.append(("baseline", f"{calibration.baseline_mm:.2f} mm"))
     rows.append(("models", ", ".join(calibration.models)))
-    rows.append(("used for scans", calibration.best))
+    rows.append(("used for scans", "nothing: it was rejected" if calibration.refused else calibration.best))
     rows += [(model, words) for model, words in calibration.scales.items()]
     return table(("Calibration", ""), rows)
 

@@ -237,7 +237,8 @@ def _verify_wrong(facts: Facts) -> Iterator[str]:
     yield from _capturing_wrong(facts)
     stale = sorted({row.capture for row in facts.session.verifications if row.stale}) if facts.session else []
     if stale:
-        yield f"{', '.join(stale)} was measured with an older calibration: measure again."
+        were = "was" if len(stale) == 1 else "were"
+        yield f"{', '.join(stale)} {were} measured with an older calibration: measure again."
 
 
 def _scan_now(facts: Facts) -> str:

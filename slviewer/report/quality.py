@@ -1,0 +1,219 @@
+"""How good a calibration is, section by section: its verdict, its models compared, the tests it stood, what it lost."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from slviewer.calibration.diagnosis.verdict import Verdict
+from slviewer.report.data import AcceptanceView, DriftRow, ModelsView
+from slviewer.report.page import Cell, Column, Headline, Item, Mark, Notice, Section, Table
+from slviewer.report.tables import UNKNOWN, number
+
+_LEVELS: dict[str, tuple[str, str]] = {
+    "good": ("Good: nothing that was seen speaks against this calibration.", "good"),
+    "doubtful": ("Doubtful: it may be used with care, better mended first.", "warning"),
+    "rejected": ("Rejected: do not measure with this calibration.", "warning"),
+}
+_DECISIONS: dict[str | None, tuple[str, Mark]] = {
+    "pass": ("pass", "better"),
+    "fail": ("fail", "worse"),
+    "undecided": ("undecided", "strong"),
+    None: ("no limit given", "muted"),
+}
+
+
+def verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
+    """The level in plain words, and every finding with what to do."""
+    words, kind = _LEVELS[verdict.level]
+    items: list[Item] = [Notice(words, kind)]  # type: ignore[arg-type]
+    for finding in verdict.findings:
+        mended = finding.severity == "note"
+        what = "Mended already." if mended else f"What to do: {finding.remedy}."
+        items.append(Notice(f"{finding.sentence}. {what}", "plain" if mended else "warning"))
+    text = "" if of_calibration else "This is said of the last attempt to calibrate, of which nothing came."
+    return Section("Verdict", text, items)
+
+
+def verdict_headline(verdict: Verdict) -> Headline:
+    """The level, beside the number of findings."""
+    mark: Mark = "better" if verdict.level == "good" else "worse"
+    count = len(verdict.findings)
+    return Headline(verdict.level, "verdict on the calibration", f"{count} finding{'s' * (count != 1)}", mark)
+
+
+def models_section(models: ModelsView) -> Section:
+    """Which models there are, how they compare on poses that they were not made from, and what splined found."""
+    items: list[Item] = [Notice(f"{model}: {words}.", "plain") for model, words in models.scales.items()]
+    used = f"Measured with {models.used}"
+    used += (
+        "."
+        if models.used == models.recommended
+        else f", as the operator has chosen; recommended: {models.recommended}."
+    )
+    compared = models.comparison
+    if compared is not None:
+        least = {f: min(compared.rms(m, f) for m in compared.models) for f in ("plane_mm", "board_mm")}
+
+        def best(model: str, figure: str) -> str | Cell:
+            value = compared.rms(model, figure)
+            text = f"{value:.4f}"
+            return Cell(text, "better") if len(compared.models) > 1 and value == least[figure] else text
+
+        rows: list[list[str | Cell]] = [
+            [
+                model,
+                best(model, "plane_mm"),
+                best(model, "board_mm"),
+                f"{compared.rms(model, 'scale_ppm'):.0f}",
+                f"{compared.rms(model, 'camera_px'):.3f}",
+                f"{compared.rms(model, 'projector_px'):.3f}",
+                "recommended" if model == compared.recommended else "",
+            ]
+            for model in compared.models
+        ]
+        columns = [Column("model", align="left"), Column("plane RMS", "mm"), Column("board RMS", "mm")]
+        columns += [Column("board's scale", "ppm"), Column("reprojection, camera", "px")]
+        columns += [Column("reprojection, projector", "px"), Column("", align="left")]
+        count = len(next(iter(compared.poses.values())))
+        notes = [
+            f"{count} poses, each measured by calibrations made without it and its fold ({len(compared.folds)} folds). "
+            "Plane: how flat the board comes out; board: how far its features lie from where they are on it."
+        ]
+        notes += [f"{model} is not judged: {why}" for model, why in compared.failed.items()]
+        items.append(Table(columns, rows, "On target poses that were left out, RMS", notes))
+    if models.splined is not None:
+        items.append(_splined_table(models.splined))
+        items += [
+            Notice(f"{name} is left out of the splined model: it {why}")
+            for name, why in models.splined["left_out"].items()
+        ]
+    return Section("Models", used, items)
+
+
+def _splined_table(found: Mapping[str, Any]) -> Table:
+    noise, local, lit = found["noise_px"], found["local_distortion_rms_px"], found["cells_lit"]
+    low, high = found["board_height_mm"]
+    rows = [
+        ["noise left in the camera", f"{noise['camera']:.4f} px"],
+        ["noise left in the projector, x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"],
+        ["local distortion learnt, camera / projector", f"{local['camera']:.3f} / {local['projector']:.3f} px RMS"],
+        ["the board's bow, lowest to highest place", f"{high - low:.3f} mm"],
+        ["the board's features, misplaced by", f"{found['board_offsets_rms_mm']:.4f} mm RMS"],
+        [
+            "field cells that target poses lit, camera / projector",
+            f"{100 * lit['camera']:.0f} / {100 * lit['projector']:.0f} %",
+        ],
+    ]
+    columns = [Column("quantity", align="left"), Column("value")]
+    return Table(columns, rows, "The joint adjustment (splined)", ["What looks through cells never lit is masked."])
+
+
+def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:
+    """Every acceptance test: decisions, scale, budget, repeatability; the last one first."""
+    items: list[Item] = []
+    for view in reversed(acceptances):
+        items += _acceptance(view)
+    text = (
+        "Artefacts with known lengths, measured in several places. A property passes where its error and the test's "
+        "own uncertainty together stay within the limit, fails where the error exceeds it by more than that, "
+        "and is undecided between. These tests follow the ideas of VDI/VDE 2634 part 2 and ISO 10360-13, and claim "
+        "conformity with neither."
+    )
+    return Section("Acceptance", text, items)
+
+
+def _acceptance(view: AcceptanceView) -> list[Item]:
+    found = view.found
+    artefact = found["artefact"]
+    named = (
+        f"{artefact['name']}, certificate {artefact['certificate']}, measured by {found['model']} on {view.time[:10]}"
+    )
+    decided, _ = _DECISIONS[found["decision"]]
+    items: list[Item] = [
+        Notice(f"{named}: {decided.upper() if found['decision'] else decided}.",
+               "good" if found["decision"] == "pass" else "plain" if found["decision"] is None else "warning")
+    ]  # fmt: skip
+    if view.stale:
+        items.append(Notice("The calibration or the captures have changed since this test: test again."))
+    items += [Notice(f"Incomplete: {what}.") for what in found["lacks"]]
+    rows: list[list[str | Cell]] = []
+    for each in found["judgements"]:
+        worst, limit = each["worst"], each["limit_mm"]
+        rows.append(
+            [
+                each["property"],
+                number(worst["error_mm"], 4, signed=True),
+                worst["position"],
+                number(worst["U_mm"], 4),
+                " ... ".join(f"{v:+.4f}".replace("-", "−") for v in worst["within_95_mm"]),
+                UNKNOWN if limit is None else f"{limit:g}",
+                Cell(*_DECISIONS[each["decision"]]),
+            ]
+        )
+    columns = [Column("property", align="left"), Column("worst", "mm"), Column("at", align="left")]
+    columns += [Column("uncertainty U, k = 2", "mm"), Column("95 % lie within", "mm", align="centre")]
+    columns += [Column("limit", "mm"), Column("decision", align="left")]
+    notes = [f"{len(found['positions'])} positions."]
+    if scale := found["scale"]:
+        U = 2 * scale["u_ppm"]
+        notes.append(
+            f"Scale: {scale['ppm']:+.0f} ppm ± {U:.0f} ppm (k = 2) over {scale['length_mm']:.3f} mm.".replace("-", "−")
+        )
+    if found["scale_applied"] is not None:
+        ppm = f"{1e6 * (found['scale_applied'] - 1):+.0f}".replace("-", "−")
+        notes.append(f"The scale was corrected by {ppm} ppm from this test on.")
+    elif found["scale_factor"] != 1:
+        ppm = f"{1e6 * (found['scale_factor'] - 1):+.0f}".replace("-", "−")
+        notes.append(f"A scale correction of {ppm} ppm was in force during the test.")
+    if steady := found["repeatability"]:
+        notes.append(
+            f"Repeatability over {steady['captures']} captures of a still object: {steady['sigma_mm']:.4f} mm (median "
+            f"over the pixels), {steady['predicted_mm']:.4f} mm expected from noise; the mean depth wandered by "
+            f"{steady['wandering_mm']:.4f} mm. It says nothing of accuracy."
+        )
+    items.append(Table(columns, rows, artefact["name"], notes))
+    if found["budget"]:
+        items.append(_budget_table(found["budget"]))
+    return items
+
+
+def _budget_table(budget: Mapping[str, Any]) -> Table:
+    rows: list[list[str | Cell]] = [
+        [c["source"], UNKNOWN if c["u_mm"] is None else f"{c['u_mm']:.4f}", c["kind"], c["how"]]
+        for c in budget["contributions"]
+    ]
+    columns = [Column("source", align="left"), Column("standard uncertainty", "mm"), Column("type", align="centre")]
+    columns.append(Column("from", align="left"))
+    without = f" Nothing is known of {' and '.join(budget['unknown'])}: U leaves it out." if budget["unknown"] else ""
+    notes = [f"Type A: from repeated observations; B: from anything else.{without}"]
+    footer = [["expanded, k = 2", f"{budget['U_mm']:.4f}", "", ""]]
+    return Table(columns, rows, f"Uncertainty of a length of {budget['length_mm']:.0f} mm", notes, footer)
+
+
+def drift_section(checks: Sequence[DriftRow]) -> Section:
+    """The answer of the last drift check, and the history."""
+    last = checks[-1].drift
+    kept = last.verdict == "still good"
+    because = f", because {'; '.join(last.reasons)}" if last.reasons else ""
+    rows: list[list[str | Cell]] = []
+    for row in reversed(checks):
+        d = row.drift
+        across = UNKNOWN if d.across_px is None else f"{d.across_px:+.4f} ± {d.across_sigma_px:.4f}".replace("-", "−")
+        good = d.verdict == "still good"
+        rows.append(
+            [
+                row.time[:16].replace("T", " "),
+                d.capture,
+                Cell(d.verdict, "better" if good else "worse"),
+                f"{d.scale_ppm:+.0f} ± {d.scale_sigma_ppm:.0f}".replace("-", "−"),
+                across,
+                "this calibration" if row.current else "an older calibration",
+            ]
+        )
+    columns = [Column("time, UTC", align="left"), Column("capture", align="left"), Column("answer", align="left")]
+    columns += [Column("board seems larger by", "ppm"), Column("off its epipolar lines", "px")]
+    columns.append(Column("of", align="left"))
+    items: list[Item] = [
+        Notice(f"{last.capture}: {last.verdict}{because}.", "good" if kept else "warning"),
+        Table(columns, rows, "Drift checks, the latest first"),
+    ]
+    return Section("Drift", "One board against the saved calibration: whether the rig is still as it was.", items)
