@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from slviewer.calibration.guidance import choosing
 from slviewer.errors import Cancelled
 from slviewer.reconstruction.ply import read_ply
 from slviewer.session.store import Session
@@ -20,6 +21,9 @@ from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.snapshot import SessionView, Snapshot
 
 
+RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
+
+
 @pytest.fixture(scope="module")
 def acts() -> list[str]:
     return []
@@ -28,7 +32,8 @@ def acts() -> list[str]:
 @pytest.fixture(scope="module")
 def operator(tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
     folder = tmp_path_factory.mktemp("flight") / "session"
-    with Operator(folder, {"driver": "simulated", "scale": 0.25, "seed": 0}) as operator:
+    with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG) as operator:
+        patch.setattr(choosing, "TRIALS", 20)  # the best of fewer poses does
         Autopilot(operator, poses=8, before=acts.append).run()
         yield operator
 
@@ -49,8 +54,14 @@ def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) ->
     assert session.coverage is not None and session.coverage.share > 0.6
     assert session.enough and session.foreseen is not None and 0.005 < session.foreseen.sigma_mm < 0.024  # type: ignore[operator]
     calibration = session.calibration
-    assert calibration is not None and calibration.best == "pixelwise" and abs(calibration.baseline_mm - 180) < 2
+    assert calibration is not None and calibration.best == "splined" and abs(calibration.baseline_mm - 180) < 2
+    assert session.verdict is not None and session.verdict_of_calibration and not calibration.refused
+    splined = calibration.splined
+    assert splined is not None and splined.noise_px["x"] < 0.03 and splined.lit["camera"] > 0.8
+    assert set(splined.trust) == set(calibration.poses) and not splined.left_out
     rows = {(row.capture, row.model): row for row in session.verifications}
+    assert rows["plane_01", "splined"].rms_mm < rows["plane_01", "pixelwise"].rms_mm
+    assert rows["plane_01", "splined"].masked is not None and rows["plane_01", "stereo"].masked is None
     assert rows["plane_01", "pixelwise"].rms_mm < rows["plane_01", "stereo"].rms_mm < 0.5
     assert rows["plane_01", "pixelwise"].noise_floor_mm < rows["plane_01", "pixelwise"].rms_mm  # type: ignore[operator]
     assert rows["sphere_01", "pixelwise"].radius_mm == pytest.approx(98, abs=0.5)
@@ -62,18 +73,31 @@ def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) ->
     assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
 
 
+def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:
+    assert operator.want_sigma(0.0001) and operator.set_hands_free(True)
+    snapshot = operator.settle()
+    foreseen = session_of(snapshot).foreseen
+    assert foreseen is not None and foreseen.wanted_mm == 0.0001 and not foreseen.enough
+    assert foreseen.next_mm is not None and foreseen.sigma_mm is not None and foreseen.next_mm < foreseen.sigma_mm
+    assert snapshot.hands_free
+    assert operator.want_sigma(None) and not operator.want_sigma(-1.0)
+    snapshot = operator.settle()
+    assert session_of(snapshot).enough and not snapshot.hands_free
+    assert "enough" in snapshot.step("poses").now
+
+
 def test_panels_find_what_they_draw(operator: Operator) -> None:
     store = operator.session
     assert store is not None
     cloud = looking.scan_cloud(store, "plane_01")
-    assert cloud.points.shape == (300, 400, 3) and set(cloud.errors) == {"stereo", "pixelwise"}
+    assert cloud.points.shape == (300, 400, 3) and set(cloud.errors) == {"stereo", "pixelwise", "splined"}
     measured = np.isfinite(cloud.points).all(-1)
     assert np.isfinite(cloud.phase[measured]).all() and cloud.modulation[measured].min() > 1
     v, u = 150, 200
     assert cloud.nearest(np.zeros(3), cloud.points[v, u]) == (u, v)
     assert cloud.nearest(np.zeros(3), np.array([0, 1.0, 0])) is None
     assert np.isfinite(cloud.points[cloud.thinned(2000)][..., 2]).sum() <= 2500
-    assert set(looking.error_histogram(store, "plane_01").counts) == {"stereo", "pixelwise"}
+    assert set(looking.error_histogram(store, "plane_01").counts) == {"stereo", "pixelwise", "splined"}
     pixels, residuals = looking.residuals(store, "pose_03")
     assert pixels.shape == (336, 2) and residuals.shape == (336, 4)
     curve = looking.pixel_curve(store, (200, 150), "x")
@@ -135,7 +159,7 @@ def test_files_for_other_programs(operator: Operator, monkeypatch: pytest.Monkey
     gaps = cKDTree(surface.vertices).query(cloud.points[::200])[0]
     assert len(surface.faces) > 5_000 and np.median(gaps) < 1.0
     table = files["verifications.csv"].path.read_text().splitlines()
-    assert len(table) == 5 and table[1].startswith("plane_01,A flat plate,plane,stereo,")
+    assert len(table) == 7 and table[1].startswith("plane_01,A flat plate,plane,stereo,")
     bundle = next(export for export in files.values() if export.name.startswith("diagnostics_"))
     with zipfile.ZipFile(bundle.path) as inside:
         names = inside.namelist()
@@ -152,6 +176,27 @@ def read_head(path: Path) -> str:
         return file.read(300).decode("ascii", "replace")
 
 
+def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(operator: Operator) -> None:
+    store = operator.session
+    assert store is not None
+    before = looking.scan_cloud(store, "scan_02").points
+    inputs = store.input_hashes("calibration/splined")
+    store.save_result("scale/splined", {"factor": 1.001, "certificate": "lab 7", "inputs": inputs}, {})
+    assert operator.choose_model("splined")
+    session = session_of(operator.settle())
+    assert session.calibration is not None and session.calibration.chosen == "splined"
+    assert session.calibration.scales == {"splined": "scale corrected by +1000 ppm, by certificate lab 7"}
+    assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
+    assert operator.reconstruct("scan_02")
+    scan = operator.settle().scan("scan_02")
+    assert scan is not None and scan.cloud == "fresh" and scan.scale.startswith("scale corrected by +1000 ppm")
+    after = looking.scan_cloud(store, "scan_02").points
+    both = np.isfinite(before[..., 2]) & np.isfinite(after[..., 2])
+    np.testing.assert_allclose(after[both], before[both] * np.float32(1.001), rtol=1e-6)
+    store.trash_result("scale/splined")
+    assert operator.choose_model("") and not operator.choose_model("anchored")
+
+
 def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     assert operator.exclude("pose_02")
     stale = operator.settle()
@@ -161,6 +206,8 @@ def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     again = operator.settle()
     session = session_of(again)
     assert session.calibration is not None and session.calibration.stale == "" and len(session.calibration.poses) == 7
+    assert session.calibration.models == ("stereo", "pixelwise")  # what was made of other poses is gone
+    assert any("it needs 8 target poses" in notice.text for notice in again.notices)
     assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
     assert session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
     assert again.pose("pose_02").state == "excluded"  # type: ignore[union-attr]
