@@ -194,12 +194,13 @@ class Reader:
         if camera is not None and projector is not None:
             counted = {name: f for name, f in features.items() if states[name][0] not in ("excluded", "refused")}
             refused = sum(state == "refused" for state, _ in states.values())
-            model = self._meta("calibration/stereo")["hash"] if stereo is not None else ""
+            trusted = None if calibration is not None and calibration.refused else stereo
+            model = self._meta("calibration/stereo")["hash"] if trusted is not None else ""
             poses = tuple((name, captures[name].hash) for name in counted)
             board = Board.parse(target)
             planned = self._keep(
                 ("plan", target, camera, projector, poses, model, focal_px, refused),
-                lambda: plan(board, camera, projector, counted, stereo, focal_px, refused),
+                lambda: plan(board, camera, projector, counted, trusted, focal_px, refused),
             )
         return self._views(captures, states, features, planned, calibration, target), planned
 
@@ -270,8 +271,9 @@ class Reader:
                 arrays = self.session.load_result(f"poses/{name}", only=(*said, "samples_sigma"))[1]
             except InputError:  # read before samples were kept
                 arrays = self.session.load_result(f"poses/{name}", only=said)[1]
-            sigma = arrays.pop("samples_sigma", np.array([np.nan]))
-            return Features(**arrays, noise_px=float(np.nanmedian(sigma)))
+            sigma = arrays.pop("samples_sigma", np.zeros(0))
+            known = sigma[np.isfinite(sigma)]
+            return Features(**arrays, noise_px=float(np.median(known)) if known.size else np.nan)
 
         return self._keep(("features", content_hash), load)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.calibration.guidance.bench import Expected, GuidanceBench
-from slviewer.calibration.guidance.choosing import guide
+from slviewer.calibration.guidance.choosing import Guidance, guide
 from slviewer.calibration.guidance.rough import rough_rig
 from slviewer.calibration.next_pose import (
     Coverage,
@@ -110,10 +110,13 @@ def plan(
     poses = {name: poses[name] for name in features if name in poses}
     usual = USUAL_SIGMA * float(np.mean(depth_range(board, lens)))
     covered = coverage(board, lens, list(poses.values()))
-    guidance = None
+    guidance: Guidance | None = None
     if known is not None:
         expected = Expected().with_noise(np.array([f.noise_px for f in seen]) / projector[0])
-        guidance = guide(GuidanceBench(known[0], board, expected), list(poses.values()))
+        try:
+            guidance = guide(GuidanceBench(known[0], board, expected), list(poses.values()))
+        except (InputError, np.linalg.LinAlgError):  # devices that share no view: what covers most may mend it
+            guidance = None
     if guidance is None:
         return Plan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
     T = guidance.poses[refused % len(guidance.poses)]

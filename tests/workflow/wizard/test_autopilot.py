@@ -20,7 +20,6 @@ from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.snapshot import SessionView, Snapshot
 
-
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
 
 
