@@ -12,6 +12,7 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.attempt import Attempt, attempt_stereo
 from slviewer.calibration.diagnosis.evidence import PoseEvidence
+from slviewer.calibration.diagnosis.poses import FEW_POSES
 from slviewer.calibration.diagnosis.verdict import Cause
 from slviewer.calibration.observe import Observation, observe
 from slviewer.errors import InputError
@@ -224,7 +225,7 @@ def _parallel(tilt_deg: float, spread_deg: float) -> Fault:
         rng = np.random.default_rng(5)
         middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
         looked = []
-        for i in bench.every:
+        for i in range(FEW_POSES):  # fewer would be a fault of its own
             pose = bench.poses[i]
             R = rotation(np.radians([tilt_deg, 0, 0]) + np.radians(spread_deg) * rng.uniform(-1, 1, 3))
             place = 0.7 * (pose.to_camera(middle) * [1, 1, 0]) + [0, 0, pose.to_camera(middle)[2]]
