@@ -185,13 +185,14 @@ def scored(
         depth_range=DEPTH_RANGE_MM,
         radius=SPHERE_RADIUS_MM if is_round else None,
     )
+    found = comparison.results["splined"]
     for name in [name for name in clouds if name not in JUDGED]:
-        c = clouds[name]
+        points, sigma = clouds[name].points, clouds[name].sigma_z
         try:
             comparison.results[name] = (
-                evaluate_sphere(c.points, comparison.common, c.sigma_z, SPHERE_RADIUS_MM)
-                if is_round
-                else evaluate_plane(c.points, comparison.common, c.sigma_z)
+                evaluate_sphere(points, comparison.common, sigma, SPHERE_RADIUS_MM, found.sphere)
+                if isinstance(found, SphereResult)
+                else evaluate_plane(points, comparison.common, sigma, found.plane)
             )
         except InputError:
             continue  # it measures nothing there
