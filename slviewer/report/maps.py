@@ -28,6 +28,7 @@ from slviewer.report.canvas import (
 from slviewer.report.page import Figure
 
 TITLE_PX = 34
+WIDE_PX = 240  # maps that have room for longer titles
 BINS = 121
 
 
@@ -96,7 +97,7 @@ def error_maps(
     drawing.suptitle(title, x=0.004, ha="left", fontsize=TITLE_PT + 1.5, color=INK, fontweight="bold")
     image = None
     for ax, (model, errors) in zip(axes, cropped.items(), strict=True):
-        bare(ax, f"{model}: {'' if width <= HALF else 'RMS '}{rms_mm[model]:.3f} mm", model_colour(model))
+        bare(ax, f"{model}: {'RMS ' if map_width > WIDE_PX else ''}{rms_mm[model]:.3f} mm", model_colour(model))
         image = ax.imshow(
             _shown(errors, map_width),
             cmap=_map("RdBu_r", 101),

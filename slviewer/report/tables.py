@@ -144,8 +144,12 @@ def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
 
 
 def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
-    """Distances between spheres, known and measured; flatness is blind to scale and shear, these are not."""
+    """Distances between spheres, known (where they are) and measured; flatness is blind to scale and shear, these are
+    not."""
     models = models_of([row.measured_mm for row in rows])
+    if not any(np.isfinite(row.known_mm) for row in rows):
+        plain = [[row.name, *(number(row.measured_mm.get(m, np.nan)) for m in models)] for row in rows]
+        return Table([Column("spheres", align="left"), *(Column(m, "mm") for m in models)], plain, caption)
     columns = [Column("spheres", align="left"), Column("known", "mm")]
     for model in models:
         columns += [Column("measured", "mm", model), Column("error", "mm", model)]

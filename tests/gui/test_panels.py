@@ -3,6 +3,7 @@
 import re
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,23 +11,30 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 from wizard_page import SIZE, Opened, button, field
 
+from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.gui.app import App
+from slviewer.gui.calibration_words import comparison_table, named_poses, verdict_words
 from slviewer.gui.pictures import Painter, spread
-from slviewer.gui.steps.scan import ordered, painting, point_words
+from slviewer.gui.steps.scan import ordered, painting, point_words, uncertainty
 from slviewer.gui.steps.verify import distances_table, likely, results_table
 from slviewer.reconstruction.ply import read_ply
 from slviewer.workflow.calibrating import calibrate
+from slviewer.workflow.diagnosing import save_verdict
 from slviewer.workflow.simulating import simulate
 from slviewer.workflow.wizard.looking import ScanCloud
 from slviewer.workflow.wizard.operator import Operator
-from slviewer.workflow.wizard.snapshot import CentreDistance, ScanView, VerificationRow
+from slviewer.workflow.wizard.snapshot import CentreDistance, ComparisonView, ModelFigures, ScanView, VerificationRow
+
+REJECTED = Verdict.of(
+    [Finding("moved", "rejected", "pose_03 moved by 0.9 px", "hold the <b>board</b> still", ("pose_03",))]
+)
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "session"
     simulate(folder, scale=0.25, poses=8)
-    calibrate(folder, "circles:21x16:9")
+    calibrate(folder, "circles:21x16:9", models=("stereo", "pixelwise"))
     return folder
 
 
@@ -136,6 +144,41 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     assert errors == []
 
 
+def test_a_rejected_calibration_says_why_and_is_used_only_where_one_insists(
+    measured: tuple[Page, Operator, list[str]],
+) -> None:
+    page, operator, errors = measured
+    store = operator.session
+    assert store is not None
+    button(page, "4. Calibrate").click()
+    expect(page.get_by_text("nothing that was seen speaks against this calibration")).to_be_visible()
+    choose(page, "Measure with", "stereo")
+    expect(page.get_by_text("stereo is used, as you have chosen; pixelwise is recommended")).to_be_visible()
+    meta, arrays = store.load_result("calibration/stereo")
+    meta = {key: value for key, value in meta.items() if key not in ("hash", "arrays")}
+    store.save_result("calibration/stereo", {**meta, "verdict": REJECTED.to_json()}, arrays)
+    save_verdict(store, REJECTED, ["pose_03"])
+    assert operator.choose_model("")
+    expect(page.get_by_text("do not measure with this")).to_be_visible()
+    expect(page.get_by_text("Hold the <b>board</b> still.")).to_be_visible()
+    button(page, "pose_03").click()
+    expect(page.get_by_text("pose_03, camera: measured minus predicted features")).to_be_visible()
+    button(page, "6. Scan").click()
+    expect(page.get_by_text("The calibration was rejected: pose_03 moved by 0.9 px").first).to_be_visible()
+    button(page, "4. Calibrate").click()
+    page.get_by_label("Use it anyway").check()
+    assert operator.wait_for(lambda s: s.step("scan").state != "blocked", 10.0)
+    assert errors == []
+
+
+def test_words_of_a_calibration() -> None:
+    rows = tuple(ModelFigures(m, p, 2 * p, 9.0, p, p) for m, p in (("stereo", 0.2), ("splined", 0.02)))
+    html = comparison_table(ComparisonView(rows, 8, 5, {"pixelwise": "too <few> poses"}), "splined")
+    assert re.search(r"font-weight:600\">0&#46;020", html) and "<few>" not in html and html.index("stereo") > 0
+    assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_words(REJECTED, True, None)
+    assert "Nothing came" in verdict_words(REJECTED, False, None)
+
+
 def test_a_painter_draws_the_last_wish_and_survives_failures() -> None:
     failures: list[BaseException] = []
     painter = Painter(failures.append)
@@ -190,6 +233,10 @@ def test_a_cloud_is_painted_by_what_is_asked() -> None:
     cloud = ScanCloud("a", "stereo", "x", points, flat, flat, flat, np.full((4, 5), 7, np.uint8), {})
     painted, words = painting(cloud, "depth")
     assert painted.shape == (4, 5, 3) and len(np.unique(painted[1], axis=0)) == 5 and "mm" in words
+    noisy = replace(cloud, sigma_z=3 * flat, sigma_calibration=4 * flat)
+    np.testing.assert_allclose(uncertainty(noisy)[1:, 1:], 5.0)
+    assert "5&#46;000" in painting(noisy, "uncertainty")[1] and "5&#46;000" in point_words(noisy, 4, 2)
+    assert "noise alone" in painting(cloud, "uncertainty")[1].replace("&#32;", " ")
     assert painting(cloud, "texture")[0][0, 0].tolist() == [7, 7, 7]
     assert "measure this capture" in painting(cloud, "error")[1].replace("&#32;", " ")
     assert "600&#46;000" in point_words(cloud, 4, 2)

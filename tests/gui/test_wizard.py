@@ -17,6 +17,7 @@ from slviewer.devices.faults import Faults, breakable
 from slviewer.gui.app import App
 from slviewer.session.store import Session
 from slviewer.target.board import Board
+from slviewer.workflow.wizard import work
 from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.rigs import Bench, Choice, set_up
 from slviewer.workflow.wizard.snapshot import SessionView
@@ -61,8 +62,14 @@ def bare(tmp_path: Path) -> Iterator[Operator]:
 
 
 def test_from_an_unknown_rig_to_a_merged_cloud(
-    bare: Operator, browser: Browser, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    bare: Operator,
+    browser: Browser,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # the joint adjustment takes long, and the autopilot's flight makes it
+    monkeypatch.setattr(work, "lacking_for_splined", lambda session: "it is made elsewhere")
     app = App(bare, port=0)
     opened = visit(browser, app.server.url)
     page = opened.page

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_rows
 
-from slviewer.report.data import PlaneRow, SpacingRow
+from slviewer.calibration.diagnosis.verdict import Finding, Verdict
+from slviewer.calibration.drift.check import Drift
+from slviewer.evaluation.crossvalidation import CrossValidation, HeldOut
+from slviewer.report.data import AcceptanceView, DriftRow, ModelsView, PlaneRow, SpacingRow
 from slviewer.report.page import Cell, Figure, Notice, Section, Table, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
@@ -184,3 +187,73 @@ def test_a_calibration_made_elsewhere() -> None:
     bare = dataclasses.replace(data.calibration, reprojection_rms_px={}, pose_rms_px={}, residuals={})
     sections = session_sections(dataclasses.replace(data, calibration=bare, verifications=(), pixel_fits=(), clouds=()))
     assert "made elsewhere" in texts(sections[1])
+
+
+def test_how_good_a_calibration_is() -> None:
+    verdict = Verdict.of(
+        [
+            Finding("empty-corner", "doubtful", "no pose reached the upper left corner", "fill it in two more poses"),
+            Finding("outlier", "note", "pose_07 is left out", ""),
+        ]
+    )
+    held = {"stereo": 0.2, "splined": 0.02}
+    compared = CrossValidation(
+        {m: {"pose_01": HeldOut(mm, mm, 100 * mm, mm, mm, 900, 550.0)} for m, mm in held.items()}, (("pose_01",),), {}
+    )
+    splined = {
+        "noise_px": {"camera": 0.01, "x": 0.011, "y": 0.012},
+        "local_distortion_rms_px": {"camera": 0.1, "projector": 0.12},
+        "board_height_mm": [-0.02, 0.08],
+        "board_offsets_rms_mm": 0.01,
+        "cells_lit": {"camera": 0.98, "projector": 0.6},
+        "left_out": {"pose_09": "contradicts the other poses"},
+    }
+    figure = {"error_mm": -0.03, "U_mm": 0.004, "position": "left", "within_95_mm": (-0.034, -0.026)}
+    found = {
+        "artefact": {"name": "bar <1>", "certificate": "lab 7"},
+        "model": "splined",
+        "positions": [1, 2],
+        "judgements": [{"property": "sphere spacing", "worst": figure, "limit_mm": 0.05, "decision": "undecided"}],
+        "scale": {"ppm": -300.0, "u_ppm": 20.0, "length_mm": 100.0},
+        "decision": "undecided",
+        "lacks": ["2 of 7 positions were measured"],
+        "scale_factor": 1.0,
+        "scale_applied": 1.0003,
+        "repeatability": {"captures": 10, "sigma_mm": 0.02, "predicted_mm": 0.021, "wandering_mm": 0.001},
+        "budget": {
+            "length_mm": 100.0,
+            "U_mm": 0.03,
+            "unknown": ["drift"],
+            "contributions": [{"source": "drift", "u_mm": None, "kind": "B", "how": "no check"}],
+        },
+    }
+    three = (0.0, 0.1, 0.0)
+    drift = Drift(
+        "plane_01", ("x",), "recalibrate", ("the board seems too large",), three, three, three, three, 0.0, 0.1, 420.0,
+        66.0, None, None, 0.02, 0.01, (0.1,) * 6, (),
+    )  # fmt: skip
+    data = dataclasses.replace(
+        session_data(WIDTH),
+        verdict=verdict,
+        models=ModelsView("stereo", "splined", compared, splined, {"splined": "scale corrected by +300 ppm"}),
+        acceptances=[AcceptanceView(found, "2026-11-21T10:00:00+00:00")],
+        drifts=[DriftRow(drift, "2026-11-22T10:00:00+00:00")],
+        spacings=[SpacingRow("a to b", float("nan"), {"stereo": 60.6, "splined": 60.5})],
+    )
+    assert session_headlines(data)[0].value == "doubtful"
+    words = "\n".join(texts(section) for section in session_sections(data))
+    for word in (
+        "What to do: fill it in two more poses",
+        "Mended already",
+        "as the operator has chosen; recommended: splined",
+        "0.0200",
+        "0.100 mm",
+        "pose_09 is left out of the splined model",
+        "UNDECIDED",
+        "−300 ppm ± 40 ppm (k = 2)",
+        "Nothing is known of drift",
+        "over 10 captures",
+        "plane_01: recalibrate, because the board seems too large",
+        "60.500",
+    ):
+        assert word in words, word

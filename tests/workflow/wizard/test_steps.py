@@ -49,6 +49,17 @@ def test_the_way_through_the_wizard() -> None:
     assert "pose_1 was excluded" in next(v for v in views(stale) if v.key == "calibrate").wrong[0]
 
 
+def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:
+    rejected = replace(calibration(), rejected="pose_3 moved by 0.9 px: take the pose again")
+    facts = Facts(replace(EMPTY, target="circles:9x7:20", poses=poses(10), calibration=rejected), OPEN, None)
+    found = {view.key: view for view in views(facts)}
+    assert {found[key].state for key in ("verify", "scan", "merge")} == {"blocked"}
+    assert "pose_3 moved by 0.9 px" in found["scan"].because and "insist" in found["verify"].because
+    assert found["calibrate"].state == "ready" and "rejected" in found["calibrate"].now
+    insisted = replace(facts, session=replace(facts.session, calibration=replace(rejected, insisted=True)))  # type: ignore[type-var]
+    assert states(insisted)["scan"] == "ready" and states(insisted)["calibrate"] == "done"
+
+
 def test_a_recorded_session_needs_no_rig() -> None:
     recorded = replace(EMPTY, target="circles:9x7:20", poses=poses(9))
     assert states(Facts(recorded, RigView(), None))["poses"] == "done"
