@@ -173,7 +173,10 @@ class Panel:
         compared = calibration.comparison
         change(self._compare, label="Compare models" if compared is None else "Compare models again")
         self._comparison.set("" if compared is None else comparison_table(compared, calibration.best))
-        self._splined.set("" if calibration.splined is None else splined_table(calibration.splined))
+        if calibration.splined is not None:
+            self._splined.set(splined_table(calibration.splined))
+        else:
+            self._splined.say(f"No splined model: {calibration.lacks}." if calibration.lacks else "", "dim")
 
     def draw_preview(self, preview: PreviewView) -> None:
         """This step needs no camera."""

@@ -48,6 +48,7 @@ from slviewer.workflow.wizard.snapshot import (
     VerificationRow,
 )
 from slviewer.workflow.wizard.suggestion import Features, Plan, plan
+from slviewer.workflow.wizard.work import lacking_for_splined
 
 
 class Reader:
@@ -321,6 +322,7 @@ class Reader:
             splined=splined,
             comparison=_comparison(session),
             scales={model: words for model in models if (words := told_scale(session, model))},
+            lacks="" if "splined" in models or not stereo.poses else lacking_for_splined(session),
         )
 
     def _is_of_calibration(self, verdict: Verdict | None, stereo: StereoModel | None) -> bool:

@@ -140,7 +140,8 @@ class CalibrationView:
     `fit_rms_mm`: {axis: {z, x, y: median mm}} of the pixel-wise fit, empty where there is none.
     `best` is the model that is used, `recommended` the one that would be if the operator had not `chosen` (empty: he
     has not). `rejected` says why it was, empty where it was not; `insisted`: it is used all the same.
-    `scales`: {model: what correction of scale was applied, in words}.
+    `scales`: {model: what correction of scale was applied, in words}. `lacks`: what the poses lack for the splined
+    model, empty where they allow it.
     """
 
     models: tuple[str, ...]
@@ -169,6 +170,7 @@ class CalibrationView:
     splined: SplinedView | None = None
     comparison: ComparisonView | None = None
     scales: Mapping[str, str] = field(default_factory=dict)
+    lacks: str = ""
 
     @property
     def refused(self) -> str:
