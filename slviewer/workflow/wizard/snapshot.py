@@ -359,12 +359,14 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class BoardSeen:
-    """The board in the preview: features (n, 2) and outline (4, 2), camera px; `still_s` since it moved last."""
+    """The board in the preview: features (n, 2) and outline (4, 2), camera px; `still_s` since it moved last; `taken`:
+    when the picture was, by the monotonic clock: the search takes its time."""
 
     pixels: np.ndarray
     outline: np.ndarray
     still_s: float
     T_camera_board: np.ndarray | None
+    taken: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,7 +129,7 @@ class Watcher:
             # centres of reduced pixels to those of the camera's
             found = replace(found, pixels=(found.pixels + 0.5) / scale - 0.5)
             still = self._stillness.of(found.pixels, STILL_PX * image.shape[1] / scale, taken)
-            board = board_seen(watch.board, found, still, watch.lens)
+            board = board_seen(watch.board, found, still, watch.lens, taken)
         else:
             self._stillness.lose()
         self._found = (watch, board, missing)
@@ -181,14 +181,14 @@ def find(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]
         return None, str(error)
 
 
-def board_seen(board: Board, found: Detection, still_s: float, lens: Lens | None) -> BoardSeen | None:
+def board_seen(board: Board, found: Detection, still_s: float, lens: Lens | None, taken: float) -> BoardSeen | None:
     """The detected board as a panel draws it."""
     points = board.points[found.ids]
     if len(points) < 4:
         return None
     H = fit_homography(points[:, :2], found.pixels)
     T = None if lens is None else approximate_pose(points, found.pixels, lens)
-    return BoardSeen(found.pixels, to_image(H, board.outline()[:, :2]), still_s, T)
+    return BoardSeen(found.pixels, to_image(H, board.outline()[:, :2]), still_s, T, taken)
 
 
 def _top(frame: np.ndarray) -> int:
@@ -209,13 +209,14 @@ class HandsFree:
         self.on = False
         self._taken: np.ndarray | None = None
         self._just_took = False
+        self._asked = 0.0
         self._begun: float | None = None
 
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
         """Seconds until the capture, 0 or less: now; None where none is coming."""
-        if self._just_took and board is not None and not busy:
+        if self._just_took and not busy and board is not None and board.taken > self._asked:
             self._taken, self._just_took = board.outline, False
-        if not self.on or board is None or busy or board.still_s < self.HOLD_S or self._same(board.outline):
+        if not self.on or self._just_took or board is None or busy or board.still_s < self.HOLD_S or self._same(board.outline):
             self._begun = None
             return None
         if self._begun is None:
@@ -223,8 +224,8 @@ class HandsFree:
         return self.COUNT_S - (now - self._begun)
 
     def took(self) -> None:
-        """A capture was asked for, by whatever means; where the board is seen after it counts as taken."""
-        self._just_took, self._begun = True, None
+        """A capture was asked for, by whatever means; where a later picture shows the board counts as taken."""
+        self._just_took, self._asked, self._begun = True, time.monotonic(), None
 
     def _same(self, outline: np.ndarray) -> bool:
         if self._taken is None:

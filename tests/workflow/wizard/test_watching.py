@@ -1,5 +1,6 @@
 """What a preview shows: the board where it is, how bright, how still; and when hands-free captures."""
 
+import math
 import threading
 import time
 
@@ -18,9 +19,9 @@ from slviewer.workflow.wizard.watching import HandsFree, Stillness, Watch, Watch
 BOARD = Board.parse("circles:9x7:20")
 
 
-def seen(still_s: float, shift: float = 0.0) -> BoardSeen:
+def seen(still_s: float, shift: float = 0.0, taken: float = math.inf) -> BoardSeen:
     outline = np.array([[10.0, 10], [90, 10], [90, 70], [10, 70]]) + shift
-    return BoardSeen(outline, outline, still_s, None)
+    return BoardSeen(outline, outline, still_s, None, taken)
 
 
 def test_the_board_is_found_in_the_cameras_pixels() -> None:
@@ -113,5 +114,7 @@ def test_hands_free_counts_down_once_a_place() -> None:
     assert last is not None and last < 0
     hands_free.took()
     assert hands_free.countdown(seen(2.6), True, 6.0) is None
+    # what is still known from before the capture is of the place before, perhaps
+    assert hands_free.countdown(seen(9, shift=-30, taken=0.0), False, 6.5) is None
     assert hands_free.countdown(seen(5), False, 7.0) is None
     assert hands_free.countdown(seen(1.5, shift=30), False, 8.0) == 1.0
