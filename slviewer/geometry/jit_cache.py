@@ -1,0 +1,116 @@
+"""Where the kernels' machine code is kept: a folder a module, named after what the module's sources say.
+
+numba itself looks at the file of a kernel alone. A kernel also holds what it calls and the constants it reads from
+other files, and stale machine code is a wrong answer: so a folder's name carries a hash over the sources of a module
+and of all the package's modules that it imports.
+"""
+
+import hashlib
+import os
+import re
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1]
+_IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+(slviewer[\w.]*)[ \t]+)?import[ \t]+(\([^)]*\)|[^\n]*)", re.MULTILINE)
+_NAME = re.compile(rb"[\w.]+")
+
+
+def folder_for(module: str) -> Path | None:
+    """The folder for the machine code of a module of this package; None where there is no place to keep any.
+
+    Those of the same module's earlier sources go.
+    """
+    try:
+        root = _root()
+        if root is None:
+            return None
+        folder = root / f"{module}-{sources_hash(module)}"
+        if not folder.is_dir():
+            for old in root.glob(f"{module}-*"):
+                if old != folder:  # another process may just have made it
+                    shutil.rmtree(old, ignore_errors=True)
+            folder.mkdir(exist_ok=True)
+    except OSError:  # no source beside the byte code, no temporary folder, or a disk that has filled up
+        return None
+    return folder
+
+
+def sources_hash(module: str) -> str:
+    """A hash of what a module and all modules of the package that it imports say. Raises OSError without sources."""
+    found, ahead = dict[str, bytes](), [module]
+    while ahead:
+        name = ahead.pop()
+        if name in found:
+            continue
+        found[name], imported = _source(name)
+        ahead += imported
+    whole = hashlib.blake2b(digest_size=8)
+    for name in sorted(found):
+        whole.update(name.encode() + found[name])
+    return whole.hexdigest()
+
+
+@cache
+def _source(module: str) -> tuple[bytes, tuple[str, ...]]:
+    """A module's digest, and the modules of the package that its text imports, anywhere in it."""
+    path = _path(module)
+    if path is None:
+        raise FileNotFoundError(f"{module} has no source file")
+    text = path.read_bytes()
+    named = set[str]()
+    for where, what in _IMPORT.findall(text):
+        names = [name.decode() for name in _NAME.findall(what)]
+        named |= {where.decode(), *(f"{where.decode()}.{name}" for name in names)} if where else set(names)
+    imported = (name for name in sorted(named) if name.split(".")[0] == "slviewer" and _path(name) is not None)
+    return hashlib.blake2b(text, digest_size=20).digest(), tuple(imported)
+
+
+def _path(module: str) -> Path | None:
+    """The source file of a module; None where there is none of that name."""
+    parts = PACKAGE.parent.joinpath(*module.split("."))
+    return next((path for path in (parts.with_suffix(".py"), parts / "__init__.py") if path.is_file()), None)
+
+
+@cache
+def _root() -> Path | None:
+    """The first place that can be written; None where there is none."""
+    return next((place for place in _places() if _usable(place)), None)
+
+
+def _places() -> Iterator[Path]:
+    """Where machine code may be kept, the best first; two installs never share a folder."""
+    install = hashlib.blake2b(str(PACKAGE).encode(), digest_size=4).hexdigest()
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        yield Path(given, f"slviewer-{install}")
+    yield PACKAGE / "__pycache__" / "kernels"
+    if sys.platform == "win32":
+        caches = os.environ.get("LOCALAPPDATA", "")
+    elif sys.platform == "darwin":
+        caches = "~/Library/Caches"
+    else:
+        caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    caches = os.path.expanduser(caches)
+    if os.path.isabs(caches):
+        yield Path(caches, "slviewer", f"kernels-{install}")
+    user = os.getuid() if hasattr(os, "getuid") else "user"
+    yield Path(tempfile.gettempdir(), f"slviewer-{user}-kernels-{install}")
+
+
+def _usable(place: Path) -> bool:
+    """Whether files can be kept there, and by nobody else: reading the cache runs what it holds."""
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.mkdir(mode=0o700, exist_ok=True)
+        found = place.lstat()
+        if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+            return False
+        tempfile.TemporaryFile(dir=place).close()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode)
