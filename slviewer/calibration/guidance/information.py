@@ -4,12 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cholesky, eigh, solve_triangular
 
 from slviewer.calibration.guidance.bench import GuidanceBench
 from slviewer.calibration.splined.posterior import point_rows
 from slviewer.calibration.splined.unknowns import State
 from slviewer.calibration.splined.volume import Volume, better_axis, motion_free, working_volume
+
+NEGLIGIBLE = 1e-4
+"""Of the points' mean variance, that gains need not tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,25 +38,33 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Of the poses had: the unknowns' ``covariance`` (n, n), and the points' ``variances`` (m,) mm^2."""
+    """Of the poses had: the points' ``variances`` (m,) mm^2, and what the unknowns may still do.
 
-    covariance: np.ndarray
+    ``free`` (n, n) float32: each column is a way in which the unknowns are off by one sigma, independent of the others,
+    the last ones those that matter most for the points; ``counts`` (k,) float32 mm: what each of the last k adds to the
+    points' error, root mean square.
+    """
+
     variances: np.ndarray
-    _both: np.ndarray
+    free: np.ndarray
+    counts: np.ndarray
 
     @classmethod
     def of(cls, bench: GuidanceBench, rows: Sequence[np.ndarray], sight: Sight) -> "Information":
         """From what each pose tells (see ``GuidanceBench.rows``)."""
         A = bench.prior()
-        for told in rows:
+        if len(rows):
+            told = np.concatenate(rows)
             A += told.T @ told
         scale = 1.0 / np.sqrt(np.diag(A))
-        factor = cho_factor(A * scale * scale[:, None], lower=True, check_finite=False)
-        covariance = cho_solve(factor, np.diag(scale), check_finite=False) * scale[:, None]
-        answer = covariance @ sight.jacobian.T
-        variances = np.einsum("mn,nm->m", sight.jacobian, answer).reshape(-1, 3).sum(axis=1)
-        spread = answer @ answer.T / len(variances)
-        return cls(covariance, variances, np.hstack([covariance, spread]))
+        L = cholesky(A * scale * scale[:, None], lower=True, check_finite=False)
+        free = solve_triangular(L, np.diag(scale), lower=True, check_finite=False).T
+        answer = sight.jacobian @ free
+        variances = (answer**2).sum(axis=1).reshape(-1, 3).sum(axis=1)
+        shares, ways = eigh(answer.T @ answer / len(variances), check_finite=False)
+        shares = np.maximum(shares, 0.0)
+        most = int((np.cumsum(shares) > NEGLIGIBLE * shares.sum()).sum())
+        return cls(variances, (free @ ways).astype(np.float32), np.sqrt(shares[-most:]).astype(np.float32))
 
     @property
     def sigma_mm(self) -> float:
@@ -62,8 +73,9 @@ class Information:
 
     def gain(self, rows: np.ndarray) -> float:
         """mm^2 by which a pose that tells these rows lowers the mean variance over the volume."""
-        both = rows @ self._both
-        n = len(self.covariance)
-        inner = both[:, :n] @ rows.T
+        seen = rows.astype(np.float32) @ self.free
+        inner = (seen @ seen.T).astype(np.float64)
         inner[np.diag_indices(len(inner))] += 1.0
-        return float(np.trace(cho_solve(cho_factor(inner, check_finite=False), both[:, n:] @ rows.T)))
+        told = seen[:, -len(self.counts) :] * self.counts
+        L = cholesky(inner, lower=True, check_finite=False)
+        return float((solve_triangular(L, told.astype(np.float64), lower=True, check_finite=False) ** 2).sum())

@@ -87,7 +87,7 @@ class Panel:
             self._world = None
         change(self._capture, disabled=snapshot.rig.state != "open" or self._board is None)
         change(self._place, visible=snapshot.world is not None)
-        change(self._place, disabled=session is None or session.suggestion is None)
+        change(self._place, disabled=session is None or session.suggestion is None or session.planning)
         self._follows.tell(snapshot.hands_free)
         self._draw_world(snapshot)
         if session is self._session:

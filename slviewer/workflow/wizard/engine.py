@@ -3,6 +3,8 @@
 Requests (`operator`) and captures (`taking`) reach in here; panels do not.
 """
 
+from __future__ import annotations
+
 import shutil
 import threading
 import time
@@ -10,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,12 +31,16 @@ from slviewer.workflow.wizard.diagnostics import LogKeeper
 from slviewer.workflow.wizard.jobs import Jobs, Reporter
 from slviewer.workflow.wizard.looking import thumbnail
 from slviewer.workflow.wizard.notices import Notices
+from slviewer.workflow.wizard.planning import Planner
 from slviewer.workflow.wizard.reading import Reader
 from slviewer.workflow.wizard.rigs import Bench, Choice, SetUp, needs_page
 from slviewer.workflow.wizard.snapshot import PreviewView, RigView, SessionView, Snapshot, Space, WorldView
 from slviewer.workflow.wizard.steps import Brightness, Facts, views
 from slviewer.workflow.wizard.telling import Teller
 from slviewer.workflow.wizard.watching import HandsFree, Watch, Watcher
+
+if TYPE_CHECKING:
+    from slviewer.workflow.wizard.live import Live, LiveCloud
 
 SATURATED, DIM = 0.005, 0.35
 """Share of saturated pixels, and brightness of the brightest ones, from which on the operator is told."""
@@ -49,6 +56,8 @@ class Engine:
         self.log = LogKeeper()
         self.preview: PreviewView | None = None
         self.preview_listeners: list[Callable[[PreviewView], None]] = []
+        self.live: Live | None = None  # the last one, whether it runs or not
+        self.live_listeners: list[Callable[[LiveCloud], None]] = []
         self.hands_free = HandsFree()
         self.autopilot = ""
         self.bench: Bench | None = None
@@ -58,6 +67,7 @@ class Engine:
         self._reader: Reader | None = None
         self._session_view: SessionView | None = None
         self._unreadable = 0
+        self._enough = False  # whether the poses were, when that was last known for sure
         self._queued: set[tuple[str, str]] = set()
         self._brightness: Brightness = ""
         nothing = Facts(None, RigView(), None)
@@ -65,6 +75,7 @@ class Engine:
         self.teller = Teller(self._make_snapshot, empty)
         self.notices = Notices(self.teller.changed)
         self.jobs = Jobs(self.notices, self.teller.changed)
+        self._planner = Planner(lambda: self.teller.changed(session=True))
         self.watcher = Watcher(self._seen)
         self.acquisition = Acquisition(self.notices, self.teller.changed, self.watcher.offer)
         self.teller.start()
@@ -109,8 +120,10 @@ class Engine:
             if before is not None and Path(path).expanduser().absolute() == before.folder:
                 return
             store = Session.open_or_create(path)
+            self.acquisition.unstream()
             self.jobs.cancel_all()
-            self._reader, self._session_view, self._queued = Reader(store), None, set()
+            self._reader, self._session_view, self._queued = Reader(store, self._planner), None, set()
+            self._enough = False
             if before is not None:
                 before.close()
             try:
@@ -199,6 +212,7 @@ class Engine:
         self.acquisition.close()
         self.watcher.close()
         self.jobs.close()
+        self._planner.close()
         self.teller.close()
         with self.lock:
             if self.session is not None:
@@ -250,8 +264,6 @@ class Engine:
         target = reader.target()
         if reader.lacks_judgement(capture, target):
             judged = work.judge_pose(reader.session, capture.name, Board.parse(target), report)
-            bench = self.bench  # the next pose takes a second or two to choose: here, where nobody waits for it
-            reader.read(self.acquisition.view(), bench.focal_px if bench else None)
             if judged.observation is None:
                 self.notices.tell("warning", f"{capture.name} cannot be used: {judged.refused}")
             self.teller.changed(session=True)  # before what may wait
@@ -318,13 +330,15 @@ class Engine:
             hands_free=self.hands_free.on,
             autopilot=self.autopilot,
             preflight=self.preflight,
+            live=self.live.figures() if self.live is not None and self.live.running else None,
         )
 
     def _read(self, reader: Reader, rig: RigView, bench: Bench | None) -> None:
         try:
-            before, self._session_view = self._session_view, reader.read(rig, bench.focal_px if bench else None)
+            view = self._session_view = reader.read(rig, bench.focal_px if bench else None)
             self._unreadable = 0
-            if self.hands_free.on and self._session_view.enough and not (before and before.enough):
+            before, self._enough = self._enough, self._enough if view.planning else view.enough
+            if self.hands_free.on and self._enough and not before:
                 self.hands_free.on = False
                 self.notices.tell("good", "the poses are enough for the accuracy wanted: hands-free has stopped")
         except (SlviewerError, OSError) as error:  # files were being changed, most likely: read them once more

@@ -4,6 +4,7 @@ A request that cannot be granted becomes a notice, and returns False. Devices ar
 computing is done by the worker, so that requests may come from any thread, a browser's callbacks too.
 """
 
+import time
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from pathlib import Path
@@ -30,6 +31,7 @@ from slviewer.workflow.wizard.autopilot import Autopilot
 from slviewer.workflow.wizard.engine import Engine
 from slviewer.workflow.wizard.exporting import FORMATS, Kind, check_export, export_file
 from slviewer.workflow.wizard.jobs import Reporter
+from slviewer.workflow.wizard.live import LiveCloud, keep_live, start_live
 from slviewer.workflow.wizard.rigs import Choice, SetUp, set_up
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
 from slviewer.workflow.wizard.taking import sequence_for_poses, take_pose, take_scan
@@ -124,12 +126,39 @@ class Operator:
         return self._engine.teller.wait_for(condition, timeout_s)
 
     def settle(self, timeout_s: float = 60.0) -> Snapshot:
-        """The snapshot after all captures and jobs that were asked for. Raises SlviewerError where it took longer."""
+        """The snapshot after all captures and jobs that were asked for, with the next pose chosen.
+
+        Raises SlviewerError where it took longer.
+        """
+        engine, end = self._engine, time.monotonic() + timeout_s
+        while True:
+            # captures first: each asks for its jobs before it ends
+            idle = self.wait_for(
+                lambda now: engine.acquisition.idle and engine.jobs.idle and not (now.session and now.session.planning),
+                end - time.monotonic(),
+            )
+            if idle is None:
+                raise SlviewerError(f"there is still work to be done after {timeout_s:g} s: cancel it, or wait longer")
+            now = engine.teller.now()
+            if now.session is None or not now.session.planning:
+                return now
+
+    def on_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
+        """Hear of every live cloud, on the thread that makes them; returns how to stop. A listener returns at once."""
         engine = self._engine
-        # captures first: each asks for its jobs before it ends
-        if self.wait_for(lambda _: engine.acquisition.idle and engine.jobs.idle, timeout_s) is None:
-            raise SlviewerError(f"there is still work to be done after {timeout_s:g} s: cancel it, or wait longer")
-        return engine.teller.now()
+        with engine.lock:
+            engine.live_listeners = [*engine.live_listeners, listener]
+
+        def stop() -> None:
+            with engine.lock:
+                engine.live_listeners = [each for each in engine.live_listeners if each is not listener]
+
+        return stop
+
+    def live_shown(self, cloud: LiveCloud) -> None:
+        """Whoever heard of a live cloud has sent it to those who look: what the latency is counted to."""
+        if self._engine.live is not None:
+            self._engine.live.shown(cloud)
 
     # session and rig
 
@@ -288,6 +317,21 @@ class Operator:
     def capture_sphere(self, label: str = "") -> None:
         """Capture a sphere and compare the models on it."""
         take_scan(self._engine, "sphere", label, lambda name: self.verify([name], "sphere"))
+
+    @_request("Scanning live")
+    def start_live(self) -> None:
+        """Show clouds while patterns run, until `stop_live`, a capture, another rig or session, or a fault."""
+        start_live(self._engine)
+
+    @_request("Ending the live scan")
+    def stop_live(self) -> None:
+        """Scan live no longer; nothing happens where nothing does."""
+        self._engine.acquisition.unstream()
+
+    @_request("Keeping the live scan")
+    def keep_live(self, label: str = "") -> None:
+        """Save what the latest live cloud was made of as a scan, and reconstruct it; the live scan goes on."""
+        keep_live(self._engine, label, self.reconstruct)
 
     @_request("Switching hands-free capture")
     def set_hands_free(self, on: bool) -> None:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -32,6 +33,7 @@ from slviewer.workflow.models import (
 )
 from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.wizard.exporting import listed
+from slviewer.workflow.wizard.planning import Asked, Planner
 from slviewer.workflow.wizard.snapshot import (
     CalibrationView,
     CentreDistance,
@@ -47,15 +49,16 @@ from slviewer.workflow.wizard.snapshot import (
     SplinedView,
     VerificationRow,
 )
-from slviewer.workflow.wizard.suggestion import Features, Plan, plan
+from slviewer.workflow.wizard.suggestion import Features, Plan, plan, plan_at_hand, takes_time
 from slviewer.workflow.wizard.work import lacking_for_splined
 
 
 class Reader:
     """Reads one session again and again, and keeps what is dear to read under its content hash."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, planner: Planner) -> None:
         self.session = session
+        self._planner = planner
         self._kept: dict[Any, Any] = {}
         self._lock = threading.Lock()
         self._thumbnails: dict[str, bytes] = {}
@@ -128,7 +131,7 @@ class Reader:
                 name = f"calibration/{model}"
                 if self._fresh(name, hashes):
                     hashes[name] = self._meta(name)["hash"]
-        poses, planned = self._poses(captures, target, stereo, calibration, rig, focal_px)
+        poses, planned, planning = self._poses(captures, target, stereo, calibration, rig, focal_px)
         factors = {model: scale_factor(session, model) for model in calibration.models} if calibration else {}
         rows, distances = self._verifications(captures, labels, hashes, factors)
         verdict = last_verdict(session)
@@ -142,6 +145,7 @@ class Reader:
             coverage=None if planned is None else planned.coverage,
             suggestion=None if planned is None else planned.suggestion,
             foreseen=None if planned is None else self._foreseen(planned),
+            planning=planning,
             calibration=calibration,
             verdict=verdict,
             verdict_of_calibration=self._is_of_calibration(verdict, stereo),
@@ -175,7 +179,8 @@ class Reader:
         calibration: CalibrationView | None,
         rig: RigView,
         focal_px: float | None,
-    ) -> tuple[tuple[PoseView, ...], Plan | None]:
+    ) -> tuple[tuple[PoseView, ...], Plan | None, bool]:
+        """(the poses, the plan after them, whether it is still being thought of)."""
         excluded = self.session.excluded()
         used = self._meta("calibration/stereo").get("inputs", {}) if stereo is not None else {}
         features: dict[str, Features] = {}
@@ -188,10 +193,10 @@ class Reader:
                 features[name] = self._features(name, meta["hash"])
             states[name] = self._state(capture, target, meta, excluded, used, calibration)
         if not target:
-            return self._views(captures, states, {}, None, calibration, ""), None
+            return self._views(captures, states, {}, None, calibration, ""), None, False
         first = next((c for c in captures.values() if c.role == "calibration"), None)
         camera, projector = (first.size, first.sequence.projector) if first else (rig.camera, rig.projector)
-        planned = None
+        planned, planning = None, False
         if camera is not None and projector is not None:
             counted = {name: f for name, f in features.items() if states[name][0] not in ("excluded", "refused")}
             refused = sum(state == "refused" for state, _ in states.values())
@@ -199,11 +204,14 @@ class Reader:
             model = self._meta("calibration/stereo")["hash"] if trusted is not None else ""
             poses = tuple((name, captures[name].hash) for name in counted)
             board = Board.parse(target)
-            planned = self._keep(
-                ("plan", target, camera, projector, poses, model, focal_px, refused),
-                lambda: plan(board, camera, projector, counted, trusted, focal_px, refused),
-            )
-        return self._views(captures, states, features, planned, calibration, target), planned
+            asked = Asked(target, camera, projector, poses, model, focal_px, refused)
+            known = board, camera, projector, counted, trusted, focal_px, refused
+            if takes_time(counted, trusted, camera):
+                at_hand = partial(plan_at_hand, *known)
+                planned, planning = self._planner.plan(asked, at_hand, partial(plan, *known))
+            else:
+                planned = self._keep(asked, partial(plan, *known))
+        return self._views(captures, states, features, planned, calibration, target), planned, planning
 
     def _foreseen(self, planned: Plan) -> Foreseen:
         decided = self.sigma_wanted_mm()

@@ -306,6 +306,7 @@ class SessionView:
     coverage: Coverage | None = None
     suggestion: Suggestion | None = None
     foreseen: Foreseen | None = None  # None before sizes are known
+    planning: bool = False  # whether a better suggestion is being thought of: these two are of fewer poses
     calibration: CalibrationView | None = None
     verdict: Verdict | None = None  # on the last attempt to calibrate, also where nothing came of it
     verdict_of_calibration: bool = True  # whether that attempt made `calibration`
@@ -326,6 +327,18 @@ class SessionView:
         return self.foreseen is not None and self.foreseen.enough
 
 
+@dataclass(frozen=True)
+class LiveView:
+    """A live scan: clouds made a second, and of those shown a second; `behind_ms`: from the first frame's light of a
+    cloud until it is sent to the screens, the median, None where nobody looks; `points` of the latest cloud.
+    """
+
+    clouds_per_s: float
+    shown_per_s: float
+    behind_ms: float | None
+    points: int
+
+
 @dataclass(frozen=True, eq=False)
 class Snapshot:
     """Everything at one moment; `version` grows with each change. `session` is None until one is open."""
@@ -341,6 +354,7 @@ class Snapshot:
     hands_free: bool
     autopilot: str  # what it does now; empty where it rests
     preflight: Preflight | None = None  # what the last check of the rig in use said
+    live: LiveView | None = None  # None while nothing is scanned live
 
     def step(self, key: str) -> StepView:
         """The step called `key`."""

@@ -144,6 +144,8 @@ def _poses_now(facts: Facts) -> str:
             return f"{facts.good_poses} good poses reach {reached}: enough. Calibrate."
         return f"{facts.good_poses} good poses cover the view: calibrate, or add more."
     suggestion = f"{session.suggestion.sentence}, and capture" if session.suggestion else "Hold the board and capture"
+    if session.planning:
+        suggestion = "Choosing where the board tells most; or hold it anywhere new, and capture"
     wanted = max(POSES_FOR_PIXELWISE, facts.good_poses + 1)
     return f"{suggestion}: pose {facts.good_poses + 1} of {wanted} or more."
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from slviewer.calibration.guidance.bench import Expected, GuidanceBench
 from slviewer.calibration.guidance.choosing import Guidance, guide
+from slviewer.calibration.guidance.rough import LEAST_POSES as LEAST_FOR_A_RIG
 from slviewer.calibration.guidance.rough import rough_rig
 from slviewer.calibration.next_pose import (
     Coverage,
@@ -88,26 +89,17 @@ def plan(
     """
     seen = list(features.values())
     known: tuple[StereoRig, dict[str, np.ndarray]] | None = None
-    if stereo is not None and stereo.rig.camera.size == camera:
-        known = stereo.rig, {name: T for name, T in stereo.poses.items() if name in features}
+    if _calibrated(stereo, camera):
+        assert stereo is not None
+        known = stereo.rig, dict(stereo.poses)
     else:
         rough = rough_rig(
             [f.points for f in seen], [f.camera for f in seen], [f.projector for f in seen], (camera, projector)
         )
         if rough is not None:
             known = rough[0], dict(zip(features, rough[1], strict=True))
-    if known is not None:
-        lens = known[0].camera
-    elif focal_px is not None:
-        lens = nominal_lens(camera, focal_px)
-    else:
-        lens = estimated_lens([f.points for f in seen], [f.camera for f in seen], camera)
-    poses = {} if known is None else dict(known[1])
-    for name, one in features.items():
-        T = poses[name] if name in poses else approximate_pose(one.points, one.camera, lens)
-        if T is not None:
-            poses[name] = T
-    poses = {name: poses[name] for name in features if name in poses}
+    lens = _lens(seen, camera, focal_px) if known is None else known[0].camera
+    poses = _placed(features, lens, {} if known is None else known[1])
     usual = USUAL_SIGMA * float(np.mean(depth_range(board, lens)))
     covered = coverage(board, lens, list(poses.values()))
     guidance: Guidance | None = None
@@ -122,6 +114,56 @@ def plan(
     T = guidance.poses[refused % len(guidance.poses)]
     next_mm = guidance.sigma_next_mm
     return Plan(lens, poses, covered, described(board, lens, T), usual, guidance.sigma_mm, next_mm)
+
+
+def takes_time(features: Mapping[str, Features], stereo: StereoModel | None, camera: tuple[int, int]) -> bool:
+    """Whether `plan` has to ask a rig's information, rather than what poses cover."""
+    return _calibrated(stereo, camera) or len(features) >= LEAST_FOR_A_RIG
+
+
+def plan_at_hand(
+    board: Board,
+    camera: tuple[int, int],
+    projector: tuple[int, int],
+    features: Mapping[str, Features],
+    stereo: StereoModel | None,
+    focal_px: float | None,
+    refused: int,
+    before: Plan | None,
+) -> Plan:
+    """What can be said at once, as in `plan`: where the poses are by the calibration, or by the lens of the plan
+    `before`, and a suggestion by what they cover."""
+    if _calibrated(stereo, camera):
+        assert stereo is not None
+        lens, known = stereo.rig.camera, dict(stereo.poses)
+    elif before is not None:
+        lens, known = before.lens, dict(before.poses)
+    else:
+        lens, known = _lens(list(features.values()), camera, focal_px), {}
+    poses = _placed(features, lens, known)
+    usual = USUAL_SIGMA * float(np.mean(depth_range(board, lens)))
+    covered = coverage(board, lens, list(poses.values()))
+    return Plan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
+
+
+def _calibrated(stereo: StereoModel | None, camera: tuple[int, int]) -> bool:
+    return stereo is not None and stereo.rig.camera.size == camera
+
+
+def _lens(seen: list[Features], camera: tuple[int, int], focal_px: float | None) -> Lens:
+    if focal_px is not None:
+        return nominal_lens(camera, focal_px)
+    return estimated_lens([f.points for f in seen], [f.camera for f in seen], camera)
+
+
+def _placed(features: Mapping[str, Features], lens: Lens, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """T_camera_board (4, 4) of each pose: as `known`, else as the lens says; without those that it cannot tell."""
+    poses = {}
+    for name, one in features.items():
+        T = known[name] if name in known else approximate_pose(one.points, one.camera, lens)
+        if T is not None:
+            poses[name] = T
+    return poses
 
 
 def _spread(
