@@ -54,6 +54,23 @@ def multifrequency(
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
+def short(projector: tuple[int, int], axis: Axis) -> PatternSequence:
+    """11 frames of one axis, for scanning live: three steps each of a period longer than the axis and of one between,
+    four of the finest, 16 px, then white.
+
+    The steps from one period to the next are alike, so that neither is the weaker. Four steps of the finest show no
+    second harmonic of the projector's, and contradict each other where something moved.
+    """
+    finest, longest = 16.0, 1.1 * projector[AXES.index(axis)]
+    between = (finest * longest) ** 0.5
+    frames = [
+        frame
+        for period, steps in ((longest, 3), (between, 3), (finest, 4))
+        for frame in phase_steps(axis, steps, period)
+    ]
+    return PatternSequence(projector, (*frames, Frame("texture")))
+
+
 PRESETS: dict[str, Callable[[tuple[int, int]], PatternSequence]] = {
     "p18": p18,
     "gray": gray,

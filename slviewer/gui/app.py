@@ -22,6 +22,7 @@ from slviewer.gui.views import FIELD_OF_VIEW, OVERVIEW, Eyes
 from slviewer.server.projector_page import serve_projector
 from slviewer.server.secure import SafeServer, serve
 from slviewer.server.text import escape
+from slviewer.server.viewers import Viewers
 from slviewer.session.store import Session
 from slviewer.workflow.rig_presets import load_rig
 from slviewer.workflow.wizard.notices import words_for
@@ -95,6 +96,7 @@ class App:
             self._go,
             self._failed,
             self._turns,
+            partial(Viewers, page),
             self._page_standing,
         )
         snapshot = operator.snapshot()

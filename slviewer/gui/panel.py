@@ -11,6 +11,7 @@ import viser
 
 from slviewer.devices.channel import Standing
 from slviewer.gui.scene import Scene
+from slviewer.server.viewers import Viewers
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ class Stage:
     gives the address at which a file of the session is downloaded; `tell(level, text)` shows a notification in every
     browser; `escape(text)` makes text that was typed or read harmless inside HTML and Markdown. `go(key)` brings
     another step to the front. `turns` does one callback after the other. `projector_page()` says where the projector
-    page stands; None where none is served.
+    page stands; None where none is served. `viewers(answered)` tells which browsers have drawn what they were sent.
     """
 
     gui: viser.GuiApi
@@ -38,6 +39,7 @@ class Stage:
     go: Callable[[str], None]
     failed: Callable[[BaseException], None]
     turns: Executor
+    viewers: Callable[[Callable[[], None]], Viewers]
     projector_page: Callable[[], Standing | None] = lambda: None
 
     def safely(self, do: Callable[[], Any], *, at_once: bool = False) -> Callable[[Any], None]:

@@ -194,7 +194,7 @@ class Scene:
             self._path(layer, name),
             shown,
             colours,
-            point_size=size_mm or _spacing(shown),
+            point_size=size_mm or spacing(shown),
             point_shape="square",
             point_shading="flat",
             precision="float32",
@@ -271,7 +271,7 @@ def _matrix(handle: Any) -> np.ndarray:
     return T
 
 
-def _spacing(points: np.ndarray) -> float:
+def spacing(points: np.ndarray) -> float:
     """About the distance between neighbours of a surface that was sampled evenly, in mm."""
     low, high = np.percentile(points, [1, 99], axis=0)
     sides = np.sort(high - low)

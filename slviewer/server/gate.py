@@ -58,7 +58,9 @@ class ViserGate:
         """The bytes that viser gets to see for this message; Refused where it may not."""
         server, client = self._server, self._client
         assert client is not None
-        if self._role != "operator" and not isinstance(message, messages.ViewerCameraMessage):
+        # besides where they look from, those who watch may say that they have drawn something, when they are asked
+        watching = messages.ViewerCameraMessage | messages.LocalStorageGetItemResponseMessage
+        if self._role != "operator" and not isinstance(message, watching):
             raise Refused("this link only watches", correct=True)
         if not _finite(vars(message)):
             raise Refused("numbers that are none")

@@ -6,6 +6,7 @@ in. `pins.py` names the version; a test compares what is used here with what it 
 
 import contextlib
 import dataclasses
+import secrets
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -235,6 +236,20 @@ def awaited(server: viser.ViserServer, client_id: int, kind: type[Message]) -> b
     """Whether the server asked this client a question that is answered by this kind of message."""
     client = server._connected_clients.get(client_id)
     return client is not None and bool(client._websock_connection._incoming_handlers.get(kind))
+
+
+def ask_back(client: viser.ClientHandle, answered: Callable[[], None]) -> None:
+    """Call `answered()`, on the server's thread, once this client has handled all that was queued for it alone."""
+    connection, kind = client._websock_connection, _messages.LocalStorageGetItemResponseMessage
+    question = secrets.token_hex(8)
+
+    def heard(_: int, message: _messages.LocalStorageGetItemResponseMessage) -> None:
+        if message.request_uuid == question:
+            connection.unregister_handler(kind, heard)
+            answered()
+
+    connection.register_handler(kind, heard)
+    connection.queue_message(_messages.LocalStorageGetItemRequestMessage("slviewer", question))
 
 
 def forget_upload(server: viser.ViserServer, client_id: int | None, transfer: str) -> None:

@@ -8,6 +8,8 @@ import numpy as np
 import viser
 
 from slviewer.gui.inputs import Choice, change, titled
+from slviewer.gui.live import LAYER as LIVE
+from slviewer.gui.live import LiveScreen
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened, spread
 from slviewer.gui.preview import drawn, legend, light_words
@@ -18,12 +20,13 @@ from slviewer.gui.widgets import Html, Picture, Words, block, boxed, cell, colou
 from slviewer.gui.world import Stand
 from slviewer.report.maps import error_limit
 from slviewer.workflow.wizard.looking import ScanCloud, scan_cloud
-from slviewer.workflow.wizard.snapshot import PreviewView, ScanView, Snapshot
+from slviewer.workflow.wizard.snapshot import LiveView, PreviewView, ScanView, Snapshot
 
 LAYER = "scan"
 SMALL_PX = 380
 """Width of the live picture: the cloud matters more here."""
 COLOURS = ("texture", "depth", "modulation", "expected noise", "uncertainty", "error")
+LIVE_HINT = "Clouds while patterns run, 11 frames each; quicker and noisier than a capture"
 MUCH_MASKED = 0.2
 """Share of a scan's pixels, masked because no target pose lit what they look through, that the operator is told of."""
 _STATES = {"absent": "not reconstructed yet", "fresh": "", "stale": "older calibration"}
@@ -43,6 +46,9 @@ class Panel:
         self._cloud: ScanCloud | None = None
         self._made: tuple[Any, ScanCloud] | None = None
         self._visible = False
+        self._is_live = False
+        self._screen = LiveScreen(stage)
+        stage.operator.on_live(self._screen.offer)
 
     def build(self) -> None:
         gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
@@ -50,6 +56,11 @@ class Panel:
             self._picture = Picture(gui, "Live picture", width_px=SMALL_PX)
             self._capture = gui.add_button("Capture scan", icon=viser.Icon.CAMERA)
             self._label = gui.add_text("Name", "", hint="If you like; else it is numbered")
+            self._live = gui.add_button("Live", icon=viser.Icon.PLAYER_PLAY, color="teal", hint=LIVE_HINT)
+            self._live.on_click(safely(self._toggle_live))
+            self._keep = gui.add_button("Keep this one", icon=viser.Icon.DOWNLOAD, color="green", visible=False)
+            self._keep.on_click(safely(lambda: operator.keep_live(self._label.value)))
+            self._live_says = Words(gui)
             self._stand = Stand(self._stage, LAYER, ("object", "sphere", "plane"))
             self._capture.on_click(safely(lambda: operator.capture_scan(self._label.value)))
         self._gallery = Words(gui)
@@ -81,6 +92,7 @@ class Panel:
             rig = snapshot.rig
             change(self._capture_folder, visible=rig.state != "none")
             change(self._capture, disabled=not ready or rig.state != "open" or rig.capture is not None)
+            self._draw_live(snapshot.live, ready and rig.state == "open" and rig.capture is None)
             self._stand.draw(snapshot)
             self._undelete.offer(session.deleted_scans if session else ())
             scans = ordered(session.scans) if session else []
@@ -107,11 +119,38 @@ class Panel:
 
     def shown(self, visible: bool) -> None:
         self._visible = visible
+        if not visible:
+            self._stage.operator.stop_live()
         self._stage.scene.show(LAYER, visible)
         self._stage.scene.on_pick(self._pick if visible else None)
         self._look()
 
     # drawing
+
+    def _draw_live(self, live: LiveView | None, ready: bool) -> None:
+        """The buttons and figures of the live scan; a cloud that was captured gives way to it meanwhile."""
+        change(self._live, label="Live" if live is None else "Stop", color="teal" if live is None else "red")
+        change(self._live, icon=viser.Icon.PLAYER_PLAY if live is None else viser.Icon.PLAYER_STOP)
+        change(self._live, disabled=live is None and not ready)
+        change(self._keep, visible=live is not None, disabled=live is None or not live.clouds_per_s)
+        self._live_says.set("" if live is None else live_words(live, self._screen.points))
+        if live is None and self._is_live:
+            self._screen.clear()
+        self._is_live = live is not None
+        if live is not None:
+            self._stage.scene.show(LIVE, True)
+            self._painter.forget("cloud")
+            self._cloud = None
+            for name in ("cloud", "picked"):
+                self._stage.scene.remove(LAYER, name)
+            self._legend.set("")
+            self._point.set("")
+
+    def _toggle_live(self) -> None:
+        if self._is_live:
+            self._stage.operator.stop_live()
+        else:
+            self._stage.operator.start_live()
 
     def _refresh(self) -> None:
         """Ask for the chosen cloud in the chosen colours."""
@@ -126,6 +165,8 @@ class Panel:
             )
             self._words.set(scan_words(scan))
             self._gallery.set(gallery(ordered(session.scans) if session else (), scan.name))
+            if self._is_live:
+                return
             if scan.cloud == "absent":
                 self._painter.forget("cloud")
                 self._cloud = None
@@ -148,6 +189,8 @@ class Panel:
 
     def _draw_cloud(self, made: tuple[Any, ScanCloud, str]) -> None:
         _, cloud, colour = made
+        if self._is_live:
+            return
         fresh = cloud is not self._cloud
         self._cloud = cloud
         rows, columns = cloud.thinned(150_000)
@@ -177,6 +220,21 @@ class Panel:
 
     def _ask_cloud(self) -> None:
         self._stage.operator.reconstruct(self._scan.value, self._model.value or None)
+
+
+def live_words(live: LiveView, drawn: int) -> Html:
+    """How fast and how late the live clouds are."""
+    if not live.clouds_per_s:
+        return block(toned("The first live clouds are on their way …", "dim"))
+    late = "" if live.behind_ms is None else f", {live.behind_ms:.0f} ms behind"
+    words = f"<b>{live.shown_per_s or live.clouds_per_s:.1f} clouds/s{late}</b>"
+    if live.shown_per_s and live.shown_per_s < 0.8 * live.clouds_per_s:
+        words += f" ({live.clouds_per_s:.1f} are made, and this is what the screens take)"
+    if not live.points:
+        nothing = "Nothing is measured: is the object lit, and within the calibrated depths?"
+        return Html(block(Html(words)) + boxed(nothing, "warning"))
+    more = f"{live.points:,} points measured, {drawn:,} of them drawn. What moves is left out; nothing is saved yet."
+    return Html(block(Html(words)) + block(toned(more, "dim")))
 
 
 def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:

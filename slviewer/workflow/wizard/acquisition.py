@@ -3,7 +3,8 @@
 Between captures it grabs previews and hands on the latest one. A capture is saved by the request's own `save` before
 anything else happens, or it never existed. A fault ends the capture in which it happens, with a sentence; the devices
 are then closed and opened again, every `RETRY_S` until they answer, and the preview goes on. Other work that needs the
-open devices, such as a check of the rig, takes its turn among the captures, and ends and fails as they do.
+open devices, such as a check of the rig, takes its turn among the captures, and ends and fails as they do. A stream
+takes the place of the previews until anything else is asked for.
 """
 
 import threading
@@ -20,6 +21,7 @@ from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import Cancelled, DeviceError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.workflow.feedback import Progress
+from slviewer.workflow.wizard.live_frames import Stream
 from slviewer.workflow.wizard.notices import Notices, words_for
 from slviewer.workflow.wizard.snapshot import CaptureProgress, RigView
 
@@ -27,6 +29,8 @@ RETRY_S = 2.0
 PREVIEWS_PER_S = 10.0
 LIGHTS = {"white": 255, "grey": 128, "dark": None}
 """What the projector may show between captures, as grey levels; "pattern" is a sequence's first frame."""
+
+_STREAM = "stream"  # what a stream lights by, among the lights
 
 T = TypeVar("T")
 
@@ -74,6 +78,7 @@ class Acquisition:
         self._settings: CameraSettings | None = None
         self._light: tuple[str, PatternSequence | None] = ("white", None)
         self._view = RigView()
+        self._stream: Stream | None = None
         self._cancel = False
         self._closing = False
         self._thread: threading.Thread | None = None
@@ -81,6 +86,7 @@ class Acquisition:
         self._rig: Rig | None = None
         self._is_open = False
         self._next_try = 0.0
+        self._next_preview = 0.0  # of a stream
         self._applied: CameraSettings | None = None
         self._lit: tuple[str, PatternSequence | None] | None = None
         self._buffer: np.ndarray | None = None
@@ -93,6 +99,7 @@ class Acquisition:
         with self._condition:
             self._wanted, self._settings = rig, settings
             given_up = [request.name for request in self._requests]
+            stream, self._stream = self._stream, None
             self._requests.clear()
             self._cancel = self._view.capture is not None
             self._light = ("white", None)  # a pattern is made for one projector
@@ -107,6 +114,8 @@ class Acquisition:
             self._condition.notify_all()
         for name in given_up:
             self._notices.tell("info", f"{name}: not taken, another rig was chosen")
+        if stream is not None:
+            stream.ended()
         self._changed()
 
     def apply(self, settings: CameraSettings) -> None:
@@ -144,6 +153,28 @@ class Acquisition:
         """
         self._queue(_Task(name, task, done), "done")
 
+    def stream(self, stream: Stream) -> None:
+        """Show and grab this over and over, in place of previews: until `unstream`, a request, another rig or a fault,
+        each of which calls `stream.ended()`. Raises DeviceError where no rig is open or something else runs on it.
+        """
+        with self._condition:
+            if self._view.state != "open":
+                raise DeviceError(self._view.fault or "choose a rig first, and wait until its preview runs")
+            if self._requests or self._view.capture is not None:
+                raise DeviceError("a capture is on its way: wait for it, or cancel it")
+            before, self._stream = self._stream, stream
+            self._condition.notify_all()
+        if before is not None:
+            before.ended()
+
+    def unstream(self) -> None:
+        """End the stream, if there is one; its devices are free within a frame."""
+        with self._condition:
+            stream, self._stream = self._stream, None
+            self._condition.notify_all()
+        if stream is not None:
+            stream.ended()
+
     def cancel(self) -> None:
         """Stop the capture or the task that runs, and forget those that wait."""
         with self._condition:
@@ -177,6 +208,7 @@ class Acquisition:
             self._closing, self._cancel = True, True
             self._requests.clear()
             self._condition.notify_all()
+        self.unstream()
         if self._thread is not None:
             self._thread.join(5.0)
 
@@ -187,6 +219,7 @@ class Acquisition:
                 raise DeviceError(f"{request.name} cannot be {done}: {why}")
             self._requests.append(request)
             self._condition.notify_all()
+        self.unstream()
 
     # on the thread
 
@@ -202,7 +235,7 @@ class Acquisition:
                     self._cancel = False
                     n = request.frames if isinstance(request, CaptureRequest) else 0
                     self._view = replace(self._view, capture=CaptureProgress(request.name, 0, n, 0))
-                wanted = self._wanted
+                wanted, stream = self._wanted, self._stream
             try:
                 if self._rig is not wanted:
                     self._close_devices()
@@ -213,6 +246,8 @@ class Acquisition:
                 elif wanted is not None and not self._is_open:
                     if time.monotonic() >= self._next_try:
                         self._open_devices()
+                elif self._is_open and stream is not None:
+                    self._flow(stream)
                 elif self._is_open and time.monotonic() >= preview:
                     preview = time.monotonic() + 1 / PREVIEWS_PER_S
                     self._preview()
@@ -224,6 +259,8 @@ class Acquisition:
     def _sleep(self, preview: float) -> None:
         with self._condition:
             if self._closing or self._requests or self._rig is not self._wanted:
+                return
+            if self._is_open and self._stream is not None:
                 return
             until = preview if self._is_open else self._next_try
             pause = RETRY_S if self._rig is None else until - time.monotonic()
@@ -244,17 +281,9 @@ class Acquisition:
     def _prepare(self) -> None:
         """Light and settings as they were asked for last."""
         assert self._rig is not None
+        self._set_camera()
         with self._condition:
-            settings, light = self._settings, self._light
-        if self._applied is None or settings != self._applied:
-            taken = self._rig.camera.settings() if settings is None else self._rig.camera.apply(settings)
-            self._applied = settings
-            if settings is None:
-                self._applied = taken
-                with self._condition:
-                    self._settings = self._settings or taken  # somebody may have set it meanwhile
-            notes = tuple(getattr(self._rig.camera, "notes", ()))  # of drivers that keep some
-            self._say(exposure_ms=taken.exposure_ms, gain=taken.gain, notes=notes)
+            light = self._light
         if light != self._lit:
             name, pattern = light
             if pattern is None:
@@ -264,6 +293,21 @@ class Acquisition:
                 self._rig.projector.show(0)
             self._lit = light
 
+    def _set_camera(self) -> None:
+        """Settings as they were asked for last."""
+        assert self._rig is not None
+        with self._condition:
+            settings = self._settings
+        if self._applied is None or settings != self._applied:
+            taken = self._rig.camera.settings() if settings is None else self._rig.camera.apply(settings)
+            self._applied = settings
+            if settings is None:
+                self._applied = taken
+                with self._condition:
+                    self._settings = self._settings or taken  # somebody may have set it meanwhile
+            notes = tuple(getattr(self._rig.camera, "notes", ()))  # of drivers that keep some
+            self._say(exposure_ms=taken.exposure_ms, gain=taken.gain, notes=notes)
+
     def _preview(self) -> None:
         assert self._rig is not None
         self._prepare()
@@ -271,6 +315,27 @@ class Acquisition:
         frame = np.empty((height, width), self._rig.camera.dtype)
         self._rig.camera.grab(frame)
         self._offer(frame)
+
+    def _flow(self, stream: Stream) -> None:
+        """One round of a stream, broken off where something else is wanted."""
+        assert self._rig is not None
+        self._set_camera()
+        try:
+            if self._lit != (_STREAM, stream.sequence):
+                self._rig.projector.load(stream.sequence)
+                self._lit = (_STREAM, stream.sequence)
+            view = self.view()
+            settings = CameraSettings(view.exposure_ms, view.gain)
+            white = stream.take(self._rig, settings, lambda: bool(self._closing or self._stream is not stream))
+        except DeviceError:
+            raise
+        except SlviewerError as error:  # the patterns: the devices are well
+            self._notices.tell("error", str(error))
+            self.unstream()
+            return
+        if white is not None and time.monotonic() >= self._next_preview:
+            self._next_preview = time.monotonic() + 1 / PREVIEWS_PER_S
+            self._offer(white)
 
     def _serve_request(self, request: CaptureRequest | _Task) -> None:
         try:
@@ -336,6 +401,7 @@ class Acquisition:
             first = not self._view.fault
             waiting = len(self._requests)
             self._requests.clear()
+            stream, self._stream = self._stream, None
             if self._rig is self._wanted:
                 self._view = replace(self._view, state="lost", fault=sentence, capture=None)
         if first:
@@ -343,6 +409,8 @@ class Acquisition:
                 waiting, f"; the {waiting} captures that waited are not taken"
             )
             self._notices.tell("error", sentence + also)
+        if stream is not None:
+            stream.ended()
         self._changed()
 
     def _close_devices(self) -> None:

@@ -6,9 +6,9 @@ computing is done by the worker, so that requests may come from any thread, a br
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,7 +31,8 @@ from slviewer.workflow.wizard.autopilot import Autopilot
 from slviewer.workflow.wizard.engine import Engine
 from slviewer.workflow.wizard.exporting import FORMATS, Kind, check_export, export_file
 from slviewer.workflow.wizard.jobs import Reporter
-from slviewer.workflow.wizard.live import LiveCloud, keep_live, start_live
+from slviewer.workflow.wizard.live_requests import LiveRequests
+from slviewer.workflow.wizard.requesting import request
 from slviewer.workflow.wizard.rigs import Choice, SetUp, set_up
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
 from slviewer.workflow.wizard.taking import sequence_for_poses, take_pose, take_scan
@@ -43,32 +44,10 @@ _CHECKED: dict[Verdict, tuple[Level, str]] = {
     "unknown": ("warning", "the rig could not be checked: the step Rig says why"),
 }
 
-P = ParamSpec("P")
 T = TypeVar("T")
-Request = Callable[Concatenate["Operator", P], bool]
 
 
-def _request(doing: str) -> Callable[[Callable[Concatenate["Operator", P], None]], Request[P]]:
-    """Turns what a request raises into a notice, and tells everybody that something changed."""
-
-    def decorate(function: Callable[Concatenate["Operator", P], None]) -> Request[P]:
-        @wraps(function)
-        def ask(self: "Operator", /, *args: P.args, **kwargs: P.kwargs) -> bool:
-            try:
-                function(self, *args, **kwargs)
-            except Exception as error:
-                self._engine.notices.fail(doing, error)
-                return False
-            finally:
-                self._engine.teller.changed(session=True)
-            return True
-
-        return ask
-
-    return decorate
-
-
-class Operator:
+class Operator(LiveRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:
@@ -143,36 +122,19 @@ class Operator:
             if now.session is None or not now.session.planning:
                 return now
 
-    def on_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
-        """Hear of every live cloud, on the thread that makes them; returns how to stop. A listener returns at once."""
-        engine = self._engine
-        with engine.lock:
-            engine.live_listeners = [*engine.live_listeners, listener]
-
-        def stop() -> None:
-            with engine.lock:
-                engine.live_listeners = [each for each in engine.live_listeners if each is not listener]
-
-        return stop
-
-    def live_shown(self, cloud: LiveCloud) -> None:
-        """Whoever heard of a live cloud has sent it to those who look: what the latency is counted to."""
-        if self._engine.live is not None:
-            self._engine.live.shown(cloud)
-
     # session and rig
 
-    @_request("Opening the session")
+    @request("Opening the session")
     def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
         """Open a session for writing, or make one, with `rig`, else the one that it remembers, else the one in use."""
         self._engine.open_session(path, rig)
 
-    @_request("Choosing the rig")
+    @request("Choosing the rig")
     def choose_rig(self, choice: Choice) -> None:
         """Use other devices from now on; `rigs` says what a choice is. The session remembers it."""
         self._engine.use_rig(choice)
 
-    @_request("Setting the exposure")
+    @request("Setting the exposure")
     def set_exposure(self, exposure_ms: float | None = None, gain: float | None = None) -> None:
         """Set exposure time and gain; None leaves one as it is. The snapshot tells what the camera really took.
 
@@ -190,12 +152,12 @@ class Operator:
             if several and exposure_ms and before:  # they are multiples of it
                 session.decide("exposures", check_exposures([each * exposure_ms / before for each in several]))
 
-    @_request("Setting the exposures")
+    @request("Setting the exposures")
     def set_exposures(self, exposures_ms: Sequence[float]) -> None:
         """Take every capture in several exposures, for shiny and dark parts; empty: in a single one."""
         self._engine.store.decide("exposures", check_exposures(exposures_ms) if exposures_ms else [])
 
-    @_request("Checking the rig")
+    @request("Checking the rig")
     def check_rig(self) -> None:
         """Run the preflight, some 10 s; the snapshot tells what it found, and the delay that it measured is heeded."""
         engine = self._engine
@@ -213,7 +175,7 @@ class Operator:
 
         engine.acquisition.run("Checking the rig", lambda rig, progress: preflight(rig, progress=progress), done)
 
-    @_request("Linearising the projector")
+    @request("Linearising the projector")
     def linearise(self, on: bool) -> None:
         """Project through the table of grey levels that the check of the rig has measured, or as it is."""
         found = self._engine.preflight
@@ -221,12 +183,12 @@ class Operator:
             raise InputError("no table of grey levels is measured: check the rig first")
         self._engine.store.decide("levels", list(found.levels) if on and found and found.levels else None)
 
-    @_request("Saving the rig")
+    @request("Saving the rig")
     def save_rig(self, name: str, what: str = "") -> None:
         """Keep the rig in use, with its exposure, under a name in the session; `rig_presets` finds it there."""
         self._engine.save_rig(name, what)
 
-    @_request("Changing the light")
+    @request("Changing the light")
     def shine(self, light: str) -> None:
         """What the projector shows between captures: "white", "grey", "dark", or "pattern" to focus by."""
         if light not in (*LIGHTS, "pattern"):
@@ -238,7 +200,7 @@ class Operator:
 
     # target, patterns, world
 
-    @_request("Choosing the target")
+    @request("Choosing the target")
     def choose_target(self, notation: str) -> None:
         """The board that will be held before the rig; poses that were captured are judged by it anew."""
         board, engine = Board.parse(notation), self._engine
@@ -251,21 +213,21 @@ class Operator:
                 engine.store.decide("target", before)
                 raise
 
-    @_request("Choosing the patterns")
+    @request("Choosing the patterns")
     def choose_patterns(self, name: str) -> None:
         """The pattern sequence of later captures."""
         if name not in PRESETS:
             raise InputError(f"no pattern sequence is called {name!r}: use {', '.join(PRESETS)}")
         self._engine.store.decide("patterns", name)
 
-    @_request("Setting the accuracy wanted")
+    @request("Setting the accuracy wanted")
     def want_sigma(self, sigma_mm: float | None) -> None:
         """Ask for poses until a calibration is predicted to be this sure of points, mm; None: what usually suffices."""
         if sigma_mm is not None and not 0 < sigma_mm < 100:
             raise InputError(f"a standard deviation of {sigma_mm:g} mm cannot be wanted: give one above 0 mm")
         self._engine.store.decide("sigma_wanted_mm", sigma_mm)
 
-    @_request("Placing")
+    @request("Placing")
     def place(self, thing: Thing, T_camera_thing: np.ndarray | None = None) -> None:
         """Put "board", "plane", "sphere" or "object" before the simulated rig, at T_camera_thing or where it was."""
         T = None if T_camera_thing is None else np.asarray(T_camera_thing, float)
@@ -273,7 +235,7 @@ class Operator:
             raise InputError(f"a pose of shape {T.shape} places nothing: give (4, 4)")
         self._engine.world.place(thing, None if T is None else Pose(T[:3, :3].copy(), T[:3, 3].copy()))
 
-    @_request("Placing")
+    @request("Placing")
     def bring(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
         """Move what stands before the simulated rig to a distance on its ray; turn it so far about the vertical."""
         self._engine.world.bring(distance_mm, turn_deg)
@@ -292,65 +254,50 @@ class Operator:
 
     # captures
 
-    @_request("Capturing the pose")
+    @request("Capturing the pose")
     def capture_pose(self) -> None:
         """Capture the board where it is; it is judged in the background."""
         self._engine.hands_free.took()  # first: what cannot be captured is not tried again with every preview
         take_pose(self._engine)
 
-    @_request("Retaking the pose")
+    @request("Retaking the pose")
     def retake_pose(self, name: str) -> None:
         """Capture the board again in place of a pose; the old one goes to the trash once the new one is saved."""
         take_pose(self._engine, name)
 
-    @_request("Capturing the scan")
+    @request("Capturing the scan")
     def capture_scan(self, label: str = "") -> None:
         """Capture an object and reconstruct it; `label` is the operator's name for it, any text."""
         take_scan(self._engine, "scan", label, self.reconstruct)
 
-    @_request("Capturing the plane")
+    @request("Capturing the plane")
     def capture_plane(self, label: str = "") -> None:
         """Capture a flat board and compare the models on it."""
         take_scan(self._engine, "plane", label, lambda name: self.verify([name], "plane"))
 
-    @_request("Capturing the sphere")
+    @request("Capturing the sphere")
     def capture_sphere(self, label: str = "") -> None:
         """Capture a sphere and compare the models on it."""
         take_scan(self._engine, "sphere", label, lambda name: self.verify([name], "sphere"))
 
-    @_request("Scanning live")
-    def start_live(self) -> None:
-        """Show clouds while patterns run, until `stop_live`, a capture, another rig or session, or a fault."""
-        start_live(self._engine)
-
-    @_request("Ending the live scan")
-    def stop_live(self) -> None:
-        """Scan live no longer; nothing happens where nothing does."""
-        self._engine.acquisition.unstream()
-
-    @_request("Keeping the live scan")
-    def keep_live(self, label: str = "") -> None:
-        """Save what the latest live cloud was made of as a scan, and reconstruct it; the live scan goes on."""
-        keep_live(self._engine, label, self.reconstruct)
-
-    @_request("Switching hands-free capture")
+    @request("Switching hands-free capture")
     def set_hands_free(self, on: bool) -> None:
         """Capture a pose by itself whenever the board is held still in a new place."""
         self._engine.hands_free.on = on
 
     # poses and scans
 
-    @_request("Excluding the pose")
+    @request("Excluding the pose")
     def exclude(self, name: str, why: str = "by hand") -> None:
         """Leave a pose out of calibrations."""
         self._engine.store.exclude(name, why)
 
-    @_request("Including the pose")
+    @request("Including the pose")
     def include(self, name: str) -> None:
         """Take a pose back in."""
         self._engine.store.include(name)
 
-    @_request("Deleting")
+    @request("Deleting")
     def delete(self, name: str) -> None:
         """Move a capture, and what was computed from it alone, to the session's trash."""
         store = self._engine.store
@@ -360,12 +307,12 @@ class Operator:
             if store.state_of(f"{kind}/{name}") != "absent":
                 store.trash_result(f"{kind}/{name}")
 
-    @_request("Bringing back")
+    @request("Bringing back")
     def undelete(self, name: str) -> None:
         """Bring a deleted capture back from the trash; what was computed from it is computed again."""
         self._engine.look_again(self._engine.store.restore_capture(name))
 
-    @_request("Renaming")
+    @request("Renaming")
     def rename(self, name: str, label: str) -> None:
         """Give a capture a name for people, any text; its files keep theirs."""
         store = self._engine.store
@@ -374,7 +321,7 @@ class Operator:
 
     # computing
 
-    @_request("Calibrating")
+    @request("Calibrating")
     def calibrate(self) -> None:
         """Calibrate from the poses that are not excluded."""
         store, target = self._engine.store, self._engine.reader.target()
@@ -394,13 +341,13 @@ class Operator:
             "Calibrating", lambda r: work.make_calibration(store, target, r, self._warn), done, failed=failed
         )
 
-    @_request("Comparing the models")
+    @request("Comparing the models")
     def compare_models(self) -> None:
         """Measure each target pose by calibrations made without it; the best model is then recommended, and used."""
         compare = partial(work.compare_models, self._engine.store, warn=self._warn)
         self._submit("Comparing the models", compare, work.told_comparison)
 
-    @_request("Choosing the model")
+    @request("Choosing the model")
     def choose_model(self, name: str) -> None:
         """Use this model from now on; empty: the one that is recommended."""
         store = self._engine.store
@@ -408,12 +355,12 @@ class Operator:
             raise InputError(f"the session holds no {name} calibration: choose one of {', '.join(there)}")
         store.decide("model", name or None)
 
-    @_request("Using the rejected calibration")
+    @request("Using the rejected calibration")
     def use_anyway(self, on: bool) -> None:
         """Use the calibration at hand although it was rejected, or do so no more."""
         insist(self._engine.store, on)
 
-    @_request("Verifying")
+    @request("Verifying")
     def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
         """Compare the models on captures of a plane or a sphere; `radius_mm`, roughly, helps to find a sphere."""
         store = self._engine.store
@@ -421,7 +368,7 @@ class Operator:
         measure = partial(work.measure, store, chosen, shape, radius_mm, warn=self._warn)
         self._submit("Verifying", measure, work.told_measures)
 
-    @_request("Reconstructing")
+    @request("Reconstructing")
     def reconstruct(self, name: str, model: str | None = None) -> None:
         """Reconstruct a capture, by the best model unless one is named."""
         store = self._engine.store
@@ -432,7 +379,7 @@ class Operator:
             lambda points: f"{name}: {points} points",
         )
 
-    @_request("Merging")
+    @request("Merging")
     def merge(self, names: Sequence[str], reference: str) -> None:
         """Register scans to a reference, and merge them; `undo_merge` takes it back."""
         store = self._engine.store
@@ -440,7 +387,7 @@ class Operator:
         merge = partial(work.merge_scans, store, chosen, reference, warn=self._warn)
         self._submit("Merging", merge, partial(work.told_merge, reference))
 
-    @_request("Undoing the merge")
+    @request("Undoing the merge")
     def undo_merge(self) -> None:
         """Move the current merge to the trash; the one before it is current again."""
         view, store = self._engine.teller.now().session, self._engine.store
@@ -449,7 +396,7 @@ class Operator:
         store.trash_result(f"merge/{view.merge.name}")
         (store.exports / f"merged_{view.merge.name}.ply").unlink(missing_ok=True)
 
-    @_request("Exporting")
+    @request("Exporting")
     def export(self, kind: Kind, name: str = "", file_format: str = "") -> None:
         """Write a file into the session's exports; `exporting.FORMATS` lists kinds and formats, the first by default.
 
@@ -477,7 +424,7 @@ class Operator:
         """Write the HTML report into the exports."""
         return self.export("report")
 
-    @_request("Collecting diagnostics")
+    @request("Collecting diagnostics")
     def diagnostic_bundle(self) -> None:
         """Write a zip with versions, settings, logs and small previews, no frames, into the exports."""
         engine = self._engine
@@ -490,7 +437,7 @@ class Operator:
 
     # stopping
 
-    @_request("Cancelling")
+    @request("Cancelling")
     def cancel(self) -> None:
         """Cancel the capture that runs, else the job; autopilot lands too."""
         if self._autopilot is not None:
@@ -500,7 +447,7 @@ class Operator:
         else:
             self._engine.jobs.cancel()
 
-    @_request("Starting autopilot")
+    @request("Starting autopilot")
     def start_autopilot(self, poses: int = 10, pause_s: float = 0.5) -> None:
         """Play the whole wizard on the simulated rig, with a pause before each act so that it can be watched."""
         with self._engine.lock:

@@ -8,12 +8,13 @@ import numpy as np
 
 from slviewer.devices.capture import Taken
 from slviewer.errors import DeviceError, InputError, SessionError
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.atomic import megabytes
 from slviewer.workflow.capturing import keep, sequence_for
 from slviewer.workflow.simulating import one_axis
 from slviewer.workflow.wizard.acquisition import CaptureRequest
 from slviewer.workflow.wizard.engine import Engine
+from slviewer.workflow.wizard.snapshot import CalibrationView
 
 Purpose = Literal["scan", "plane", "sphere"]
 
@@ -36,7 +37,7 @@ def take_pose(engine: Engine, name: str | None = None) -> None:
     retake = name is not None
     if name is not None and store.load_capture(name).role != "calibration":
         raise InputError(f"{name} is no target pose: capture another scan instead")
-    sequence, name = sequence_for_poses(engine), name or _next_name(engine, "pose")
+    sequence, name = sequence_for_poses(engine), name or next_name(engine, "pose")
     source = engine.acquisition.view().name
 
     def save(taken: Taken) -> None:
@@ -53,12 +54,10 @@ def take_scan(engine: Engine, purpose: Purpose, label: str, follow: Callable[[st
     view = engine.teller.now().session
     if view is None or view.calibration is None:
         raise InputError("calibrate first: without a calibration a capture cannot be measured")
-    # half of the frames, of the axis along which the projector's picture moves more with depth
-    shift = np.abs(np.diag(view.calibration.K_projector)[:2] * view.calibration.t[:2])
     sequence = sequence_for_poses(engine)
     if engine.bench is not None and engine.bench.reel is None:
-        sequence = one_axis(sequence, "x" if shift[0] >= shift[1] else "y")
-    name = _next_name(engine, purpose)
+        sequence = one_axis(sequence, depth_axis(view.calibration))  # half of the frames
+    name = next_name(engine, purpose)
     source = engine.acquisition.view().name
 
     def save(taken: Taken) -> None:
@@ -77,13 +76,7 @@ def _take(
     follow: Callable[[], object],
 ) -> None:
     exposures = engine.reader.exposures_ms()
-    space = engine.space(len(sequence.frames) * max(1, len(exposures)))
-    if space is not None and not space.enough:
-        raise SessionError(
-            f"{name} needs {megabytes(space.capture_bytes or 0)} and {megabytes(space.free_bytes)} are free on "
-            f"{engine.store.folder}: free some space first"
-        )
-
+    check_space(engine, name, len(sequence.frames) * max(1, len(exposures)))
     bench = engine.bench
 
     def saved() -> None:
@@ -98,7 +91,23 @@ def _take(
     engine.acquisition.capture(CaptureRequest(name, sequence, save, saved, exposures))
 
 
-def _next_name(engine: Engine, kind: str) -> str:
+def depth_axis(calibration: CalibrationView) -> Axis:
+    """The axis along which the projector's picture moves more with depth."""
+    shift = np.abs(np.diag(calibration.K_projector)[:2] * calibration.t[:2])
+    return "x" if shift[0] >= shift[1] else "y"
+
+
+def check_space(engine: Engine, name: str, frames: int) -> None:
+    """Raise SessionError where so many frames would fill the disk."""
+    space = engine.space(frames)
+    if space is not None and not space.enough:
+        raise SessionError(
+            f"{name} needs {megabytes(space.capture_bytes or 0)} and {megabytes(space.free_bytes)} are free on "
+            f"{engine.store.folder}: free some space first"
+        )
+
+
+def next_name(engine: Engine, kind: str) -> str:
     """A name that no capture has, nor one that is still on its way."""
     taken = [*engine.store.capture_names(), *engine.acquisition.names()]
     numbers = [name.removeprefix(f"{kind}_") for name in taken if name.startswith(f"{kind}_")]

@@ -1,0 +1,139 @@
+"""Live clouds on the browsers' screens: to each the newest, as soon as it has drawn the one before.
+
+A browser that stalls gets nothing more until it has caught up; it holds nobody up, and one cloud at most waits for it.
+"""
+
+import threading
+from typing import Any
+
+import numpy as np
+import viser
+
+from slviewer.gui.panel import Stage
+from slviewer.gui.scene import spacing
+from slviewer.workflow.wizard.live import LiveCloud
+
+LAYER = "live"
+MOST_POINTS, FEWEST_POINTS = 60_000, 6_000
+_SLOW_S, _QUICK_S = 0.09, 0.05  # a browser that takes longer, or less, for a cloud is sent fewer points, or more
+
+
+class LiveScreen:
+    """Draws live clouds, on a thread of its own from the first one on. Every method may be called from any thread."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._viewers = stage.viewers(self._wake)
+        self._condition = threading.Condition()
+        self._cloud: LiveCloud | None = None
+        self._nodes: dict[int, Any] = {}
+        self._drawn: dict[int, int] = {}
+        self._limit, self._told = MOST_POINTS, 0
+        self._looked = False
+        self._thread: threading.Thread | None = None
+        self.points = 0
+        """How many were drawn of the last cloud."""
+
+    def offer(self, cloud: LiveCloud) -> None:
+        """Draw this one next, instead of any that was not drawn yet."""
+        with self._condition:
+            self._cloud = cloud
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._serve, name="slviewer live screen", daemon=True)
+                self._thread.start()
+            self._condition.notify_all()
+
+    def clear(self) -> None:
+        """Show no live cloud any more."""
+        with self._condition:
+            self._cloud, self._looked = None, False
+            self._condition.notify_all()
+
+    def _wake(self) -> None:
+        with self._condition:
+            self._condition.notify_all()
+
+    def _serve(self) -> None:
+        while True:
+            with self._condition:
+                cloud = self._cloud
+            try:
+                drawn = self._draw(cloud) if cloud is not None else self._remove()
+            except Exception as error:
+                self._stage.failed(error)
+                drawn = False
+            with self._condition:
+                if not drawn and self._cloud is cloud:
+                    # a browser that has come meanwhile is found without being told
+                    self._condition.wait(None if cloud is None else 0.5)
+
+    def _draw(self, cloud: LiveCloud) -> bool:
+        """Send it to the browsers that are ready for it; whether there was any."""
+        clients = [c for c in self._viewers.ready() if self._drawn.get(c.client_id) != cloud.number]
+        if not clients:
+            return False
+        self._adapt()
+        points, colours = thinned(cloud, self._limit)
+        self.points = len(points)
+        if not len(points):
+            return self._remove()
+        size = spacing(points)
+        for client in clients:
+            self._send(client, points, colours, size)
+            self._drawn[client.client_id] = cloud.number
+        if not self._looked:
+            self._looked = True
+            self._stage.eyes.at(f"{LAYER} {cloud.begun}", points)
+        if cloud.number != self._told:
+            self._told = cloud.number
+            self._stage.operator.live_shown(cloud)
+        return True
+
+    def _send(self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray, size: float) -> None:
+        number = client.client_id
+        with client.atomic():
+            if number not in self._nodes:
+                self._nodes[number] = client.scene.add_point_cloud(
+                    f"/{LAYER}/cloud",
+                    points,
+                    colours,
+                    point_size=size,
+                    point_shape="square",
+                    point_shading="flat",
+                    precision="float32",
+                )
+            else:
+                node = self._nodes[number]
+                node.points, node.colors, node.point_size = points, colours, size
+            self._viewers.sent(client)
+
+    def _remove(self) -> bool:
+        nodes, self._nodes, self._drawn = self._nodes, {}, {}
+        for node in nodes.values():
+            node.remove()
+        return False
+
+    def _adapt(self) -> None:
+        slowest = self._viewers.slowest_s()
+        if slowest > _SLOW_S:
+            self._limit = max(int(0.8 * self._limit), FEWEST_POINTS)
+        elif slowest < _QUICK_S:
+            self._limit = min(int(1.1 * self._limit), MOST_POINTS)
+        for gone in self._nodes.keys() - self._viewers.here():
+            del self._nodes[gone], self._drawn[gone]
+
+
+def thinned(cloud: LiveCloud, limit: int) -> tuple[np.ndarray, np.ndarray]:
+    """((n, 3) float32 mm, (n, 3) uint8): every so many rows and columns of a cloud, `limit` measured points at most."""
+    z = cloud.points[..., 2]
+    rows = columns = 1
+    measured = np.count_nonzero(np.isfinite(z[::4, ::4])) * 16
+    if measured > limit:
+        rows = columns = int(np.ceil(np.sqrt(measured / limit)))
+    points = cloud.points[::rows, ::columns].reshape(-1, 3)
+    grey = cloud.texture[::rows, ::columns].reshape(-1)
+    valid = np.isfinite(points[:, 2])
+    points, grey = points[valid], grey[valid]
+    if grey.dtype != np.uint8:
+        grey = (grey * (255.0 / max(int(cloud.texture.max()), 1))).astype(np.uint8)
+    return points, np.repeat(grey[:, None], 3, axis=1)

@@ -1,0 +1,62 @@
+"""Which browsers have drawn what they were sent: what is sent over and over goes at each one's own pace.
+
+A browser answers a question once all that was sent before it has been drawn, so that an answer tells more than any
+buffer of the network's: one that stalls, on the way or at its screen, has one picture on its way to it and no more.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+
+import viser
+
+from slviewer.server import viser_internals
+
+STALLED_S = 1.0
+"""A browser that has not answered for so long sets the pace for itself alone."""
+
+
+class Viewers:
+    """The browsers of one server. Every method may be called from any thread; `answered()` is called on the server's
+    own, whenever one has caught up, and must return at once.
+    """
+
+    def __init__(self, server: viser.ViserServer, answered: Callable[[], None]) -> None:
+        self._server, self._answered = server, answered
+        self._lock = threading.Lock()
+        self._asked: dict[int, float] = {}
+        self._took: dict[int, float] = {}
+
+    def ready(self) -> list[viser.ClientHandle]:
+        """Those that have drawn everything that was marked by `sent`."""
+        clients = self._server.get_clients()
+        with self._lock:
+            for known in (self._asked, self._took):
+                for gone in known.keys() - clients.keys():
+                    del known[gone]
+            return [client for number, client in clients.items() if number not in self._asked]
+
+    def here(self) -> set[int]:
+        """The numbers of all that are connected."""
+        return set(self._server.get_clients())
+
+    def sent(self, client: viser.ClientHandle) -> None:
+        """Something was sent to this one: it is not ready until it has drawn it."""
+        number = client.client_id
+        with self._lock:
+            self._asked[number] = time.monotonic()
+        viser_internals.ask_back(client, lambda: self._heard(number))
+
+    def slowest_s(self) -> float:
+        """How long the slowest of them took for what it was sent last, those apart that have stalled; 0: none did."""
+        now = time.monotonic()
+        with self._lock:
+            waiting = [now - asked for asked in self._asked.values() if now - asked < STALLED_S]
+            return max([*self._took.values(), *waiting], default=0.0)
+
+    def _heard(self, number: int) -> None:
+        with self._lock:
+            asked = self._asked.pop(number, None)
+            if asked is not None:
+                self._took[number] = min(time.monotonic() - asked, STALLED_S)
+        self._answered()

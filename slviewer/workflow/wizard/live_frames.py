@@ -1,0 +1,114 @@
+"""The frames of a live scan: short captures one after the other, in a few buffers, of which the newest counts."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.devices.capture import settle
+from slviewer.devices.protocols import CameraSettings, Rig
+from slviewer.fringe.sequence import PatternSequence
+
+
+@dataclass(eq=False)
+class Shot:
+    """One short capture: frames (n, h, w); when its first frame was asked for, by `time.monotonic`; the settings."""
+
+    frames: np.ndarray
+    begun: float
+    settings: CameraSettings
+
+
+class Stream:
+    """A sequence that is shown and grabbed over and over; whoever reads gets the newest capture that is whole.
+
+    `take` is called by the thread that owns the devices, `next` by one that reads, the others by any. At most three
+    buffers exist: one that is filled, one that waits, and one that is read.
+    `on_end` is called once, on whichever thread ends it.
+    """
+
+    def __init__(self, sequence: PatternSequence, on_end: Callable[[], None]) -> None:
+        self.sequence, self._on_end = sequence, on_end
+        self._condition = threading.Condition()
+        self._free: list[np.ndarray] = []
+        self._waiting: Shot | None = None
+        self._read: Shot | None = None
+        self._over = False
+        self.taken = 0
+        """Captures that are whole, those included that nobody read."""
+
+    def take(self, rig: Rig, settings: CameraSettings, stopped: Callable[[], bool]) -> np.ndarray | None:
+        """Show and grab every frame of the sequence, which the rig's projector has loaded. Returns a copy of the last
+        frame; None where it was `stopped` before, and then nobody gets anything of it.
+
+        Raises DeviceError.
+        """
+        count, (width, height) = len(self.sequence.frames), rig.camera.size
+        frames = self._room((count, height, width), rig.camera.dtype)
+        begun = time.monotonic()
+        for k in range(count):
+            if stopped():
+                break
+            rig.projector.show(k)
+            settle(rig)
+            rig.camera.grab(frames[k])
+        else:
+            rig.projector.show(count - 1)  # one that changed during this exposure says so only when it is asked again
+            last = frames[-1].copy()
+            self._give(Shot(frames, begun, settings))
+            return last
+        with self._condition:
+            self._free.append(frames)
+        return None
+
+    def next(self) -> Shot | None:
+        """Wait for a capture that was not read yet, the newest; its frames stay as they are until the next call.
+        None once the stream has ended.
+        """
+        with self._condition:
+            self._condition.wait_for(lambda: self._over or self._waiting is not None)
+            if self._over:
+                return None
+            self._recycle(self._read)
+            self._read, self._waiting = self._waiting, None
+            return self._read
+
+    def kept(self) -> Shot | None:
+        """A copy of the capture that was read last; None before the first."""
+        with self._condition:
+            if self._read is None:
+                return None
+            return Shot(self._read.frames.copy(), self._read.begun, self._read.settings)
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return self._over
+
+    def ended(self) -> None:
+        """No more is taken."""
+        with self._condition:
+            first, self._over = not self._over, True
+            self._condition.notify_all()
+        if first:
+            self._on_end()
+
+    def _room(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        with self._condition:
+            found = self._free.pop() if self._free else None
+        if found is None or found.shape != shape or found.dtype != dtype:
+            return np.empty(shape, dtype)
+        return found
+
+    def _give(self, shot: Shot) -> None:
+        with self._condition:
+            self._recycle(self._waiting)  # nobody was quick enough for it
+            self._waiting = shot
+            self.taken += 1
+            self._condition.notify_all()
+
+    def _recycle(self, shot: Shot | None) -> None:
+        if shot is not None:
+            self._free.append(shot.frames)

@@ -1,0 +1,81 @@
+"""What moved while a short sequence was taken: a handful of frames still contradict each other where it did.
+
+The frames of every period have the same mean, the background, at a pixel that stands still; and where the finest has an
+even number of steps, its frames added with alternating signs leave nothing but noise and what the projector adds
+evenly everywhere, its second harmonic, which is measured from all pixels and taken out.
+"""
+
+import numba
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.layout import layout
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.geometry.jit import kernel
+
+SIGMAS = 5.0
+PART = 0.1
+"""A contradiction of so many standard deviations of its noise, and this part of the modulation besides, is motion: some
+0.2 rad from one frame to the next."""
+_SPARSE = 8  # every so many rows and columns tell the projector's second harmonic
+
+
+def hide_moved(sequence: PatternSequence, frames: np.ndarray, phase: PhaseMap, points: np.ndarray) -> None:
+    """Set `points` (h, w, 3) to NaN where the frames (n, h, w) that `phase` was decoded from contradict each other.
+
+    Raises InputError where the finest period has an odd number of steps.
+    """
+    shifts = layout(sequence, phase.axis).shifts
+    finest = np.array(shifts[-1].indices, np.int64)
+    if len(finest) % 2:
+        raise InputError(f"{len(finest)} steps of the finest period do not tell what moved: use an even number")
+    begins = np.cumsum([0, *(len(shift.indices) for shift in shifts)])
+    indices = np.concatenate([np.array(shift.indices, np.int64) for shift in shifts])
+    signs = np.where(np.arange(len(finest)) % 2, -1.0, 1.0).astype(np.float32) / np.float32(len(finest))
+    some = (slice(None, None, _SPARSE),) * 2
+    left = np.tensordot(signs, frames[finest][(slice(None), *some)], 1)
+    shape = phase.modulation[some] * np.cos(2 * phase.wrapped[some])
+    valid = phase.mask[some]
+    power = float((shape[valid] ** 2).sum())
+    harmonic = float((shape[valid] * left[valid]).sum()) / power if power > 0 and len(finest) == 4 else 0.0
+    few, many = (extreme(len(shift.indices) for shift in shifts) for extreme in (min, max))
+    _hide(
+        frames, indices, begins, signs, phase.modulation, phase.background, phase.wrapped, np.float32(harmonic),
+        np.float32(phase.noise[0]), np.float32(phase.noise[1]), np.float32(SIGMAS * np.sqrt(1 / few + 1 / many)),
+        np.float32(SIGMAS / np.sqrt(len(finest))), np.float32(PART), points,
+    )  # fmt: skip
+
+
+@kernel(parallel=True)
+def _hide(
+    frames, indices, begins, signs, modulation, background, wrapped, harmonic, a, b, mean, alternating, part, points
+):
+    """``mean``, ``alternating``: limits of the two contradictions, in standard deviations of a frame's noise."""
+    height, width = modulation.shape
+    groups = len(begins) - 1
+    for row in numba.prange(height):
+        lowest, highest = np.empty(width, np.float32), np.empty(width, np.float32)
+        total, left = np.empty(width, np.float32), np.zeros(width, np.float32)
+        for g in range(groups):
+            total[:] = 0.0
+            share = np.float32(1.0) / np.float32(begins[g + 1] - begins[g])
+            for i in range(begins[g], begins[g + 1]):
+                sign = signs[i - begins[g]] if g == groups - 1 else np.float32(0.0)
+                frame = frames[indices[i], row]
+                for x in range(width):
+                    level = np.float32(frame[x])
+                    total[x] += share * level
+                    left[x] += sign * level
+            for x in range(width):
+                lowest[x] = total[x] if g == 0 else min(lowest[x], total[x])
+                highest[x] = total[x] if g == 0 else max(highest[x], total[x])
+        for x in range(width):
+            B = modulation[row, x]
+            noise = np.sqrt(max(a + b * background[row, x], np.float32(0.0)))
+            known = harmonic * B * np.cos(np.float32(2.0) * wrapped[row, x])
+            moved = (highest[x] - lowest[x] > mean * noise + part * B) | (
+                abs(left[x] - known) > alternating * noise + part * B
+            )
+            if moved:
+                points[row, x, 0] = points[row, x, 1] = points[row, x, 2] = np.nan
