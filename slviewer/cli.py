@@ -11,6 +11,7 @@ from typing import Any
 import tyro
 
 from slviewer import __version__, terminal
+from slviewer.commands.batching import batch
 from slviewer.commands.devices import capture, devices, preflight
 from slviewer.commands.importing import bring_in
 from slviewer.commands.measuring import calibrate, merge, reconstruct, validate, verify
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "reconstruct": reconstruct,
     "verify": verify,
     "merge": merge,
+    "batch": batch,
     "check": check,
     "accept": accept,
     "simulate": simulate,

@@ -68,6 +68,7 @@ def reconstruct(
     axis: Axis | None = None,
     out: Path | None = None,
     grid: Path | None = None,
+    mesh: bool = False,
     accept_rejected: bool = False,
 ) -> None:
     """Reconstruct a capture as a cloud; a board pose also says how flat each model measures the board.
@@ -80,13 +81,13 @@ def reconstruct(
         out: PLY file; by default in the session's exports. That of a board pose holds the points inside the board's
             outline.
         grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as .npy.
+        mesh: Put the triangles between neighbouring pixels into the PLY.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
-    print(
-        workflow.reconstruct(
-            session, capture, model=model, axis=axis, out=out, grid=grid, accept_rejected=accept_rejected, **ui()
-        ).text()
+    result = workflow.reconstruct(
+        session, capture, model=model, axis=axis, out=out, grid=grid, mesh=mesh, accept_rejected=accept_rejected, **ui()
     )
+    print(result.text())
 
 
 @deferred

@@ -12,7 +12,9 @@ from slviewer.evaluation.compare import Comparison, compare
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.mesh import grid_triangles
 from slviewer.reconstruction.ply import write_ply
+from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -71,13 +73,15 @@ def reconstruct(
     axis: Axis | None = None,
     out: Path | str | None = None,
     grid: Path | str | None = None,
+    mesh: bool = False,
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Reconstruction:
     """Reconstruct a capture, write it as PLY, and ``grid`` as an organised (h, w, 3) float32 .npy.
 
-    The PLY of a board pose holds the points inside the board's outline; a scan's holds every point.
+    The PLY of a board pose holds the points inside the board's outline; a scan's holds every point. That of a ``mesh``
+    also holds the triangles between neighbouring pixels.
     """
     with opened(session) as store:
         check_accepted(store, accept_rejected)
@@ -107,16 +111,23 @@ def reconstruct(
                 f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong to this camera "
                 "and projector, and is the scene within its depths?"
             )
-        ply = Path(out) if out is not None else store.exports / f"{capture}_{name}.ply"
+        ply = Path(out) if out is not None else store.exports / f"{capture}_{name}{'_mesh' if mesh else ''}.ply"
         progress(0.8, "writing")
         ply.parent.mkdir(parents=True, exist_ok=True)
-        write_ply(ply, cloud.points[keep], colours=texture[keep], scalars=cloud.sigmas(keep))
+        faces = triangles(cloud.points, keep) if mesh else None
+        write_ply(ply, cloud.points[keep], colours=texture[keep], scalars=cloud.sigmas(keep), faces=faces)
         if grid is not None:
             write_grid(Path(grid), cloud.points)
         scale, fitted = told_scale(store, name), chosen[name]
         masked = unsupported(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
         progress(1.0, "reconstructed")
     return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked)
+
+
+def triangles(points: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """Faces (m, 3) int32 over the pixels ``keep`` (h, w) bool of organised points; surfaces end where depth jumps."""
+    kept = np.where(keep[..., None], points, np.float32(np.nan))
+    return grid_triangles(kept, JUMP * float(np.median(points[..., 2][keep])))
 
 
 def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
