@@ -190,6 +190,10 @@ class Session:
         """Names of the results, such as `calibration/stereo`, sorted."""
         return sorted(list_results(self.folder / "results"), key=natural_key)
 
+    def has_result(self, name: str) -> bool:
+        """Whether there is a result of that name, fresh or stale: `state_of` reads all that it was made from."""
+        return (self.folder / "results" / safe_path(name) / "meta.json").is_file()
+
     def save_result(self, name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         """Save what was computed; replaces a result of that name in one step, which stays if this fails.
 

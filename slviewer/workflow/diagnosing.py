@@ -77,7 +77,7 @@ def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None
 
 def last_verdict(store: Session) -> Verdict | None:
     """What was said of the last calibration that was tried, also if none came of it; None where nothing was."""
-    if store.state_of(VERDICT) == "absent":
+    if not store.has_result(VERDICT):
         return None
     return Verdict.from_json(store.load_result(VERDICT, only=())[0]["verdict"])
 

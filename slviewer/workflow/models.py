@@ -62,7 +62,7 @@ def save_splined(store: Session, model: SplinedModel, inputs: Mapping[str, str],
 
 def available(store: Session) -> tuple[str, ...]:
     """Names of the calibrations that the session holds."""
-    return tuple(name for name in MODELS if store.state_of(f"calibration/{name}") != "absent")
+    return tuple(name for name in MODELS if store.has_result(f"calibration/{name}"))
 
 
 def save_imported_stereo(

@@ -113,7 +113,7 @@ def load_observations(store: Session, names: Sequence[str]) -> list[Observation]
     """Observations that the session keeps, of poses by name."""
     found = []
     for name in names:
-        if store.state_of(f"poses/{name}") != "absent":
+        if store.has_result(f"poses/{name}"):
             meta, arrays = store.load_result(f"poses/{name}")
             if not meta["refused"]:
                 found.append(Observation.from_arrays(name, arrays))

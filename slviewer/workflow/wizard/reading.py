@@ -165,10 +165,9 @@ class Reader:
 
     def _judged(self, capture: Capture, target: str) -> dict[str, Any] | None:
         """The `meta` of what the session knows of a pose, if it is of these frames and this board."""
-        try:
-            meta = self._meta(f"poses/{capture.name}")
-        except InputError:
+        if not self.session.has_result(f"poses/{capture.name}"):
             return None
+        meta = self._meta(f"poses/{capture.name}")
         return meta if meta["inputs"].get(capture.name) == capture.hash and meta["target"] == target else None
 
     def _poses(
@@ -390,10 +389,7 @@ class Reader:
         self, capture: Capture, labels: Mapping[str, str], hashes: Mapping[str, str], factors: Mapping[str, float]
     ) -> ScanView:
         result = f"clouds/{capture.name}"
-        try:
-            meta = self._meta(result)
-        except InputError:
-            meta = None
+        meta = self._meta(result) if self.session.has_result(result) else None
         depths = None if meta is None else (float(meta["depth_mm"][0]), float(meta["depth_mm"][1]))
         return ScanView(
             name=capture.name,
