@@ -12,6 +12,7 @@ _FLAGS = [
     "--no-sandbox",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",  # in software it costs more than without
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",

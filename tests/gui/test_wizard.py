@@ -24,6 +24,11 @@ from slviewer.workflow.wizard.snapshot import SessionView
 
 TARGET = "circles:21x16:9"
 RIG = {"driver": "simulated", "scale": 0.25}
+SLOW = """driver = "simulated"
+scale = 0.25
+settle_ms = 60
+"""
+"""A rig whose captures last longer than a browser takes to tell of them."""
 PATIENCE_S = PATIENCE_MS / 1000
 ON_THE_CLOUD = (530, 420)
 """Page px, in the middle of the scene."""
@@ -254,7 +259,9 @@ class Program:
 
 
 def test_a_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser) -> None:
-    program = Program(tmp_path / "session", "--rig", "simulated:0.25")
+    rig = tmp_path / "rig.toml"
+    rig.write_text(SLOW)
+    program = Program(tmp_path / "session", "--rig", str(rig))
     try:
         page = visit(browser, program.url).page
         button(page, "2. Target").click()
