@@ -41,6 +41,11 @@ class LiveRequests(Asked):
 
         return stop
 
+    @property
+    def live_captures(self) -> int:
+        """How many short captures the latest live scan has taken, those included that nobody made a cloud of."""
+        return 0 if self._engine.live is None else self._engine.live.stream.taken
+
     def live_shown(self, cloud: LiveCloud) -> None:
         """Whoever heard of a live cloud has sent it to those who look: what the latency is counted to."""
         if self._engine.live is not None:
