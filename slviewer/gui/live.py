@@ -14,7 +14,7 @@ from slviewer.gui.scene import spacing
 from slviewer.workflow.wizard.live import LiveCloud
 
 LAYER = "live"
-MOST_POINTS, FEWEST_POINTS = 60_000, 6_000
+MOST_POINTS, FEWEST_POINTS = 60_000, 15_000
 _SLOW_S, _QUICK_S = 0.09, 0.05  # a browser that takes longer, or less, for a cloud is sent fewer points, or more
 
 
@@ -126,10 +126,10 @@ class LiveScreen:
 def thinned(cloud: LiveCloud, limit: int) -> tuple[np.ndarray, np.ndarray]:
     """((n, 3) float32 mm, (n, 3) uint8): every so many rows and columns of a cloud, `limit` measured points at most."""
     z = cloud.points[..., 2]
+    share = 16 * np.count_nonzero(np.isfinite(z[::4, ::4])) / limit
     rows = columns = 1
-    measured = np.count_nonzero(np.isfinite(z[::4, ::4])) * 16
-    if measured > limit:
-        rows = columns = int(np.ceil(np.sqrt(measured / limit)))
+    while rows * columns < share:
+        rows, columns = (rows, columns + 1) if rows == columns else (columns, columns)
     points = cloud.points[::rows, ::columns].reshape(-1, 3)
     grey = cloud.texture[::rows, ::columns].reshape(-1)
     valid = np.isfinite(points[:, 2])

@@ -129,7 +129,7 @@ class Panel:
 
     def _draw_live(self, live: LiveView | None, ready: bool) -> None:
         """The buttons and figures of the live scan; a cloud that was captured gives way to it meanwhile."""
-        change(self._live, label="Live" if live is None else "Stop", color="teal" if live is None else "red")
+        change(self._live, label="Live" if live is None else "Stop live", color="teal" if live is None else "red")
         change(self._live, icon=viser.Icon.PLAYER_PLAY if live is None else viser.Icon.PLAYER_STOP)
         change(self._live, disabled=live is None and not ready)
         change(self._keep, visible=live is not None, disabled=live is None or not live.clouds_per_s)

@@ -171,7 +171,7 @@ def cloud_of(sequence: PatternSequence, frames: np.ndarray, calibrated: Scaled) 
     """
     phase = decode(sequence, frames, calibrated.axis)
     points = calibrated.model.points(phase)
-    hide_moved(sequence, frames, phase, points)
+    hide_moved(sequence, frames, phase.axis, phase.phase, phase.modulation, phase.noise, points)
     if calibrated.factor != 1.0:
         points *= np.float32(calibrated.factor)
     return points, frames[-1].copy()

@@ -10,8 +10,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import layout
-from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.jit import kernel
 
 SIGMAS = 5.0
@@ -21,12 +20,21 @@ PART = 0.1
 _SPARSE = 8  # every so many rows and columns tell the projector's second harmonic
 
 
-def hide_moved(sequence: PatternSequence, frames: np.ndarray, phase: PhaseMap, points: np.ndarray) -> None:
-    """Set `points` (h, w, 3) to NaN where the frames (n, h, w) that `phase` was decoded from contradict each other.
+def hide_moved(
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    axis: Axis,
+    phase: np.ndarray,
+    modulation: np.ndarray,
+    noise: tuple[float, float],
+    points: np.ndarray,
+) -> None:
+    """Set `points` (h, w, 3) to NaN where the frames (n, h, w) that they were made of contradict each other.
 
-    Raises InputError where the finest period has an odd number of steps.
+    `phase` (h, w) rad, NaN where there is none, `modulation` (h, w) grey levels and `noise` are those that decoding
+    the axis gave, as a `PhaseMap` has them. Raises InputError where the finest period has an odd number of steps.
     """
-    shifts = layout(sequence, phase.axis).shifts
+    shifts = layout(sequence, axis).shifts
     finest = np.array(shifts[-1].indices, np.int64)
     if len(finest) % 2:
         raise InputError(f"{len(finest)} steps of the finest period do not tell what moved: use an even number")
@@ -34,23 +42,21 @@ def hide_moved(sequence: PatternSequence, frames: np.ndarray, phase: PhaseMap, p
     indices = np.concatenate([np.array(shift.indices, np.int64) for shift in shifts])
     signs = np.where(np.arange(len(finest)) % 2, -1.0, 1.0).astype(np.float32) / np.float32(len(finest))
     some = (slice(None, None, _SPARSE),) * 2
-    left = np.tensordot(signs, frames[finest][(slice(None), *some)], 1)
-    shape = phase.modulation[some] * np.cos(2 * phase.wrapped[some])
-    valid = phase.mask[some]
+    left = np.tensordot(signs, frames[(slice(None), *some)][finest], 1)
+    shape = modulation[some] * np.cos(2 * phase[some])
+    valid = np.isfinite(shape)
     power = float((shape[valid] ** 2).sum())
     harmonic = float((shape[valid] * left[valid]).sum()) / power if power > 0 and len(finest) == 4 else 0.0
     few, many = (extreme(len(shift.indices) for shift in shifts) for extreme in (min, max))
     _hide(
-        frames, indices, begins, signs, phase.modulation, phase.background, phase.wrapped, np.float32(harmonic),
-        np.float32(phase.noise[0]), np.float32(phase.noise[1]), np.float32(SIGMAS * np.sqrt(1 / few + 1 / many)),
+        frames, indices, begins, signs, modulation, phase, np.float32(harmonic),
+        np.float32(noise[0]), np.float32(noise[1]), np.float32(SIGMAS * np.sqrt(1 / few + 1 / many)),
         np.float32(SIGMAS / np.sqrt(len(finest))), np.float32(PART), points,
     )  # fmt: skip
 
 
 @kernel(parallel=True)
-def _hide(
-    frames, indices, begins, signs, modulation, background, wrapped, harmonic, a, b, mean, alternating, part, points
-):
+def _hide(frames, indices, begins, signs, modulation, phase, harmonic, a, b, mean, alternating, part, points):
     """``mean``, ``alternating``: limits of the two contradictions, in standard deviations of a frame's noise."""
     height, width = modulation.shape
     groups = len(begins) - 1
@@ -72,8 +78,8 @@ def _hide(
                 highest[x] = total[x] if g == 0 else max(highest[x], total[x])
         for x in range(width):
             B = modulation[row, x]
-            noise = np.sqrt(max(a + b * background[row, x], np.float32(0.0)))
-            known = harmonic * B * np.cos(np.float32(2.0) * wrapped[row, x])
+            noise = np.sqrt(max(a + b * total[x], np.float32(0.0)))
+            known = harmonic * B * np.cos(np.float32(2.0) * phase[row, x])
             moved = (highest[x] - lowest[x] > mean * noise + part * B) | (
                 abs(left[x] - known) > alternating * noise + part * B
             )
