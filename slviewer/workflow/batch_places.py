@@ -71,6 +71,8 @@ def delivered(address: str, batch: str) -> Iterator[Path]:
         for path in sorted(folder.iterdir()):
             os.replace(path, exports / path.name)
         folder.rmdir()
+        with contextlib.suppress(OSError):  # another worker's is in it
+            folder.parent.rmdir()
     except OSError as error:
         raise SessionError(f"{address} cannot be written ({error}): check its permissions and free space") from error
 

@@ -4,7 +4,7 @@ import os
 import secrets
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +15,7 @@ from slviewer.evaluation.render import render
 from slviewer.workflow.batch_places import resolved, swept
 from slviewer.workflow.batch_work import Do, Done, Task, joined, listed, verification_file, worked
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
-from slviewer.workflow.verifying import Shape
+from slviewer.workflow.verifying import Shape, Verification
 
 INSTALL = "pip install 'slviewer[batch]'"
 PATIENCE_S = 10.0
@@ -94,26 +94,20 @@ def batch(
     if not addresses:
         raise UsageError("no session named: give the folders or addresses of one or more")
     task = Task(do, secrets.token_hex(4), model, shape, radius, accept_rejected)
+    looking = {address: (address, tuple(captures), task.version) for address in addresses}
+    progress(0.0, f"looking into {len(addresses)} sessions")
     try:
-        with _client(scheduler) as client:
-            progress(0.0, f"looking into {len(addresses)} sessions")
-            plans = _gathered(client, {a: (listed, a, tuple(captures), task.version) for a in addresses}, unheard, warn)
-            broken = {a: plan for a, plan in plans.items() if isinstance(plan, str)}
-            wanted = [(a, name) for a in addresses if a not in broken for name in plans[a]]
-            calls = {(a, name): (worked, a, name, task) for a, name in wanted}
-            found = _gathered(client, calls, progress, warn)
-            done = tuple(
-                found[key] if isinstance(found[key], Done) else Done(*key, failed=found[key]) for key in wanted
-            )
-            for sentence in dict.fromkeys(f"{one.session}: {words}" for one in done for words in one.warnings):
-                warn(sentence)
-            if do == "verify":
-                parts: dict[str, list[Any]] = {}
-                for one in done:
-                    if one.verification is not None:
-                        parts.setdefault(one.session, []).append(one.verification)
-                writing = {a: (joined, a, tuple(verified), task) for a, verified in parts.items()}
-                broken |= {a: why for a, why in _gathered(client, writing, unheard, warn).items() if why}
+        with ExitStack() as ended:
+            if scheduler is None:  # workers will see what is seen from here, and are as many as there is work for
+                plans: dict[str, list[str] | str] = {address: listed(*given) for address, given in looking.items()}
+                client = ended.enter_context(_own(sum(len(plan) for plan in plans.values() if isinstance(plan, list))))
+            else:
+                client = ended.enter_context(_theirs(scheduler))
+                plans = _gathered(client, {a: (listed, *given) for a, given in looking.items()}, unheard, warn)
+            broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
+            wanted = [(a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan]
+            done = _worked(client, wanted, task, progress, warn)
+            broken |= _joined(client, done, task, warn)
             progress(1.0, "done")
     finally:
         for address in addresses:
@@ -121,17 +115,33 @@ def batch(
     return Batch(done, broken, task)
 
 
+def _worked(
+    client: Any, wanted: Sequence[tuple[str, str]], task: Task, progress: Progress, warn: Warn
+) -> tuple[Done, ...]:
+    """What came of each (session, capture)."""
+    found = _gathered(client, {(a, name): (worked, a, name, task) for a, name in wanted}, progress, warn)
+    done = tuple(came if isinstance(came, Done) else Done(a, name, failed=came) for (a, name), came in found.items())
+    for sentence in dict.fromkeys(f"{one.session}: {words}" for one in done for words in one.warnings):
+        warn(sentence)
+    return done
+
+
+def _joined(client: Any, done: Sequence[Done], task: Task, warn: Warn) -> dict[str, str]:
+    """Have each session's verifications written; {session: why it could not be done}."""
+    parts: dict[str, list[Verification]] = {}
+    for one in done:
+        if one.verification is not None:
+            parts.setdefault(one.session, []).append(one.verification)
+    writing = {address: (joined, address, tuple(verified), task) for address, verified in parts.items()}
+    return {address: why for address, why in _gathered(client, writing, unheard, warn).items() if why}
+
+
 @contextmanager
-def _client(scheduler: str | None) -> Iterator[Any]:
-    """A client of the scheduler; a cluster that was started here ends with it, and so does its work."""
-    if find_spec("distributed") is None:
-        raise SlviewerError(f"a batch needs the package distributed, which is missing: {INSTALL}")
+def _theirs(scheduler: str) -> Iterator[Any]:
+    """A client of a scheduler that runs already, and has a worker."""
+    _check_installed()
     from distributed import Client
 
-    if scheduler is None:
-        with _cluster() as cluster, Client(cluster, set_as_default=False) as client:
-            yield client
-        return
     try:
         client = Client(scheduler, timeout=PATIENCE_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
@@ -150,14 +160,16 @@ def _client(scheduler: str | None) -> Iterator[Any]:
 
 
 @contextmanager
-def _cluster() -> Iterator[Any]:
-    """Worker processes on this machine: as many as cores and memory allow, which share the cores among them."""
+def _own(most: int) -> Iterator[Any]:
+    """A client of worker processes on this machine, which end with it and share its cores among them: ``most``, or as
+    many as cores and memory allow."""
+    _check_installed()
     import dask.config
     from dask.system import CPU_COUNT
-    from distributed import LocalCluster
+    from distributed import Client, LocalCluster
     from distributed.system import MEMORY_LIMIT
 
-    workers = max(1, min(CPU_COUNT, MEMORY_LIMIT // BYTES_PER_WORKER))
+    workers = max(1, min(most, CPU_COUNT, MEMORY_LIMIT // BYTES_PER_WORKER))
     threads = str(max(1, CPU_COUNT // workers))
     libraries = ("OMP", "OPENBLAS", "MKL", "NUMBA")
     environ = {f"{library}_NUM_THREADS": os.environ.get(f"{library}_NUM_THREADS", threads) for library in libraries}
@@ -171,8 +183,15 @@ def _cluster() -> Iterator[Any]:
             security=True,  # whoever reaches a scheduler runs what they like as its user; others share this machine
             silence_logs="ERROR",
         ) as cluster,
+        Client(cluster, set_as_default=False) as client,
     ):
-        yield cluster
+        yield client
+
+
+def _check_installed() -> None:
+    for package in ("distributed", "fsspec", "cryptography"):
+        if find_spec(package) is None:
+            raise SlviewerError(f"a batch needs the package {package}, which is missing: {INSTALL}")
 
 
 def _gathered(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progress, warn: Warn) -> dict[Any, Any]:
