@@ -88,7 +88,7 @@ def live_rate(scale: float = 0.5, seconds: float = 30.0, progress: Progress = un
     progress(0.0, "preparing the rig")
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
-        _true_calibration(session, scale)
+        true_calibration(session, scale)
         with Operator(session, {"driver": "simulated", "scale": scale}) as operator, _served(operator) as server:
             _wait(lambda: operator.snapshot().rig.state == "open", operator)
             operator.place("object")
@@ -202,7 +202,8 @@ def _served(operator: Operator) -> Iterator[SafeServer]:
         app.close()
 
 
-def _true_calibration(folder: Path, scale: float) -> None:
+def true_calibration(folder: Path, scale: float) -> None:
+    """Make a session whose stereo calibration is that of the simulated rig's true lenses, local distortion apart."""
     rig = letter(scale)
     record = rig_record(rig)
     matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}

@@ -27,6 +27,7 @@ from slviewer.workflow.wizard.snapshot import CaptureProgress, RigView
 
 RETRY_S = 2.0
 PREVIEWS_PER_S = 10.0
+PREVIEWS_OF_STREAM_PER_S = 4.0  # the clouds are what is looked at then
 LIGHTS = {"white": 255, "grey": 128, "dark": None}
 """What the projector may show between captures, as grey levels; "pattern" is a sequence's first frame."""
 
@@ -334,7 +335,7 @@ class Acquisition:
             self.unstream()
             return
         if white is not None and time.monotonic() >= self._next_preview:
-            self._next_preview = time.monotonic() + 1 / PREVIEWS_PER_S
+            self._next_preview = time.monotonic() + 1 / PREVIEWS_OF_STREAM_PER_S
             self._offer(white)
 
     def _serve_request(self, request: CaptureRequest | _Task) -> None:

@@ -1,0 +1,73 @@
+"""Live clouds in a browser: who operates starts and keeps them, who watches sees them and changes nothing."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, expect
+from wizard_page import SIZE, Opened, button
+
+from slviewer.gui.app import App
+from slviewer.gui.live import thinned
+from slviewer.gui.live_rate import live_rate, true_calibration
+from slviewer.workflow.wizard.live import LiveCloud
+from slviewer.workflow.wizard.operator import Operator
+
+SCALE = 0.15
+
+
+@pytest.fixture
+def app(tmp_path: Path) -> Iterator[App]:
+    folder = tmp_path / "session"
+    true_calibration(folder, SCALE)
+    with Operator(folder, {"driver": "simulated", "scale": SCALE}) as operator:
+        assert operator.wait_for(lambda s: s.rig.state == "open", 20.0) is not None
+        operator.place("object")
+        wizard = App(operator, port=0)
+        yield wizard
+        wizard.close()
+
+
+def test_live_clouds_are_seen_kept_and_ended(browser: Browser, app: App) -> None:
+    page = browser.new_page(viewport=SIZE)
+    found = Opened(page)
+    page.goto(app.server.url)
+    button(page, "6. Scan").click()
+    button(page, "Live").click()
+    expect(page.get_by_text("clouds/s").first).to_be_visible()
+    expect(page.get_by_text("nothing is saved yet")).to_be_visible()
+    button(page, "Keep this one").click()
+    expect(page.get_by_text("scan_01").first).to_be_visible()
+    shown = app.operator.snapshot().live
+    assert shown is not None and shown.shown_per_s > 0
+
+    page.goto(app.server.view_url)  # who watches sees it too, and cannot end it
+    expect(button(page, "Stop live")).to_be_visible()
+    drawn = app.operator.live_captures
+    button(page, "Stop live").click()
+    expect(page.get_by_text("You are watching")).to_be_visible()
+    assert app.operator.wait_for(lambda s: s.live is not None and app.operator.live_captures > drawn + 2, 20)
+    app.shell.go("merge")  # to leave the step ends it
+    assert app.operator.wait_for(lambda s: s.live is None, 10)
+    assert found.errors == []
+    page.close()
+
+
+def test_the_rate_is_measured_beside_a_stalled_viewer() -> None:
+    found = live_rate(SCALE, 2.0)
+    assert found.size == (240, 180) and found.points > 3000
+    assert found.captures_per_s > 0.5 and found.captures_per_s_stalled > 0.3 * found.captures_per_s
+    assert 0 < found.shown_per_s <= 1.2 * found.clouds_per_s + 1 and 5 < found.behind_ms < 20_000
+    assert set(found.to_json()) > {"behind_ms", "growth_mb"} and "240x180" in found.text()
+
+
+def test_a_cloud_is_thinned_evenly_to_what_a_screen_takes() -> None:
+    points = np.full((120, 160, 3), 500, np.float32)
+    points[:, :40] = np.nan
+    texture = np.arange(120 * 160, dtype=np.uint16).reshape(120, 160)
+    cloud = LiveCloud(1, points, texture, 0.0)
+    for limit, left in ((20_000, 14_400), (8_000, 7_200), (4_000, 3_600), (2_500, 2_400)):
+        few, colours = thinned(cloud, limit)
+        assert len(few) == len(colours) == left and np.isfinite(few).all()
+        assert colours.dtype == np.uint8 and colours.max() >= 250
