@@ -9,6 +9,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.board_shape import board_frame
 from slviewer.calibration.splined.evidence import Noise, measured_noise, pose_trust, robust_weights
 from slviewer.calibration.splined.found import Bundle, PoseFit
+from slviewer.calibration.splined.half_turns import half_turned, may_be_turned, turned_over
 from slviewer.calibration.splined.normal import Data, normal_equations, predicted
 from slviewer.calibration.splined.prior import Prior
 from slviewer.calibration.splined.unknowns import State
@@ -79,9 +80,16 @@ def adjust(
     prior = Prior.of(state, data)
     strengths = [FIRST_STRENGTH, FIRST_STRENGTH]
     aside = np.zeros(len(names), bool)
+    marked = {o.name for o in observations if o.marked}
+    certain = np.array([name in marked or not may_be_turned(stereo.board) for name in names])
+    turned = np.zeros(len(names), bool)
     updates, count = 0, 0
     residuals = _residuals(state, data)
     for step in range(1, MOST_STEPS + 1):
+        if step == 3:  # before such poses seem to contradict the others
+            turned = half_turned(state, data, residuals[0], certain)
+            state, data = turned_over(state, data, turned)
+            residuals = _residuals(state, data)
         noise = measured_noise(*residuals, sample_sigma)
         weights = robust_weights(*residuals, sample_sigma, noise)
         if step > 2:
@@ -131,6 +139,7 @@ def adjust(
         projector_poses=projector_poses,
         packed_factor=_packed(factor[layout.rig :, layout.rig :]),
         steps=step,
+        turned=tuple(name for name, over in zip(names, turned, strict=True) if over),
     )
 
 

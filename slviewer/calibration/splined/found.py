@@ -35,7 +35,8 @@ class Bundle:
 
     ``points`` (f, 3) mm: the board's features, whose offsets the state has. ``strengths`` 1/px^2: of the camera's and
     the projector's prior. ``left_out``: poses set aside, with the reason. ``camera_poses`` and ``projector_poses``:
-    how many poses lit each cell of the fields (rows, columns).
+    how many poses lit each cell of the fields (rows, columns). ``turned``: poses whose board was numbered from the
+    other end, and is no more.
 
     ``packed_factor``: the lower triangle of ``factor``, row by row, float32.
     """
@@ -52,6 +53,7 @@ class Bundle:
     projector_poses: np.ndarray
     packed_factor: np.ndarray
     steps: int
+    turned: tuple[str, ...] = ()
 
     @cached_property
     def factor(self) -> np.ndarray:
@@ -100,6 +102,7 @@ class Bundle:
             },
             "sigma_volume_mm": self.sigma_volume,
             "left_out": dict(self.left_out),
+            "turned": list(self.turned),
         }
 
     def text(self) -> str:
@@ -118,6 +121,10 @@ class Bundle:
                 f"{local['projector']:.3f} px in the projector",
                 f"  board: height {low:+.4f} ... {high:+.4f} mm, features misplaced by "
                 f"{s['board_offsets_rms_mm']:.4f} mm RMS",
+                *(
+                    [f"  board turned by 180 degrees in {', '.join(self.turned)}: numbered as in the others"]
+                    * bool(self.turned)
+                ),
                 f"  lit by target poses: {100 * lit['camera']:.0f} % of the camera's cells, "
                 f"{100 * lit['projector']:.0f} % of the projector's",
                 f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma): median "
@@ -136,6 +143,7 @@ class Bundle:
             "left_out": dict(self.left_out),
             "depth_range_mm": list(self.depth_range_mm),
             "steps": self.steps,
+            "turned": list(self.turned),
         }
 
     def to_arrays(self) -> dict[str, np.ndarray]:
@@ -184,4 +192,5 @@ class Bundle:
             projector_poses=a["projector_poses"],
             packed_factor=a["factor"],
             steps=data["steps"],
+            turned=tuple(data.get("turned", ())),
         )

@@ -1,0 +1,114 @@
+"""Poses whose board was numbered from its other end: a grid of circles looks the same turned by 180 degrees.
+
+Bow and twist are the same then, yet each circle's misplacement is another circle's. So what each pose says of the
+circles' places is compared with what the others say: the part that a half turn reverses, less what is smooth over the
+board and may come from lenses. It is the paper's own noise, the same in all poses, and reversed where one was turned.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from slviewer.calibration.splined.normal import Data, predicted
+from slviewer.calibration.splined.unknowns import State
+from slviewer.errors import InputError
+from slviewer.target.board import Board
+
+SURE = 5.0
+"""Sigmas of pure chance by which a pose must agree with the others' reverse before it counts as turned."""
+SMOOTH = 4
+"""Degree of the polynomials that are no evidence."""
+_STEP_MM = 0.01
+
+
+def may_be_turned(notation: str) -> bool:
+    """Whether a board's numbering may start at either end: circles that are not seen to be marked."""
+    try:
+        return Board.parse(notation).kind in ("circles", "acircles")
+    except InputError:  # a calibration made elsewhere
+        return False
+
+
+def opposite(points: np.ndarray) -> np.ndarray | None:
+    """(f,) where each feature of (f, 3) mm lies after half a turn of the board; None where the board is not the same
+    then."""
+    middle = (points.min(0) + points.max(0)) / 2
+    away = np.linalg.norm((2 * middle - points)[:, None, :2] - points[None, :, :2], axis=2)
+    partner = np.argmin(away, axis=1)
+    apart = away[np.arange(len(points)), partner].max()
+    return partner if apart < 1e-3 and np.array_equal(partner[partner], np.arange(len(points))) else None
+
+
+def half_turned(state: State, data: Data, residuals: np.ndarray, certain: np.ndarray) -> np.ndarray:
+    """(p,) bool: poses that are numbered from the other end than most, or than the ``certain`` (p,) bool ones, beyond
+    doubt.
+
+    ``residuals`` (n, 2) px: of the features.
+    """
+    partner = opposite(data.points)
+    count = state.layout.poses
+    if partner is None or count < 3 or certain.all():
+        return np.zeros(count, bool)
+    reversed_part = _reversed(_places(state, data, residuals), partner, data.points)
+    length = np.linalg.norm(reversed_part, axis=1)
+    unit = reversed_part / np.maximum(length, 1e-12)[:, None]
+    alike = unit @ unit.T
+    np.fill_diagonal(alike, 0.0)
+    signs = np.sign(np.linalg.eigh(alike)[1][:, -1])
+    signs[signs == 0] = 1.0
+    chosen = signs[certain].sum() if certain.any() else signs.sum()
+    signs = signs if chosen >= 0 else -signs
+    total = signs @ reversed_part
+    others = total - signs[:, None] * reversed_part
+    agree = np.einsum("pn,pn->p", unit, others) / np.maximum(np.linalg.norm(others, axis=1), 1e-12)
+    # of two features that are each other's opposite only one counts, and what is smooth does not
+    freedom = max(len(data.points) - (SMOOTH + 1) * (SMOOTH + 2) // 2, 1)
+    return np.asarray((agree * np.sqrt(freedom) < -SURE) & ~certain)
+
+
+def turned_over(state: State, data: Data, poses: np.ndarray) -> tuple[State, Data]:
+    """Both with these ``poses`` (p,) bool numbered from the other end."""
+    partner = opposite(data.points)
+    if partner is None or not poses.any():
+        return state, data
+    middle = (data.points.min(0) + data.points.max(0)) / 2
+    feature, R, t = data.feature.copy(), state.R_board.copy(), state.t_board.copy()
+    for i in np.nonzero(poses)[0]:
+        part = slice(data.feature_from[i], data.feature_from[i + 1])
+        feature[part] = partner[feature[part]]
+        t[i] += 2 * R[i] @ np.array([middle[0], middle[1], 0.0])
+        R[i] = R[i] @ np.diag([-1.0, -1.0, 1.0])
+    return replace(state, R_board=R, t_board=t), data._replace(feature=feature)
+
+
+def _places(state: State, data: Data, residuals: np.ndarray) -> np.ndarray:
+    """(p, f, 2) mm: how far off each pose sees each feature on the board; 0 where it does not see it, or badly."""
+    by_place = []
+    here, _ = predicted(state, data)
+    for k in range(2):
+        step = np.zeros_like(state.offsets)
+        step[:, k] = _STEP_MM
+        by_place.append((predicted(replace(state, offsets=state.offsets + step), data)[0] - here) / _STEP_MM)
+    J = np.stack(by_place, axis=2)  # of px by mm
+    usable = np.isfinite(J).all((1, 2)) & np.isfinite(residuals).all(1)
+    usable[usable] &= np.abs(np.linalg.det(J[usable])) > 1e-9
+    seen = np.zeros_like(residuals)
+    seen[usable] = np.linalg.solve(J[usable], residuals[usable][..., None])[..., 0]
+    seen[usable] += state.offsets[data.feature[usable]]
+    places = np.zeros((state.layout.poses, len(data.points), 2))
+    for i, (first, last) in enumerate(zip(data.feature_from[:-1], data.feature_from[1:], strict=True)):
+        each = seen[first:last]
+        outlying = (np.abs(each) > 6 * 1.4826 * np.median(np.abs(each), axis=0)).any(1)
+        places[i, data.feature[first:last]] = np.where(outlying[:, None], 0.0, each)
+    return places
+
+
+def _reversed(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(p, 2 f): of places (p, f, 2), what half a turn of the board changes the sign of, and is not smooth."""
+    # the circle there moves the other way when the board is turned: what reverses is the mean of both
+    odd = (places + places[:, partner]) / 2
+    x, y = (2 * (points[:, :2] - points[:, :2].min(0)) / np.maximum(np.ptp(points[:, :2], axis=0), 1e-9) - 1).T
+    smooth = np.stack([x**i * y**j for i in range(SMOOTH + 1) for j in range(SMOOTH + 1 - i)], axis=1)
+    basis, _ = np.linalg.qr(smooth)
+    odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)
+    return np.asarray(odd.reshape(len(places), -1))
