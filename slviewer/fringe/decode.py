@@ -25,7 +25,7 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
     stack = np.ascontiguousarray(stack)
     white = white_level(stack, sequence.select(axis))
     noise = measure_noise(found, stack, white)
-    scale = kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(found), white)
+    scale = grey_scale(found, noise, white)
     if not found.shifts:
         maps = _gray_alone(found, stack, scale)
     elif found.gray:
@@ -59,17 +59,10 @@ def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
 def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
     phase, wrapped, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(4))
     reason = np.empty(stack.shape[1:], np.uint8)
-    rules = kernels.CodeRules(
-        found.gray_origin_px / found.period_px,
-        limits.EDGE,
-        limits.WEAK_BIT,
-        limits.WEAKER,
-        fringe_mean(found, stack) if is_plain(found) else MIDDLE,
-        limits.UNDECIDED_BIT,
-    )
+    rules = code_rules(found, fringe_mean(found, stack) if is_plain(found) else MIDDLE)
     kernels.decode_coded(
         stack,
-        *_waves(found.shifts[0], found.sign),
+        *waves(found.shifts[0], found.sign),
         np.array(found.gray, np.int64),
         np.array(found.inverse, np.int64),
         -1 if found.complementary is None else found.complementary,
@@ -91,8 +84,8 @@ def _levels(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.
     phase, modulation, background = (np.empty(shape, np.float32) for _ in range(3))
     weakest, clipped, reason = np.full(shape, np.inf, np.float32), np.zeros(shape, bool), np.empty(shape, np.uint8)
     for shift, psi in zip(found.shifts, wrapped, strict=True):  # the finest is last, and its maps stay
-        waves = _waves(shift, found.sign)
-        kernels_levels.decode_shift(stack, *waves, scale, psi, modulation, background, weakest, clipped)
+        turned = waves(shift, found.sign)
+        kernels_levels.decode_shift(stack, *turned, scale, psi, modulation, background, weakest, clipped)
     kernels_levels.unwrap_levels(
         wrapped,
         np.array([level.weights for level in levels], np.float64),
@@ -137,7 +130,35 @@ def _gray_alone(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple
 
 def _settled(found: Layout, phase: np.ndarray, reason: np.ndarray) -> np.ndarray:
     """The phase that stands after a look at each neighbourhood; ``reason`` learns why the rest does not."""
-    rules = kernels_spikes.SpikeRules(
+    rules = spike_rules(found)
+    other = np.empty_like(phase)
+    if rules.plain:
+        kernels_spikes.repair(phase, rules, other)
+        phase, other = other, phase
+    kernels_spikes.settle(phase, reason, rules, other)
+    return other
+
+
+def grey_scale(found: Layout, noise: tuple[float, float], white: float) -> kernels.Scale:
+    """The grey levels that decide about a pixel, from the noise (a, b) and the level at which the camera clips."""
+    return kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(found), white)
+
+
+def code_rules(found: Layout, mean: float) -> kernels.CodeRules:
+    """How the Gray bits of a layout are read; ``mean`` as `threshold.fringe_mean` has it."""
+    return kernels.CodeRules(
+        found.gray_origin_px / found.period_px,
+        limits.EDGE,
+        limits.WEAK_BIT,
+        limits.WEAKER,
+        mean,
+        limits.UNDECIDED_BIT,
+    )
+
+
+def spike_rules(found: Layout) -> kernels_spikes.SpikeRules:
+    """How a neighbourhood decides about a pixel of a layout."""
+    return kernels_spikes.SpikeRules(
         cell_rad(found),
         is_plain(found),
         found.origin_rad,
@@ -150,15 +171,9 @@ def _settled(found: Layout, phase: np.ndarray, reason: np.ndarray) -> np.ndarray
         limits.LONELY_NEIGHBOURS,
         *border_rad(found),
     )
-    other = np.empty_like(phase)
-    if rules.plain:
-        kernels_spikes.repair(phase, rules, other)
-        phase, other = other, phase
-    kernels_spikes.settle(phase, reason, rules, other)
-    return other
 
 
-def _waves(shift: Shift, sign: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def waves(shift: Shift, sign: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frame indices of a period by step, and the cosines and sines that they are weighed with."""
     angle = 2 * np.pi * np.arange(len(shift.indices)) / len(shift.indices)
     return (

@@ -17,6 +17,8 @@ VALID, DARK, SATURATED, INCONSISTENT = (
 )
 TWO_PI = 2 * np.pi
 PER_TURN = np.float32(1 / TWO_PI)
+RUN = 32
+"""Pixels that are passed over together where none of them is doubtful."""
 
 
 class Scale(NamedTuple):
@@ -125,15 +127,14 @@ def bit_height(stack, frames, inverses, bit, row, x, threshold):
 def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom):
     """One row's binary code, the least distance of a bit from its threshold, and the highest and lowest bit."""
     width = stack.shape[2]
-    digit = np.zeros(width, np.int32)
-    for x in range(width):
-        code[x] = 0
-        least[x] = np.float32(np.inf)
-        top[x] = bottom[x] = np.float32(0)
-    for b in range(len(frames)):
-        frame = stack[frames[b], row]
-        if len(inverses):
-            inverse = stack[inverses[b], row]
+    if len(inverses):
+        digit = np.zeros(width, np.int32)
+        for x in range(width):
+            code[x] = 0
+            least[x] = np.float32(np.inf)
+            top[x] = bottom[x] = np.float32(0)
+        for b in range(len(frames)):
+            frame, inverse = stack[frames[b], row], stack[inverses[b], row]
             for x in range(width):
                 height = (np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
                 digit[x] ^= np.int32(height > 0)
@@ -141,14 +142,45 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom):
                 least[x] = min(least[x], abs(height))
                 top[x] = max(top[x], height)
                 bottom[x] = min(bottom[x], height)
-        else:
+        return
+    # Against one threshold the frames' own numbers can be compared: four times as many fit a register.
+    grey = stack.dtype.type
+    full = grey(65535 if stack.itemsize == 2 else 255)
+    level, bits = np.empty(width, stack.dtype), np.empty(width, np.uint8)
+    over_least, under_most = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
+    most, fewest = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
+    for x in range(width):
+        level[x] = grey(np.int32(threshold[x]))
+        over_least[x] = fewest[x] = full
+        under_most[x] = most[x] = grey(0)
+        code[x] = 0
+    for start in range(0, len(frames), 8):
+        last = min(start + 8, len(frames))
+        for x in range(width):
+            bits[x] = 0
+        for b in range(start, last):
+            frame = stack[frames[b], row]
             for x in range(width):
-                height = np.float32(frame[x]) - threshold[x]
-                digit[x] ^= np.int32(height > 0)
-                code[x] = 2 * code[x] + digit[x]
-                least[x] = min(least[x], abs(height))
-                top[x] = max(top[x], height)
-                bottom[x] = min(bottom[x], height)
+                over = frame[x] > level[x]
+                bits[x] = (bits[x] << 1) | np.uint8(over)
+                over_least[x] = min(over_least[x], frame[x] if over else full)
+                under_most[x] = max(under_most[x], grey(0) if over else frame[x])
+                most[x] = max(most[x], frame[x])
+                fewest[x] = min(fewest[x], frame[x])
+        for x in range(width):  # each binary digit is the parity of all Gray bits down to it
+            bits[x] ^= bits[x] >> 1
+            bits[x] ^= bits[x] >> 2
+            bits[x] ^= bits[x] >> 4
+        turned, more = np.int32((1 << (last - start)) - 1), np.int32(1 << (last - start))
+        for x in range(width):
+            code[x] = code[x] * more + (np.int32(bits[x]) ^ (turned * (code[x] & np.int32(1))))
+    none = np.float32(np.inf)
+    for x in range(width):
+        above = np.float32(over_least[x]) - threshold[x] if most[x] > level[x] else none
+        below = threshold[x] - np.float32(under_most[x]) if fewest[x] <= level[x] else none
+        least[x] = min(above, below)
+        top[x] = max(np.float32(0), np.float32(most[x]) - threshold[x])
+        bottom[x] = min(np.float32(0), np.float32(fewest[x]) - threshold[x])
 
 
 @numba.njit
@@ -171,6 +203,64 @@ def misread(stack, frames, inverses, row, x, threshold, contrast, code, part, ru
     if part < np.float32(0.5):
         return 1 if upper < weak and upper < weaker * lower else 0
     return -1 if lower < weak and lower < weaker * upper else 0
+
+
+@numba.njit(inline="always")
+def coded_row(
+    stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak,
+    code, least, top, bottom, contrast, doubtful, phase, reason,
+):  # fmt: skip
+    """One row's absolute phase and reason from what ``shift_row`` left; ``code`` ... ``doubtful`` (w,) are room."""
+    width = stack.shape[2]
+    code_row(stack, gray, inverse, row, A, code, least, top, bottom)
+    origin, undecided = np.float32(rules.origin_turns), np.float32(rules.undecided)
+    edge, far_edge = np.float32(rules.edge), np.float32(1 - rules.edge)
+    mean, over = np.float32(rules.mean), np.float32(1) - np.float32(rules.mean)
+    reach = np.float32(abs(0.5 - rules.mean) + rules.weak / 2)
+    if complementary >= 0:
+        extra = stack[complementary, row]
+        for x in range(width):
+            turns = psi[x] * PER_TURN - origin
+            whole = np.floor(turns)
+            part = turns - whole
+            last = np.float32(extra[x]) - A[x]
+            half = 2 * code[x] + ((code[x] & 1) ^ np.int32(last > 0))
+            middle = (part >= np.float32(0.25)) & (part < np.float32(0.75))
+            beside = ((half + 1) >> 1) - np.int32(part >= np.float32(0.75))
+            order = half >> 1 if middle else beside
+            unclear = (least[x] if middle else abs(last)) < undecided * B[x]
+            dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
+            reason[x] = verdict(dark, clipped, unclear)
+            absolute = np.float32(psi[x] + TWO_PI * (order - whole))
+            phase[x] = np.float32(np.nan) if dark | clipped | unclear else absolute
+    else:
+        for x in range(width):
+            turns = psi[x] * PER_TURN - origin
+            whole = np.floor(turns)
+            part = turns - whole
+            beside = (part < edge) | (part >= far_edge)
+            unclear = (least[x] < undecided * B[x]) & (not beside)
+            dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
+            reason[x] = verdict(dark, clipped, unclear)
+            absolute = np.float32(psi[x] + TWO_PI * (code[x] - whole))
+            phase[x] = np.float32(np.nan) if dark | clipped | unclear else absolute
+            contrast[x] = max(np.divide(top[x], over), np.divide(-bottom[x], mean))
+            doubtful[x] = beside & (least[x] < reach * contrast[x]) & (not (dark | clipped | unclear))
+        for first in range(0, width, RUN):
+            some = False
+            for x in range(first, min(first + RUN, width)):
+                some |= doubtful[x]
+            if not some:
+                continue
+            for x in range(first, min(first + RUN, width)):  # the few pixels on a blurred edge
+                if not doubtful[x]:
+                    continue
+                turns = psi[x] * PER_TURN - origin
+                whole = np.floor(turns)
+                order = code[x] + misread(
+                    stack, gray, inverse, row, x, A[x], contrast[x], code[x], turns - whole, rules
+                )
+                phase[x] = np.float32(psi[x] + TWO_PI * (order - whole))
 
 
 @kernel(parallel=True)
@@ -201,45 +291,7 @@ def decode_coded(
         top, bottom, contrast = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
         psi, B, A = wrapped[row], modulation[row], background[row]
         shift_row(stack, shift, cosines, sines, row, psi, B, A, peak)
-        code_row(stack, gray, inverse, row, A, code, least, top, bottom)
-        origin, undecided = np.float32(rules.origin_turns), np.float32(rules.undecided)
-        edge, far_edge = np.float32(rules.edge), np.float32(1 - rules.edge)
-        mean, over = np.float32(rules.mean), np.float32(1) - np.float32(rules.mean)
-        reach = np.float32(abs(0.5 - rules.mean) + rules.weak / 2)
-        if complementary >= 0:
-            extra = stack[complementary, row]
-            for x in range(width):
-                turns = psi[x] * PER_TURN - origin
-                whole = np.floor(turns)
-                part = turns - whole
-                last = np.float32(extra[x]) - A[x]
-                half = 2 * code[x] + ((code[x] & 1) ^ np.int32(last > 0))
-                middle = (part >= np.float32(0.25)) & (part < np.float32(0.75))
-                beside = ((half + 1) >> 1) - np.int32(part >= np.float32(0.75))
-                order = half >> 1 if middle else beside
-                unclear = (least[x] if middle else abs(last)) < undecided * B[x]
-                dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
-                reason[row, x] = verdict(dark, clipped, unclear)
-                absolute = np.float32(psi[x] + TWO_PI * (order - whole))
-                phase[row, x] = np.float32(np.nan) if dark | clipped | unclear else absolute
-        else:
-            for x in range(width):
-                turns = psi[x] * PER_TURN - origin
-                whole = np.floor(turns)
-                part = turns - whole
-                beside = (part < edge) | (part >= far_edge)
-                unclear = (least[x] < undecided * B[x]) & (not beside)
-                dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
-                reason[row, x] = verdict(dark, clipped, unclear)
-                absolute = np.float32(psi[x] + TWO_PI * (code[x] - whole))
-                phase[row, x] = np.float32(np.nan) if dark | clipped | unclear else absolute
-                contrast[x] = max(np.divide(top[x], over), np.divide(-bottom[x], mean))
-                doubtful[x] = beside & (least[x] < reach * contrast[x])
-            for x in range(width):  # the few pixels on a blurred edge
-                if doubtful[x] and reason[row, x] == VALID:
-                    turns = psi[x] * PER_TURN - origin
-                    whole = np.floor(turns)
-                    order = code[x] + misread(
-                        stack, gray, inverse, row, x, A[x], contrast[x], code[x], turns - whole, rules
-                    )
-                    phase[row, x] = np.float32(psi[x] + TWO_PI * (order - whole))
+        coded_row(
+            stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak,
+            code, least, top, bottom, contrast, doubtful, phase[row], reason[row],
+        )  # fmt: skip

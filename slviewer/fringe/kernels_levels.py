@@ -22,29 +22,55 @@ def decode_shift(stack, shift, cosines, sines, scale, wrapped, modulation, backg
             clipped[row, x] |= is_clipped(B[x], A[x], peak[x], scale)
 
 
+@numba.njit(inline="always")
+def levels_row(psi, weights, periods, low, misfit, B, A, clipped, scale, coordinate, order, own, worst, phase, reason):
+    """One row's absolute phase and reason from its (m, w) wrapped phases; ``coordinate`` ... ``worst`` (w,) are room.
+
+    ``B`` is the weakest modulation. Loops run along the row, which the compiler turns into vector instructions.
+    """
+    count, width = psi.shape
+    for x in range(width):
+        worst[x] = 0.0
+    for level in range(len(periods)):
+        period = periods[level]
+        per_px, per_rad = 1.0 / period, period / TWO_PI
+        for x in range(width):
+            own[x] = 0.0
+        for i in range(count):
+            weight = weights[level, i]
+            if weight != 0.0:
+                for x in range(width):
+                    own[x] += weight * np.float64(psi[i, x])
+        if level == 0:
+            for x in range(width):
+                position = own[x] * per_rad
+                order[x] = -np.floor((position - low) * per_px)
+                coordinate[x] = position + order[x] * period
+        else:
+            for x in range(width):
+                position = own[x] * per_rad
+                turns = (coordinate[x] - position) * per_px
+                order[x] = np.rint(turns)
+                worst[x] = max(worst[x], abs(turns - order[x]))
+                coordinate[x] = position + order[x] * period
+    for x in range(width):
+        dark, unclear = is_dark(B[x], A[x], scale), worst[x] > misfit
+        reason[x] = verdict(dark, clipped[x], unclear)
+        absolute = np.float32(psi[count - 1, x] + TWO_PI * order[x])
+        phase[x] = np.float32(np.nan) if dark | clipped[x] | unclear else absolute
+
+
 @kernel(parallel=True)
 def unwrap_levels(wrapped, weights, periods, low, misfit, background, weakest, clipped, scale, phase, reason):
     """Absolute phase of the finest period from (m, h, w) ``wrapped`` phases, longest period first.
 
     ``weights`` (levels, m) and ``periods`` (levels,) px describe the levels; ``low`` px is where the first is cut.
     """
-    count, height, width = wrapped.shape
+    _, height, width = wrapped.shape
     for row in numba.prange(height):
-        for x in range(width):
-            coordinate, order, worst = 0.0, 0.0, 0.0
-            for level in range(len(periods)):
-                angle = 0.0
-                for i in range(count):
-                    angle += weights[level, i] * np.float64(wrapped[i, row, x])
-                own = angle * (periods[level] / TWO_PI)
-                if level == 0:
-                    order = -np.floor((own - low) / periods[level])
-                else:
-                    turns = (coordinate - own) / periods[level]
-                    order = np.rint(turns)
-                    worst = max(worst, abs(turns - order))
-                coordinate = own + order * periods[level]
-            dark, unclear = is_dark(weakest[row, x], background[row, x], scale), worst > misfit
-            reason[row, x] = verdict(dark, clipped[row, x], unclear)
-            absolute = np.float32(wrapped[count - 1, row, x] + TWO_PI * order)
-            phase[row, x] = np.float32(np.nan) if dark | clipped[row, x] | unclear else absolute
+        coordinate, order = np.empty(width, np.float64), np.empty(width, np.float64)
+        own, worst = np.empty(width, np.float64), np.empty(width, np.float64)
+        levels_row(
+            wrapped[:, row], weights, periods, low, misfit, weakest[row], background[row], clipped[row], scale,
+            coordinate, order, own, worst, phase[row], reason[row],
+        )  # fmt: skip

@@ -1,0 +1,223 @@
+"""From frames to a cloud in one pass over them, as fast as memory allows: for live scanning and for many captures."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from slviewer.calibration.pixelwise import REACH, PixelwiseModel
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import InputError
+from slviewer.fringe import limits
+from slviewer.fringe.decode import code_rules, grey_scale, spike_rules, waves
+from slviewer.fringe.layout import Layout, check_stack, clip_level, layout, white_level
+from slviewer.fringe.noise import measure_noise
+from slviewer.fringe.reference import found_levels, lowest_coordinate
+from slviewer.fringe.reference_spikes import is_plain
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.threshold import MIDDLE, fringe_mean
+from slviewer.reconstruction import onepass_kernels as kernels
+from slviewer.reconstruction import onepass_spikes as spikes
+from slviewer.reconstruction.cloud import Cloud
+
+
+@dataclass(frozen=True)
+class Light:
+    """What a rig's frames say about themselves: ``noise`` (a, b) and ``mean`` as `measure_noise` and `fringe_mean`
+    have them, and the grey level ``white`` at which the camera clips. It changes when the camera is set anew."""
+
+    noise: tuple[float, float]
+    mean: float
+    white: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What one pass leaves on the camera's grid; the next pass into the same arrays writes over it.
+
+    ``points`` (h, w, 3) float32 mm, NaN where invalid; ``phase`` (h, w) float32 rad, absolute, NaN where ``reason``
+    (uint8, a `fringe.phase.Reason`) is not VALID; ``sigma_z`` float32 mm, the depth's noise where there is a phase;
+    ``modulation`` float32 grey levels; ``texture`` of the frames' dtype: the scene under white light. ``light`` is what
+    the pixels were judged by.
+    """
+
+    axis: Axis
+    model: str
+    points: np.ndarray
+    phase: np.ndarray
+    reason: np.ndarray
+    sigma_z: np.ndarray
+    modulation: np.ndarray
+    texture: np.ndarray
+    light: Light
+
+    def cloud(self) -> Cloud:
+        """The organised cloud; it shares this scan's arrays."""
+        return Cloud(self.points, self.axis, self.model, self.sigma_z, self.texture)
+
+
+@dataclass(eq=False)
+class OnePass:
+    """One rig and sequence, made ready: frames of one axis become a cloud by a pixelwise or a splined calibration.
+
+    The results are those of `fringe.decode.decode` and the model's ``points``. Raises InputError for other models, an
+    axis that sequence or model lacks, and Gray code without phase steps.
+    """
+
+    sequence: PatternSequence
+    model: PixelwiseModel | SplinedModel
+    axis: Axis
+    _layout: Layout = field(init=False, repr=False)
+    _order: kernels.Order = field(init=False, repr=False)
+    _ladder: kernels.Ladder = field(init=False, repr=False)
+    _depths: kernels.Depths = field(init=False, repr=False)
+    _lists: tuple[np.ndarray, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._layout = layout(self.sequence, self.axis)
+        if not self._layout.shifts:
+            raise InputError("Gray code without phase steps is not measured in one pass: decode and reconstruct it")
+        if self.axis not in self.model.axes:
+            raise InputError(f"The {self.model.name} calibration has no axis {self.axis}: choose another axis.")
+        if isinstance(self.model, PixelwiseModel):
+            self._depths = _pixelwise(self.model, self.axis, self._layout.period_px)
+        elif isinstance(self.model, SplinedModel):
+            self._depths = _splined(self.model, self.axis, self._layout.period_px)
+        else:
+            raise InputError(
+                f"A {self.model.name} calibration measures no cloud in one pass: use the pixelwise or the splined one."
+            )
+        self._order = _order(self.sequence, self._layout)
+        self._ladder = _ladder(self._layout)
+        height, width = self.shape
+        self._lists = np.empty((height, width), np.uint16), np.empty((height, width), np.uint8), np.empty(height, int)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(h, w) of the frames that the calibration belongs to."""
+        _, height, width = self._depths.c.shape
+        return height, width
+
+    def light(self, frames: np.ndarray) -> Light:
+        """What the frames (n, h, w) say about camera and light, from a sample of their pixels; of uint16 frames the
+        largest grey level is sought in all of them."""
+        self._check(frames)
+        white = white_level(frames, self.sequence.select(self.axis))
+        mean = fringe_mean(self._layout, frames) if is_plain(self._layout) else MIDDLE
+        return Light(measure_noise(self._layout, frames, white), mean, white)
+
+    def run(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
+        """The scan of frames (n, h, w) uint8 or uint16, spikes mended.
+
+        ``light``: of earlier frames of the same rig; None measures it from these. ``out``: an earlier scan of frames
+        like these, whose arrays are used again; None makes new ones.
+        """
+        scan = self.sweep(frames, light, out)
+        self.mend(scan)
+        return scan
+
+    def sweep(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
+        """The first pass: every pixel by itself; each frame is read once."""
+        self._check(frames)
+        frames = np.ascontiguousarray(frames)
+        light = light or self.light(frames)
+        scan = self._room(frames.dtype, light) if out is None else replace(out, light=light)
+        if scan.texture.dtype != frames.dtype or scan.points.shape[:2] != self.shape:
+            raise InputError("The arrays to write into belong to other frames: leave them out, and new ones are made.")
+        deep = frames.dtype == np.uint16
+        peaks = np.zeros(-(-self.shape[0] // kernels.ROWS) if deep else 0, np.int32)
+        kernels.sweep(
+            frames,
+            self._order,
+            self._ladder,
+            code_rules(self._layout, light.mean),
+            grey_scale(self._layout, light.noise, light.white),
+            self._depths,
+            _maps(scan),
+            peaks,
+        )
+        if deep and clip_level(frames.dtype, int(peaks.max())) > light.white:  # a camera of more bits than it seemed
+            return self.sweep(frames, self.light(frames), scan)
+        return scan
+
+    def mend(self, scan: Scan) -> None:
+        """The second pass, over few pixels: spikes of one period are moved, lonely and outside pixels masked."""
+        rules, maps = spike_rules(self._layout), _maps(scan)
+        if rules.plain:
+            spikes.find(scan.phase, rules, False, *self._lists)
+            spikes.move(*self._lists, self._depths, maps)
+        spikes.find(scan.phase, rules, True, *self._lists)
+        spikes.refuse(*self._lists, maps)
+
+    def _check(self, frames: np.ndarray) -> None:
+        check_stack(self.sequence, frames)
+        if frames.shape[1:] != self.shape:
+            height, width = self.shape
+            raise InputError(
+                f"Frames of {frames.shape[2]}x{frames.shape[1]} px were given, and the camera was calibrated at "
+                f"{width}x{height}: use captures of the same camera, at the same resolution and without cropping."
+            )
+
+    def _room(self, dtype: np.dtype, light: Light) -> Scan:
+        phase, sigma_z, modulation = (np.empty(self.shape, np.float32) for _ in range(3))
+        points, reason = np.empty((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
+        texture = np.empty(self.shape, dtype)
+        return Scan(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, texture, light)
+
+
+def _maps(scan: Scan) -> kernels.Maps:
+    return kernels.Maps(scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture)
+
+
+def _order(sequence: PatternSequence, found: Layout) -> kernels.Order:
+    turned = [waves(shift, found.sign) for shift in found.shifts]
+    frames, cosines, sines = (np.concatenate(parts) for parts in zip(*turned, strict=True))
+    read = {*frames.tolist(), *found.gray, *found.inverse}
+    kinds = [frame.kind for frame in sequence.frames]
+    return kernels.Order(
+        frames,
+        np.cumsum([0, *(len(shift.indices) for shift in found.shifts)]),
+        cosines,
+        sines,
+        np.array(found.gray, np.int64),
+        np.array(found.inverse, np.int64),
+        -1 if found.complementary is None else found.complementary,
+        next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), -1),
+        np.array([i for i in sequence.select(found.axis) if i not in read], np.int64),
+    )
+
+
+def _ladder(found: Layout) -> kernels.Ladder:
+    if found.gray:
+        return kernels.Ladder(np.zeros((0, 0)), np.zeros(0), 0.0, 0.0)
+    levels = found_levels(found)
+    return kernels.Ladder(
+        np.array([level.weights for level in levels], np.float64),
+        np.array([level.period_px for level in levels], np.float64),
+        lowest_coordinate(levels[0].period_px, found.extent),
+        limits.LEVEL_MISFIT,
+    )
+
+
+def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.Depths:
+    """Coefficients about the middle of all phases, where float32 holds depths to some 1e-5 mm."""
+    fit = model.fits[axis]
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        low, high = fit.phase_min.astype(float), fit.phase_max.astype(float)
+        seen = np.isfinite(low) & np.isfinite(high)
+        middle = float(np.median(0.5 * (low + high)[seen])) if seen.any() else 0.0
+        margin = REACH * (high - low)
+        bounds = np.stack([low - margin - middle, high + margin - middle]).astype(np.float32)
+        c0, c1, c2, c3, c4 = fit.coefficients
+        scale = 1 + c2 * middle
+        c = np.stack([(c0 + c1 * middle) / scale, c1 / scale, c2 / scale, c3, c4]).astype(np.float32)
+    grid = np.empty((0, 0, 0), np.float32)
+    return kernels.Depths(c, period_px / model.periods_px[axis], middle, bounds, grid, 1, 0.0, 0.0)
+
+
+def _splined(model: SplinedModel, axis: Axis, period_px: float) -> kernels.Depths:
+    """The compiled form; pixels that look where no target pose was are masked."""
+    fast = model.compiled(axis)
+    c = np.concatenate([fast.coefficients, model.rays.astype(np.float32)])
+    per_mm = (fast.held.shape[2] - 1) / (fast.far - fast.near)
+    bounds = np.empty((0, 0, 0), np.float32)
+    return kernels.Depths(c, period_px / (2 * np.pi), fast.centre, bounds, fast.held, fast.step, fast.near, per_mm)
