@@ -55,14 +55,25 @@ def inspect(session: Positional[Path]) -> None:
 
 
 @deferred
-def bench(calibration: bool = False, scale: float = 1.0, json: Path | None = None) -> None:
+def bench(
+    calibration: bool = False, live: bool = False, minutes: float = 0.5, scale: float = 1.0, json: Path | None = None
+) -> None:
     """Time the main stages on this machine, beside what they cannot beat.
 
     Args:
         calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full size).
+        live: Also scan live, at half the resolution, with one viewer that draws and one that stalls.
+        minutes: How long.
         scale: Resolution of the camera, as a share of 1600x1200.
         json: Write the figures to this file too.
     """
     result = workflow.bench(calibration=calibration, scale=scale, progress=terminal.progress)
-    write_json(json, result.to_json())
     print(result.text())
+    figures = result.to_json()
+    if live:
+        from slviewer.gui.live_rate import live_rate
+
+        streamed = live_rate(0.5 * scale, 60 * minutes, terminal.progress)
+        print(streamed.text())
+        figures["live"] = streamed.to_json()
+    write_json(json, figures)

