@@ -84,6 +84,30 @@ def test_a_calibration_shows_its_poses_and_what_a_pixel_learnt(measured: tuple[P
     assert errors == []
 
 
+def test_models_are_compared_on_request_and_the_comparison_can_be_cancelled(
+    measured: tuple[Page, Operator, list[str]],
+) -> None:
+    page, engine, errors = measured
+    button(page, "4. Calibrate").click()
+    button(page, "Compare models").click()
+    again = button(page, "Compare models again")
+    expect(again).to_be_enabled(timeout=90_000)
+    expect(page.get_by_text("pixelwise is recommended").first).to_be_visible()
+    session = engine.snapshot().session
+    assert session is not None and session.calibration is not None
+    compared = session.calibration.comparison
+    assert compared is not None and compared.poses == 8 and not compared.failed
+    rms = {each.model: each.plane_mm for each in compared.models}
+    assert 0.01 < rms["pixelwise"] < rms["stereo"] < 1
+
+    again.click()
+    button(page, "Cancel").click()
+    expect(page.get_by_text("Comparing the models: cancelled").first).to_be_visible()
+    expect(again).to_be_enabled()
+    assert engine.settle().session.calibration.comparison == compared  # type: ignore[union-attr]
+    assert errors == []
+
+
 def test_a_plane_is_measured_and_its_table_written(measured: tuple[Page, Operator, list[str]]) -> None:
     page, _, errors = measured
     button(page, "5. Verify").click()
