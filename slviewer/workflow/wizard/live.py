@@ -14,17 +14,15 @@ import numpy as np
 
 from slviewer.devices.capture import Taken
 from slviewer.errors import InputError
-from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.reconstruction.reconstruct import Model
 from slviewer.session.store import Session
 from slviewer.workflow.capturing import keep
 from slviewer.workflow.models import check_accepted, insisted, load_model, preferred
 from slviewer.workflow.scaling import scale_factor
 from slviewer.workflow.wizard.engine import Engine
 from slviewer.workflow.wizard.live_frames import Shot, Stream
-from slviewer.workflow.wizard.live_motion import hide_moved
+from slviewer.workflow.wizard.live_measuring import Measuring
 from slviewer.workflow.wizard.snapshot import LiveView
 from slviewer.workflow.wizard.taking import check_space, depth_axis, next_name
 
@@ -61,7 +59,7 @@ class Live:
 
     def start(self) -> None:
         """Begin. Raises DeviceError where the rig cannot, SlviewerError where the session has no calibration to use."""
-        self._model = Calibrated(self._store, self.axis)
+        self._model = Calibrated(self._store, self.stream.sequence, self.axis)
         self._engine.acquisition.stream(self.stream)
         self._thread.start()
 
@@ -113,7 +111,7 @@ class Live:
 
     def _cloud(self, shot: Shot) -> LiveCloud:
         assert self._model is not None
-        points, texture = cloud_of(self.stream.sequence, shot.frames, self._model.current())
+        points, texture = self._model.current().cloud(shot.frames)
         self._number += 1
         self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
         return LiveCloud(self._number, points, texture, shot.begun)
@@ -122,31 +120,22 @@ class Live:
         self._engine.teller.changed()
 
 
-@dataclass(frozen=True, eq=False)
-class Scaled:
-    """A calibration, the axis that depth is taken from, and the scale that was applied to it."""
-
-    model: Model
-    axis: Axis
-    factor: float
-
-
 class Calibrated:
     """The calibration that the session uses, also when it becomes another one meanwhile."""
 
-    def __init__(self, store: Session, axis: Axis) -> None:
-        self._store, self._axis = store, axis
+    def __init__(self, store: Session, sequence: PatternSequence, axis: Axis) -> None:
+        self._store, self._sequence, self._axis = store, sequence, axis
         self._key: tuple[object, ...] = ()
         self._looked = 0.0
         self._current = self._load()
 
-    def current(self) -> Scaled:
+    def current(self) -> Measuring:
         """As it is now, or was up to a second ago. Raises SlviewerError where there is none to use any more."""
         if time.monotonic() - self._looked > _LOOK_S:
             self._current = self._load()
         return self._current
 
-    def _load(self) -> Scaled:
+    def _load(self) -> Measuring:
         store = self._store
         self._looked = time.monotonic()
         name = preferred(store)
@@ -161,20 +150,7 @@ class Calibrated:
                 f"the {name} calibration has no axis {self._axis}, which a live scan needs: capture a scan"
             )
         self._key = key
-        return Scaled(model, self._axis, factor)
-
-
-def cloud_of(sequence: PatternSequence, frames: np.ndarray, calibrated: Scaled) -> tuple[np.ndarray, np.ndarray]:
-    """(points (h, w, 3) float32 mm, texture (h, w)) of the frames (n, h, w) of a short sequence; both are new arrays.
-
-    As `reconstruct` has them, but that what moved between the frames is NaN too.
-    """
-    phase = decode(sequence, frames, calibrated.axis)
-    points = calibrated.model.points(phase)
-    hide_moved(sequence, frames, phase.axis, phase.phase, phase.modulation, phase.noise, points)
-    if calibrated.factor != 1.0:
-        points *= np.float32(calibrated.factor)
-    return points, frames[-1].copy()
+        return Measuring(self._sequence, self._axis, model, factor)
 
 
 def start_live(engine: Engine) -> None:

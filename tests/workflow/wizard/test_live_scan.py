@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.devices.faults import Faults, breakable
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.simulated import simulated_rig
@@ -21,8 +22,9 @@ from slviewer.target.board import Board
 from slviewer.workflow.decoding import decode_capture
 from slviewer.workflow.models import load_stereo, save_imported_stereo
 from slviewer.workflow.wizard import acquisition
-from slviewer.workflow.wizard.live import LiveCloud, Scaled, cloud_of
+from slviewer.workflow.wizard.live import LiveCloud
 from slviewer.workflow.wizard.live_frames import Stream
+from slviewer.workflow.wizard.live_measuring import Measuring
 from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.rigs import Bench, Choice, set_up
 
@@ -101,7 +103,7 @@ def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> Non
     assert len(kept.sequence.frames) == 11 and kept.sequence.axes == ("x",)
     model = load_stereo(store)
     normal = model.points(decode_capture(kept)["x"])
-    points, _ = cloud_of(kept.sequence, kept.stack(), Scaled(model, "x", 1.0))
+    points, _ = Measuring(kept.sequence, "x", model).cloud(kept.stack())
     both = np.isfinite(points[..., 2])
     np.testing.assert_array_equal(points[both], normal[both])
     assert both.sum() > 0.97 * np.isfinite(normal[..., 2]).sum()  # nothing moved
@@ -199,8 +201,33 @@ def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
         def sigma_z(self, phase, points):
             return points[..., 2]
 
-    still, moved = (cloud_of(sequence, each, Scaled(Depth(), "x", 1.0))[0][..., 2] for each in (frames, late))
+    still, moved = (Measuring(sequence, "x", Depth()).cloud(each)[0][..., 2] for each in (frames, late))
     assert np.isfinite(still).sum() > 0.95 * phases[0].mask.sum() > 1000
     wrong = np.abs(phases[1].phase - phases[0].phase) > 0.5
     assert wrong[moving[1:]].sum() > 200
     assert np.isfinite(moved[wrong]).mean() < 0.1
+
+
+def test_one_pass_gives_what_decoding_and_reconstructing_give() -> None:
+    world = SimulatedWorld(letter(0.15))
+    world.place("object")
+    sequence = short(world.rig.projector.size, "x")
+    renderer, shape = world.renderer(False), (180, 240)
+    low, high, ones = np.zeros(shape, np.float32), np.full(shape, 400, np.float32), np.ones(shape, np.float32)
+    terms = [np.full(shape, value) for value in (900.0, -1.0, -9e-4, 0.1, 0.05)]
+    fit = PixelFit(np.stack(terms), np.stack([ones] * 3), np.full(shape, 20, np.uint16), low, high, ones)
+    model = PixelwiseModel({"x": fit}, {"x": 18.0}, {}, "x")
+    measuring = Measuring(sequence, "x", model, factor=1.5)
+    clouds = []
+    for seed in (1, 2):
+        frames = renderer.capture(sequence, seed)
+        normal = 1.5 * model.points(decode(sequence, frames, "x"))
+        points, texture = measuring.cloud(frames)
+        clouds.append((points, points.copy(), texture))
+        both = np.isfinite(points[..., 2])
+        assert both.sum() > 0.95 * np.isfinite(normal[..., 2]).sum() > 3000
+        assert not np.isfinite(points[~np.isfinite(normal[..., 2])]).any()
+        np.testing.assert_allclose(points[both], normal[both], rtol=1e-5)
+        np.testing.assert_array_equal(texture, frames[-1])
+    assert clouds[0][0] is not clouds[1][0]
+    np.testing.assert_array_equal(clouds[0][0], clouds[0][1])  # the second was written elsewhere
