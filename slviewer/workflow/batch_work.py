@@ -1,6 +1,7 @@
 """What a worker of a batch is asked to do: the commands' own functions, on one capture at a time."""
 
 import json
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +20,10 @@ from slviewer.workflow.reconstructing import reconstruct
 from slviewer.workflow.verifying import Shape, Verification, verify
 
 Do = Literal["reconstruct", "verify", "mesh"]
+
+_ONE = threading.Lock()
+"""A process works on one capture at a time, however many threads its worker has: the kernels use its cores already, and
+each capture more would need as much memory again."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ def worked(address: str, capture: str, task: Task) -> Done:
     started = time.perf_counter()
     try:
         _check(task.version)
-        with at_hand(address, capture) as folder, Session.open(folder) as store:
+        with at_hand(address, capture) as folder, _ONE, Session.open(folder) as store:
             done = _verified(store, capture, task, warnings) if task.do == "verify" else None
             if done is None:
                 with delivered(address, task.batch) as made:

@@ -23,6 +23,14 @@ PATIENCE_S = 10.0
 BYTES_PER_WORKER = 3 << 30
 """What reconstructing a capture of two megapixels may need, with every calibration loaded."""
 
+_DEAF = """
+import signal
+
+def dask_setup(worker):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+"""
+"""A terminal's Ctrl-C reaches workers too: they leave it to the process that started them, which ends them."""
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -179,7 +187,8 @@ def _own(most: int) -> Iterator[Any]:
             n_workers=workers,
             threads_per_worker=1,
             memory_limit=MEMORY_LIMIT // workers,
-            dashboard_address=None,
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+            preload=_DEAF,
             security=True,  # whoever reaches a scheduler runs what they like as its user; others share this machine
             silence_logs="ERROR",
         ) as cluster,

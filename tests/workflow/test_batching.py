@@ -169,11 +169,9 @@ def test_a_killed_worker_costs_a_retry(session: Path, alone: dict[str, bytes], c
     assert len(read_ply(session / "exports" / "plane_03_stereo_mesh.ply").faces) > 10_000
 
 
-def test_workers_of_its_own(session: Path, alone: dict[str, bytes], tmp_path: Path) -> None:
-    """As a user starts it, and the processes are gone when it ends."""
-    arguments = ["batch", str(session), "--do", "reconstruct", "--captures", "plane_03"]
-    done = subprocess.run([sys.executable, "-m", "slviewer.cli", *arguments], capture_output=True, text=True)
-    assert done.returncode == 0 and "1 captures done, 0 failed" in done.stdout, done.stderr
+def test_workers_of_its_own(session: Path, alone: dict[str, bytes], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["batch", str(session), "--do", "reconstruct", "--captures", "plane_03"]) == 0
+    assert "1 captures done, 0 failed" in capsys.readouterr().out
     assert made_in(session) == {"plane_03_stereo.ply": alone["plane_03_stereo.ply"]}
 
 
