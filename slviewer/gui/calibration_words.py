@@ -132,6 +132,8 @@ def splined_table(splined: SplinedView) -> Html:
     ]
     if suspect := [f"{name} {min(pair):.2f}" for name, pair in splined.trust.items() if min(pair) < LEAST_TRUST]:
         rows.append((f"poses trusted below {LEAST_TRUST:g}", ", ".join(suspect)))
+    if splined.turned:
+        rows.append(("board turned by 180°, numbered as in the others", ", ".join(splined.turned)))
     note = "Pixels that look where no target pose was are masked."
     return Html(table(("Joint adjustment", ""), rows) + block(toned(note, "dim")))
 

@@ -463,6 +463,7 @@ def _splined(session: Session) -> SplinedView:
         lit=found["cells_lit"],
         left_out=found["left_out"],
         trust={name: (fit.camera_trust, fit.projector_trust) for name, fit in fits.items()},
+        turned=model.bundle.turned,
     )
 
 

@@ -98,7 +98,7 @@ class SplinedView:
     """What the joint adjustment found: residual noise px of the camera and along the projector's x and y, each device's
     local distortion px RMS, the board's lowest and highest place and its features' misplacement in mm, and the shares
     of both devices' cells that target poses lit. `left_out`: poses that contradict the others, with the reason; `trust`
-    of each pose in camera and projector, 0 ... 1.
+    of each pose in camera and projector, 0 ... 1. `turned`: poses whose board was numbered from its other end.
     """
 
     noise_px: Mapping[str, float]
@@ -108,6 +108,7 @@ class SplinedView:
     lit: Mapping[str, float]
     left_out: Mapping[str, str]
     trust: Mapping[str, tuple[float, float]]
+    turned: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

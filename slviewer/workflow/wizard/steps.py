@@ -142,6 +142,9 @@ def _poses_now(facts: Facts) -> str:
         if foreseen is not None and foreseen.enough:
             reached = f"a predicted sigma of {foreseen.sigma_mm:.3f} mm, where {foreseen.wanted_mm:.3f} mm is wanted"
             return f"{facts.good_poses} good poses reach {reached}: enough. Calibrate."
+        if foreseen is not None and foreseen.sigma_mm is not None:
+            lack = f"a sigma of {foreseen.sigma_mm:.3f} mm is predicted, and {foreseen.wanted_mm:.3f} mm wanted"
+            return f"{facts.good_poses} good poses cover the view; {lack}: add more, or calibrate."
         return f"{facts.good_poses} good poses cover the view: calibrate, or add more."
     suggestion = f"{session.suggestion.sentence}, and capture" if session.suggestion else "Hold the board and capture"
     if session.planning:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.calibration.next_pose import Coverage
-from slviewer.workflow.wizard.snapshot import CalibrationView, PoseView, RigView, SessionView, Space
+from slviewer.workflow.wizard.snapshot import CalibrationView, Foreseen, PoseView, RigView, SessionView, Space
 from slviewer.workflow.wizard.steps import Facts, views
 
 OPEN = RigView(state="open", name="bench", camera=(400, 300), projector=(912, 1140))
@@ -75,3 +75,12 @@ def test_every_step_says_in_one_sentence_what_to_do_and_what_is_wrong() -> None:
         assert all(len(sentence) > 20 and "\n" not in sentence for sentence in view.wrong)
     wrong = " ".join(next(v for v in views(facts) if v.key == "poses").wrong)
     assert "plug it in" in wrong and "free some space" in wrong and "saturated" in wrong and "12 of 336" in wrong
+
+
+def test_poses_that_cover_the_view_may_still_lack_accuracy() -> None:
+    covering = replace(EMPTY, target="circles:9x7:20", poses=poses(10), coverage=COVERED)
+    assert "cover the view: calibrate" in views(Facts(covering, OPEN, None))[2].now
+    lacking = replace(covering, foreseen=Foreseen(0.03, 0.02, 0.024, False))
+    assert "0.030 mm is predicted, and 0.024 mm wanted: add more" in views(Facts(lacking, OPEN, None))[2].now
+    few = replace(lacking, poses=poses(3), coverage=None)
+    assert "Choosing where the board tells most" in views(Facts(replace(few, planning=True), OPEN, None))[2].now
