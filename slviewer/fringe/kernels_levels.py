@@ -66,11 +66,15 @@ def unwrap_levels(wrapped, weights, periods, low, misfit, background, weakest, c
 
     ``weights`` (levels, m) and ``periods`` (levels,) px describe the levels; ``low`` px is where the first is cut.
     """
-    _, height, width = wrapped.shape
+    count, height, width = wrapped.shape
     for row in numba.prange(height):
+        psi = np.empty((count, width), np.float32)  # neighbours in memory, for the vector instructions
+        for i in range(count):
+            for x in range(width):
+                psi[i, x] = wrapped[i, row, x]
         coordinate, order = np.empty(width, np.float64), np.empty(width, np.float64)
         own, worst = np.empty(width, np.float64), np.empty(width, np.float64)
         levels_row(
-            wrapped[:, row], weights, periods, low, misfit, weakest[row], background[row], clipped[row], scale,
+            psi, weights, periods, low, misfit, weakest[row], background[row], clipped[row], scale,
             coordinate, order, own, worst, phase[row], reason[row],
         )  # fmt: skip

@@ -1,107 +1,218 @@
 """How long the main stages take, beside what they cannot beat."""
 
 import resource
-import statistics
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import prange
 
+from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel, calibrate_pixelwise
+from slviewer.calibration.splined.compiled import CELLS_ACROSS, DEPTHS, Compiled
+from slviewer.calibration.splined.model import SplinedModel
 from slviewer.evaluation.render import render
 from slviewer.fringe.decode import decode
-from slviewer.fringe.presets import p18
+from slviewer.fringe.presets import multifrequency, p18
 from slviewer.fringe.reference import decode_reference
-from slviewer.geometry.jit import kernel
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.onepass import OnePass
+from slviewer.reconstruction.ply import write_ply
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
-from slviewer.simulation.rig import letter
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.workflow.benchmarking_floors import beside, median, megabytes, row, through
+from slviewer.workflow.benchmarking_peers import fringes_row, icp_rows, missing
 from slviewer.workflow.calibrating import calibrate
 from slviewer.workflow.feedback import Progress, part, unheard
+from slviewer.workflow.models import load_model, load_stereo
+from slviewer.workflow.opening import opened
+from slviewer.workflow.poses import load_observations
 from slviewer.workflow.simulating import TARGET, one_axis, simulate
+
+PERIOD_PX = 18.0
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Stages as rows: seconds, and the ratio that matters."""
+    """Stages as rows: seconds, and the ratio that matters. ``missing`` says which peers were not there."""
 
-    rows: list[dict[str, Any]]
+    rows: list[Row]
     peak_memory_gb: float | None
+    missing: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """The rows as they are."""
-        return {"stages": self.rows, "peak_memory_gb": self.peak_memory_gb}
+        return {"stages": self.rows, "peak_memory_gb": self.peak_memory_gb, "missing": list(self.missing)}
 
     def text(self) -> str:
         """For people."""
-        lines = [render(self.rows)]
+        lines = [render(self.rows), *self.missing]
         if self.peak_memory_gb is not None:
             lines.append(f"peak memory of the whole run {self.peak_memory_gb:.2f} GB")
         return "\n".join(lines)
 
 
 def bench(*, calibration: bool = False, scale: float = 1.0, progress: Progress = unheard) -> Benchmark:
-    """Time rendering and decoding of one axis of one pose; with ``calibration``, also that of 25 recorded poses."""
+    """Time the stages from a rendered pose to a file, with the peers that are installed; with ``calibration``, also the
+    pixel-wise fit of 25 recorded poses, and all of their calibration."""
     progress(0.0, "rendering a pose")
     rig = letter(scale)
+    plan = letter_plan(rig, poses=3)
     sequence = one_axis(p18(rig.projector.size), "x")
-    renderer = Renderer(rig, next(iter(letter_plan(rig, poses=3).values())))
+    renderer = Renderer(rig, plan["pose_01"])
     frames = renderer.capture(sequence)
-    rendering = _median(lambda: renderer.capture(sequence), 3) / len(frames)
-    progress(0.1, "decoding")
-    coded = frames[:-1]  # without the texture
-    out = np.empty((3, *frames.shape[1:]), np.float32)
-    floor = _median(lambda: _touch(coded, out), 9)
-    fast = _median(lambda: decode(sequence, frames, "x"), 5)
-    defined = _median(lambda: decode_reference(sequence, frames, "x"), 1)
+    rendering = median(lambda: renderer.capture(sequence), 3) / len(frames)
     size = f"{frames.shape[2]}x{frames.shape[1]}"
-    rows: list[dict[str, Any]] = [
-        _row(f"render one frame, {size}", rendering),
-        _row(f"read {len(coded)} frames, write three maps: the floor", floor),
-        _row(f"decode {len(coded)} frames, kernel", fast, fast / floor, defined / fast),
-        _row(f"decode {len(coded)} frames, NumPy definition", defined, defined / floor),
-    ]
+    rows = [row(f"render one frame, {size}", rendering, frames[0].nbytes / 1e6)]
+    progress(0.1, "decoding")
+    rows += _decoding(sequence, frames)
+    progress(0.2, "measuring")
+    rows += _measuring(sequence, frames)
+    progress(0.3, "live")
+    rows += _live(rig, renderer)
+    progress(0.35, "peers")
+    peers, absent = _peers(rig, renderer, plan)
     memory = None
     if calibration:
-        with tempfile.TemporaryDirectory() as folder:
-            session = Path(folder) / "session"
-            simulate(session, scale=scale, progress=part(progress, 0.2, 0.7))
-            start = time.perf_counter()
-            calibrate(session, TARGET, progress=part(progress, 0.7, 1.0))
-            rows.append(_row("calibrate 25 recorded poses, both axes, both models", time.perf_counter() - start))
+        rows += _calibration(scale, part(progress, 0.4, 1.0))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         memory = peak / (1e9 if sys.platform == "darwin" else 1e6)
     progress(1.0, "measured")
-    return Benchmark(rows, memory)
+    return Benchmark(rows + peers, memory, absent)
 
 
-def _row(stage: str, seconds: float, to_floor: float | None = None, faster: float | None = None) -> dict[str, Any]:
-    return {"stage": stage, "ms": 1e3 * seconds, "ratio to floor": to_floor, "ratio NumPy / kernel": faster}
+def _decoding(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
+    coded = frames[:-1]  # without the texture
+    fast, moved, least = _beside_floor(lambda: decode(sequence, frames, "x"), coded, 0, (1, 4, 0))
+    defined = median(lambda: decode_reference(sequence, frames, "x"), 1, warm=False)
+    return [
+        row(f"decode {len(coded)} frames, kernels", fast, moved, least, defined),
+        row(f"decode {len(coded)} frames, NumPy definition", defined, moved, least),
+    ]
 
 
-def _median(work: Callable[[], object], times: int) -> float:
-    work()  # compiled, and in the caches
-    taken = []
-    for _ in range(times):
-        start = time.perf_counter()
-        work()
-        taken.append(time.perf_counter() - start)
-    return statistics.median(taken)
+def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
+    """Points from phases, and all in one pass, by both fast models; then a file of them."""
+    rows = []
+    phase = decode(sequence, frames, "x")
+    pixelwise, compiled, rays = _calibrations(frames.shape[1:])
+    fast = {
+        "pixelwise": (13, lambda: pixelwise.points(phase)),  # coefficients of float64 count twice
+        "splined": (6, lambda: compiled.depth(phase.phase, PERIOD_PX / (2 * np.pi), rays, True)),
+    }
+    for name, (numbers, work) in fast.items():
+        seconds, moved, least = _beside_floor(work, frames[:0], numbers, (0, 0, 1))
+        rows.append(row(f"reconstruct from phases, {name}", seconds, moved, least))
+    one = OnePass(sequence, pixelwise, "x")
+    light = one.light(frames)
+    scan = one.run(frames, light)
+    rows.append(_one_pass(one, frames, 7))
+    rows.append(row("second pass, over spikes", median(lambda: one.mend(scan), 9), megabytes(scan.phase)))
+    rows.append(row("noise and fringe mean of a capture, sampled", median(lambda: one.light(frames), 5)))
+    rows.append(_file(scan.cloud()))
+    return rows
 
 
-@kernel(parallel=True)
-def _touch(frames, out):
-    """Reads every byte of frames (n, h, w) once and writes out (3, h, w): no decoder can do less."""
-    for y in prange(frames.shape[1]):
-        for x in range(frames.shape[2]):
-            total = np.int32(0)
-            for k in range(frames.shape[0]):
-                total += frames[k, y, x]
-            out[0, y, x] = total
-            out[1, y, x] = total
-            out[2, y, x] = total
+def _one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
+    """The fused kernel, which reads ``numbers`` float32 of calibration a pixel; nothing new is asked for in it."""
+    light = one.light(frames)
+    scan = one.run(frames, light)
+    seconds, moved, least = _beside_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
+    note = "frames to points, depth noise, modulation and texture"
+    return row(f"one pass over {len(frames)} frames, {one.model.name}", seconds, moved, least, note=note)
+
+
+def _beside_floor(
+    work: Callable[[], object], frames: np.ndarray, numbers: int, written: tuple[int, int, int]
+) -> tuple[float, float, float]:
+    """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as `through` has them."""
+    shape = frames.shape[1:]
+    values = np.zeros((numbers, *shape), np.float32)
+    grey = np.zeros((written[0], *shape), frames.dtype)
+    single, triple = np.zeros((written[1], *shape), np.float32), np.zeros((written[2], *shape, 3), np.float32)
+    seconds, least = beside(work, lambda: through(frames, values, grey, single, triple), 11)
+    return seconds, megabytes(frames, values, grey, single, triple), least
+
+
+def _live(rig: SimulatedRig, renderer: Renderer) -> list[Row]:
+    sequence = one_axis(multifrequency(rig.projector.size, 4), "x")
+    frames = np.ascontiguousarray(renderer.capture(sequence)[: len(sequence.frames)])
+    pixelwise, _, _ = _calibrations(frames.shape[1:])
+    one = OnePass(sequence, pixelwise, "x")
+    scan = one.run(frames)
+    seconds = median(lambda: one.run(frames, scan.light, scan), 15)
+    count = len(frames) - 1
+    return [row(f"live: {count} recorded frames to arrays", seconds, note=f"{1 / seconds:.0f} clouds/s")]
+
+
+def _peers(rig: SimulatedRig, renderer: Renderer, plan: dict[str, Any]) -> tuple[list[Row], tuple[str, ...]]:
+    rows: list[Row] = []
+    absent = tuple(text for text in (missing("fringes"), missing("small-gicp")) if text)
+    if not missing("fringes"):
+        sequence = one_axis(multifrequency(rig.projector.size, 6), "x")
+        frames = renderer.capture(sequence)
+        ours = median(lambda: decode(sequence, frames, "x"), 7)
+        count, size = len(frames) - 1, (frames.shape[2], frames.shape[1])
+        rows += [row(f"decode {count} frames of three periods, kernels", ours), fringes_row(count, size, ours)]
+    if not missing("small-gicp"):
+        truth = Renderer(rig, plan["object_r2"]).truth()
+        rows += icp_rows(truth.points[truth.mask])
+    return rows, absent
+
+
+def _calibration(scale: float, progress: Progress) -> list[Row]:
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder) / "session"
+        simulate(session, scale=scale, progress=part(progress, 0.0, 0.5))
+        whole = median(lambda: calibrate(session, TARGET, progress=part(progress, 0.5, 0.9)), 1, warm=False)
+        with opened(session) as store:
+            stereo = load_stereo(store)
+            observations = load_observations(store, list(stereo.poses))
+            shot = store.load_capture(next(iter(stereo.poses)))
+            splined = load_model(store, "splined")
+            assert isinstance(splined, SplinedModel)
+            passed = _one_pass(
+                OnePass(one_axis(shot.sequence, "x"), splined, "x"),
+                shot.stack()[: len(one_axis(shot.sequence, "x").frames)],
+                5,
+            )
+        fit = median(lambda: calibrate_pixelwise(observations, stereo), 1)
+    note = "steps 3 to 5, both axes, the smoothed phases in memory"
+    return [
+        row(f"pixel-wise fit of {len(observations)} poses", fit, note=note),
+        passed,
+        row("calibrate 25 recorded poses, both axes, all default models", whole),
+    ]
+
+
+def _file(cloud: Cloud) -> Row:
+    """A cloud with texture and noise as a PLY, beside writing as many bytes."""
+    keep = cloud.mask
+    with tempfile.TemporaryDirectory() as folder:
+        path, plain = Path(folder) / "cloud.ply", Path(folder) / "plain"
+        seconds = median(
+            lambda: write_ply(path, cloud.points[keep], colours=cloud.colours(), scalars=cloud.sigmas(keep)), 3
+        )
+        content = path.read_bytes()
+        least = median(lambda: plain.write_bytes(content), 3)
+    return row(f"write {np.count_nonzero(keep) / 1e6:.2f} M points as PLY", seconds, len(content) / 1e6, least)
+
+
+def _calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, Compiled, np.ndarray]:
+    """Coefficients of a plausible rig: their values do not change the time."""
+    height, width = shape
+    v, u = np.mgrid[:height, :width] / width
+    ones = np.ones(shape, np.float32)
+    c = np.stack([300 + 16 * u, 1.3 * ones, -2e-4 * ones, (u - 0.5) / 2, (v - 0.4) / 2])
+    fit = PixelFit(c, np.zeros((3, *shape), np.float32), np.full(shape, 25, np.uint16), 30 * ones, 250 * ones, ones)
+    near, far = 200.0, 1000.0
+    step = max(2, -(-width // CELLS_ACROSS))
+    grid = np.zeros(((height - 1) // step + 2, (width - 1) // step + 2, DEPTHS), np.float32)
+    centred = np.stack([500 + 16 * u, 0.45 * ones, -1e-4 * ones]).astype(np.float32)
+    compiled = Compiled(centred, 455.5, grid, grid, step, near, far)
+    return PixelwiseModel({"x": fit}, {"x": PERIOD_PX}, {}, "x"), compiled, c[3:].astype(np.float32)

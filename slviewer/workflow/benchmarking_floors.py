@@ -1,0 +1,85 @@
+"""What no stage can beat: passes that only read its bytes and write its results, and how times are taken."""
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from slviewer.geometry.jit import kernel
+
+
+def row(
+    stage: str,
+    seconds: float,
+    megabytes: float | None = None,
+    floor: float | None = None,
+    definition: float | None = None,
+    note: str = "",
+) -> dict[str, Any]:
+    """One row of the table; ``floor`` and ``definition`` in seconds, for the ratios."""
+    return {
+        "stage": stage,
+        "ms": 1e3 * seconds,
+        "MB": megabytes,
+        "ratio to floor": None if floor is None else seconds / floor,
+        "ratio NumPy / kernel": None if definition is None else definition / seconds,
+        "note": note,
+    }
+
+
+def beside(work: Callable[[], object], floor: Callable[[], object], times: int = 9) -> tuple[float, float]:
+    """Median seconds of some work and of its floor, one after the other in turns, so that both see the same machine."""
+    work(), floor()  # compiled, and in the caches
+    taken: tuple[list[float], list[float]] = ([], [])
+    for _ in range(times):
+        for seconds, one in zip(taken, (work, floor), strict=True):
+            start = time.perf_counter()
+            one()
+            seconds.append(time.perf_counter() - start)
+    return statistics.median(taken[0]), statistics.median(taken[1])
+
+
+def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
+    """Median seconds."""
+    if warm:
+        work()
+    taken = []
+    for _ in range(times):
+        start = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - start)
+    return statistics.median(taken)
+
+
+def megabytes(*arrays: np.ndarray) -> float:
+    """What these arrays hold."""
+    return sum(a.nbytes for a in arrays) / 1e6
+
+
+@kernel(parallel=True)
+def through(frames, numbers, grey, single, triple):
+    """Reads ``frames`` (n, h, w) and float32 ``numbers`` (m, h, w) once, and writes ``grey`` (k, h, w) of 8 or 16 bits,
+    ``single`` (j, h, w) float32 and ``triple`` (i, h, w, 3) float32."""
+    width = frames.shape[2]
+    for y in prange(frames.shape[1]):
+        whole, broken = np.zeros(width, frames.dtype), np.zeros(width, np.float32)
+        for k in range(frames.shape[0]):
+            line = frames[k, y]
+            for x in range(width):
+                whole[x] ^= line[x]
+        for k in range(numbers.shape[0]):
+            values = numbers[k, y]
+            for x in range(width):
+                broken[x] += values[x]
+        for k in range(grey.shape[0]):
+            for x in range(width):
+                grey[k, y, x] = whole[x]
+        for k in range(single.shape[0]):
+            for x in range(width):
+                single[k, y, x] = broken[x]
+        for k in range(triple.shape[0]):
+            for x in range(width):
+                triple[k, y, x, 0] = triple[k, y, x, 1] = triple[k, y, x, 2] = broken[x]
