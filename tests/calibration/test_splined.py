@@ -92,6 +92,16 @@ def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(model
     assert np.nanstd(good - other) < 0.01
 
 
+def test_poses_read_with_more_noise_count_less_and_do_not_pass_for_moved(seen, stereo) -> None:
+    rng = np.random.default_rng(1)
+    noisy = ("pose_02", "pose_07")
+    read = [replace(o, camera=o.camera + rng.normal(0, 0.02, o.camera.shape)) if o.name in noisy else o for o in seen]
+    bundle = adjust(read, stereo)
+    assert not bundle.left_out
+    assert all(bundle.fits[name].camera_trust > 0.65 for name in noisy)
+    assert bundle.noise.camera_px < 0.013  # that of the others
+
+
 def test_where_no_pose_looked_points_are_masked_unless_asked_for(seen, stereo, true) -> None:
     left = [replace(o, samples=_left_of(o, 0.6 * true.camera.size[0])) for o in seen]
     model = SplinedModel(adjust(left, stereo))

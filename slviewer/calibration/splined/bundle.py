@@ -7,7 +7,7 @@ from scipy.linalg import cho_solve, lapack
 
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.board_shape import board_frame
-from slviewer.calibration.splined.evidence import Noise, measured_noise, pose_trust, robust_weights
+from slviewer.calibration.splined.evidence import Noise, measured_noise, own_sigmas, pose_trust, robust_weights
 from slviewer.calibration.splined.found import Bundle, PoseFit
 from slviewer.calibration.splined.half_turns import half_turned, may_be_turned, turned_over
 from slviewer.calibration.splined.normal import Data, normal_equations, predicted
@@ -91,9 +91,10 @@ def adjust(
             state, data = turned_over(state, data, turned)
             residuals = _residuals(state, data)
         noise = measured_noise(*residuals, sample_sigma)
-        weights = robust_weights(*residuals, sample_sigma, noise)
+        sigmas = _sigmas(residuals, noise, sample_sigma, data)
+        weights = robust_weights(*residuals, sigmas)
         if step > 2:
-            aside |= _contradicting(weights, noise, sample_sigma, data)
+            aside |= (pose_trust(weights, sigmas, data) < LEAST_TRUST).any(axis=1)
         _silence(weights, aside, data)
         A, b = normal_equations(state, data, residuals, weights)
         prior.add(A, b, state, strengths)
@@ -118,7 +119,7 @@ def adjust(
         raise CalibrationRejected(
             f"{np.count_nonzero(aside)} of {len(names)} poses contradict the others: capture the board anew, at rest"
         )
-    fits = _fits(names, residuals, weights, noise, sample_sigma, data)
+    fits = _fits(names, residuals, _sigmas(residuals, noise, sample_sigma, data), data)
     left_out = {
         name: f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera, "
         f"{fits[name].projector_trust:.2f} in the projector): was the board moved during the capture?"
@@ -195,11 +196,10 @@ def _inverse(factor: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     return lambda right: np.asarray(cho_solve((factor, True), right, check_finite=False))
 
 
-def _contradicting(
-    weights: tuple[np.ndarray, np.ndarray], noise: Noise, sample_sigma: np.ndarray, data: Data
-) -> np.ndarray:
-    sigmas = np.full_like(weights[0], noise.camera_px), noise.sigmas(sample_sigma)
-    return np.asarray((pose_trust(weights, sigmas, data) < LEAST_TRUST).any(axis=1))
+def _sigmas(
+    residuals: tuple[np.ndarray, np.ndarray], noise: Noise, sample_sigma: np.ndarray, data: Data
+) -> tuple[np.ndarray, np.ndarray]:
+    return own_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
 
 
 def _silence(weights: tuple[np.ndarray, np.ndarray], aside: np.ndarray, data: Data) -> None:
@@ -211,13 +211,10 @@ def _silence(weights: tuple[np.ndarray, np.ndarray], aside: np.ndarray, data: Da
 def _fits(
     names: Sequence[str],
     residuals: tuple[np.ndarray, np.ndarray],
-    weights: tuple[np.ndarray, np.ndarray],
-    noise: Noise,
-    sample_sigma: np.ndarray,
+    sigmas: tuple[np.ndarray, np.ndarray],
     data: Data,
 ) -> dict[str, PoseFit]:
-    fresh = robust_weights(*residuals, sample_sigma, noise)
-    sigmas = np.full_like(weights[0], noise.camera_px), noise.sigmas(sample_sigma)
+    fresh = robust_weights(*residuals, sigmas)
     trust = pose_trust(fresh, sigmas, data)
     fits = {}
     for i, name in enumerate(names):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from slviewer.calibration.splined.normal import Data
 TUKEY = 4.685
 """Sigmas beyond which an observation says nothing: 95 % efficient on normal residuals."""
 LEAST_SIGMA_PX = 1e-4
+MOST_OWN = 2.5
+"""How many times the features' common noise one pose may have of its own: a tilted or blurred board is read less well.
+What exceeds that contradicts the other poses."""
 PROBES = 24
 """Random vectors that estimate a trace: to a percent of it."""
 STRENGTHS = (1e-1, 1e6)
@@ -52,13 +56,26 @@ def _excess(residuals: np.ndarray, sigma: np.ndarray) -> float:
     return high
 
 
+def own_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) -> np.ndarray:
+    """(n, 2) px: each feature's noise, that of its pose where it exceeds what all have in common."""
+    sigma = np.full_like(features, noise.camera_px)
+    for first, last in pairwise(feature_from):
+        found = np.abs(features[first:last])
+        if np.isfinite(found).any():
+            own = 1.4826 * float(np.nanmedian(found))
+            sigma[first:last] = np.clip(own, noise.camera_px, MOST_OWN * noise.camera_px)
+    return sigma
+
+
 def robust_weights(
-    features: np.ndarray, samples: np.ndarray, sample_sigma: np.ndarray, noise: Noise
+    features: np.ndarray, samples: np.ndarray, sigmas: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) and (m, 2) 1/px^2: one over the variance, times Tukey's biweight of both coordinates of one place."""
-    sigma = noise.sigmas(sample_sigma)
+    """(n, 2) and (m, 2) 1/px^2: one over the variance, times Tukey's biweight of both coordinates of one place.
+
+    ``sigmas``: (n, 2) and (m, 2) px, of the features and of the samples.
+    """
     weights = []
-    for r, s in ((features, np.full_like(features, noise.camera_px)), (samples, sigma)):
+    for r, s in zip((features, samples), sigmas, strict=True):
         scaled = np.minimum(np.abs(np.nan_to_num(r / s, nan=0.0)) / TUKEY, 1.0)
         trust = np.prod((1.0 - scaled**2) ** 2, axis=1, keepdims=True)
         weights.append(np.where(np.isfinite(r / s), trust / s**2, 0.0))
