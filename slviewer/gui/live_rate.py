@@ -51,7 +51,7 @@ class LiveFigures:
     one that has stalled.
 
     Captures a second before and after that; clouds a second decoded, reconstructed and sent to the viewer that draws;
-    `behind_ms`: the median from the first frame's light until a cloud is sent; `growth_mb`: how much more memory the
+    `behind_ms`: the median from the first frame's light until a cloud is sent, NaN where none was; `growth_mb`: how much more memory the
     program used in the last quarter than in the second, None where the system does not tell.
     """
 
@@ -107,7 +107,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
     with contextlib.ExitStack() as stack:
         stalled: _Viewer | None = None
         halfway, then = 0.0, 0
-        while (passed := time.monotonic() - begun) < seconds:
+        while (passed := time.monotonic() - begun) < seconds or stalled is None:
             if stalled is None and passed > seconds / 3:
                 halfway, then = passed, operator.live_captures
                 stalled = stack.enter_context(_Viewer(server, draws=False))
@@ -133,7 +133,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
         captures_per_s_stalled=(taken - then) / (time.monotonic() - begun - halfway),
         clouds_per_s=statistics.median(made),
         shown_per_s=statistics.median(shown),
-        behind_ms=statistics.median(behind),
+        behind_ms=statistics.median(behind) if behind else float("nan"),
         points=points,
         growth_mb=statistics.median(last) - statistics.median(quarter) if known else None,
     )

@@ -29,7 +29,7 @@ from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.rigs import Bench, Choice, set_up
 
 SCALE = 0.15
-RIG = {"driver": "simulated", "scale": SCALE}
+RIG = {"driver": "simulated", "scale": SCALE, "settle_ms": 4}  # what waits beside it needs the cores too
 SETTINGS = CameraSettings(1.0, 1.0)
 
 
