@@ -51,8 +51,8 @@ class LiveFigures:
     one that has stalled.
 
     Captures a second before and after that; clouds a second decoded, reconstructed and sent to the viewer that draws;
-    `behind_ms`: the median from the first frame's light until a cloud is sent, NaN where none was; `growth_mb`: how much more memory the
-    program used in the last quarter than in the second, None where the system does not tell.
+    `behind_ms`: the median from the first frame's light until a cloud is sent, NaN where none was; `growth_mb`: how
+    much more memory the program used in the last quarter than in the second, None where the system does not tell.
     """
 
     size: tuple[int, int]
