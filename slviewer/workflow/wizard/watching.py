@@ -216,7 +216,14 @@ class HandsFree:
         """Seconds until the capture, 0 or less: now; None where none is coming."""
         if self._just_took and not busy and board is not None and board.taken > self._asked:
             self._taken, self._just_took = board.outline, False
-        if not self.on or self._just_took or board is None or busy or board.still_s < self.HOLD_S or self._same(board.outline):
+        if (
+            not self.on
+            or self._just_took
+            or board is None
+            or busy
+            or board.still_s < self.HOLD_S
+            or self._same(board.outline)
+        ):
             self._begun = None
             return None
         if self._begun is None:
