@@ -1,6 +1,7 @@
 """The joint adjustment: Gauss-Newton from a stereo calibration, robust, with weights and priors that the data set."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from scipy.linalg import cho_solve, lapack
@@ -17,7 +18,9 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 
 MIN_POSES = 3
-MOST_STEPS = 15
+MOST_STEPS = 30
+LEAST_DAMPING, DAMPING_STEP, MOST_DAMPING = 1e-6, 10.0, 10.0
+"""Of the information's diagonal: what is added to it where full steps fail."""
 CONVERGED = 0.02
 """Sigmas that the predictions of all observations still move by, RMS: a fiftieth of their noise."""
 FIRST_STRENGTH = 10.0
@@ -83,7 +86,7 @@ def adjust(
     marked = {o.name for o in observations if o.marked}
     certain = np.array([name in marked or not may_be_turned(stereo.board) for name in names])
     turned = np.zeros(len(names), bool)
-    updates, count = 0, 0
+    updates, count, damping = 0, 0, 0.0
     residuals = _residuals(state, data)
     for step in range(1, MOST_STEPS + 1):
         if step == 3:  # before such poses seem to contradict the others
@@ -98,11 +101,13 @@ def adjust(
         _silence(weights, aside, data)
         A, b = normal_equations(state, data, residuals, weights)
         prior.add(A, b, state, strengths)
+        undamped = A.copy()
         factor = _cholesky(A)
-        move = _inverse(factor)(b)
         count = int(sum(np.count_nonzero(w) for w in weights))
+        cost = partial(_cost, data=data, weights=weights, prior=prior, strengths=strengths)
+        state, move, damping = _advance(state, cost, (undamped, b, _inverse(factor)(b)), damping)
+        residuals = _residuals(state, data)
         moved = float(np.sqrt(max(move @ b, 0.0) / count))
-        state, residuals = _advance(state, data, residuals, weights, move, prior, strengths)
         if progress:
             progress(step / (step + 3))
         if moved < 0.3 and updates < STRENGTH_STEPS:
@@ -112,8 +117,8 @@ def adjust(
             break
     else:
         raise CalibrationRejected(
-            f"the joint adjustment still moves by {moved:.1f} sigma after {MOST_STEPS} steps: look at the stereo "
-            "calibration's residuals, and leave out poses that stand out"
+            f"the joint adjustment still moves by {moved:.2f} sigma after {MOST_STEPS} steps: look at the stereo "
+            "calibration's residuals, leave out poses that stand out, and add some that reach into the corners"
         )
     if np.count_nonzero(~aside) < MIN_POSES:
         raise CalibrationRejected(
@@ -149,32 +154,46 @@ def _residuals(state: State, data: Data) -> tuple[np.ndarray, np.ndarray]:
     return data.feature_px - features, data.projector_px - samples
 
 
-def _cost(residuals: tuple[np.ndarray, np.ndarray], weights: tuple[np.ndarray, np.ndarray]) -> float:
+def _cost(
+    state: State,
+    data: Data,
+    weights: tuple[np.ndarray, np.ndarray],
+    prior: Prior,
+    strengths: Sequence[float],
+) -> float:
     total = 0.0
-    for r, w in zip(residuals, weights, strict=True):
+    for r, w in zip(_residuals(state, data), weights, strict=True):
         used = w > 0
         total += float(np.sum(w[used] * r[used] ** 2))  # NaN where a step left the view
-    return 0.5 * total
+    return 0.5 * total + prior.cost(state, strengths)
 
 
 def _advance(
     state: State,
-    data: Data,
-    residuals: tuple[np.ndarray, np.ndarray],
-    weights: tuple[np.ndarray, np.ndarray],
-    move: np.ndarray,
-    prior: Prior,
-    strengths: Sequence[float],
-) -> tuple[State, tuple[np.ndarray, np.ndarray]]:
-    """The state after the step, or after as much of it as makes matters no worse."""
-    before = _cost(residuals, weights) + prior.cost(state, strengths)
-    for _ in range(8):
+    cost: Callable[[State], float],
+    system: tuple[np.ndarray, np.ndarray, np.ndarray],
+    damping: float,
+) -> tuple[State, np.ndarray, float]:
+    """The state after the step, the step, and how damped it was. ``system``: information, right side, the full step.
+
+    Where a full step makes matters worse, devices and arrangement are held back: together with the fields they have a
+    valley that bends where lenses bend a lot, and full steps leave it.
+    """
+    information, b, full = system
+    layout, before = state.layout, cost(state)
+    rig = np.arange(layout.rig, layout.camera_field)
+    damping = damping / DAMPING_STEP if damping > LEAST_DAMPING else 0.0
+    while damping < MOST_DAMPING:
+        move = full
+        if damping:
+            A = information.copy()
+            A[rig, rig] *= 1 + damping
+            move = _inverse(_cholesky(A))(b)
         after = state.moved(move)
-        new = _residuals(after, data)
-        if _cost(new, weights) + prior.cost(after, strengths) <= before * (1 + 1e-9):  # False for NaN
-            return after, new
-        move = 0.5 * move
-    return state, residuals
+        if cost(after) <= before * (1 + 1e-9):  # False for NaN
+            return after, move, damping
+        damping = max(DAMPING_STEP * damping, LEAST_DAMPING)
+    return state, full, damping
 
 
 def _cholesky(A: np.ndarray) -> np.ndarray:
