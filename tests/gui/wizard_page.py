@@ -2,7 +2,7 @@
 
 import re
 
-from playwright.sync_api import ConsoleMessage, Locator, Page, expect
+from playwright.sync_api import ConsoleMessage, Locator, Page, TimeoutError, expect
 
 SIZE = {"width": 1280, "height": 800}
 PATIENCE_MS = 60_000
@@ -34,9 +34,16 @@ def field(page: Page, label: str) -> Locator:
 
 
 def choose(page: Page, label: str, option: str) -> None:
-    """Choose an option of the dropdown beside this label."""
-    field(page, label).click()
-    page.get_by_role("option", name=option, exact=True).click()
+    """Choose an option of the dropdown beside this label; it closes where the panel is drawn anew meanwhile."""
+    for _ in range(4):
+        field(page, label).click()
+        try:
+            page.get_by_role("option", name=option, exact=True).click(timeout=PATIENCE_MS / 10)
+        except TimeoutError:
+            page.keyboard.press("Escape")
+        else:
+            return
+    raise AssertionError(f"{label} does not offer {option}")
 
 
 def pose_row(page: Page, name: str, state: str) -> Locator:
