@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from playwright.sync_api import Browser, Page, expect
-from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose, field, pose_row
+from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose, field, pose_row, press
 
 from slviewer.devices.faults import Faults, breakable
 from slviewer.gui.app import App
@@ -133,8 +133,8 @@ def scan(page: Page, operator: Operator) -> None:
     for number, depth in enumerate(DEPTHS_MM, 1):
         field(page, "At, mm").fill(str(depth))
         assert operator.wait_for(lambda s, z=depth: abs(s.world.T_camera_thing[2, 3] - z) < 0.5, PATIENCE_S)  # type: ignore[misc, union-attr]
-        button(page, "Capture scan").click()
         name = f"scan_{number:02d}"
+        press(page, "Capture scan", lambda n=name: operator.snapshot().scan(n) is not None)  # type: ignore[misc]
         assert operator.wait_for(lambda s, n=name: (v := s.scan(n)) is not None and v.cloud == "fresh", PATIENCE_S)  # type: ignore[misc]
         expect(page.get_by_text(name).first).to_be_visible()
     expect(page.get_by_text("8 poses, 5 scans")).to_be_visible()

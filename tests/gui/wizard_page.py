@@ -1,6 +1,8 @@
 """The wizard's page as a person finds their way in it: by what stands there to be read."""
 
 import re
+import time
+from collections.abc import Callable
 
 from playwright.sync_api import ConsoleMessage, Locator, Page, TimeoutError, expect
 
@@ -44,6 +46,18 @@ def choose(page: Page, label: str, option: str) -> None:
         else:
             return
     raise AssertionError(f"{label} does not offer {option}")
+
+
+def press(page: Page, name: str, came: Callable[[], bool]) -> None:
+    """Press a button until what it asks for has come: what is drawn anew just then may take the click."""
+    for _ in range(4):
+        button(page, name).click()
+        end = time.monotonic() + PATIENCE_MS / 4000
+        while time.monotonic() < end:
+            if came():
+                return
+            page.wait_for_timeout(100)
+    raise AssertionError(f"nothing came of pressing {name}")
 
 
 def pose_row(page: Page, name: str, state: str) -> Locator:
