@@ -104,9 +104,9 @@ def adjust(
         undamped = A.copy()
         factor = _cholesky(A)
         count = int(sum(np.count_nonzero(w) for w in weights))
-        cost = partial(_cost, data=data, weights=weights, prior=prior, strengths=strengths)
-        state, move, damping = _advance(state, cost, (undamped, b, _inverse(factor)(b)), damping)
-        residuals = _residuals(state, data)
+        cost = partial(_cost, weights=weights, prior=prior, strengths=strengths)
+        system = undamped, b, _inverse(factor)(b)
+        state, residuals, move, damping = _advance(state, residuals, data, cost, system, damping)
         moved = float(np.sqrt(max(move @ b, 0.0) / count))
         if progress:
             progress(step / (step + 3))
@@ -156,13 +156,13 @@ def _residuals(state: State, data: Data) -> tuple[np.ndarray, np.ndarray]:
 
 def _cost(
     state: State,
-    data: Data,
+    residuals: tuple[np.ndarray, np.ndarray],
     weights: tuple[np.ndarray, np.ndarray],
     prior: Prior,
     strengths: Sequence[float],
 ) -> float:
     total = 0.0
-    for r, w in zip(_residuals(state, data), weights, strict=True):
+    for r, w in zip(residuals, weights, strict=True):
         used = w > 0
         total += float(np.sum(w[used] * r[used] ** 2))  # NaN where a step left the view
     return 0.5 * total + prior.cost(state, strengths)
@@ -170,17 +170,20 @@ def _cost(
 
 def _advance(
     state: State,
-    cost: Callable[[State], float],
+    residuals: tuple[np.ndarray, np.ndarray],
+    data: Data,
+    cost: Callable[[State, tuple[np.ndarray, np.ndarray]], float],
     system: tuple[np.ndarray, np.ndarray, np.ndarray],
     damping: float,
-) -> tuple[State, np.ndarray, float]:
-    """The state after the step, the step, and how damped it was. ``system``: information, right side, the full step.
+) -> tuple[State, tuple[np.ndarray, np.ndarray], np.ndarray, float]:
+    """The state after the step, its residuals, the step, and how damped it was. ``system``: information, right side,
+    the full step.
 
     Where a full step makes matters worse, devices and arrangement are held back: together with the fields they have a
     valley that bends where lenses bend a lot, and full steps leave it.
     """
     information, b, full = system
-    layout, before = state.layout, cost(state)
+    layout, before = state.layout, cost(state, residuals)
     rig = np.arange(layout.rig, layout.camera_field)
     damping = damping / DAMPING_STEP if damping > LEAST_DAMPING else 0.0
     while damping < MOST_DAMPING:
@@ -190,10 +193,11 @@ def _advance(
             A[rig, rig] *= 1 + damping
             move = _inverse(_cholesky(A))(b)
         after = state.moved(move)
-        if cost(after) <= before * (1 + 1e-9):  # False for NaN
-            return after, move, damping
+        new = _residuals(after, data)
+        if cost(after, new) <= before * (1 + 1e-9):  # False for NaN
+            return after, new, move, damping
         damping = max(DAMPING_STEP * damping, LEAST_DAMPING)
-    return state, full, damping
+    return state, residuals, full, damping
 
 
 def _cholesky(A: np.ndarray) -> np.ndarray:
