@@ -16,7 +16,7 @@ from slviewer.errors import CalibrationRejected, InputError
 from slviewer.target.board import Board
 from slviewer.workflow.diagnosing import attempt, keep_rejected, rejected, save_verdict
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import save_anchored, save_pixelwise, save_splined, save_stereo
+from slviewer.workflow.models import save_fitted, save_stereo
 from slviewer.workflow.opening import SessionLike, opened
 
 _LENGTH = {"pixelwise": 1.0, "anchored": 1.0, "splined": 2.0}
@@ -157,12 +157,9 @@ def calibrate(
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         save_stereo(store, stereo, inputs, settings, found.verdict)
-        if made.pixelwise is not None:
-            save_pixelwise(store, made.pixelwise, inputs, settings)
-        if made.anchored is not None:
-            save_anchored(store, made.anchored, inputs, settings)
-        if made.splined is not None:
-            save_splined(store, made.splined, inputs, settings)
+        for model in (made.pixelwise, made.anchored, made.splined):
+            if model is not None:
+                save_fitted(store, model, inputs, settings)
         save_verdict(store, found.verdict, names)
         progress(1.0, "calibrated")
     return replace(made, verdict=found.verdict)

@@ -40,24 +40,15 @@ def save_stereo(
     store.save_result("calibration/stereo", meta, {f"residuals_{n}": r for n, r in model.residuals_px.items()})
 
 
-def save_pixelwise(
-    store: Session, model: PixelwiseModel, inputs: Mapping[str, str], settings: Mapping[str, Any]
+def save_fitted(
+    store: Session,
+    model: PixelwiseModel | AnchoredModel | SplinedModel,
+    inputs: Mapping[str, str],
+    settings: Mapping[str, Any],
 ) -> None:
-    """Replace the session's pixelwise calibration."""
+    """Replace the session's calibration of this kind."""
     meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
-    store.save_result("calibration/pixelwise", meta, model.to_arrays())
-
-
-def save_anchored(store: Session, model: AnchoredModel, inputs: Mapping[str, str], settings: Mapping[str, Any]) -> None:
-    """Replace the session's anchored calibration."""
-    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
-    store.save_result("calibration/anchored", meta, model.to_arrays())
-
-
-def save_splined(store: Session, model: SplinedModel, inputs: Mapping[str, str], settings: Mapping[str, Any]) -> None:
-    """Replace the session's splined calibration."""
-    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
-    store.save_result("calibration/splined", meta, model.to_arrays())
+    store.save_result(f"calibration/{model.name}", meta, model.to_arrays())
 
 
 def available(store: Session) -> tuple[str, ...]:

@@ -29,16 +29,6 @@ def calibrated(session: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
     return json.loads(out.read_text())
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    def command(*arguments: object) -> tuple[int, str, str]:
-        status = main([str(a) for a in arguments])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return command
-
-
 def test_calibrate_reports_what_its_contract_says(calibrated: dict) -> None:
     stereo = calibrated["models"]["stereo"]
     assert set(stereo) >= {"reprojection_rms_px", "K_camera", "D_camera", "K_projector", "D_projector", "R", "T"}

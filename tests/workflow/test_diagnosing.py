@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from slviewer.calibration.observe import Smoothing
-from slviewer.cli import main
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.workflow.calibrating import calibrate
@@ -26,16 +25,6 @@ POSES = 7
 @pytest.fixture(scope="module")
 def bench() -> Bench:
     return Bench(letter(0.2, 3), count=POSES, steps=6)
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    def command(*arguments: object) -> tuple[int, str, str]:
-        status = main([str(a) for a in arguments])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return command
 
 
 def fill(folder: Path, bench: Bench, period_px: float = 18.0, force: bool = False) -> None:
