@@ -20,8 +20,9 @@ depth ranges       R1 in front of the calibrated depths, R2 inside, R3 behind
 "The Letter" is Vargas, Romero, Zhang and Marrugo, *Pixel-wise rational model for structured light system*,
 Optics Letters 2023; symbols follow it, and docstrings cite its equation or step.
 
-Data flows one way: geometry, fringe, target, calibration, reconstruction, registration, evaluation, simulation,
-devices, session, report, workflow, and the command line at the end. A folder imports only from those before it.
+Data flows one way: geometry, fringe, target, calibration, reconstruction, registration, surface, evaluation,
+inspection, simulation, devices, session, report, workflow, server, gui, and the command line at the end. A folder
+imports only from those before it.
 """
 
 __version__ = "0.1.0"

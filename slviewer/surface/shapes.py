@@ -1,0 +1,68 @@
+"""A surface as points and as triangles, without the camera's grid."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class PointSet:
+    """Points of a surface, in one frame.
+
+    ``points`` (n, 3) float32 mm, finite. Where known: ``normals`` (n, 3) float32, of unit length, outwards; ``colours``
+    (n, 3) uint8 RGB; ``sigma_mm`` (n,) float32, the expected error of each point along its normal.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray | None = None
+    colours: np.ndarray | None = None
+    sigma_mm: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        _settle(self, "points", self.points, np.float32, (len(self.points), 3))
+        _settle_each(self, len(self.points))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles of a surface.
+
+    ``vertices`` (n, 3) float32 mm; ``faces`` (m, 3) int32, counter-clockwise seen from outside. Of each vertex where
+    known: ``normals`` (n, 3) float32, ``colours`` (n, 3) uint8 RGB, ``sigma_mm`` (n,) float32.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None = None
+    colours: np.ndarray | None = None
+    sigma_mm: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        _settle(self, "vertices", self.vertices, np.float32, (len(self.vertices), 3))
+        _settle(self, "faces", self.faces, np.int32, (len(self.faces), 3))
+        if len(self.faces) and not (0 <= self.faces.min() and self.faces.max() < len(self.vertices)):
+            raise InputError(f"Faces name vertices outside the {len(self.vertices)} that there are.")
+        _settle_each(self, len(self.vertices))
+
+
+def _settle_each(shape: "PointSet | Mesh", n: int) -> None:
+    for name, dtype, wanted in (
+        ("normals", np.float32, (n, 3)),
+        ("colours", np.uint8, (n, 3)),
+        ("sigma_mm", np.float32, (n,)),
+    ):
+        value = getattr(shape, name)
+        if value is not None:
+            _settle(shape, name, value, dtype, wanted)
+
+
+def _settle(shape: "PointSet | Mesh", name: str, value: np.ndarray, dtype: type, wanted: tuple[int, ...]) -> None:
+    array = np.asarray(value, dtype=dtype)
+    if array.shape != wanted:
+        raise InputError(f"The {name} have shape {array.shape}: {wanted} is needed.")
+    object.__setattr__(shape, name, array)
