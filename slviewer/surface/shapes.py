@@ -45,7 +45,7 @@ class Mesh:
     def __post_init__(self) -> None:
         _settle(self, "vertices", self.vertices, np.float32, (len(self.vertices), 3))
         _settle(self, "faces", self.faces, np.int32, (len(self.faces), 3))
-        if len(self.faces) and not (0 <= self.faces.min() and self.faces.max() < len(self.vertices)):
+        if len(self.faces) and not (self.faces.min() >= 0 and self.faces.max() < len(self.vertices)):
             raise InputError(f"Faces name vertices outside the {len(self.vertices)} that there are.")
         _settle_each(self, len(self.vertices))
 
@@ -62,7 +62,7 @@ def _settle_each(shape: "PointSet | Mesh", n: int) -> None:
 
 
 def _settle(shape: "PointSet | Mesh", name: str, value: np.ndarray, dtype: type, wanted: tuple[int, ...]) -> None:
-    array = np.asarray(value, dtype=dtype)
+    array: np.ndarray = np.asarray(value, dtype=dtype)
     if array.shape != wanted:
         raise InputError(f"The {name} have shape {array.shape}: {wanted} is needed.")
     object.__setattr__(shape, name, array)
