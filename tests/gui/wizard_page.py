@@ -18,7 +18,7 @@ class Opened:
         self.page = page
         self.errors: list[str] = []
         page.on("console", self._heard)
-        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.on("pageerror", lambda error: self.errors.append(error.stack or str(error)))
 
     def _heard(self, message: ConsoleMessage) -> None:
         if message.type == "error":
