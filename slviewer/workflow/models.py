@@ -1,6 +1,6 @@
 """Calibrations in a session: saving, loading, choosing, and noticing when one is stale."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import CalibrationRejected, InputError
+from slviewer.errors import CalibrationRejected, InputError, SessionError
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
@@ -24,6 +24,11 @@ VERDICT = "calibration/verdict"
 VALIDATION = "calibration/validation"
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
+_RESTORED: dict[str, Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], Model]] = {
+    "pixelwise": PixelwiseModel.restored,
+    "anchored": AnchoredModel.restored,
+    "splined": SplinedModel.restored,
+}
 
 
 def save_stereo(
@@ -106,11 +111,13 @@ def load_model(store: Session, name: str) -> Model:
     if name == "stereo":
         return load_stereo(store)
     meta, arrays = store.load_result(f"calibration/{name}")
-    if name == "anchored":
-        return AnchoredModel.restored(meta["model"], arrays)
-    if name == "splined":
-        return SplinedModel.restored(meta["model"], arrays)
-    return PixelwiseModel.restored(meta["model"], arrays)
+    try:
+        return _RESTORED[name](meta["model"], arrays)
+    except (KeyError, TypeError) as error:
+        raise SessionError(
+            f"the {name} calibration in {store.folder} was saved by another version of slviewer: "
+            "run `slviewer calibrate` again"
+        ) from error
 
 
 def best(store: Session, accept_rejected: bool = False) -> str:
