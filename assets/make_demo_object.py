@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slviewer.reconstruction.ply import write_ply
+from slviewer.session.ply import write_ply
 
 RINGS = 142  # triangles of half a millimetre on the front
 SIDE_RINGS = 6

@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -85,6 +85,29 @@ def replace_file(path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             write_bytes(temporary, data)
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        sync_folder(path.parent)
+
+
+@contextmanager
+def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
+    """A file to write that takes the place of `path` in one step when the block ends, and leaves no trace if it fails.
+
+    For what is too large to be one `bytes`. Raises SessionError if the disk has not `needs_bytes` to spare, or refuses;
+    what stood there then stays.
+    """
+    temporary = _beside(path, "tmp")
+    with _disk_errors(path.parent, needs_bytes):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _check_space(path.parent, needs_bytes)
+        try:
+            with open(temporary, "xb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
             os.replace(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)

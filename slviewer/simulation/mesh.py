@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.reconstruction.ply import read_ply
 from slviewer.registration.open3d_loader import open3d
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
@@ -88,7 +87,7 @@ class MeshScene:
 
 def demo_object(pose: Pose) -> MeshScene:
     """The ammonite of ``assets/objects/ammonite.ply``: about 140 mm wide, its front towards -z of its own frame."""
-    mesh = read_ply(asset("objects/ammonite.ply"))
-    if mesh.faces is None:
+    mesh = open3d().io.read_triangle_mesh(str(asset("objects/ammonite.ply")))
+    if not mesh.has_triangles():
         raise InputError("the shipped file assets/objects/ammonite.ply has no triangles: install slviewer again")
-    return MeshScene(mesh.points.astype(np.float64), mesh.faces, pose)
+    return MeshScene(np.asarray(mesh.vertices), np.asarray(mesh.triangles), pose)

@@ -20,7 +20,7 @@ from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.onepass import OnePass
-from slviewer.reconstruction.ply import write_ply
+from slviewer.session.ply import write_ply
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter

@@ -9,9 +9,9 @@ import numpy as np
 
 from slviewer.errors import UsageError
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.ply import write_ply
 from slviewer.registration.merge import Merged
 from slviewer.registration.merge import merge as merge_clouds
+from slviewer.session.ply import write_ply
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_model, preferred, warn_if_stale

@@ -13,9 +13,9 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.mesh import grid_triangles
-from slviewer.reconstruction.ply import write_ply
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.session.capture import Capture
+from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect

@@ -17,8 +17,8 @@ from slviewer.calibration.splined.volume import (
 )
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
-from slviewer.reconstruction.ply import read_ply, write_ply
 from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.workflow.proving_uncertainty import Honesty, UncertaintyProof, compare_with_truth
 

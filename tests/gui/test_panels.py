@@ -17,7 +17,7 @@ from slviewer.gui.calibration_words import comparison_table, named_poses, verdic
 from slviewer.gui.pictures import Painter, spread
 from slviewer.gui.steps.scan import ordered, painting, point_words, uncertainty
 from slviewer.gui.steps.verify import distances_table, likely, results_table
-from slviewer.reconstruction.ply import read_ply
+from slviewer.session.ply import read_ply
 from slviewer.workflow.calibrating import calibrate
 from slviewer.workflow.diagnosing import save_verdict
 from slviewer.workflow.simulating import simulate

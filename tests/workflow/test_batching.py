@@ -16,7 +16,7 @@ from distributed import Client
 from slviewer.cli import main
 from slviewer.errors import Cancelled, SlviewerError, UsageError
 from slviewer.fringe.presets import p18
-from slviewer.reconstruction.ply import read_ply
+from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer

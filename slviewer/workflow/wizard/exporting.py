@@ -11,12 +11,12 @@ import numpy as np
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.reconstruction.mesh import grid_triangles
-from slviewer.reconstruction.ply import write_ply
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.registration.open3d_loader import open3d
 from slviewer.session import atomic
 from slviewer.session.exporters import write_calibration
 from slviewer.session.names import safe_name
+from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.workflow.feedback import Warn
 from slviewer.workflow.models import load_stereo

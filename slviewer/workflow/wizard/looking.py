@@ -11,9 +11,9 @@ from slviewer.errors import InputError
 from slviewer.evaluation.histogram import Histogram, histogram
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.sequence import Axis
-from slviewer.reconstruction.ply import Ply, read_ply
 from slviewer.report.data import PixelCurve
 from slviewer.session.capture import Capture
+from slviewer.session.ply import Ply, read_ply
 from slviewer.session.store import Session
 from slviewer.workflow.models import load_model, load_residuals, load_stereo
 from slviewer.workflow.poses import load_observations

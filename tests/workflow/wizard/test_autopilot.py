@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.calibration.guidance import choosing
 from slviewer.errors import Cancelled
-from slviewer.reconstruction.ply import read_ply
+from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.workflow.wizard import exporting, looking, work
 from slviewer.workflow.wizard.autopilot import TARGET, Autopilot

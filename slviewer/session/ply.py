@@ -1,18 +1,22 @@
 """Clouds and meshes as binary PLY: little endian, float32, in mm; complete or absent."""
 
-import os
-import secrets
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from slviewer.errors import InputError, SlviewerError
+from slviewer import __version__
+from slviewer.errors import InputError
+from slviewer.session.atomic import arriving_file
 
 COLOURS = ("red", "green", "blue")
 TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
+PIECE = 1 << 16
+"""Records that are put together at a time: a few MB, however large the file becomes."""
+UNKNOWN_SIGMA = -1.0
+"""What stands for a standard deviation that nobody knows: no NaN is written, and 0 would claim too much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,24 +38,44 @@ def write_ply(
     normals: np.ndarray | None = None,
     scalars: Mapping[str, np.ndarray] | None = None,
     faces: np.ndarray | None = None,
+    notes: Sequence[str] = (),
 ) -> None:
     """Writes points (n, 3) mm, and what else is given, as one binary PLY that appears whole or not at all.
 
-    ``colours``: (n,) grey or (n, 3) RGB, uint8. ``normals``: (n, 3). ``scalars``: named (n,), as float32 properties of
-    the vertices. ``faces``: (m, 3) indices into the points. Raises InputError for shapes that do not fit together
-    and for NaN points; SlviewerError where the file cannot be written (an older file of that name is left as it was).
+    ``colours``: (n,) grey or (n, 3) RGB, uint8. ``normals``: (n, 3); one that is not known (NaN) is written as 0 0 0.
+    ``scalars``: named (n,), as float32 properties of the vertices; a sigma that is not known is written as -1.
+    ``faces``: (m, 3) indices into the points. ``notes``: sentences for the file's comments, beside those that state
+    the program and the units. Raises InputError for shapes that do not fit together and for NaN elsewhere;
+    SessionError where the file cannot be written (an older file of that name is left as it was).
     """
-    vertices = _vertices(np.asarray(points), colours, normals, dict(scalars or {}))
-    header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm, camera frame"]
-    header.append(f"element vertex {len(vertices)}")
+    points = np.asarray(points)
+    fields = _fields(points, colours, normals, dict(scalars or {}))
+    vertex = np.dtype([(name, code) for name, code, _ in fields])
     names = {np.dtype(code): name for name, code in TYPES.items()}
-    header += [f"property {names[vertices.dtype[name]]} {name}" for name in vertices.dtype.names or ()]
-    blocks = [vertices]
+    header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm"]
+    header += [f"comment {plain(note)}" for note in (f"written by slviewer {__version__}", *notes)]
+    header.append(f"element vertex {len(points)}")
+    header += [f"property {names[vertex[name]]} {name}" for name in vertex.names or ()]
+    size = len(points) * vertex.itemsize
     if faces is not None:
-        blocks.append(_faces(np.asarray(faces), len(vertices)))
-        header += [f"element face {len(blocks[1])}", "property list uchar int vertex_indices"]
+        faces = np.asarray(faces)
+        check_faces(faces, len(points))
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        size += len(faces) * FACE.itemsize
     header.append("end_header\n")
-    _write_whole(Path(path), "\n".join(header).encode("ascii"), blocks)
+    with arriving_file(Path(path), size) as file:
+        file.write("\n".join(header).encode("ascii"))
+        for part in pieces(len(points)):
+            records = np.empty(part.stop - part.start, vertex)
+            for name, _, values in fields:
+                records[name] = without_nan(name, values[part])
+            file.write(records.data)
+        for part in pieces(0 if faces is None else len(faces)):
+            assert faces is not None
+            triangles = np.empty(part.stop - part.start, FACE)
+            triangles["count"] = 3
+            triangles["vertices"] = faces[part]
+            file.write(triangles.data)
 
 
 def read_ply(path: str | Path) -> Ply:
@@ -89,6 +113,31 @@ def read_ply(path: str | Path) -> Ply:
     return _content(vertices, faces["vertices"].copy() if "face" in counts else None)
 
 
+def pieces(count: int) -> Iterator[slice]:
+    """The parts in which ``count`` records are written, one after the other."""
+    return (slice(start, min(start + PIECE, count)) for start in range(0, count, PIECE))
+
+
+def plain(note: str) -> str:
+    """A sentence as one line of printable ASCII, for the comments of a file."""
+    return " ".join(note.encode("ascii", "replace").decode().split())
+
+
+def without_nan(name: str, values: np.ndarray) -> np.ndarray:
+    """Values of a vertex property with what stands for those that are not known: see ``write_ply``."""
+    if values.dtype.kind != "f" or name in ("x", "y", "z"):
+        return values
+    return np.where(np.isfinite(values), values, 0.0 if name in ("nx", "ny", "nz") else UNKNOWN_SIGMA)
+
+
+def check_faces(faces: np.ndarray, count: int) -> None:
+    """Raise InputError for faces that are no triangles between ``count`` points."""
+    if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and not 0 <= faces.min() <= faces.max() < count):
+        raise InputError(
+            f"Faces of shape {faces.shape} were given: (m, 3) indices below {count}, the number of points."
+        )
+
+
 def _content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
     names = vertices.dtype.names or ()
 
@@ -102,10 +151,10 @@ def _content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
     return Ply(points, joined(*COLOURS), joined("nx", "ny", "nz"), scalars, faces)
 
 
-def _vertices(
+def _fields(
     points: np.ndarray, colours: np.ndarray | None, normals: np.ndarray | None, scalars: dict[str, np.ndarray]
-) -> np.ndarray:
-    """One record a vertex, as PLY lays them out."""
+) -> list[tuple[str, str, np.ndarray]]:
+    """(name, type, values (n,)) of each property of a vertex, in the order in which PLY lays them out."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"Points of shape {points.shape} were given: a PLY holds (n, 3); select the valid ones first.")
     if not np.isfinite(points).all():
@@ -119,49 +168,19 @@ def _vertices(
         if colours.dtype != np.uint8:
             raise InputError(f"Colours of {colours.dtype} were given: they must be uint8.")
         fields += [(name, "u1", colours if colours.ndim == 1 else colours[:, i]) for i, name in enumerate(COLOURS)]
-    for name, values in scalars.items():
-        _check(np.shape(values) == points.shape[:1], name, np.asarray(values), len(points))
+    for name, given in scalars.items():
+        values = np.asarray(given)
+        _check(values.shape == points.shape[:1], name, values, len(points))
         if not (name.isascii() and name.isidentifier()) or name in {field[0] for field in fields}:
             raise InputError(
                 f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a new name."
             )
+        if not name.startswith("sigma") and not np.isfinite(values).all():
+            raise InputError(f"{name} is not known of {np.count_nonzero(~np.isfinite(values))} points: leave them out.")
         fields.append((name, "<f4", values))
-    vertices = np.empty(len(points), dtype=[(name, code) for name, code, _ in fields])
-    for name, _, values in fields:
-        vertices[name] = values
-    return vertices
-
-
-def _faces(faces: np.ndarray, count: int) -> np.ndarray:
-    if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and not 0 <= faces.min() <= faces.max() < count):
-        raise InputError(
-            f"Faces of shape {faces.shape} were given: (m, 3) indices below {count}, the number of points."
-        )
-    records = np.empty(len(faces), dtype=FACE)
-    records["count"] = 3
-    records["vertices"] = faces
-    return records
+    return fields
 
 
 def _check(fits: bool, what: str, values: np.ndarray, count: int) -> None:
     if not fits:
         raise InputError(f"{what} of shape {values.shape} do not belong to {count} points: give one for each point.")
-
-
-def _write_whole(path: Path, header: bytes, blocks: list[np.ndarray]) -> None:
-    """Into a file beside it, which then takes the name."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
-        with temporary.open("xb") as file:
-            file.write(header)
-            for block in blocks:
-                file.write(block.data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        raise SlviewerError(
-            f"{path} could not be written ({error.strerror}): check the folder and its free space."
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from slviewer.errors import InputError, SlviewerError
-from slviewer.reconstruction.ply import read_ply, write_ply
+from slviewer.session.ply import read_ply, write_ply
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(0, 100, (50, 3)).astype(np.float32)
@@ -68,6 +68,24 @@ def test_open3d_reads_it(tmp_path: Path) -> None:
     assert np.allclose(np.asarray(cloud.normals), NORMALS)
 
 
+def test_what_is_not_known_is_no_nan_in_the_file(tmp_path: Path) -> None:
+    normals, sigma = NORMALS.copy(), SIGMA.copy()
+    normals[:3], sigma[5] = np.nan, np.nan
+    write_ply(tmp_path / "a.ply", POINTS, normals=normals, scalars={"sigma_noise": sigma}, notes=["é\nof a scan"])
+    ply = read_ply(tmp_path / "a.ply")
+    assert ply.normals is not None and np.array_equal(ply.normals[:3], np.zeros((3, 3)))
+    assert np.array_equal(ply.normals[3:], NORMALS[3:])
+    assert ply.scalars["sigma_noise"][5] == -1 and np.array_equal(ply.scalars["sigma_noise"][6:], SIGMA[6:])
+    assert b"comment ? of a scan\n" in (tmp_path / "a.ply").read_bytes()
+
+
+def test_many_points_are_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("slviewer.session.ply.PIECE", 7)
+    write_ply(tmp_path / "a.ply", POINTS, COLOURS, faces=FACES)
+    ply = read_ply(tmp_path / "a.ply")
+    assert np.array_equal(ply.points, POINTS) and ply.faces is not None and np.array_equal(ply.faces, FACES)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -79,6 +97,7 @@ def test_open3d_reads_it(tmp_path: Path) -> None:
         ({"scalars": {"a b": SIGMA}}, "property"),
         ({"scalars": {"x": SIGMA}}, "property"),
         ({"scalars": {"a": SIGMA[:3]}}, "50 points"),
+        ({"scalars": {"deviation": np.full(50, np.nan)}}, "deviation is not known of 50 points"),
         ({"faces": [[0, 1, 50]]}, "below 50"),
         ({"faces": [[0, 1]]}, r"\(m, 3\)"),
     ],
@@ -98,12 +117,12 @@ def test_a_failed_write_keeps_the_older_file(tmp_path: Path, monkeypatch: pytest
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(SlviewerError, match="No space left"):
+    with pytest.raises(SlviewerError, match="disk is full"):
         write_ply(path, POINTS[:3])
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
-    with pytest.raises(SlviewerError, match="No such file"):
-        write_ply(tmp_path / "absent" / "a.ply", POINTS)
+    with pytest.raises(SlviewerError, match="cannot be written"):
+        write_ply(path / "a.ply", POINTS)  # below a file
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
