@@ -1,0 +1,184 @@
+"""Points and meshes for other programs; the file's suffix says how. What is written can be read anywhere, in its size.
+
+=======  ===========================================================================================================
+`.ply`   binary, float32, mm: normals, colours, the expected errors (sigma) and other values of each point
+`.stl`   binary, mm: triangles alone
+`.obj`   text, mm: colours of the vertices, normals
+`.glb`   binary glTF, whose unit is the metre: vertices are written in metres; colours, normals
+`.xyz`   text, mm: a line a point, columns named in the first lines
+=======  ===========================================================================================================
+
+Large ones are written piece by piece, and appear whole or not at all.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from slviewer import __version__
+from slviewer.errors import InputError
+from slviewer.session.atomic import arriving_file
+from slviewer.session.digits import Field, lines
+from slviewer.session.glb import write_glb
+from slviewer.session.ply import FACE, check_faces, pieces, plain, without_nan, write_ply
+from slviewer.surface.shapes import Mesh, PointSet
+
+POINT_FORMATS = ("ply", "xyz", "glb")
+MESH_FORMATS = ("ply", "stl", "obj", "glb", "xyz")
+IN_WORDS = {
+    "ply": "mm; with colours, normals and sigma",
+    "stl": "mm; the triangles alone",
+    "obj": "mm; with colours and normals",
+    "glb": "metres, as glTF demands, so that programs show the true size; with colours",
+    "xyz": "mm; text, one line a point, columns named at the top",
+}
+"""Units and content of each format."""
+FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+DECIMALS = 6
+"""Of lengths in text: a nanometre, below what a float32 of some hundred mm resolves."""
+_NUMBER, _SMALL, _GREY = 11, 9, 4
+"""Characters that a coordinate, a sigma or a part of a normal, and a grey level take in text, with the blank."""
+
+
+def write_shape(
+    path: str | Path,
+    shape: PointSet | Mesh,
+    *,
+    scalars: Mapping[str, np.ndarray] | None = None,
+    notes: Sequence[str] = (),
+) -> int:
+    """Writes points or a mesh as the suffix says, and returns the file's size in bytes.
+
+    ``scalars``: values (n,) of each point by name, such as ``sigma_noise`` mm or ``deviation`` mm, for the formats that
+    hold them (PLY, XYZ); the shape's own ``sigma_mm`` is called ``sigma``. ``notes``: sentences for the comments.
+
+    Raises InputError for another suffix, for points where a format takes only triangles, for NaN points and for an
+    empty shape; SessionError where the disk refuses (a file of that name is left as it was).
+    """
+    path = Path(path)
+    file_format = path.suffix.lower().removeprefix(".")
+    points, faces = (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
+    formats = POINT_FORMATS if faces is None else MESH_FORMATS
+    if file_format not in formats:
+        what = "a cloud" if faces is None else "a mesh"
+        why = ": it has no triangles" if file_format in MESH_FORMATS else ""
+        listed = ", ".join(f".{each}" for each in formats)
+        raise InputError(f"{path.name}: {what} cannot be written so{why}; choose one of {listed}")
+    if not len(points) or (faces is not None and not len(faces)):
+        raise InputError(f"{path.name} would be empty: there is nothing to write")
+    if not np.isfinite(points).all():
+        raise InputError(f"{path.name}: some points are NaN: select the valid ones first")
+    values = dict(scalars or {})
+    if shape.sigma_mm is not None:
+        values.setdefault("sigma", shape.sigma_mm)
+    if file_format == "ply":
+        write_ply(path, points, shape.colours, shape.normals, values, faces, notes)
+    elif file_format == "glb":
+        write_glb(path, shape, notes)
+    elif faces is None or file_format == "xyz":
+        columns = _columns(points, shape.normals, shape.colours, values)
+        _write_xyz(path, columns, notes, estimated_bytes(file_format, len(points), scalars=len(values)))
+    elif file_format == "stl":
+        _write_stl(path, points, faces)
+    else:
+        _write_obj(path, points, faces, shape.normals, shape.colours, notes)
+    return path.stat().st_size
+
+
+def estimated_bytes(
+    file_format: str, points: int, faces: int = 0, *, colours: bool = True, normals: bool = True, scalars: int = 0
+) -> int:
+    """How large a file of so many points and faces becomes: within 1 % of the binary ones, some 20 % of texts."""
+    if file_format == "ply":
+        return 300 + points * (12 + 12 * normals + 3 * colours + 4 * scalars) + faces * FACE.itemsize
+    if file_format == "stl":
+        return 84 + faces * FACET.itemsize
+    if file_format == "glb":
+        return 1200 + points * (12 + 12 * normals + 4 * colours) + 12 * faces
+    if file_format == "obj":
+        vertex = 3 * _NUMBER + 2 + normals * (3 * _SMALL + 4) + 21 * colours
+        return 200 + points * vertex + faces * (3 + 3 * (1 + normals) * len(str(points)) + 6 * normals)
+    return 300 + points * (3 * _NUMBER + (3 * normals + scalars) * _SMALL + 3 * _GREY * colours)
+
+
+def _columns(
+    points: np.ndarray, normals: np.ndarray | None, colours: np.ndarray | None, scalars: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    columns = dict(zip("xyz", points.T, strict=True))
+    if normals is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
+    if colours is not None:
+        columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
+    for name, values in scalars.items():
+        if np.shape(values) != points.shape[:1]:
+            raise InputError(f"{name} has shape {np.shape(values)}: one value for each of {len(points)} points")
+        columns[name] = np.asarray(values)
+    return columns
+
+
+def _comments(notes: Sequence[str]) -> str:
+    return "".join(f"# {plain(line)}\n" for line in (f"slviewer {__version__}: units mm", *notes))
+
+
+def _write_xyz(path: Path, columns: dict[str, np.ndarray], notes: Sequence[str], size: int) -> None:
+    with arriving_file(path, size) as file:
+        file.write(f"{_comments(notes)}# columns: {' '.join(columns)}\n".encode("ascii"))
+        for part in pieces(len(columns["x"])):
+            fields: list[Field] = []
+            for name, values in columns.items():
+                fields += [(without_nan(name, values[part]), 0 if values.dtype.kind in "iu" else DECIMALS), b" "]
+            file.write(lines(fields[:-1]))
+
+
+def _write_stl(path: Path, points: np.ndarray, faces: np.ndarray) -> None:
+    check_faces(faces, len(points))
+    # a header that began with "solid" would be taken for a text file
+    header = f"slviewer {__version__}, binary STL, units mm".encode("ascii").ljust(80)
+    with arriving_file(path, 84 + len(faces) * FACET.itemsize) as file:
+        file.write(header + np.uint32(len(faces)).astype("<u4").tobytes())
+        for part in pieces(len(faces)):
+            corners = points[faces[part]]
+            records = np.zeros(len(corners), FACET)
+            across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            records["normal"] = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+            records["corners"] = corners
+            file.write(records.data)
+
+
+def _write_obj(
+    path: Path,
+    points: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray | None,
+    colours: np.ndarray | None,
+    notes: Sequence[str],
+) -> None:
+    check_faces(faces, len(points))
+    size = estimated_bytes("obj", len(points), len(faces), colours=colours is not None, normals=normals is not None)
+    with arriving_file(path, size) as file:
+        file.write(_comments(notes).encode("ascii"))
+        _write_vertices(file, points, colours)
+        for part in pieces(0 if normals is None else len(points)):
+            assert normals is not None
+            file.write(lines([b"vn", *_numbers(without_nan("nx", normals[part]), DECIMALS)]))
+        for part in pieces(len(faces)):
+            corners = _numbers(faces[part] + 1, 0)
+            if normals is not None:  # each vertex has its own
+                blank, vertex = corners[::2], corners[1::2]
+                corners = [each for pair in zip(blank, vertex, strict=True) for each in (*pair, b"//", pair[1])]
+            file.write(lines([b"f", *corners]))
+
+
+def _write_vertices(file: BinaryIO, points: np.ndarray, colours: np.ndarray | None) -> None:
+    for part in pieces(len(points)):
+        fields = _numbers(points[part], DECIMALS)
+        if colours is not None:
+            fields += _numbers(colours[part].astype(np.float32) / 255, 4)
+        file.write(lines([b"v", *fields]))
+
+
+def _numbers(rows: np.ndarray, decimals: int) -> list[Field]:
+    """The columns of (n, k) numbers, a blank before each."""
+    return [field for column in rows.T for field in (b" ", (column, decimals))]

@@ -1,0 +1,171 @@
+"""What is written for other programs is read back by other programs: as it was, and in its true size."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from slviewer.errors import InputError
+from slviewer.registration.open3d_loader import open3d
+from slviewer.session.digits import lines
+from slviewer.session.mesh_files import MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
+from slviewer.surface.shapes import Mesh, PointSet
+
+RNG = np.random.default_rng(7)
+NOTES = ("calibration: splined", "frame: the camera's")
+
+
+def bumpy(n: int = 40) -> Mesh:
+    """A grid of 60 mm x 60 mm, 600 mm away: normals towards the camera, colours, sigma."""
+    y, x = np.mgrid[-30 : 30 : n * 1j, -30 : 30 : n * 1j]
+    z = 600 + 3 * np.sin(x / 7) * np.cos(y / 9)
+    vertices = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32)
+    k = np.arange(n * n).reshape(n, n)
+    faces = [[k[:-1, :-1], k[1:, :-1], k[:-1, 1:]], [k[:-1, 1:], k[1:, :-1], k[1:, 1:]]]
+    triangles = np.concatenate([np.stack([each.ravel() for each in one], 1) for one in faces])
+    triangles = triangles[:, ::-1]  # counter-clockwise seen by the camera
+    normals = trimesh.Trimesh(vertices, triangles, process=False).vertex_normals
+    colours = RNG.integers(0, 256, (n * n, 3), dtype=np.uint8)
+    return Mesh(vertices, triangles, normals, colours, RNG.random(n * n) * 0.05)
+
+
+MESH = bumpy()
+POINTS = PointSet(MESH.vertices, MESH.normals, MESH.colours, MESH.sigma_mm)
+SIZE = np.ptp(MESH.vertices, axis=0)
+
+
+def near(found: np.ndarray, truth: np.ndarray, within: float = 1e-6) -> None:
+    """To the seven digits of float32."""
+    np.testing.assert_allclose(found, truth, rtol=within, atol=within)
+
+
+@pytest.mark.parametrize("suffix", MESH_FORMATS[:4])
+def test_trimesh_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"part.{suffix}"
+    assert write_shape(path, MESH, notes=NOTES) == path.stat().st_size
+    found = trimesh.load(path, process=False, force="mesh", maintain_order=True)
+    assert len(found.faces) == len(MESH.faces)
+    unit = 1000 if suffix == "glb" else 1
+    near(unit * found.extents, SIZE, 1e-5)
+    if suffix == "stl":
+        near(found.triangles, MESH.vertices[MESH.faces])
+        near(found.face_normals, trimesh.Trimesh(MESH.vertices, MESH.faces, process=False).face_normals, 1e-4)
+        return
+    turned = [1, -1, -1] if suffix == "glb" else [1, 1, 1]  # y up, z towards the viewer
+    near(unit * found.vertices, MESH.vertices * turned)
+    assert np.array_equal(found.faces, MESH.faces)
+    if suffix == "glb":  # beside a material, trimesh keeps the colours as an attribute of the scene's mesh
+        ((_, found),) = trimesh.load(path, process=False).geometry.items()
+        painted = found.visual.vertex_attributes["color"]
+    else:
+        painted = found.visual.vertex_colors
+    assert np.array_equal(painted[:, :3], MESH.colours)
+    assert MESH.normals is not None
+    near(found.vertex_normals, MESH.normals, 1e-4)
+
+
+@pytest.mark.parametrize("suffix", MESH_FORMATS[:4])
+def test_open3d_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"part.{suffix}"
+    write_shape(path, MESH, notes=NOTES)
+    found = open3d().io.read_triangle_mesh(str(path))
+    assert len(found.triangles) == len(MESH.faces)
+    corners = np.asarray(found.vertices)[np.asarray(found.triangles)]
+    size = np.ptp(corners.reshape(-1, 3), axis=0)
+    near((1000 if suffix == "glb" else 1) * size, SIZE, 1e-5)
+    if suffix == "stl":
+        near(corners, MESH.vertices[MESH.faces])
+    else:
+        near(np.asarray(found.vertex_colors)[np.asarray(found.triangles)] * 255, MESH.colours[MESH.faces], 0.02)  # type: ignore[index]
+
+
+@pytest.mark.parametrize("suffix", POINT_FORMATS)
+def test_clouds_are_read_by_both(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cloud.{suffix}"
+    write_shape(path, POINTS, scalars={"sigma_noise": POINTS.sigma_mm}, notes=NOTES)  # type: ignore[dict-item]
+    if suffix == "glb":
+        scene = trimesh.load(path)
+        near(1000 * scene.extents, SIZE, 1e-5)
+        (cloud,) = scene.geometry.values()
+        near(1000 * cloud.vertices, POINTS.points)
+        assert np.array_equal(cloud.colors[:, :3], POINTS.colours)
+        return
+    cloud = open3d().io.read_point_cloud(str(path))
+    near(np.asarray(cloud.points), POINTS.points)
+    if suffix == "ply":
+        assert np.array_equal(np.round(np.asarray(cloud.colors) * 255), POINTS.colours)
+        near(np.asarray(cloud.normals), POINTS.normals)  # type: ignore[arg-type]
+        raw = trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
+        near(raw["sigma"].ravel(), POINTS.sigma_mm)  # type: ignore[arg-type]
+        near(raw["sigma_noise"].ravel(), POINTS.sigma_mm)  # type: ignore[arg-type]
+
+
+def test_text_names_its_columns(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.xyz"
+    write_shape(path, POINTS, notes=NOTES)
+    lines = path.read_text().splitlines()
+    assert lines[0].endswith("units mm") and lines[1] == "# calibration: splined"
+    assert lines[3] == "# columns: x y z nx ny nz red green blue sigma"
+    numbers = np.loadtxt(path)
+    near(numbers[:, :3], POINTS.points)
+    near(numbers[:, 9], POINTS.sigma_mm, 1e-4)  # type: ignore[arg-type]
+    assert np.array_equal(numbers[:, 6:9], POINTS.colours)
+
+
+@pytest.mark.parametrize("suffix", MESH_FORMATS)
+def test_units_are_stated_and_sizes_foreseen(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"part.{suffix}"
+    size = write_shape(path, MESH, notes=NOTES)
+    head = path.read_bytes()[:1500]
+    assert b"slviewer" in head and (b"metres" if suffix == "glb" else b"units mm") in head
+    assert (suffix == "stl") != (b"splined" in head) and not head.startswith(b"solid")
+    foreseen = estimated_bytes(suffix, len(MESH.vertices), len(MESH.faces), scalars=1)
+    assert foreseen == pytest.approx(size, rel=0.2 if suffix in ("obj", "xyz") else 0.03)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", MESH_FORMATS)
+def test_pieces_make_the_same_file_and_nothing_unknown_is_nan(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert MESH.normals is not None and MESH.sigma_mm is not None
+    normals, sigma = MESH.normals.copy(), MESH.sigma_mm.copy()
+    normals[3], sigma[4] = np.nan, np.nan
+    holed = Mesh(MESH.vertices, MESH.faces, normals, None, sigma)
+    write_shape(tmp_path / f"whole.{suffix}", holed)
+    monkeypatch.setattr("slviewer.session.ply.PIECE", 97)
+    write_shape(tmp_path / f"pieces.{suffix}", holed)
+    whole = (tmp_path / f"whole.{suffix}").read_bytes()
+    assert (tmp_path / f"pieces.{suffix}").read_bytes() == whole
+    if suffix in ("obj", "xyz"):
+        assert b"nan" not in whole
+    found = trimesh.load(tmp_path / f"whole.{suffix}", process=False) if suffix != "xyz" else None
+    assert found is None or np.isfinite(found.bounds).all()
+
+
+def test_numbers_as_text() -> None:
+    values = np.array([0.0, -0.25, 999.9999999, -12.5, 5e-7, -4e-7, 1234.000001])
+    text = lines([b"v ", (values, 6), b"/", (np.arange(7), 0)])
+    assert text.splitlines()[:3] == [b"v 0.000000/0", b"v -0.250000/1", b"v 1000.000000/2"]
+    found = [float(line.split()[1].split(b"/")[0]) for line in text.splitlines()]
+    np.testing.assert_allclose(found, values, atol=5.1e-7)
+    assert b"-0.000000" not in text and text.endswith(b"v 1234.000001/6\n")
+    many = RNG.normal(0, 300, 1000).astype(np.float32)
+    assert np.array_equal(np.array(lines([(many, 6)]).split(), np.float64).round(6), many.astype(float).round(6))
+    with pytest.raises(InputError, match="is it a measurement"):
+        lines([(np.array([1e13]), 6)])
+
+
+def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"choose one of .ply, .stl, .obj, .glb, .xyz"):
+        write_shape(tmp_path / "a.doc", MESH)
+    with pytest.raises(InputError, match=r"no triangles; choose one of .ply, .xyz, .glb"):
+        write_shape(tmp_path / "a.stl", POINTS)
+    with pytest.raises(InputError, match="NaN"):
+        write_shape(tmp_path / "a.ply", PointSet(np.full((3, 3), np.nan)))
+    with pytest.raises(InputError, match="empty"):
+        write_shape(tmp_path / "a.glb", PointSet(np.zeros((0, 3))))
+    with pytest.raises(InputError, match="one value for each"):
+        write_shape(tmp_path / "a.xyz", POINTS, scalars={"deviation": np.zeros(3)})
+    assert not list(tmp_path.iterdir())
