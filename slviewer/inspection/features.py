@@ -1,0 +1,106 @@
+"""What is picked or fitted on a measured surface: a point, a plane, a sphere, a cylinder."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.errors import InputError
+
+Kind = Literal["point", "plane", "sphere", "cylinder"]
+KINDS: tuple[Kind, ...] = ("point", "plane", "sphere", "cylinder")
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """A point (``place``); a plane (``place`` on it, in the middle of what was measured, unit normal ``direction``); a
+    sphere (centre, ``radius``); a cylinder (``place`` on its axis, in the middle of what was measured, unit
+    ``direction``, ``radius``). mm.
+
+    Its parameters, by which it can be ``moved``: of a point and a sphere the shift of ``place`` (3), of a sphere then
+    that of the radius; of a plane the tilt of its normal towards two directions across (rad) and its shift along the
+    normal; of a cylinder the tilts of its axis, its shifts across, and that of its radius.
+    """
+
+    kind: Kind
+    place: np.ndarray
+    direction: np.ndarray | None = None
+    radius: float | None = None
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """(n,) mm: how far points (n, 3) lie off it: from a plane signed by the normal, of the others outwards."""
+        offsets = np.asarray(points, np.float64) - self.place
+        if self.kind == "plane":
+            return np.asarray(offsets @ self._direction)
+        return np.linalg.norm(self._across(offsets), axis=-1) - (self.radius or 0.0)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3): unit vectors along which ``distance`` grows."""
+        offsets = np.asarray(points, np.float64) - self.place
+        if self.kind == "plane":
+            return np.broadcast_to(self._direction, offsets.shape)
+        across = self._across(offsets)
+        return np.asarray(across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300))
+
+    def jacobian(self, points: np.ndarray) -> np.ndarray:
+        """(n, p): how ``distance`` of the points (n, 3) answers to the parameters."""
+        offsets, normals = np.asarray(points, np.float64) - self.place, self.normals(points)
+        minus = -np.ones((len(offsets), 1))
+        if self.kind == "point":
+            return -normals
+        if self.kind == "sphere":
+            return np.hstack([-normals, minus])
+        e = self._tangents()
+        if self.kind == "plane":
+            return np.hstack([offsets @ e.T, minus])
+        shifts = -normals @ e.T
+        return np.hstack([(offsets @ self._direction)[:, None] * shifts, shifts, minus])
+
+    def moved(self, step: np.ndarray) -> "Feature":
+        """The feature with its parameters changed by a step (p,)."""
+        step = np.asarray(step, np.float64)
+        if self.kind in ("point", "sphere"):
+            radius = None if self.radius is None else self.radius + step[3]
+            return replace(self, place=self.place + step[:3], radius=radius)
+        e = self._tangents()
+        tilted = self._direction + step[:2] @ e
+        tilted /= np.linalg.norm(tilted)
+        if self.kind == "plane":
+            return replace(self, place=self.place + step[2] * self._direction, direction=tilted)
+        assert self.radius is not None
+        return replace(self, place=self.place + step[2:4] @ e, direction=tilted, radius=self.radius + step[4])
+
+    @property
+    def parameters(self) -> int:
+        """How many parameters it has."""
+        return {"point": 3, "plane": 3, "sphere": 4, "cylinder": 5}[self.kind]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        direction = None if self.direction is None else self.direction.tolist()
+        return {"kind": self.kind, "place": self.place.tolist(), "direction": direction, "radius": self.radius}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Feature":
+        """The inverse of ``to_dict``."""
+        direction = None if data["direction"] is None else np.array(data["direction"])
+        return cls(data["kind"], np.array(data["place"]), direction, data["radius"])
+
+    @property
+    def _direction(self) -> np.ndarray:
+        if self.direction is None:
+            raise InputError(f"A {self.kind} has no direction: fit a plane or a cylinder.")
+        return self.direction
+
+    def _across(self, offsets: np.ndarray) -> np.ndarray:
+        if self.kind != "cylinder":
+            return offsets
+        return np.asarray(offsets - (offsets @ self._direction)[..., None] * self._direction)
+
+    def _tangents(self) -> np.ndarray:
+        """(2, 3): unit vectors across the direction and each other."""
+        least = np.eye(3)[np.argmin(np.abs(self._direction))]
+        first = np.cross(self._direction, least)
+        first /= np.linalg.norm(first)
+        return np.stack([first, np.cross(self._direction, first)])

@@ -1,0 +1,282 @@
+"""Planes, spheres and cylinders fitted to a selected region: what they are, how sure, and whether they are any."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.evaluation.acceptance.figures import narrowest
+from slviewer.evaluation.fit import SET_ASIDE_SIGMA, SET_ASIDE_WARNING
+from slviewer.geometry.robust import reweighted, robust_sigma
+from slviewer.inspection.features import Feature, Kind
+from slviewer.inspection.quantities import Quantity
+from slviewer.inspection.starts import as_plane, as_sphere, start
+from slviewer.inspection.uncertainty import Shared, Spread, propagated, scatter
+
+LEAST_POINTS = 50
+MOST_FITTED = 20_000
+"""Points that a fit looks at: more of them change it by less than what it cannot know anyway."""
+MOST_SHARED = 400
+MOST_COMPARED = 2_000
+MOST_LEFT_OUT = 0.4
+"""Share of a region that may lie off the shape; beyond it the region holds something else."""
+MOST_RISE = 0.005
+"""Distance from a plane (1 sigma), as a share of the region's size, from which on a region that bends is no plane."""
+RIVAL = 2.0
+"""Another shape must leave this many times less before a region is said to hold that one instead."""
+SURE_RADIUS = 0.1
+"""A radius less sure than this share of itself (1 sigma) is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A feature with what its fit left over, mm.
+
+    ``rms`` and ``maximum`` (signed, the one farthest off) over the points used; ``form``: width of the narrowest range
+    that holds 95 % of their deviations; ``used`` and ``left_out`` count points; ``warnings``: sentences.
+    """
+
+    feature: Feature
+    spread: Spread
+    rms: float
+    maximum: float
+    form: float
+    used: int
+    left_out: int
+    warnings: tuple[str, ...] = ()
+
+    def quantities(self) -> list[Quantity]:
+        """What is read off it, each with its uncertainty where that is known."""
+        f, covariance = self.feature, self.spread.covariance
+        known = self.spread.shared is not None
+        found: list[Quantity] = []
+        if f.radius is not None:
+            sigma = propagated(lambda step: float(f.moved(step).radius or 0.0), covariance)
+            found.append(Quantity("radius", f.radius, "mm", sigma, known))
+            found.append(Quantity("diameter", 2 * f.radius, "mm", 2 * sigma, known))
+        found.append(Quantity("form (95 %)", self.form, "mm"))
+        found.append(Quantity("RMS", self.rms, "mm"))
+        found.append(Quantity("farthest off", self.maximum, "mm"))
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able, without the spread's shared part."""
+        return {
+            "feature": self.feature.to_dict(),
+            "scatter": self.spread.scatter.tolist(),
+            "calibration": self.spread.calibration,
+            "sigmas": self.spread.sigmas.tolist(),
+            "rms_mm": self.rms,
+            "max_mm": self.maximum,
+            "form_mm": self.form,
+            "used": self.used,
+            "left_out": self.left_out,
+            "warnings": list(self.warnings),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], shared: np.ndarray | None) -> "Fit":
+        """The inverse of ``to_dict``."""
+        spread = Spread(np.array(data["scatter"]), shared, data["calibration"])
+        return cls(
+            Feature.from_dict(data["feature"]),
+            spread,
+            data["rms_mm"],
+            data["max_mm"],
+            data["form_mm"],
+            data["used"],
+            data["left_out"],
+            tuple(data["warnings"]),
+        )
+
+
+def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, calibration: str = "") -> Fit:
+    """The shape of a region's points (n, 3) mm, by least squares of the distances, stray points set aside.
+
+    ``shared``: what the calibration leaves uncertain at places, of the ``calibration`` of that name or hash. Raises
+    InputError where the region does not hold the shape.
+    """
+    points = np.asarray(points, np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < LEAST_POINTS:
+        raise InputError(
+            f"The region holds {len(points)} measured points: a {kind} needs {LEAST_POINTS}; select a wider region."
+        )
+    if kind == "point":
+        raise InputError("A point is picked, not fitted: fit a plane, a sphere or a cylinder.")
+    looked_at = points[:: -(-len(points) // MOST_FITTED)]
+    try:
+        feature, kept = _settled(kind, looked_at)
+    except InputError as error:
+        raise _why_not(kind, looked_at, error) from error
+    residuals = feature.distance(points)
+    counted = np.abs(residuals - np.median(residuals)) <= _reach(residuals, points)
+    used = int(np.count_nonzero(counted))
+    aside = 1 - used / len(points)
+    rms = float(np.sqrt(np.mean(residuals[counted] ** 2)))
+    if aside > MOST_LEFT_OUT:
+        raise InputError(
+            f"{100 * aside:.0f} % of the region lies off the best {kind}: select a region that shows nothing else."
+        )
+    basis = looked_at[kept]
+    _refuse_other(kind, feature, basis)
+    spread = _spread(feature, basis, shared, calibration)
+    _refuse_unsure(kind, feature, spread)
+    warnings = []
+    if aside > SET_ASIDE_WARNING:
+        warnings.append(
+            f"{100 * aside:.1f} % of the region lie beyond {SET_ASIDE_SIGMA:g} robust sigma of the {kind} and were set "
+            "aside: see that it shows nothing else"
+        )
+    farthest = float(residuals[counted][np.argmax(np.abs(residuals[counted]))])
+    form = narrowest(residuals[counted], 0.95)
+    return Fit(feature, spread, rms, farthest, form, used, len(points) - used, tuple(warnings))
+
+
+def least_squares(kind: Kind, points: np.ndarray, begin: Feature | None) -> Feature:
+    """The shape of least squared distances from points (n, 3); a cylinder needs somewhere to ``begin``."""
+    if kind == "plane":
+        return as_plane(points)
+    if kind == "sphere":
+        return as_sphere(points)
+    assert begin is not None
+    return _refined(begin, points)
+
+
+def _settled(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
+    """The feature, and which of the points it was fitted to: repeated until the set is stable."""
+    feature = start(kind, points, lambda some, begin: least_squares(kind, some, begin))
+    kept = np.zeros(len(points), bool)
+    for _ in range(30):
+        residuals = feature.distance(points)
+        before, kept = kept, np.abs(residuals - np.median(residuals)) <= _reach(residuals, points)
+        if np.count_nonzero(kept ^ before) <= 1e-5 * len(points):
+            break
+        feature = least_squares(kind, points[kept], feature)
+    return feature, kept
+
+
+def _reach(residuals: np.ndarray, points: np.ndarray) -> float:
+    # exact points have no spread: rounding must not set any of them aside
+    return max(SET_ASIDE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
+
+
+def _refined(feature: Feature, points: np.ndarray) -> Feature:
+    """Levenberg-Marquardt from a start; its place ends beside the middle of the points. Raises InputError where the
+    radius runs away: the points are flat."""
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    damping, residuals = 1e-4, feature.distance(points)
+    cost = float(residuals @ residuals)
+    for _ in range(60):
+        J = feature.jacobian(points)
+        normal, gradient = J.T @ J, J.T @ residuals
+        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), gradient)
+        moved = feature.moved(step)
+        if moved.radius is not None and not 0 < moved.radius < 100 * size:
+            damping *= 10
+        else:
+            after = moved.distance(points)
+            gain = cost - float(after @ after)
+            if gain >= 0:
+                feature, residuals, cost = moved, after, cost - gain
+                damping = max(0.1 * damping, 1e-10)
+                if gain <= 1e-12 * cost:
+                    break
+            else:
+                damping *= 10
+        if damping > 1e8:
+            break
+    assert feature.direction is not None
+    along = feature.direction * np.sign(feature.direction[np.argmax(np.abs(feature.direction))])
+    middle = feature.place + ((points.mean(axis=0) - feature.place) @ along) * along
+    return Feature("cylinder", middle, along, feature.radius)
+
+
+def _spread(feature: Feature, points: np.ndarray, shared: Shared | None, calibration: str) -> Spread:
+    J = feature.jacobian(points)
+    own = scatter(points, J, feature.distance(points))
+    if shared is None:
+        return Spread(own)
+    some = points[:: -(-len(points) // MOST_SHARED)]
+    J = feature.jacobian(some)
+    # a displacement of the points changes each distance by its part along the normal, and the fit makes up for it
+    answers = -np.linalg.pinv(J)[:, :, None] * feature.normals(some)[None]
+    return Spread(own, shared(some, answers), calibration)
+
+
+def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
+    """Raise InputError where the region plainly holds something else than the shape asked for."""
+    some = points[:: -(-len(points) // MOST_COMPARED)]
+    mine = robust_sigma(feature.distance(some))
+    if kind == "plane":
+        size = float(np.linalg.norm(np.ptp(some, axis=0)))
+        if mine > MOST_RISE * size and mine > RIVAL * _bent(feature, some):
+            raise InputError(
+                f"The region bends: it rises {mine:.3g} mm off its best plane over {size:.3g} mm; fit a sphere or a "
+                "cylinder, or select a flatter region."
+            )
+        return
+    other: Kind = "cylinder" if kind == "sphere" else "sphere"
+    rival, flat = _left_by(other, some), _left_by("plane", some)
+    if rival * RIVAL < mine and rival * RIVAL < flat:
+        raise InputError(
+            f"The region is no {kind}: points lie {mine:.3g} mm off it, and {rival:.3g} mm off a {other} (1 sigma); "
+            f"fit a {other}, or select another region."
+        )
+    if not flat > RIVAL * mine:
+        raise InputError(
+            f"The region is nearly flat: points lie {flat:.3g} mm off a plane, and {mine:.3g} mm off the {kind} (1 "
+            f"sigma); fit a plane, or select more of the {kind}'s curve."
+        )
+
+
+def _why_not(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
+    """What the region holds instead of a shape that could not be fitted at all."""
+    some = points[:: -(-len(points) // MOST_COMPARED)]
+    other: Kind = "cylinder" if kind == "sphere" else "sphere"
+    flat, rival = _left_by("plane", some), _left_by(other, some)
+    best, left = (other, rival) if rival * RIVAL < flat else ("plane", flat)
+    if not np.isfinite(left):
+        return error
+    return InputError(
+        f"The region holds no {kind}, rather a {best}: points lie {left:.3g} mm off that (1 sigma); fit a {best}, or "
+        f"select more of the {kind}'s curve."
+    )
+
+
+def _left_by(kind: Kind, points: np.ndarray) -> float:
+    """How far points lie off another shape, robust sigma in mm; infinite where it does not fit at all."""
+    try:
+        return robust_sigma(_settled(kind, points)[0].distance(points))
+    except (InputError, np.linalg.LinAlgError):
+        return float("inf")
+
+
+def _bent(plane: Feature, points: np.ndarray) -> float:
+    """Robust sigma in mm about the quadratic surface over a plane: curvature taken away, noise is left."""
+    assert plane.direction is not None
+    offsets = points - points.mean(axis=0)
+    _, _, axes = np.linalg.svd(offsets - (offsets @ plane.direction)[:, None] * plane.direction, full_matrices=False)
+    u, v = offsets @ axes[0], offsets @ axes[1]
+    basis = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
+    heights = plane.distance(points)
+
+    def solve(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        root = np.sqrt(weights)
+        fitted = basis @ np.linalg.lstsq(basis * root[:, None], heights * root, rcond=None)[0]
+        return fitted, fitted
+
+    return robust_sigma(heights - reweighted(solve, heights, np.ones(len(heights))))
+
+
+def _refuse_unsure(kind: Kind, feature: Feature, spread: Spread) -> None:
+    if feature.radius is None:
+        return
+    sigma = float(spread.sigmas[-1])
+    if not sigma <= SURE_RADIUS * feature.radius:
+        raise InputError(
+            f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the region shows too "
+            "little of its curve; select more of it."
+        )

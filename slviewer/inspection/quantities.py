@@ -1,0 +1,42 @@
+"""One number that was measured, with its unit and how sure it is."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+Unit = Literal["mm", "deg", "mm²", "%", ""]
+COVERAGE = 2.0
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """``sigma``: its standard uncertainty, None where it has none (a residual, a count); ``whole``: whether that holds
+    the calibration's part, which only some models know."""
+
+    name: str
+    value: float
+    unit: Unit
+    sigma: float | None = None
+    whole: bool = True
+
+    @property
+    def U(self) -> float | None:
+        """Expanded uncertainty, k = 2."""
+        return None if self.sigma is None else COVERAGE * self.sigma
+
+    def text(self) -> str:
+        """For people."""
+        digits = 1 if self.unit == "%" else 4
+        unit = {"deg": "°", "%": " %", "": ""}.get(self.unit, f" {self.unit}")
+        if self.U is None:
+            return f"{self.name} {self.value:.{digits}f}{unit}"
+        return f"{self.name} {self.value:.{digits}f} ± {self.U:.{digits}f}{unit} (k = 2)"
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Quantity":
+        """The inverse of ``to_dict``."""
+        return cls(**data)

@@ -1,0 +1,136 @@
+"""Distances and angles between features."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.inspection.features import KINDS, Feature
+from slviewer.inspection.quantities import Quantity, Unit
+from slviewer.inspection.uncertainty import Spread, joint, propagated
+
+PARALLEL_DEG = 5.0
+"""Axes nearer to parallel than this are as far apart as they are in the measured region: where they would meet, if they
+do, is far away and means nothing."""
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """A quantity between two kinds of features, in words, and how it is computed; the first kind comes first in
+    ``features.KINDS``."""
+
+    name: str
+    unit: Unit
+    words: str
+    of: Callable[[Feature, Feature], float]
+
+
+def _apart(a: Feature, b: Feature) -> float:
+    return float(np.linalg.norm(b.place - a.place))
+
+
+def _angle(a: Feature, b: Feature) -> float:
+    """Between two directions, 0 to 90 degrees."""
+    u, v = _directed(a), _directed(b)
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), abs(u @ v))))
+
+
+def _off_axis(a: Feature, axis: Feature) -> float:
+    return float(np.linalg.norm(np.cross(a.place - axis.place, _directed(axis))))
+
+
+def _over(a: Feature, plane: Feature) -> float:
+    return float((a.place - plane.place) @ _directed(plane))
+
+
+def _planes(a: Feature, b: Feature) -> float:
+    return 0.5 * (abs(_over(a, b)) + abs(_over(b, a)))
+
+
+def _axes(a: Feature, b: Feature) -> float:
+    if _angle(a, b) < PARALLEL_DEG:
+        return 0.5 * (_off_axis(a, b) + _off_axis(b, a))
+    across = np.cross(_directed(a), _directed(b))
+    return float(abs((b.place - a.place) @ across) / np.linalg.norm(across))
+
+
+def _size(feature: Feature) -> float:
+    return feature.radius or 0.0
+
+
+def _directed(feature: Feature) -> np.ndarray:
+    if feature.direction is None:
+        raise InputError(f"A {feature.kind} has no direction.")
+    return feature.direction
+
+
+MEANINGS: dict[tuple[str, str], tuple[Meaning, ...]] = {
+    ("point", "point"): (Meaning("distance", "mm", "between the two points", _apart),),
+    ("point", "plane"): (
+        Meaning("height", "mm", "of the point over the plane, positive on the camera's side", _over),
+    ),
+    ("point", "sphere"): (
+        Meaning("distance from the centre", "mm", "of the point", _apart),
+        Meaning(
+            "distance from the surface", "mm", "of the point, negative inside", lambda p, s: _apart(p, s) - _size(s)
+        ),
+    ),
+    ("point", "cylinder"): (
+        Meaning("distance from the axis", "mm", "of the point", _off_axis),
+        Meaning(
+            "distance from the surface", "mm", "of the point, negative inside", lambda p, c: _off_axis(p, c) - _size(c)
+        ),
+    ),
+    ("plane", "plane"): (
+        Meaning("angle", "deg", "between the planes, 0 to 90", _angle),
+        Meaning("distance", "mm", "of the middle of each region from the other's plane, the mean of both", _planes),
+    ),
+    ("plane", "sphere"): (
+        Meaning("height of the centre", "mm", "over the plane", lambda p, s: _over(s, p)),
+        Meaning("gap", "mm", "to the sphere, negative where they cut", lambda p, s: abs(_over(s, p)) - _size(s)),
+    ),
+    ("plane", "cylinder"): (
+        Meaning("angle", "deg", "between the axis and the plane", lambda p, c: 90.0 - _angle(p, c)),
+        Meaning("height of the axis", "mm", "over the plane, in the middle of the cylinder's region",
+                lambda p, c: _over(c, p)),
+    ),
+    ("sphere", "sphere"): (
+        Meaning("distance of the centres", "mm", "of the two spheres", _apart),
+        Meaning("gap", "mm", "between the spheres", lambda a, b: _apart(a, b) - _size(a) - _size(b)),
+    ),
+    ("sphere", "cylinder"): (
+        Meaning("distance from the axis", "mm", "of the sphere's centre", _off_axis),
+    ),
+    ("cylinder", "cylinder"): (
+        Meaning("angle", "deg", "between the axes, 0 to 90", _angle),
+        Meaning("distance of the axes", "mm", f"the shortest; within {PARALLEL_DEG:g} degrees of parallel, that in the "
+                "middle of the regions", _axes),
+    ),
+}  # fmt: skip
+"""What can be asked of two features."""
+
+
+def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list[Quantity]:
+    """All quantities between two features, in either order, with what is known of their uncertainty.
+
+    What the same calibration leaves uncertain of both is not taken twice.
+    """
+    if KINDS.index(a.kind) > KINDS.index(b.kind):
+        a, a_spread, b, b_spread = b, b_spread, a, a_spread
+    covariance = joint(a_spread, b_spread)
+    whole = a_spread.shared is not None and b_spread.shared is not None
+    p = a.parameters
+
+    def quantity(meaning: Meaning) -> Quantity:
+        def moved(step: np.ndarray) -> float:
+            return meaning.of(a.moved(step[:p]), b.moved(step[p:]))
+
+        return Quantity(meaning.name, meaning.of(a, b), meaning.unit, propagated(moved, covariance), whole)
+
+    return [quantity(meaning) for meaning in MEANINGS[a.kind, b.kind]]
+
+
+def distance(a: np.ndarray, b: np.ndarray, a_spread: Spread, b_spread: Spread) -> Quantity:
+    """Between two picked points (3,) mm, with its uncertainty."""
+    return relation(Feature("point", np.asarray(a)), a_spread, Feature("point", np.asarray(b)), b_spread)[0]

@@ -1,0 +1,117 @@
+"""Where to start a fit in a region that also holds stray points: least median of squares over small samples."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.errors import InputError
+from slviewer.geometry.shapes import fit_plane, fit_sphere
+from slviewer.inspection.features import Feature, Kind
+
+SAMPLE = 1000
+HYPOTHESES = 400
+POLISHED = 5
+NEIGHBOURS = (12, 60)
+NEAR = 2.5
+"""Robust standard deviations: what lies nearer belongs to a hypothesis."""
+
+
+def start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Feature | None], Feature]) -> Feature:
+    """The shape that at least half of the points (n, 3) lie closest to; the same points give the same answer.
+
+    ``fit``: least squares over points, from a start. Raises InputError, the last one's, where no sample holds a shape.
+    """
+    rng = np.random.default_rng(0)
+    sample = points[rng.choice(len(points), min(SAMPLE, len(points)), replace=False)]
+    normals = local_normals(sample, points) if kind == "cylinder" else None
+    # samples of the whole region show its curvature; noise would hide it from neighbours
+    rated: list[tuple[float, int, Feature]] = []
+    for n in range(HYPOTHESES if kind != "plane" else HYPOTHESES // 4):
+        try:
+            found = _through(kind, sample, normals, rng)
+        except (InputError, np.linalg.LinAlgError):
+            continue
+        if found is not None:
+            rated.append((_median(found, sample), n, found))
+    refused: InputError | None = None
+    best: tuple[float, Feature] | None = None
+    for rating, _, found in sorted(rated, key=lambda each: each[:2])[:POLISHED]:
+        for _ in range(3):
+            chosen = np.abs(found.distance(sample)) <= NEAR * 1.4826 * rating + 1e-9
+            try:
+                found = fit(sample[chosen], found)
+            except InputError as error:
+                refused = error
+                break
+            rating = _median(found, sample)
+        else:
+            if best is None or rating < best[0]:
+                best = rating, found
+    if best is None:
+        raise refused or InputError(f"No {kind} passes through the {len(points)} points: select another region.")
+    return best[1]
+
+
+def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(m, 3): unit normals at ``sample`` (m, 3), of either sign, from neighbours among ``points`` (n, 3): about a tenth
+    of the region across, so that the noise of a point does not tilt them."""
+    thin = points[:: max(1, len(points) // 6000)]
+    count = int(np.clip(len(thin) // 100, *NEIGHBOURS))
+    _, near = cKDTree(thin).query(sample, k=min(count, len(thin)))
+    patches = thin[near]
+    patches = patches - patches.mean(axis=1, keepdims=True)
+    return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0])
+
+
+def _through(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator) -> Feature | None:
+    """The shape through as few points as fix it; None where they do not."""
+    if kind == "cylinder":
+        assert normals is not None
+        return _cylinder(sample, normals, rng)
+    some = sample[rng.integers(0, len(sample), 3 if kind == "plane" else 4)]
+    if kind == "plane":
+        plane = fit_plane(some)
+        return Feature("plane", some.mean(axis=0), plane.normal)
+    edges = some[1:] - some[0]
+    if abs(np.linalg.det(edges)) <= 1e-9 * np.linalg.norm(edges, axis=1).prod():
+        return None
+    offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
+    return Feature("sphere", some[0] + offset, None, float(np.linalg.norm(offset)))
+
+
+def _cylinder(sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> Feature | None:
+    """Normals of a cylinder lie on a great circle about its axis (Gauss map): two of them give the axis, and the circle
+    through three points, seen along it, the rest."""
+    i, j, k = rng.integers(0, len(sample), 3)
+    axis = np.cross(normals[i], normals[j])
+    length = np.linalg.norm(axis)
+    if length < 0.05:
+        return None
+    axis /= length
+    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    u /= np.linalg.norm(u)
+    frame = np.stack([u, np.cross(axis, u)])
+    flat = sample[[i, j, k]] @ frame.T
+    edges = flat[1:] - flat[0]
+    if abs(np.linalg.det(edges)) <= 1e-6 * np.linalg.norm(edges, axis=1).prod():
+        return None
+    offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
+    return Feature("cylinder", (flat[0] + offset) @ frame, axis, float(np.linalg.norm(offset)))
+
+
+def _median(feature: Feature, points: np.ndarray) -> float:
+    return float(np.median(np.abs(feature.distance(points))))
+
+
+def as_sphere(points: np.ndarray) -> Feature:
+    """The least-squares sphere of points (n, 3). Raises InputError where they are too flat for one."""
+    found = fit_sphere(points)
+    return Feature("sphere", found.centre, None, found.radius)
+
+
+def as_plane(points: np.ndarray) -> Feature:
+    """The least-squares plane of points (n, 3); its place is their middle."""
+    found = fit_plane(points)
+    middle = points.mean(axis=0)
+    return Feature("plane", middle - found.distance(middle) * found.normal, found.normal)

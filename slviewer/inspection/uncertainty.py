@@ -1,0 +1,127 @@
+"""How sure a fitted parameter is: what the points' scatter says, and what the calibration leaves, which all share."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.calibration.splined.found import Bundle
+from slviewer.calibration.splined.uncertainty import beyond
+from slviewer.calibration.splined.volume import BestMotion, Volume, looked, working_volume
+from slviewer.fringe.sequence import Axis
+
+Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p), whose product with
+itself is the parameters' covariance by errors that no averaging lessens. The k of two calls are the same errors."""
+
+PATCHES = 8
+"""Across a region: deviations within a patch are taken for one another's company, those of different patches not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Covariance of p parameters: ``scatter`` (p, p) of its own, and ``shared`` (k, p), the calibration's part, as
+    ``Shared`` gives it; None where that is not known. ``calibration``: by whose errors; only one calibration's are
+    the same."""
+
+    scatter: np.ndarray
+    shared: np.ndarray | None = None
+    calibration: str = ""
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(p, p)."""
+        return self.scatter if self.shared is None else self.scatter + self.shared.T @ self.shared
+
+    @property
+    def sigmas(self) -> np.ndarray:
+        """(p,): standard deviations."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def joint(a: Spread, b: Spread) -> np.ndarray:
+    """(p + q, p + q): the covariance of two features' parameters; errors of a calibration that both have, are one."""
+    p = len(a.scatter)
+    whole = np.zeros((p + len(b.scatter),) * 2)
+    whole[:p, :p], whole[p:, p:] = a.covariance, b.covariance
+    if a.shared is not None and b.shared is not None and a.calibration == b.calibration:
+        whole[:p, p:] = a.shared.T @ b.shared
+        whole[p:, :p] = whole[:p, p:].T
+    return whole
+
+
+def propagated(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:
+    """Standard deviation of f(step) at step 0, for steps (p,) of a covariance.
+
+    Along each principal direction f is asked one standard deviation to both sides, which also holds where f has a kink
+    there (an angle at zero, a distance at zero).
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    middle = f(np.zeros(len(values)))
+    variance = 0.0
+    for value, vector in zip(values, vectors.T, strict=True):
+        step = np.sqrt(max(value, 0.0)) * vector
+        variance += 0.5 * ((f(step) - middle) ** 2 + (f(-step) - middle) ** 2)
+    return float(np.sqrt(variance))
+
+
+def scatter(points: np.ndarray, jacobian: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    """(p, p): covariance of parameters fitted to points (n, 3) by least squares, from what the fit leaves over.
+
+    The residuals (n,) of one patch count together: form and smooth errors do not average out over neighbours as noise
+    does. Never below what independent residuals would give.
+    """
+    n, p = jacobian.shape
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+    plain = inverse * float(residuals @ residuals) / max(n - p, 1)
+    low = points.min(axis=0)
+    side = max(float(np.ptp(points, axis=0).max()) / PATCHES, 1e-12)
+    _, patch = np.unique(((points - low) / side).astype(int), axis=0, return_inverse=True)
+    count = int(patch.max()) + 1
+    if count <= 2 * p:
+        return plain
+    sums = np.stack([np.bincount(patch.ravel(), jacobian[:, k] * residuals, count) for k in range(p)], axis=1)
+    together = inverse @ (sums.T @ sums) @ inverse * count / (count - p)
+    # elementwise larger standard deviations, with the correlations of the patches
+    ratio = np.sqrt(np.maximum(np.diag(plain) / np.maximum(np.diag(together), 1e-300), 1.0))
+    return np.asarray(together * np.outer(ratio, ratio))
+
+
+def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0) -> Shared:
+    """What a splined calibration leaves uncertain in points measured through one axis, rigid motion apart: that of the
+    working volume's places is taken from all, so that distances and angles are as they were. ``scale``: by what factor
+    the points were enlarged after their reconstruction."""
+    rig = bundle.state.rig
+    reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
+    motion = BestMotion.of(reference.points)
+    moved = motion.weights.T @ bundle.point_jacobian(axis, reference.pixels, reference.z).toarray()
+
+    def shared(points: np.ndarray, answers: np.ndarray) -> np.ndarray:
+        places = np.asarray(points, np.float64) / scale
+        pixels = _pixels(bundle, places)
+        jacobian = bundle.point_jacobian(axis, pixels, places[:, 2])
+        jacobian.data[~np.isfinite(jacobian.data)] = 0.0
+        volume = Volume(pixels, places[:, 2], *looked(rig, pixels, places[:, 2]))
+        weighed = (answers * (scale * beyond(bundle, volume))[None, :, None]).reshape(len(answers), -1)
+        free = weighed @ jacobian - (weighed @ motion.at(places)) @ moved
+        return np.asarray(bundle.whitened(np.asarray(free)), np.float64)
+
+    return shared
+
+
+def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
+    """(n, 2): where the camera sees points (n, 3), by Newton on what its pixels look at."""
+    rig = bundle.state.rig
+    width, height = (float(n) for n in rig.camera.size)
+    # the rays of a coarse grid give a start that is linear in the normalised point
+    u, v = np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 7))
+    grid = np.column_stack([u.ravel(), v.ravel()])
+    rays = looked(rig, grid, np.ones(len(grid)))[0]
+    known = np.isfinite(rays).all(axis=1)
+    linear = np.linalg.lstsq(rays[known], grid[known], rcond=None)[0]
+    pixels = points / points[:, 2:] @ linear
+    for _ in range(6):
+        seen = looked(rig, pixels, points[:, 2])[0]
+        wrong = np.nan_to_num(points - seen) / points[:, 2:]
+        pixels = pixels + wrong[:, :2] @ linear[:2]
+    return pixels
