@@ -1,0 +1,78 @@
+"""What of an organised cloud is no surface: edge pixels that fly between two depths, grazing ones, small groups."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from slviewer.reconstruction.cloud import Cloud
+
+STEEPEST = 6.0
+"""Steps between neighbours, in their own distance across the line of sight, from which they are two surfaces (80°)."""
+FLATTEST_SIGHT = 0.12
+"""The cosine between a surface's normal and the line of sight below which it is not measured, but guessed (83°)."""
+LEAST_GROUP = 2e-4
+"""Share of a scan's pixels below which a group without neighbours is no part of the object."""
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """What of a scan is left out, in pixels: at depth jumps, seen grazing or without a normal, in small groups."""
+
+    edges: int
+    grazing: int
+    groups: int
+
+    @property
+    def total(self) -> int:
+        """All of them."""
+        return self.edges + self.grazing + self.groups
+
+
+def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, Cleaned]:
+    """(h, w) bool: the pixels of a cloud that lie on a surface, and what was left out.
+
+    ``normals``: (h, w, 3), towards the camera.
+    """
+    mask = cloud.mask
+    kept = mask & ~at_jumps(cloud.points, cloud.sigma_z)
+    edges = int(mask.sum() - kept.sum())
+    seen = kept & (np.abs(sight(cloud.points, normals)) > FLATTEST_SIGHT)  # False where the normal is NaN
+    grazing = int(kept.sum() - seen.sum())
+    large = _large_groups(seen)
+    return large, Cleaned(edges, grazing, int(seen.sum() - large.sum()))
+
+
+def sight(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(h, w) cosine between the normals (h, w, 3) and the lines of sight to points (h, w, 3) in the camera's frame."""
+    away = np.linalg.norm(points, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(-np.einsum("ijk,ijk->ij", points, normals) / away)
+
+
+def at_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the pixels (h, w, 3) mm whose depth leaps to a neighbour's: there one pixel sees two surfaces.
+
+    A leap is larger than ``STEEPEST`` times the distance of the neighbours across the line of sight and six times their
+    noise ``sigma_z`` (h, w) (where it is known) together.
+    """
+    noise = 6 * np.nan_to_num(sigma_z, nan=0.0, posinf=0.0, neginf=0.0)
+    jumps = np.zeros(points.shape[:2], bool)
+    for here, there in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        step = np.abs(points[there] - points[here])
+        across = np.hypot(step[..., 0], step[..., 1])
+        # along a line of sight that is oblique to the camera's axis, depth itself leads aside
+        leap = step[..., 2] > STEEPEST * across.clip(max=2 * np.nanmedian(across)) + np.maximum(
+            noise[here], noise[there]
+        )
+        jumps[here] |= leap
+        jumps[there] |= leap
+    return jumps
+
+
+def _large_groups(mask: np.ndarray) -> np.ndarray:
+    least = max(20.0, LEAST_GROUP * np.count_nonzero(mask))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= least
+    large[0] = False
+    return np.asarray(large[labels])

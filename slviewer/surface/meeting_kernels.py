@@ -1,0 +1,168 @@
+"""Where one scan's points meet another scan's surface: compiled loops over the points of the one."""
+
+import numba
+import numpy as np
+
+from slviewer.geometry.jit import kernel
+
+SAME_SIDE = 0.5
+"""The cosine between two normals from which they may belong to one surface."""
+FIELDS = 12
+"""Of a point's sums: weight, weight x height, (weight x noise)2, weight x lasting, weight x normal (3), number of
+scans, weight of colour, weight x colour (3)."""
+
+
+@kernel()
+def pixel_of(x, y, z, to_pixel):
+    """(column, row) that sees (x, y, z); NaN beside what the scan covers."""
+    if not z > 0.0:
+        return np.nan, np.nan
+    a = (x / z - to_pixel[0]) / to_pixel[2]
+    b = (y / z - to_pixel[1]) / to_pixel[3]
+    if abs(a) > 1.02 or abs(b) > 1.02:
+        return np.nan, np.nan
+    u = v = 0.0
+    k = 4
+    power = 1.0
+    for i in range(6):
+        term = power
+        for _ in range(6 - i):
+            u += to_pixel[k] * term
+            v += to_pixel[k + 21] * term
+            term *= b
+            k += 1
+        power *= a
+    return u, v
+
+
+@kernel()
+def meet(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+    """How a scan's surface lies at the point ``p`` (3,) with normal ``n``, in that scan's frame; False where not there.
+
+    Fills ``mean`` (8,): height above p along n, its variance, lasting, inner weight, normal (3), and the pixel
+    (v * width + u). The height is the mean of those of the tangent planes of the pixels around, within ``reach`` mm
+    across n. Where these planes differ by more than noise the surface bends within a pixel, and its mean is the less
+    sure: what exceeds twice the variance of noise is added.
+    """
+    height, width = noise.shape
+    u, v = pixel_of(p[0], p[1], p[2], to_pixel)
+    if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+        return False
+    row, column = int(np.rint(v)), int(np.rint(u))
+    total = squares = t = tt = noises = s = w = m0 = m1 = m2 = 0.0
+    for y in range(max(row - 2, 0), min(row + 3, height)):
+        for x in range(max(column - 2, 0), min(column + 3, width)):
+            if not np.isfinite(points[y, x, 2]):
+                continue
+            d0, d1, d2 = points[y, x, 0] - p[0], points[y, x, 1] - p[1], points[y, x, 2] - p[2]
+            along = d0 * n[0] + d1 * n[1] + d2 * n[2]
+            near = 1.0 - (d0 * d0 + d1 * d1 + d2 * d2 - along * along) / (reach * reach)
+            if near <= 0.0:
+                continue
+            q0, q1, q2 = normals[y, x, 0], normals[y, x, 1], normals[y, x, 2]
+            cosine = q0 * n[0] + q1 * n[1] + q2 * n[2]
+            if cosine < SAME_SIDE:
+                continue
+            rise = (q0 * d0 + q1 * d1 + q2 * d2) / cosine
+            if abs(rise) > gate:
+                continue
+            total += near
+            t += near * rise
+            tt += near * rise * rise
+            variance = noise[y, x] * noise[y, x]
+            noises += near * variance
+            squares += near * near * variance
+            s += near * lasting[y, x]
+            w += near * inner[y, x]
+            m0, m1, m2 = m0 + near * q0, m1 + near * q1, m2 + near * q2
+    if not total > 0.3:  # one pixel at the rim of the reach says nothing about this place
+        return False
+    t /= total
+    bent = max(tt / total - t * t - 2.0 * noises / total, 0.0)
+    mean[0], mean[1], mean[2], mean[3] = t, squares / (total * total) + bent, s / total, w / total
+    length = np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+    mean[4], mean[5], mean[6] = m0 / length, m1 / length, m2 / length
+    mean[7] = row * width + column
+    return True
+
+
+@kernel(parallel=True)
+def compare(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, out):
+    """Fills ``out`` (k, 2): the height of the scan above each of the points p (k, 3), and its pixel; NaN, -1 where
+    they do not meet. Points and normals n (k, 3) in the scan's frame."""
+    for i in numba.prange(len(p)):
+        mean = np.empty(8)
+        out[i, 0], out[i, 1] = np.nan, -1.0
+        if meet(p[i], n[i], reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+            out[i, 0], out[i, 1] = mean[0], mean[7]
+
+
+@kernel(parallel=True)
+def vote(p, gate, points, sure, to_pixel, agreed, denied):
+    """Adds 1 to ``agreed`` (k,) where a scan sees its surface at the points p (k, 3) of its frame, or to ``denied``
+    where it sees through them, further than ``gate`` mm. Only pixels ``sure`` (h, w) say so."""
+    height, width = sure.shape
+    for i in numba.prange(len(p)):
+        u, v = pixel_of(p[i, 0], p[i, 1], p[i, 2], to_pixel)
+        if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+            continue
+        y, x = int(np.rint(v)), int(np.rint(u))
+        if not sure[y, x]:
+            continue
+        behind = points[y, x, 2] - p[i, 2]
+        if abs(behind) <= gate:
+            agreed[i] += 1
+        elif behind > 3.0 * gate:
+            denied[i] += 1
+
+
+@kernel(parallel=True)
+def gather(
+    p,
+    n,
+    own,
+    R,
+    reach,
+    gate,
+    points,
+    normals,
+    noise,
+    lasting,
+    inner,
+    quality,
+    colours,
+    gain,
+    earlier,
+    to_pixel,
+    sums,
+    lost,
+):
+    """Adds a scan's surface to the ``sums`` (k, FIELDS) of the points p (k, 3) with normals n (k, 3) in its frame.
+
+    ``R`` (3, 3) turns its frame into the reference's. ``lost`` (k,) becomes True where the scan knows the place better
+    than ``own`` (k,), its quality for those points; of two alike the ``earlier`` wins.
+    """
+    width = noise.shape[1]
+    for i in numba.prange(len(p)):
+        mean = np.empty(8)
+        if not meet(p[i], n[i], reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+            continue
+        y, x = int(mean[7]) // width, int(mean[7]) % width
+        weight = mean[3] / (mean[1] + mean[2] * mean[2])
+        sums[i, 0] += weight
+        sums[i, 1] += weight * mean[0]
+        sums[i, 2] += weight * weight * mean[1]
+        sums[i, 3] += weight * mean[2]
+        for k in range(3):
+            sums[i, 4 + k] += weight * (R[k, 0] * mean[4] + R[k, 1] * mean[5] + R[k, 2] * mean[6])
+        sums[i, 7] += 1.0
+        if colours.shape[0] == noise.shape[0]:
+            sight = -(p[i, 0] * n[i, 0] + p[i, 1] * n[i, 1] + p[i, 2] * n[i, 2])
+            sight /= np.sqrt(p[i, 0] ** 2 + p[i, 1] ** 2 + p[i, 2] ** 2)
+            share = mean[3] * max(sight, 0.0)
+            sums[i, 8] += share
+            for k in range(3):
+                sums[i, 9 + k] += share * gain * colours[y, x, k]
+        rival = quality[y, x]
+        if rival > own[i] or (rival == own[i] and earlier):
+            lost[i] = True
