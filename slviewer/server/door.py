@@ -2,9 +2,7 @@
 
 import logging
 import re
-from collections.abc import Awaitable, Callable
 from http import HTTPStatus
-from typing import Any
 from urllib.parse import parse_qsl
 
 from websockets.http11 import Request, Response
@@ -26,16 +24,20 @@ _ONWARD = """<!doctype html><meta charset="utf-8"><title>slviewer</title><script
 class Door:
     """Answers a server's requests: viser's page, our own pages and files, and who may open a WebSocket."""
 
-    def __init__(self, access: Access, routes: Routes, downloads: Downloads, scripts: tuple[str, ...]) -> None:
+    def __init__(
+        self, access: Access, routes: Routes, downloads: Downloads, page: bytes, scripts: tuple[str, ...]
+    ) -> None:
+        """`page` is viser's, and `scripts` the hashes of those that it may run."""
         self._access = access
         self._routes = routes
         self._downloads = downloads
+        self._viser_page = page
         self._scripts = scripts
 
-    async def answer(self, connection: Connection, request: Request, viser_page: Callable[..., Any]) -> Response | None:
-        """The answer, or None to open a WebSocket; `viser_page` is viser's own process_request."""
+    async def answer(self, connection: Connection, request: Request) -> Response | None:
+        """The answer, or None to open a WebSocket."""
         try:
-            return await self._answer(connection, request, viser_page)
+            return await self._answer(connection, request)
         except Refusal as refusal:
             response = respond(refusal.status, refusal.sentence + "\n")
         except Exception:
@@ -44,9 +46,7 @@ class Door:
         harden(response.headers)
         return response
 
-    async def _answer(
-        self, connection: Connection, request: Request, viser_page: Callable[..., Any]
-    ) -> Response | None:
+    async def _answer(self, connection: Connection, request: Request) -> Response | None:
         headers, access = request.headers, self._access
         host = access.host(headers, connection.transport.get_extra_info("sockname")[0])
         websocket = any(value.lower() == "websocket" for value in headers.get_all("Upgrade"))
@@ -64,9 +64,7 @@ class Door:
             connection.role = role
             return None
         if path == "/":
-            response = viser_page(connection, request)
-            if isinstance(response, Awaitable):
-                response = await response
+            response = respond(HTTPStatus.OK, self._viser_page, "text/html; charset=utf-8")
             harden(response.headers, viser_policy(self._scripts, host))
             return response
         if path == "/favicon.ico":  # browsers ask by themselves, and would report that there is none

@@ -17,6 +17,7 @@ from slviewer.server.connection import Connection, quiet_logger
 from slviewer.server.door import Door
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
+from slviewer.server.responses import script_hash
 from slviewer.server.routes import Routes
 from slviewer.server.uploads import Budget
 
@@ -97,13 +98,12 @@ def serve(
     try:
         access = Access(port, token, view_token, names)
         routes, downloads = Routes(), Downloads()
-        door = Door(access, routes, downloads, pins.VISER_SCRIPTS)
+        scripts = (*pins.VISER_SCRIPTS, script_hash(viser_internals.ONE_DRAW))
+        door = Door(access, routes, downloads, viser_internals.client_page(), scripts)
         budget = Budget(upload_limit)
         started: list[viser.ViserServer] = []
 
         def serve_viser(viser_handler: Callable[..., Any], _host: str, _port: int, **options: Any) -> serve_websockets:
-            viser_page = options.pop("process_request")
-
             async def handle(connection: ServerConnection) -> None:
                 assert isinstance(connection, Connection)
                 path = connection.request.path if connection.request else "/"
@@ -119,7 +119,7 @@ def serve(
 
             options.update(
                 sock=sock,
-                process_request=lambda connection, request: door.answer(connection, request, viser_page),
+                process_request=door.answer,
                 create_connection=Connection,
                 max_size=MESSAGE_LIMIT,
                 server_header=None,

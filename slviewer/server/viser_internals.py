@@ -10,6 +10,7 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
@@ -26,6 +27,8 @@ from slviewer.errors import SlviewerError
 Message = _messages.Message
 
 CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
+ONE_DRAW = resources.files("slviewer.server").joinpath("one_draw.js").read_bytes()
+"""A script of ours that runs in viser's page before its own."""
 
 FROM_CLIENTS: dict[str, type[Any]] = {
     kind.__name__: kind
@@ -82,6 +85,12 @@ def start(serve: Callable[..., Any], host: str, port: int, label: str | None) ->
         setattr(owner, name, value)
     themed()
     return server
+
+
+def client_page() -> bytes:
+    """The page that viser serves, with our script in it."""
+    before, loader, after = CLIENT_PAGE.read_bytes().partition(b"<script data-p=")
+    return b"".join([before, b"<script>", ONE_DRAW, b"</script>", loader, after])
 
 
 def stop(server: viser.ViserServer) -> None:
