@@ -1,0 +1,218 @@
+"""How far a scan lies off a nominal model, after the best fit of the one to the other."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.errors import InputError
+from slviewer.inspection.nominal_surface import NominalSurface
+from slviewer.inspection.placing import found_start
+from slviewer.inspection.uncertainty import scatter
+from slviewer.registration.pairwise import Registration
+from slviewer.surface.shapes import Mesh
+
+REACH = 0.02
+"""Of the nominal's diagonal: scan points farther from it belong to something else, a table or a clamp."""
+NOISE_REACH = 10.0
+COVERAGE_SAMPLES = 20_000
+MOST_ALIGNED = 60_000
+MOST_FEET = 400_000
+SPACINGS = 3.0
+"""A place on the nominal was measured if a scan point's foot is no farther than so many of their spacings."""
+ROUNDS = 40
+SLANT = 0.5
+"""Cosine: a scan point whose normal is turned away further from the nominal's lies on something else there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """A scan's points against a nominal model.
+
+    ``signed`` (n,) float32 mm: of each scan point, positive outside the nominal; NaN for points farther than
+    ``reach_mm``, or that face another way. ``T_nominal_scan`` (4, 4) is the best fit; ``normals`` (n, 3) the nominal's
+    where each point's nearest place is, in the scan's frame, NaN likewise. ``coverage``: share of the nominal's area
+    that was measured; ``uncovered`` (k, 3) mm: places of the rest, in the scan's frame. ``alignment_mm``: standard
+    uncertainty that the best fit adds to a point, RMS over the points.
+    """
+
+    signed: np.ndarray
+    normals: np.ndarray
+    T_nominal_scan: np.ndarray
+    reach_mm: float
+    coverage: float
+    uncovered: np.ndarray
+    alignment_mm: float
+    start: Registration | None = None
+
+    @property
+    def counted(self) -> np.ndarray:
+        """(n,) bool: the points that belong to the nominal."""
+        return np.isfinite(self.signed)
+
+    def statistics(self) -> dict[str, float]:
+        """Of the points that belong to the nominal, mm: ``mean``, ``rms``, ``sigma`` about the mean, ``within_95`` (95
+        % are off by less), ``lowest`` and ``highest``, and ``p_low``, ``p_high``, between which 99.7 % lie; and the
+        numbers of ``points`` used and ``left_out``."""
+        values = self.signed[self.counted].astype(np.float64)
+        low, high = np.percentile(values, [0.15, 99.85])
+        return {
+            "mean": float(values.mean()),
+            "rms": float(np.sqrt(np.mean(values**2))),
+            "sigma": float(values.std()),
+            "within_95": float(np.percentile(np.abs(values), 95)),
+            "lowest": float(values.min()),
+            "highest": float(values.max()),
+            "p_low": float(low),
+            "p_high": float(high),
+            "points": int(values.size),
+            "left_out": int(self.signed.size - values.size),
+        }
+
+    def histogram(self, bins: int = 81) -> tuple[np.ndarray, np.ndarray]:
+        """Edges (bins + 1,) mm, symmetric about 0, and counts (bins,); what lies beyond 99.8 % is left out."""
+        values = self.signed[self.counted]
+        limit = max(float(np.percentile(np.abs(values), 99.8)), 1e-6)
+        edges = np.linspace(-limit, limit, bins + 1)
+        return edges, np.histogram(values, edges)[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able: everything but what is told point by point."""
+        return {
+            "statistics_mm": self.statistics(),
+            "reach_mm": self.reach_mm,
+            "coverage": self.coverage,
+            "alignment_mm": self.alignment_mm,
+            "T_nominal_scan": self.T_nominal_scan.tolist(),
+        }
+
+
+def deviation(
+    points: np.ndarray,
+    nominal: Mesh,
+    *,
+    normals: np.ndarray | None = None,
+    sigma_mm: float | None = None,
+    reach_mm: float | None = None,
+    initial: np.ndarray | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Deviation:
+    """Align scan points (n, 3) mm with a nominal model, and tell how far each lies off it.
+
+    ``normals`` (n, 3) of the scan, towards the camera, NaN where unknown: what faces another way than the nominal is
+    told apart by them. ``sigma_mm``: the expected error of one point. ``reach_mm``: points farther off the nominal
+    belong to something else; by default 2 % of its diagonal, never below ten times the noise. ``initial`` (4, 4) scan
+    to nominal: replaces the search. Raises SlviewerError where the two cannot be aligned with trust.
+    """
+    say = progress or (lambda share: None)
+    points = np.asarray(points, np.float64)
+    surface = NominalSurface(nominal)
+    if reach_mm is None:
+        reach_mm = max(REACH * surface.diagonal, NOISE_REACH * (sigma_mm or 0.0))
+    if not reach_mm > 0:
+        raise InputError(f"A reach of {reach_mm:g} mm was given: give a positive one.")
+    say(0.0)
+    start = None
+    if initial is None:
+        start = found_start(points, normals, surface, sigma_mm, lambda share: say(0.6 * share))
+        initial = start.T_reference_scan
+    T, alignment = _best_fit(points, normals, surface, initial, reach_mm, lambda share: say(0.6 + 0.2 * share))
+    say(0.8)
+    signed, towards = _signed(points, normals, surface, T, reach_mm)
+    kept = np.isfinite(signed)
+    if not kept.any():
+        raise InputError(
+            f"No point of the scan lies within {reach_mm:.3g} mm of the nominal model: does it show that part?"
+        )
+    say(0.95)
+    feet = _moved(points[kept], T) - signed[kept, None] * towards[kept]
+    measured, uncovered = _coverage(feet, surface)
+    back = np.linalg.inv(T)
+    say(1.0)
+    return Deviation(
+        signed.astype(np.float32),
+        (towards @ T[:3, :3]).astype(np.float32),
+        T,
+        reach_mm,
+        measured,
+        (uncovered @ back[:3, :3].T + back[:3, 3]).astype(np.float32),
+        alignment,
+        start,
+    )
+
+
+def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _signed(
+    points: np.ndarray, normals: np.ndarray | None, surface: NominalSurface, T: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distances (n,) and the nominal's normals (n, 3), NaN where a point does not belong to it."""
+    away, towards = surface.signed(_moved(points, T))
+    belongs = np.abs(away) <= reach
+    if normals is not None:
+        cosine = np.sum((normals @ T[:3, :3].T) * towards, axis=1)
+        belongs &= ~(cosine < SLANT)  # an unknown normal says nothing
+    away[~belongs] = np.nan
+    towards[~belongs] = np.nan
+    return away, towards
+
+
+def _best_fit(
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    surface: NominalSurface,
+    T: np.ndarray,
+    reach: float,
+    say: Callable[[float], None],
+) -> tuple[np.ndarray, float]:
+    """The pose of least squared distances of the points that belong to the nominal, by Gauss-Newton, and the standard
+    uncertainty, mm, that its own gives the points."""
+    step = -(-len(points) // MOST_ALIGNED)
+    points = points[::step]
+    normals = None if normals is None else normals[::step]
+    T = np.array(T, np.float64)
+    for turn in range(ROUNDS):
+        say(turn / ROUNDS)
+        away, towards = _signed(points, normals, surface, T, reach)
+        kept = np.isfinite(away)
+        if np.count_nonzero(kept) < 100:
+            raise InputError(
+                f"Only {np.count_nonzero(kept)} points of the scan lie within {reach:.3g} mm of the nominal model: "
+                "does it show that part?"
+            )
+        moved = _moved(points[kept], T)
+        middle = moved.mean(axis=0)
+        J = np.hstack([np.cross(moved - middle, towards[kept]), towards[kept]])
+        information = J.T @ J
+        change = -np.linalg.lstsq(information, J.T @ away[kept], rcond=1e-10)[0]
+        T = _turned(change, middle) @ T
+        if np.abs(J @ change).max() < 1e-5:
+            break
+    covariance = scatter(moved, J, away[kept])
+    return T, float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean()))
+
+
+def _turned(change: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """(4, 4): turned by the vector change[:3] about ``middle``, then shifted by change[3:]."""
+    from scipy.spatial.transform import Rotation
+
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix()
+    T[:3, 3] = middle - T[:3, :3] @ middle + change[3:]
+    return T
+
+
+def _coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndarray]:
+    """Share of the nominal's area that was measured, and places (k, 3) in its frame of the rest. ``feet`` (n, 3): where
+    on the nominal the scan's points were measured."""
+    places, _ = surface.sampled(COVERAGE_SAMPLES, seed=1)
+    thin = feet[:: -(-len(feet) // MOST_FEET)]
+    tree = cKDTree(thin)
+    spacing, _ = tree.query(thin[:: -(-len(thin) // 2000)], k=2)
+    away, _ = tree.query(places, workers=-1)
+    measured = away <= SPACINGS * float(np.percentile(spacing[:, 1], 95))
+    return float(measured.mean()), places[~measured]

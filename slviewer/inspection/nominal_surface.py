@@ -1,0 +1,109 @@
+"""A nominal model that can be asked how far places lie off it, and on which side."""
+
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.registration.open3d_loader import open3d
+from slviewer.surface.shapes import Mesh
+
+RIM = 0.5
+"""Cosine: what a place's nearest triangle faces less than this lies beyond the surface's rim, not above it."""
+CORNER = 1e-4
+"""Barycentric: nearer to a side than this, the nearest place lies on it."""
+NEGLIGIBLE = 1e-4
+"""mm: directions from nearer than this to the surface are rounding."""
+
+
+class NominalSurface:
+    """A mesh, closed or open; its normals say what is outside. Distances are right within a micrometre."""
+
+    def __init__(self, mesh: Mesh):
+        if not len(mesh.faces):
+            raise InputError("The nominal model has no triangles: give a mesh.")
+        vertices = mesh.vertices.astype(np.float64)
+        self._middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # casting in float32 is finest about 0
+        self.diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+        self._corners = (vertices - self._middle)[mesh.faces]
+        flat = np.cross(self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0])
+        lengths = np.linalg.norm(flat, axis=1)
+        self.areas = lengths / 2
+        if not self.areas.sum() > 0:
+            raise InputError("The nominal model's triangles have no area: give another file.")
+        self._flat = flat / np.maximum(lengths, 1e-300)[:, None]
+        self._smooth = _smooth(self._corners, self._flat, mesh.faces, len(vertices))
+        self._faces = mesh.faces
+        core = open3d().core
+        self._scene: Any = open3d().t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            core.Tensor((vertices - self._middle).astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32))
+        )
+
+    def signed(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open mesh; and the
+        surface's normals (n, 3) where each is nearest."""
+        centred = points - self._middle
+        found = self._scene.compute_closest_points(open3d().core.Tensor(centred.astype(np.float32)))
+        face = found["primitive_ids"].numpy().astype(np.int64)
+        s, t = found["primitive_uvs"].numpy().astype(np.float64).T
+        offsets = centred - found["points"].numpy().astype(np.float64)
+        normals = self._flat[face]
+        # inside a triangle its own plane says how far; at a side or corner the direction does, and the side of the
+        # surface is told by what is smooth between the triangles there
+        at_side = (s < CORNER) | (t < CORNER) | (1 - s - t < CORNER)
+        away = np.sum(normals * offsets, axis=1)
+        if at_side.any():
+            some = self._smooth[self._faces[face[at_side]]]
+            weights = np.stack([1 - s - t, s, t], axis=1)[at_side, :, None]
+            smooth = (some * weights).sum(axis=1)
+            smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-300)
+            lengths = np.linalg.norm(offsets[at_side], axis=1)
+            above = np.sum(smooth * offsets[at_side], axis=1)
+            signs = np.where(above < 0, -1.0, 1.0)
+            away[at_side] = np.where(lengths > NEGLIGIBLE, signs * lengths, away[at_side])
+            beyond = (np.abs(above) < RIM * lengths) & (lengths > NEGLIGIBLE)
+            away[np.flatnonzero(at_side)[beyond]] = np.inf
+            normals = normals.copy()
+            clear = lengths > 10 * NEGLIGIBLE
+            normals[np.flatnonzero(at_side)[clear]] = (signs / np.maximum(lengths, 1e-300))[clear, None] * offsets[
+                at_side
+            ][clear]
+        return away, normals
+
+    def seen_from(self, places: np.ndarray, facing: np.ndarray, view: np.ndarray, least: float) -> np.ndarray:
+        """(n,) bool: which places (n, 3) on the surface, facing (n, 3), are seen from far away, in the direction
+        ``view`` (3,); ``least``: cosine between the two."""
+        seen: np.ndarray = facing @ view > least
+        lift = 1e-4 * self.diagonal
+        begin = (places[seen] - self._middle + lift * facing[seen]).astype(np.float32)
+        rays = np.concatenate([begin, np.broadcast_to(view, begin.shape)], axis=1).astype(np.float32)
+        seen[seen] = ~self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy()
+        return seen
+
+    def sampled(self, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Places (count, 3) evenly over the area, and the triangles' normals there."""
+        rng = np.random.default_rng(seed)
+        # one place in each of so many equal shares of the area
+        shares = np.cumsum(self.areas) / self.areas.sum()
+        face = np.searchsorted(shares, (np.arange(count) + rng.random(count)) / count)
+        face = np.minimum(face, len(self.areas) - 1)
+        a, b = rng.random((2, count))
+        inside = a + b > 1
+        a[inside], b[inside] = 1 - a[inside], 1 - b[inside]
+        corners = self._corners[face]
+        places = corners[:, 0] + a[:, None] * (corners[:, 1] - corners[:, 0])
+        places += b[:, None] * (corners[:, 2] - corners[:, 0])
+        return places + self._middle, self._flat[face]
+
+
+def _smooth(corners: np.ndarray, flat: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
+    """(count, 3): a normal a vertex, its triangles' weighed by their angles there: on which side of the surface a place
+    lies is told right by it (Bærentzen and Aanæs 2005)."""
+    normals = np.zeros((count, 3))
+    for k in range(3):
+        a, b = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
+        angles = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
+        for axis in range(3):
+            normals[:, axis] += np.bincount(faces[:, k], angles * flat[:, axis], count)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300))

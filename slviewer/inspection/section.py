@@ -1,0 +1,145 @@
+"""A surface cut by a plane: ordered lines to read heights, widths and radii off."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.inspection.quantities import Quantity
+
+
+@dataclass(frozen=True, eq=False)
+class CutPlane:
+    """``origin`` (3,) mm, and the two unit axes (3,) of the drawing: ``along`` to the right, ``up``."""
+
+    origin: np.ndarray
+    along: np.ndarray
+    up: np.ndarray
+
+    @classmethod
+    def through(cls, a: np.ndarray, b: np.ndarray, up: np.ndarray) -> "CutPlane":
+        """Through two points (3,) mm, a at 0 and b to its right, with ``up`` (3,) in it as nearly as can be; for a scan
+        that is towards the camera, (0, 0, -1). Raises InputError for points that are one, or lie above one another."""
+        a, b, up = (np.asarray(v, np.float64) for v in (a, b, up))
+        along = b - a
+        length = np.linalg.norm(along)
+        if not length > 1e-6:
+            raise InputError("The section's two points are one: pick them apart.")
+        along = along / length
+        across = up - (up @ along) * along
+        if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(up):
+            raise InputError("The section's two points lie above one another: pick one beside the other.")
+        return cls(a, along, across / np.linalg.norm(across))
+
+    @property
+    def normal(self) -> np.ndarray:
+        """(3,)."""
+        return np.cross(self.along, self.up)
+
+    def drawn(self, points: np.ndarray) -> np.ndarray:
+        """(n, 2) mm: points (n, 3) in the drawing, along and up."""
+        return np.asarray((points - self.origin) @ np.stack([self.along, self.up]).T)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {name: getattr(self, name).tolist() for name in ("origin", "along", "up")}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "CutPlane":
+        """The inverse of ``to_dict``."""
+        return cls(*(np.array(data[name]) for name in ("origin", "along", "up")))
+
+
+def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np.ndarray]:
+    """The lines (k, 2) mm in the plane's drawing in which it cuts triangles ``faces`` (m, 3) over ``vertices`` (n, 3).
+
+    Each line's points follow one another, a closed line ends where it began; the longest line first, open ones from
+    left to right. Raises InputError where nothing is cut.
+    """
+    heights = (np.asarray(vertices, np.float64) - plane.origin) @ plane.normal
+    above = heights >= 0  # what lies in the plane counts as above: every triangle is cut through two sides or none
+    cut = faces[above[faces].any(axis=1) & ~above[faces].all(axis=1)]
+    if not len(cut):
+        raise InputError("The section's plane does not meet the surface: pick two points on it.")
+    sides = np.stack([cut, np.roll(cut, -1, axis=1)], axis=2)  # (m, 3, 2)
+    crossed = above[sides[..., 0]] != above[sides[..., 1]]
+    ends = np.sort(sides[crossed].reshape(-1, 2), axis=1)  # two a triangle, in its order
+    edges, segments = np.unique(ends, axis=0, return_inverse=True)
+    segments = segments.reshape(-1, 2)
+    low, high = (heights[edges[:, k]] for k in (0, 1))
+    share = (low / (low - high))[:, None]
+    places = vertices[edges[:, 0]] * (1 - share) + vertices[edges[:, 1]] * share
+    drawn = plane.drawn(places)
+    lines = [_ordered(drawn[chain]) for chain in _chains(segments, len(edges))]
+    return sorted(lines, key=lambda line: -float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))
+
+
+def _ordered(line: np.ndarray) -> np.ndarray:
+    closed = np.array_equal(line[0], line[-1])
+    return line if closed or line[0, 0] <= line[-1, 0] else line[::-1]
+
+
+def _chains(segments: np.ndarray, count: int) -> list[list[int]]:
+    """Segments (m, 2) of numbered places as lines of places that follow one another; open ones first."""
+    touching: list[list[int]] = [[] for _ in range(count)]
+    for number, (a, b) in enumerate(segments.tolist()):
+        touching[a].append(number)
+        touching[b].append(number)
+    ends, left = segments.tolist(), [True] * len(segments)
+    # where more than two triangles share a side, lines end
+    starts = [place for place in range(count) if len(touching[place]) != 2]
+    chains = []
+    for place in [*starts, *range(count)]:
+        for first in touching[place]:
+            if not left[first]:
+                continue
+            chain, number = [place], first
+            while True:
+                left[number] = False
+                a, b = ends[number]
+                chain.append(b if a == chain[-1] else a)
+                onwards = [n for n in touching[chain[-1]] if left[n]]
+                if len(touching[chain[-1]]) != 2 or not onwards:
+                    break
+                number = onwards[0]
+            chains.append(chain)
+    return chains
+
+
+def between(a: np.ndarray, b: np.ndarray) -> list[Quantity]:
+    """What two cursors (2,) mm on a section read."""
+    width, height = (float(value) for value in np.subtract(b, a))
+    return [
+        Quantity("distance", float(np.hypot(width, height)), "mm"),
+        Quantity("along", width, "mm"),
+        Quantity("height difference", height, "mm"),
+    ]
+
+
+def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Quantity:
+    """The radius of the circle through three cursors (2,) mm. Raises InputError where they lie on a line."""
+    edges = np.stack([np.subtract(b, a), np.subtract(c, a)])
+    area = abs(float(np.linalg.det(edges)))
+    sides = [float(np.linalg.norm(v)) for v in (edges[0], edges[1], edges[1] - edges[0])]
+    if not area > 1e-6 * max(sides) ** 2:
+        raise InputError("The three cursors lie on a straight line: put the middle one on a curve.")
+    return Quantity("radius", sides[0] * sides[1] * sides[2] / (2 * area), "mm")
+
+
+def nearest_on(lines: list[np.ndarray], x: float, y: float | None = None) -> np.ndarray:
+    """(2,) mm: where a cursor at ``x`` meets the section, at the line nearest to ``y`` or else the highest one; the
+    nearest point drawn where no line passes x."""
+    met = []
+    for line in lines:
+        left, right = line[:-1], line[1:]
+        passes = (left[:, 0] - x) * (right[:, 0] - x) <= 0
+        passes &= left[:, 0] != right[:, 0]
+        share = (x - left[passes, 0]) / (right[passes, 0] - left[passes, 0])
+        met.append(left[passes, 1] + share * (right[passes, 1] - left[passes, 1]))
+    heights = np.concatenate(met)
+    if not heights.size:
+        drawn = np.concatenate(lines)
+        return np.asarray(drawn[np.argmin(np.abs(drawn[:, 0] - x))])
+    return np.array([x, heights.max() if y is None else heights[np.argmin(np.abs(heights - y))]])
