@@ -17,7 +17,8 @@ LEAST_GROUP = 2e-4
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What of a scan is left out, in pixels: at depth jumps, seen grazing or without a normal, in small groups."""
+    """What of a scan is left out, in pixels: at its rim and at depth jumps, seen grazing or without a normal, in small
+    groups."""
 
     edges: int
     grazing: int
@@ -36,6 +37,8 @@ def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, Cleaned]:
     """
     mask = cloud.mask
     kept = mask & ~at_jumps(cloud.points, cloud.sigma_z)
+    # a pixel at the rim sees the surface with a part of its area only, in half a shadow, or with what lies behind
+    kept &= cv2.erode(without_pinholes(kept), np.ones((3, 3), np.uint8), borderValue=1).astype(bool)
     edges = int(mask.sum() - kept.sum())
     seen = kept & (np.abs(sight(cloud.points, normals)) > FLATTEST_SIGHT)  # False where the normal is NaN
     grazing = int(kept.sum() - seen.sum())
@@ -48,6 +51,12 @@ def sight(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     away = np.linalg.norm(points, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(-np.einsum("ijk,ijk->ij", points, normals) / away)
+
+
+def without_pinholes(mask: np.ndarray) -> np.ndarray:
+    """(h, w) uint8, 0 or 1: the mask with gaps of up to four pixels closed."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    return np.asarray(cv2.morphologyEx(np.pad(mask, 2).astype(np.uint8), cv2.MORPH_CLOSE, disc)[2:-2, 2:-2])
 
 
 def at_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:

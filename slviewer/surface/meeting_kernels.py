@@ -100,7 +100,7 @@ def compare(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel,
 @kernel(parallel=True)
 def vote(p, gate, points, sure, to_pixel, agreed, denied):
     """Adds 1 to ``agreed`` (k,) where a scan sees its surface at the points p (k, 3) of its frame, or to ``denied``
-    where it sees through them, further than ``gate`` mm. Only pixels ``sure`` (h, w) say so."""
+    where it sees through them, clearly further than ``gate`` mm. Only pixels ``sure`` (h, w) say so."""
     height, width = sure.shape
     for i in numba.prange(len(p)):
         u, v = pixel_of(p[i, 0], p[i, 1], p[i, 2], to_pixel)
@@ -112,7 +112,7 @@ def vote(p, gate, points, sure, to_pixel, agreed, denied):
         behind = points[y, x, 2] - p[i, 2]
         if abs(behind) <= gate:
             agreed[i] += 1
-        elif behind > 3.0 * gate:
+        elif behind > 1.5 * gate:
             denied[i] += 1
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.surface.clean import Cleaned, clean, sight
+from slviewer.surface.clean import Cleaned, clean, sight, without_pinholes
 
 LEAST_POINTS = 200
 FEATHER = 0.02
@@ -116,10 +116,7 @@ def _box(mask: np.ndarray) -> tuple[slice, slice]:
 
 def _inwards(kept: np.ndarray) -> np.ndarray:
     """(h, w) float32: 0 outside, rising smoothly to 1; pinholes are no border."""
-    closed = cv2.morphologyEx(
-        np.pad(kept, 2).astype(np.uint8), cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
-    )
-    distance = cv2.distanceTransform(closed, cv2.DIST_L2, 5)[2:-2, 2:-2]
+    distance = cv2.distanceTransform(np.pad(without_pinholes(kept), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
     width = max(4.0, FEATHER * float(np.hypot(*kept.shape)))
     share = np.clip((distance - 0.5) / width, 0, 1)
     return np.where(kept, np.maximum(share * share * (3 - 2 * share), _LEAST_WEIGHT), 0).astype(np.float32)
