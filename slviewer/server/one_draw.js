@@ -14,7 +14,11 @@
           const data = arrived[i++];
           if (data?.type === "message_batch")
             while (arrived[i]?.type === "message_batch") data.messages = data.messages.concat(arrived[i++].messages);
-          handler.call(this, { data });
+          try {
+            handler.call(this, { data });
+          } catch (error) {
+            reportError(error); // and the rest is still handed over
+          }
         }
       };
       onmessage.set.call(this, ({ data }) => {
