@@ -1,0 +1,164 @@
+"""A nominal model from a file: checked, cleaned, and in millimetres."""
+
+import hashlib
+import io
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.errors import InputError, SessionError
+from slviewer.registration.open3d_loader import open3d
+from slviewer.session.nominal_file import Format, looked_at
+from slviewer.surface.shapes import Mesh
+
+Units = Literal["mm", "cm", "m", "inch"]
+MM: dict[Units, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+LIKELY = 5.0
+"""A scan's size over the nominal's, or its inverse, from which on other units are asked for."""
+NEAR = 2.0
+"""Units that bring the two so near are proposed."""
+FARTHEST_MM = 1e5
+MOST_LEFT_OUT = 0.5
+"""Share of triangles without area from which on a file is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nominal:
+    """A nominal model: its ``mesh`` in mm, the file's ``name`` and content ``hash``, the ``units`` that it was read in
+    (None: none were given, and mm taken), whether it is ``closed``, and ``notes``, sentences on what was mended."""
+
+    mesh: Mesh
+    name: str
+    hash: str
+    units: Units | None
+    closed: bool
+    notes: tuple[str, ...] = ()
+
+    @property
+    def size_mm(self) -> np.ndarray:
+        """(3,): of the box around it."""
+        return np.ptp(self.mesh.vertices.astype(np.float64), axis=0)
+
+    def text(self) -> str:
+        """In words."""
+        size = " x ".join(f"{side:.1f}" for side in self.size_mm)
+        kind = "closed" if self.closed else "open"
+        return f"{self.name}: {len(self.mesh.faces):,} triangles, {kind}, {size} mm"
+
+
+def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
+    """The model in an STL, PLY or OBJ file, whose numbers are in ``units``; where none are given, in mm.
+
+    Raises SessionError for a file that cannot be used, with the reason. Such a file may be anything: it is looked at
+    before it is loaded, and never trusted.
+    """
+    path = Path(path).expanduser()
+    form = looked_at(path)
+    try:
+        data = path.read_bytes()
+        vertices, faces = _loaded(path.name, data, form)
+    except OSError as error:
+        raise SessionError(f"{path} cannot be read ({error.strerror}): check its name") from error
+    if not np.isfinite(vertices).all():
+        raise SessionError(f"{path.name} holds points that are no numbers (NaN or infinite): export the model again")
+    vertices = vertices * MM[units or "mm"]
+    if not np.abs(vertices).max() < FARTHEST_MM:
+        raise SessionError(
+            f"{path.name} reaches {np.abs(vertices).max():.3g} mm: models up to {FARTHEST_MM:g} mm are read; give its "
+            "units, or move it to its origin"
+        )
+    notes: list[str] = []
+    vertices, faces = _cleaned(path.name, vertices, faces, notes)
+    faces, closed = _wound(vertices, faces, notes)
+    digest = hashlib.blake2b(data, digest_size=20).hexdigest()
+    return Nominal(Mesh(vertices, faces), path.name, digest, units, closed, tuple(notes))
+
+
+def check_size(nominal: Nominal, points: np.ndarray) -> None:
+    """Raise InputError where a model, whose units nobody gave, is so much smaller or larger than a scan's points (n, 3)
+    mm that they may be others: it says what was seen, and what to give. Nothing is ever enlarged unasked."""
+    if nominal.units is not None:
+        return
+    some = points[:: max(1, len(points) // 100_000)]
+    scan = float(np.linalg.norm(np.ptp(np.percentile(some, [1, 99], axis=0), axis=0)))
+    model = float(np.linalg.norm(nominal.size_mm))
+    ratio = scan / model
+    if 1 / LIKELY < ratio < LIKELY:
+        return
+    fitting = [name for name, mm in MM.items() if 1 / NEAR < ratio / mm < NEAR and name != "mm"]
+    many = f"{ratio:.3g} times larger" if ratio > 1 else f"{1 / ratio:.3g} times smaller"
+    seen = f"{nominal.name} measures {model:.4g} across if its numbers are mm, and the scan {scan:.4g} mm, {many}"
+    if fitting:
+        raise InputError(f"{seen}: give --units {' or --units '.join(fitting)} if it is so, else --units mm")
+    raise InputError(f"{seen}: see that it is the same part; give --units mm if its numbers are mm all the same")
+
+
+def _loaded(name: str, data: bytes, form: Format) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float64 and faces (m, 3) int64, as they are in the file, equal vertices made one."""
+    import trimesh
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # from memory, and so without a way to the files beside it that it may name; unprocessed, or points that are
+            # no numbers would go without a word
+            mesh: Any = trimesh.load(io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False)
+            if np.isfinite(mesh.vertices).all():
+                mesh.merge_vertices(merge_tex=True, merge_norm=True)
+            vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    except Exception as error:  # whatever a hostile file makes its reader do
+        raise SessionError(
+            f"{name} cannot be read ({type(error).__name__}): export the model again, as triangles"
+        ) from error
+    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
+        raise SessionError(f"{name} holds no triangles: export the model as a mesh")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise SessionError(f"{name} has triangles whose points are missing: export the model again")
+    return vertices, faces
+
+
+def _cleaned(name: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Without triangles that have no area, and without the points that only those had."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    sides = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
+    sound = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9 * sides**2
+    flat = len(faces) - int(np.count_nonzero(sound))
+    if flat > MOST_LEFT_OUT * len(faces):
+        raise SessionError(f"{flat:,} of the {len(faces):,} triangles in {name} have no area: export the model again")
+    if flat:
+        notes.append(f"{flat:,} of {len(faces):,} triangles without area were left out")
+    faces = faces[sound]
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
+
+
+def _wound(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, bool]:
+    """Triangles that all turn one way, outwards where the model is closed; and whether it is."""
+    o3d = open3d()
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices.astype(np.float64)), o3d.utility.Vector3iVector(faces)
+    )
+    closed = bool(mesh.is_edge_manifold(allow_boundary_edges=False))
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    keys = directed[:, 0] * (len(vertices) + 1) + directed[:, 1]
+    twice = len(keys) - len(np.unique(keys))  # neighbours that turn alike run along their side in opposite directions
+    if twice:
+        if mesh.orient_triangles():
+            faces = np.asarray(mesh.triangles).astype(np.int32)
+            notes.append("its triangles did not all turn one way: they were turned")
+        else:
+            notes.append(
+                "its triangles do not all turn one way, and cannot be turned: some deviations may have the wrong sign"
+            )
+            return faces, False
+    if closed:
+        a, b, c = (vertices[faces[:, k]].astype(np.float64) - vertices.mean(axis=0) for k in range(3))
+        if float(np.sum(a * np.cross(b, c))) < 0:
+            faces = faces[:, ::-1].copy()
+            notes.append("its triangles faced inwards: they were turned")
+    else:
+        notes.append("it is open: outside is where its triangles face")
+    return faces, closed
