@@ -13,6 +13,7 @@ import tyro
 from slviewer import __version__, terminal
 from slviewer.commands.batching import batch
 from slviewer.commands.devices import capture, devices, preflight
+from slviewer.commands.exporting import export
 from slviewer.commands.importing import bring_in
 from slviewer.commands.measuring import calibrate, merge, reconstruct, validate, verify
 from slviewer.commands.parsing import union
@@ -34,6 +35,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "reconstruct": reconstruct,
     "verify": verify,
     "merge": merge,
+    "export": export,
     "batch": batch,
     "check": check,
     "accept": accept,

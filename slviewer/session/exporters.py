@@ -14,18 +14,20 @@ from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.atomic import commit, replace_file, staged_folder, to_json, write_bytes
 
 
-def write_calibration(path: Path, entries: Mapping[str, Any]) -> None:
-    """Write named matrices, numbers and words; the suffix says how.
+def write_calibration(path: Path, entries: Mapping[str, Any], meanings: Mapping[str, str] | None = None) -> None:
+    """Write named matrices, numbers, words, and lists of such mappings (poses by name); the suffix says how.
 
     .yml, .yaml and .xml are OpenCV FileStorage, .json is plain JSON with matrices as nested lists; `import
-    opencv-calibration` reads them all. Replaces a file of that name in one step.
+    opencv-calibration` reads them all. ``meanings``: {name: what the entry says, in which unit}, as comments; JSON,
+    which knows none, gets them under "meanings". Replaces a file of that name in one step.
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    meanings = meanings or {}
     if suffix == ".json":
-        data = to_json(dict(entries))
+        data = to_json({"meanings": dict(meanings), **entries} if meanings else dict(entries))
     elif suffix in (".yml", ".yaml", ".xml"):
-        data = _file_storage(suffix, entries).encode()
+        data = _file_storage(suffix, entries, meanings).encode()
     else:
         raise InputError(f"{path.name}: a calibration is written as .yml, .xml or .json: choose one of these")
     replace_file(path, data)
@@ -73,16 +75,32 @@ def _line(key: str, value: str | int | float) -> str:
     return f"{key} = {json.dumps(value)}"
 
 
-def _file_storage(suffix: str, entries: Mapping[str, Any]) -> str:
+def _file_storage(suffix: str, entries: Mapping[str, Any], meanings: Mapping[str, str]) -> str:
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for key, value in entries.items():
-        if isinstance(value, str | int | float) and not isinstance(value, bool):
-            storage.write(key, value)
-            continue
+        if key in meanings:
+            storage.writeComment(f"{key}: {meanings[key]}", False)
+        _store(storage, key, value)
+    return storage.releaseAndGetString()
+
+
+def _store(storage: Any, key: str, value: Any) -> None:
+    if isinstance(value, str | int | float) and not isinstance(value, bool):
+        storage.write(key, value)
+    elif isinstance(value, Mapping):
+        storage.startWriteStruct(key, cv2.FileNode_MAP)
+        for inner, each in value.items():
+            _store(storage, inner, each)
+        storage.endWriteStruct()
+    elif isinstance(value, list | tuple) and all(isinstance(each, Mapping | str) for each in value):
+        storage.startWriteStruct(key, cv2.FileNode_SEQ)
+        for each in value:
+            _store(storage, "", each)
+        storage.endWriteStruct()
+    else:
         matrix = np.asarray(value)
         if matrix.ndim not in (1, 2) or matrix.dtype.kind not in "iuf":
             raise InputError(f"{key} is no number, word or matrix: an OpenCV file cannot hold it, write .json instead")
         # a vector as a column: OpenCV's own files hold T so, and D is read either way
         column = matrix if matrix.ndim == 2 else matrix[:, None]
         storage.write(key, np.ascontiguousarray(column, np.float64 if matrix.dtype.kind == "f" else np.int32))
-    return storage.releaseAndGetString()

@@ -22,6 +22,7 @@ _HOMES = {
     "reconstruct": "reconstructing",
     "verify": "verifying",
     "merge": "merging",
+    "export": "exporting",
     "batch": "batching",
     "check": "drifting",
     "accept": "accepting",

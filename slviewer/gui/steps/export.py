@@ -148,7 +148,7 @@ class Panel:
         name, shape = self._what.value, self._shape.value
         kind = shape.removeprefix(MESH).lower()
         if name == MERGED:
-            self._stage.operator.export("merged mesh", "", kind)
+            self._stage.operator.export("merged-mesh", "", kind)
         elif shape == CLOUD:
             self._stage.operator.export("cloud", name, "ply")
         elif name:

@@ -21,6 +21,7 @@ from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
 from slviewer.workflow.calibrating import CalibrationResult
+from slviewer.workflow.exporting import FORMATS, What, check_export
 from slviewer.workflow.models import available, check_accepted, insist, insisted
 from slviewer.workflow.preflight.checks import Preflight, Verdict
 from slviewer.workflow.preflight.run import preflight
@@ -29,7 +30,7 @@ from slviewer.workflow.wizard import diagnostics, work
 from slviewer.workflow.wizard.acquisition import LIGHTS
 from slviewer.workflow.wizard.autopilot import Autopilot
 from slviewer.workflow.wizard.engine import Engine
-from slviewer.workflow.wizard.exporting import FORMATS, Kind, check_export, export_file
+from slviewer.workflow.wizard.exporting import export_file
 from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.live_requests import LiveRequests
 from slviewer.workflow.wizard.requesting import request
@@ -397,26 +398,24 @@ class Operator(LiveRequests):
         (store.exports / f"merged_{view.merge.name}.ply").unlink(missing_ok=True)
 
     @request("Exporting")
-    def export(self, kind: Kind, name: str = "", file_format: str = "") -> None:
-        """Write a file into the session's exports; `exporting.FORMATS` lists kinds and formats, the first by default.
-
-        `name` is the scan of a cloud or a mesh; a merged mesh is the current merge's.
+    def export(self, what: What, name: str = "", file_format: str = "") -> None:
+        """Write a file into the session's exports; `exporting.FORMATS` lists what there is and the formats, the first
+        by default. `name` is the scan of a cloud or a mesh, and the model of coefficients; a merge is the current one.
         """
         store, view = self._engine.store, self._engine.teller.now().session
-        check_export(kind, file_format or FORMATS.get(kind, ("",))[0])
-        chosen = file_format or FORMATS[kind][0]
-        if kind == "calibration":
+        chosen = file_format or FORMATS.get(what, ("",))[0]
+        check_export(what, chosen)
+        if what not in ("report", "table"):
             check_accepted(store, insisted(store))
-        if kind in ("cloud", "mesh"):
+        if what in ("cloud", "mesh"):
             store.load_capture(name)
-        if kind == "merged mesh":
+        if what in ("merge", "merged-mesh"):
             if view is None or view.merge is None:
                 raise InputError("there is no merge yet: merge scans first")
             name = view.merge.name
-        rows = view.verifications if view else ()
         self._submit(
             "Exporting",
-            lambda r: export_file(store, kind, name, chosen, rows, r, self._warn),
+            lambda r: export_file(store, what, name, chosen, r, self._warn),
             lambda file_name: f"{file_name} is ready to download",
         )
 

@@ -1,0 +1,40 @@
+"""Files for other programs."""
+
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from slviewer import workflow
+from slviewer.commands.parsing import ModelName, deferred, ui
+
+What = Literal["cloud", "mesh", "merge", "merged-mesh", "calibration", "coefficients", "poses", "report", "table"]
+
+
+@deferred
+def export(
+    session: Positional[Path],
+    what: Positional[What],
+    name: Positional[str] = "",
+    out: Path | None = None,
+    format: str = "",
+    model: ModelName | None = None,
+    accept_rejected: bool = False,
+) -> None:
+    """Write a file for other programs: shapes in mm as .ply .stl .obj .xyz, in metres as .glb; the calibration; poses.
+
+    Args:
+        session: Session folder.
+        what: cloud and mesh of a scan; merge (the points) and merged-mesh; calibration for OpenCV or as JSON;
+            coefficients of each pixel as .npz; poses of camera, projector, target and scans as 4x4 matrices; report as
+            HTML; table of the verifications as CSV.
+        name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model of coefficients.
+        out: The file, whose suffix says how it is written, or a folder; by default the session's exports.
+        format: ply, stl, obj, glb, xyz, yml, xml, json, …, where out is a folder or left out.
+        model: Which calibration to make a cloud with; by default the one that the scan is kept from, or the best.
+        accept_rejected: Use the calibration although its verdict rejects it.
+    """
+    found = workflow.export(
+        session, what, name, out=out, file_format=format, model=model, accept_rejected=accept_rejected, **ui()
+    )
+    print(found.text())
