@@ -1,0 +1,153 @@
+"""The one pass where there is a CUDA device: `one_pass` decides, and without one it is the processor's."""
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.fringe.decode import decode, texture
+from slviewer.fringe.layout import Layout, clip_level, layout
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry import cuda_device
+from slviewer.geometry.rig import StereoRig
+from slviewer.reconstruction.onepass import Light, OnePass, Scan, _ladder, _order
+from slviewer.reconstruction.onepass_kernels import Depths, Ladder, Order
+
+if TYPE_CHECKING:  # it imports CUDA
+    from slviewer.reconstruction.onepass_cuda_card import Card
+
+Fast = PixelwiseModel | SplinedModel | StereoModel
+
+
+def one_pass(sequence: PatternSequence, model: Fast, axis: Axis) -> OnePass:
+    """What makes clouds of a sequence's frames fastest here: the CUDA device's pass, or else the processor's.
+
+    Raises InputError as `OnePass` does; so does a stereo calibration where there is no device, see `has_pass`.
+    """
+    if cuda_device.device() is not None:
+        return CudaPass(sequence, model, axis)  # type: ignore[arg-type]
+    return OnePass(sequence, model, axis)  # type: ignore[arg-type]
+
+
+def has_pass(model: object) -> bool:
+    """Whether `one_pass` measures with a calibration here: pixelwise and splined always, stereo on a CUDA device."""
+    if isinstance(model, StereoModel):
+        return cuda_device.device() is not None
+    return isinstance(model, PixelwiseModel | SplinedModel)
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What a device is made ready for: frames of a camera, what they mean, and how depth comes of their phase."""
+
+    shape: tuple[int, int]
+    axis: Axis
+    layout: Layout
+    order: Order
+    ladder: Ladder
+    depths: Depths | StereoRig
+
+
+@dataclass(eq=False)
+class CudaPass(OnePass):
+    """`OnePass` on a CUDA device, for stereo calibrations too; for one thread at a time.
+
+    Coefficients stay on the device, frames go there once, and maps come back when spikes are mended. Frames and scans
+    in memory from `cuda_device.frame_room` travel at full speed. Should the device fail, the processor goes on.
+    """
+
+    _card: "Card | None" = field(init=False, repr=False, default=None)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.model, StereoModel):
+            self._layout = layout(self.sequence, self.axis)
+            if not self._layout.shifts:
+                raise InputError("Gray code without phase steps is not measured in one pass: decode and reconstruct it")
+            if self.axis not in self.model.axes:
+                raise InputError(f"The stereo calibration has no axis {self.axis}: choose another axis.")
+            self._order, self._ladder = _order(self.sequence, self._layout), _ladder(self._layout)
+        else:
+            super().__post_init__()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        if isinstance(self.model, StereoModel):
+            width, height = self.model.rig.camera.size
+            return height, width
+        return super().shape
+
+    def run(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
+        return self._scan(frames, light, out, True)
+
+    def sweep(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
+        return self._scan(frames, light, out, False)
+
+    def mend(self, scan: Scan) -> None:
+        if isinstance(self.model, StereoModel):
+            raise InputError("a stereo calibration's spikes are mended where they are found: use run, not sweep")
+        super().mend(scan)
+
+    def card(self, dtype: np.dtype) -> "Card":
+        """What lies on the device for frames of a dtype, to be used step by step: its errors are not caught."""
+        if self._card is None or self._card.dtype != dtype:
+            from slviewer.reconstruction.onepass_cuda_card import Card
+
+            self._card = None  # its memory goes before the next one's is asked for
+            self._card = Card(self._job(), dtype)
+        return self._card
+
+    def _scan(self, frames: np.ndarray, light: Light | None, out: Scan | None, mended: bool) -> Scan:
+        self._check(frames)
+        frames = np.ascontiguousarray(frames)
+        light = light or self.light(frames)
+        scan = self._room(frames.dtype, light) if out is None else replace(out, light=light)
+        if scan.texture.dtype != frames.dtype or scan.points.shape[:2] != self.shape:
+            raise InputError("The arrays to write into belong to other frames: leave them out, and new ones are made.")
+        if cuda_device.device() is not None:
+            try:
+                return self._on_card(frames, scan, mended)
+            except Exception as error:  # of the driver, the compiler, or memory: whatever it is, there is a processor
+                cuda_device.give_up(error)
+        self._card = None
+        if isinstance(self.model, StereoModel):
+            return self._defined(frames, scan)
+        return super().run(frames, light, scan) if mended else super().sweep(frames, light, scan)
+
+    def _on_card(self, frames: np.ndarray, scan: Scan, mended: bool) -> Scan:
+        card = self.card(frames.dtype)
+        card.load(frames)
+        card.sweep(scan.light)
+        if mended:
+            card.mend()
+        if self._order.texture >= 0:  # the device has no use for it
+            np.copyto(scan.texture, frames[self._order.texture])
+        highest = card.fetch(scan)
+        if clip_level(frames.dtype, highest) > scan.light.white:  # a camera of more bits than it seemed
+            return self._on_card(frames, replace(scan, light=self.light(frames)), mended)
+        return scan
+
+    def _job(self) -> Job:
+        depths = self.model.rig if isinstance(self.model, StereoModel) else self._depths
+        return Job(self.shape, self.axis, self._layout, self._order, self._ladder, depths)
+
+    def _defined(self, frames: np.ndarray, scan: Scan) -> Scan:
+        """A stereo calibration's scan by the processor."""
+        assert isinstance(self.model, StereoModel)
+        found = decode(self.sequence, frames, self.axis)
+        points = self.model.points(found)
+        sigma = self.model.sigma_z(found, points)
+        light = Light(found.noise, scan.light.mean, scan.light.white)
+        return Scan(
+            self.axis, self.model.name, points, found.phase, found.reason, sigma, found.modulation,
+            texture(self.sequence, frames), light,
+        )  # fmt: skip
+
+    def _room(self, dtype: np.dtype, light: Light) -> Scan:
+        phase, sigma_z, modulation = (cuda_device.frame_room(self.shape, np.float32) for _ in range(3))
+        points, reason = cuda_device.frame_room((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
+        grey = cuda_device.frame_room(self.shape, dtype)
+        return Scan(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, grey, light)

@@ -1,0 +1,239 @@
+"""Frames to points on a CUDA device, one thread a pixel: a twin of `onepass_kernels` and of `fringe.kernels`.
+
+A kernel is compiled for one sequence, so that loops over steps and bits have a known length and are unrolled, and for
+one way to measure depth. Everything is float32 but the sums that `fringe.kernels_levels` takes in float64, and the
+absolute phase. Imported only where there is a device.
+"""
+
+import math
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from slviewer.fringe.phase import Reason
+
+cuda: Any = import_module("numba.cuda")  # its own annotations are not those of what a kernel may call
+
+VALID, DARK, SATURATED, INCONSISTENT = (
+    np.uint8(r) for r in (Reason.VALID, Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT)
+)
+TWO_PI = 2 * math.pi
+PER_TURN = np.float32(1 / TWO_PI)
+ZERO, HALF, ONE, NONE, ENDLESS = (np.float32(number) for number in (0, 0.5, 1, math.nan, math.inf))
+NEAR_EDGE, FAR_EDGE = np.float32(0.25), np.float32(0.75)
+
+NOISE_A, NOISE_B, DARK_LEVELS, DARK_SIGMAS, WHITE, MEAN = range(6)
+"""What a light is, float32: see `fringe.kernels.Scale`, and `threshold` for the mean."""
+
+
+class Plan(NamedTuple):
+    """What of a sequence a kernel is compiled for. Frames lie one after the other: phase steps, longest period first,
+    period i from ``starts[i]`` on; Gray bits; their inverses; the complementary bit; those that only tell how bright
+    the camera's white is."""
+
+    starts: tuple[int, ...]
+    cosines: np.ndarray
+    sines: np.ndarray
+    bits: int
+    inverses: int
+    complementary: int
+    others: int
+    origin_turns: float
+    edge: float
+    weak: float
+    weaker: float
+    undecided: float
+    weights: np.ndarray
+    periods: np.ndarray
+    low: float
+    misfit: float
+
+
+def sweep_kernel(plan: Plan, measure: Callable[..., Any], deep: bool, shaded: bool) -> Any:
+    """The kernel for one plan and one of `onepass_cuda_depths`.
+
+    ``deep``: the largest grey level is sought, as uint16 frames need. ``shaded``: texture is the fringes' background.
+    It takes frames (slots, n) of n pixels, the light, two arrays and what it writes, (n,) each, points (n, 3), and the
+    largest grey level (1,) int32.
+    """
+    decode = _coded(plan) if plan.bits else _levels(plan)
+    count = plan.starts[-1] + plan.bits + plan.inverses + plan.complementary + plan.others
+    per_step = np.float32(2.0 / (plan.starts[-1] - plan.starts[-2]))
+    least = np.float32(1e-6)
+
+    @cuda.jit
+    def sweep(stack, light, c, extra, phase, reason, modulation, points, sigma_z, texture, highest):
+        i = cuda.grid(1)
+        if i >= phase.shape[0]:
+            return
+        absolute, why, B, A = decode(stack, i, light)
+        if deep:
+            brightest = np.int32(0)
+            for k in range(count):
+                brightest = max(brightest, np.int32(stack[k, i]))
+            if brightest > highest[0]:  # perhaps an old value; the next line settles it
+                cuda.atomic.max(highest, 0, brightest)
+        x, y, z, sigma = NONE, NONE, NONE, NONE
+        if why == VALID:
+            x, y, z, slope = measure(i, absolute, c, extra)
+            variance = light[NOISE_A] + light[NOISE_B] * A
+            sigma = slope * (np.float32(math.sqrt(variance * per_step)) / max(B, least))
+        phase[i] = absolute
+        reason[i] = why
+        modulation[i] = B
+        points[i, 0] = x
+        points[i, 1] = y
+        points[i, 2] = z
+        sigma_z[i] = sigma
+        if shaded:
+            texture[i] = np.int32(A + HALF)
+
+    return sweep
+
+
+def _shift(plan: Plan) -> Any:
+    """Device function: wrapped phase, modulation, background and largest sample of the period in some frames."""
+    cosines, sines = plan.cosines.astype(np.float32), plan.sines.astype(np.float32)
+
+    @cuda.jit(device=True)
+    def shift(stack, i, first, last):
+        cosine_of, sine_of = cuda.const.array_like(cosines), cuda.const.array_like(sines)
+        base = np.float32(stack[first, i])
+        cosine, sine, total, peak = ZERO, ZERO, ZERO, base
+        for k in range(first + 1, last):
+            value = np.float32(stack[k, i])
+            peak = max(peak, value)
+            value = value - base
+            cosine = cosine + cosine_of[k] * value
+            sine = sine + sine_of[k] * value
+            total = total + value
+        steps = np.float32(last - first)
+        wrapped = np.float32(math.atan2(ZERO - sine, cosine))
+        length = np.float32(math.sqrt(cosine * cosine + sine * sine))
+        return wrapped, length * (np.float32(2) / steps), base + total * (ONE / steps), peak
+
+    return shift
+
+
+@cuda.jit(device=True)
+def _verdict(B, A, clipped, inconsistent, light):
+    """Why a pixel is masked: the first reason that applies."""
+    sigma = np.float32(math.sqrt(light[NOISE_A] + light[NOISE_B] * A))
+    if clipped:
+        return SATURATED
+    if max(light[DARK_LEVELS], light[DARK_SIGMAS] * sigma) > B:
+        return DARK
+    return INCONSISTENT if inconsistent else VALID
+
+
+def _coded(plan: Plan) -> Any:
+    """Device function: (absolute phase, reason, modulation, background) of a pixel by Gray code."""
+    shift = _shift(plan)
+    steps, bits, inverses, complementary = plan.starts[-1], plan.bits, plan.inverses > 0, plan.complementary > 0
+    inverse_from, extra_at = steps + bits, steps + bits + plan.inverses
+    origin, undecided = np.float32(plan.origin_turns), np.float32(plan.undecided)
+    edge, far_edge = np.float32(plan.edge), np.float32(1 - plan.edge)
+    half_weak, weaker = np.float32(plan.weak / 2), np.float32(plan.weaker)
+
+    @cuda.jit(device=True)
+    def height_of(stack, i, bit, threshold):
+        value = np.float32(stack[steps + bit, i])
+        if inverses:
+            return (value - np.float32(stack[inverse_from + bit, i])) * HALF
+        return value - threshold
+
+    @cuda.jit(device=True)
+    def misread(stack, i, threshold, top, bottom, code, part, mean):
+        contrast = max(top / (ONE - mean), -bottom / mean)
+        middle = (HALF - mean) * contrast
+        zeros, ones = 0, 0
+        while zeros < bits and not (code >> zeros) & 1:
+            zeros += 1
+        while ones < bits and (code >> ones) & 1:
+            ones += 1
+        lower, upper = ENDLESS, ENDLESS
+        if zeros < bits:
+            lower = abs(height_of(stack, i, bits - 1 - zeros, threshold) - middle)
+        if ones < bits:
+            upper = abs(height_of(stack, i, bits - 1 - ones, threshold) - middle)
+        weak = half_weak * contrast
+        if part < HALF:
+            return 1 if upper < weak and upper < weaker * lower else 0
+        return -1 if lower < weak and lower < weaker * upper else 0
+
+    @cuda.jit(device=True)
+    def decode(stack, i, light):
+        psi, B, A, peak = shift(stack, i, 0, steps)
+        code, digit = 0, 0
+        least, top, bottom = ENDLESS, ZERO, ZERO
+        for b in range(bits):
+            height = height_of(stack, i, b, A)
+            digit = digit ^ (1 if height > ZERO else 0)
+            code = 2 * code + digit
+            least = min(least, abs(height))
+            top = max(top, height)
+            bottom = min(bottom, height)
+        turns = psi * PER_TURN - origin
+        whole = np.float32(math.floor(turns))
+        part = turns - whole
+        if complementary:
+            last = np.float32(stack[extra_at, i]) - A
+            half = 2 * code + (digit ^ (1 if last > ZERO else 0))
+            middle = NEAR_EDGE <= part < FAR_EDGE
+            order = half >> 1 if middle else ((half + 1) >> 1) - (1 if part >= FAR_EDGE else 0)
+            unclear = (least if middle else abs(last)) < undecided * B
+        else:
+            beside = part < edge or part >= far_edge
+            order = code
+            unclear = not beside and least < undecided * B
+            if beside:
+                order = code + misread(stack, i, A, top, bottom, code, part, light[MEAN])
+        clipped = peak >= light[WHITE] and light[WHITE] <= A + B
+        why = _verdict(B, A, clipped, unclear, light)
+        absolute = np.float32(np.float64(psi) + TWO_PI * (np.float64(order) - np.float64(whole)))
+        return absolute if why == VALID else NONE, why, B, A
+
+    return decode
+
+
+def _levels(plan: Plan) -> Any:
+    """Device function: (absolute phase, reason, modulation, background) of a pixel by several periods."""
+    shift = _shift(plan)
+    count, levels = len(plan.starts) - 1, len(plan.periods)
+    starts = np.array(plan.starts, np.int32)
+    weights, periods = plan.weights.astype(np.float64), plan.periods.astype(np.float64)
+    per_px, per_rad = 1.0 / periods, periods / TWO_PI
+    low, misfit = float(plan.low), float(plan.misfit)
+
+    @cuda.jit(device=True)
+    def decode(stack, i, light):
+        begin, weight_of = cuda.const.array_like(starts), cuda.const.array_like(weights)
+        period_of = cuda.const.array_like(periods)
+        turns_of, px_of = cuda.const.array_like(per_px), cuda.const.array_like(per_rad)
+        psi = cuda.local.array(count, np.float32)
+        weakest, clipped, A, B = ENDLESS, False, ZERO, ZERO
+        for p in range(count):
+            wrapped, B, A, peak = shift(stack, i, begin[p], begin[p + 1])
+            psi[p] = wrapped
+            weakest = min(weakest, B)
+            clipped = clipped or (peak >= light[WHITE] and light[WHITE] <= A + B)
+        coordinate, order, worst = 0.0, 0.0, 0.0
+        for level in range(levels):
+            own = 0.0
+            for p in range(count):
+                own = own + weight_of[level, p] * np.float64(psi[p])
+            position = own * px_of[level]
+            if level == 0:
+                order = -np.float64(math.floor((position - low) * turns_of[level]))
+            else:
+                turns = (coordinate - position) * turns_of[level]
+                order = np.float64(round(turns))
+                worst = max(worst, abs(turns - order))
+            coordinate = position + order * period_of[level]
+        why = _verdict(weakest, A, clipped, worst > misfit, light)
+        absolute = np.float32(np.float64(psi[count - 1]) + TWO_PI * order)
+        return absolute if why == VALID else NONE, why, B, A
+
+    return decode
