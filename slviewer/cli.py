@@ -12,6 +12,7 @@ import tyro
 
 from slviewer import __version__, terminal
 from slviewer.commands.batching import batch
+from slviewer.commands.comparing import compare
 from slviewer.commands.devices import capture, devices, preflight
 from slviewer.commands.exporting import export
 from slviewer.commands.importing import bring_in
@@ -35,6 +36,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "reconstruct": reconstruct,
     "verify": verify,
     "merge": merge,
+    "compare": compare,
     "export": export,
     "batch": batch,
     "check": check,

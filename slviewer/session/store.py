@@ -230,6 +230,23 @@ class Session:
         atomic.move(self.folder / "results" / name, target)
         return target
 
+    def deleted_results(self) -> list[str]:
+        """Names of the results in the trash, the slashes in them dashes, the last deleted first."""
+        trash = self.folder / "trash"
+        places = [place for place in trash.glob("*-*") if (place / "meta.json").is_file()] if trash.is_dir() else []
+        places.sort(key=lambda place: place.name.rpartition("-")[2], reverse=True)
+        return list(dict.fromkeys(place.name.rpartition("-")[0] for place in places))
+
+    def restore_result(self, name: str) -> None:
+        """Bring the last deleted result of that name back. InputError where there is none, or the name is in use."""
+        self._require_writer()
+        target = self.folder / "results" / safe_path(name)
+        stem = name.replace("/", "-")
+        places = [p for p in (self.folder / "trash").glob(f"{stem}-*") if p.name.rpartition("-")[0] == stem]
+        if target.exists() or not places:
+            raise InputError(f"no deleted result {name!r} can be brought back: another may have its name now")
+        atomic.move(max(places, key=lambda place: place.name), target)
+
     def input_hashes(self, *names: str) -> dict[str, str]:
         """{name: content hash} of captures and results as they are now, for `meta["inputs"]`; InputError if absent."""
         hashes = {}

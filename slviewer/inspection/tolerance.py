@@ -1,0 +1,75 @@
+"""Whether deviations stay within a tolerance, as far as their uncertainty lets one say."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.evaluation.acceptance.figures import Decision, Figure, judge
+from slviewer.inspection.deviation import Deviation
+
+DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
+LIMITED = "deviation of 99.7 % of the points"
+RULE = (
+    "decided with a guard band as in ISO 14253-1: pass if the deviations of 99.7 % of the points and their expanded "
+    "uncertainty (k = 2) together stay within the tolerance, fail if one exceeds it by more than the uncertainty, else "
+    "too close to tell"
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Deviations against plus and minus a tolerance, mm.
+
+    ``lowest`` and ``highest``: the ends of the range of 99.7 % of the points, each with its decision; ``decision`` of
+    both. Percent of the points that lie ``within`` it, ``inside`` it by more than U, ``outside`` it by more than U, and
+    too ``close`` to tell. ``U_mm``: expanded uncertainty (k = 2) of a point, in the median.
+    """
+
+    tolerance_mm: float
+    U_mm: float
+    lowest: tuple[float, Decision]
+    highest: tuple[float, Decision]
+    decision: Decision
+    within: float
+    inside: float
+    outside: float
+    close: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Verdict":
+        """The inverse of ``to_dict``."""
+        low, high = tuple(data["lowest"]), tuple(data["highest"])
+        return cls(**{**data, "lowest": low, "highest": high})
+
+
+def judged(found: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> Verdict:
+    """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the surface's normal."""
+    if not tolerance_mm > 0:
+        raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
+    kept = found.counted
+    signed = found.signed[kept].astype(np.float64)
+    U = 2 * np.hypot(np.nan_to_num(sigma_mm[kept].astype(np.float64)), found.alignment_mm)
+    typical = float(np.median(U))
+    off = np.abs(signed)
+    inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
+    numbers = found.statistics()
+    ends = [Figure.of_length(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")]
+    decisions = [judge(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends]
+    return Verdict(
+        tolerance_mm,
+        typical,
+        (ends[0].error_mm, decisions[0]),
+        (ends[1].error_mm, decisions[1]),
+        judge(LIMITED, ends, tolerance_mm).decision or "undecided",
+        100 * float(np.mean(off <= tolerance_mm)),
+        100 * float(inside.mean()),
+        100 * float(outside.mean()),
+        100 * float(np.mean(~inside & ~outside)),
+    )

@@ -1,0 +1,133 @@
+"""What was measured on a session's scans: each is a result of its own, numbered as they were made."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.session.names import natural_key
+from slviewer.session.store import Session
+
+FOLDER = "measurements"
+NAMES = "measurement names"
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One measurement: its ``id`` (m1, m2, …), ``name``, ``kind``, the scan (or merged surface) ``source`` that it was
+    made on, the calibration ``model``, ``time`` (ISO 8601, UTC), what its kind needs in ``data``, and whether what it
+    was made from has changed since (``stale``). ``of``: the measurements that it was made from, by id.
+    """
+
+    id: str
+    name: str
+    kind: str
+    source: str
+    model: str
+    time: str
+    data: dict[str, Any]
+    of: tuple[str, ...] = ()
+    stale: bool = False
+
+
+def save_measurement(
+    store: Session,
+    kind: str,
+    *,
+    source: str,
+    model: str,
+    inputs: Mapping[str, str],
+    data: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    of: tuple[str, ...] = (),
+    name: str = "",
+) -> Measurement:
+    """Save a new measurement. ``inputs``: {capture or result: hash} of all that it was made from, so that it is seen as
+    stale when one changes; the measurements ``of`` are added to them."""
+    numbers = [int(each.removeprefix("m")) for each in _ids(store)] + _numbers_in_trash(store)
+    identity = f"m{1 + max(numbers, default=0)}"
+    used = dict(inputs) | store.input_hashes(*(_result(store, each) for each in of))
+    meta = {
+        "kind": kind,
+        "name": name.strip(),
+        "source": source,
+        "model": model,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "of": list(of),
+        "data": dict(data),
+        "inputs": used,
+    }
+    store.save_result(f"{FOLDER}/{identity}", meta, arrays)
+    return load_measurement(store, identity)
+
+
+def list_measurements(store: Session) -> list[Measurement]:
+    """All measurements, in the order in which they were made."""
+    return [load_measurement(store, each) for each in _ids(store)]
+
+
+def load_measurement(store: Session, identity: str) -> Measurement:
+    """One measurement. Raises InputError where there is none of that id."""
+    result = _result(store, identity)
+    meta = store.load_result(result, only=())[0]
+    kind, named = meta["kind"], (store.decision(NAMES) or {}).get(identity)
+    return Measurement(
+        identity,
+        str(named or meta["name"] or f"{kind} {identity.removeprefix('m')}"),
+        kind,
+        meta["source"],
+        meta["model"],
+        meta["time"],
+        meta["data"],
+        tuple(meta["of"]),
+        store.state_of(result) == "stale",
+    )
+
+
+def measurement_arrays(store: Session, identity: str) -> dict[str, np.ndarray]:
+    """What a measurement keeps besides numbers and words, by name."""
+    return store.load_result(_result(store, identity))[1]
+
+
+def rename_measurement(store: Session, identity: str, name: str) -> Measurement:
+    """Give a measurement another name; an empty one gives back the name that it was made with."""
+    _result(store, identity)
+    store.decide(NAMES, {**(store.decision(NAMES) or {}), identity: name.strip()})
+    return load_measurement(store, identity)
+
+
+def trash_measurement(store: Session, identity: str) -> None:
+    """Move a measurement to the trash; ``restore_measurement`` brings it back. What was made from it becomes stale."""
+    store.trash_result(_result(store, identity))
+
+
+def restore_measurement(store: Session, identity: str = "") -> Measurement:
+    """Bring a deleted measurement back, by default the last one deleted. Raises InputError where there is none."""
+    if not identity:
+        deleted = [each for each in store.deleted_results() if each.startswith(f"{FOLDER}-")]
+        if not deleted:
+            raise InputError("no measurement was deleted: there is none to bring back")
+        identity = deleted[0].removeprefix(f"{FOLDER}-")
+    store.restore_result(f"{FOLDER}/{identity}")
+    return load_measurement(store, identity)
+
+
+def _ids(store: Session) -> list[str]:
+    names = [name for name in store.result_names() if name.startswith(f"{FOLDER}/m")]
+    return sorted((name.removeprefix(f"{FOLDER}/") for name in names), key=natural_key)
+
+
+def _numbers_in_trash(store: Session) -> list[int]:
+    """So that no id is given twice, and one that was deleted can come back."""
+    found = [each.removeprefix(f"{FOLDER}-m") for each in store.deleted_results() if each.startswith(f"{FOLDER}-m")]
+    return [int(number) for number in found if number.isdecimal()]
+
+
+def _result(store: Session, identity: str) -> str:
+    result = f"{FOLDER}/{identity}"
+    if not store.has_result(result):
+        raise InputError(f"there is no measurement {identity!r}: there are {', '.join(_ids(store)) or 'none'}")
+    return result

@@ -1,0 +1,141 @@
+"""The surface that is measured on: a scan's points with all that is known of their errors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import InputError
+from slviewer.inspection.features import Feature
+from slviewer.inspection.regions import Region
+from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.session.store import Session
+from slviewer.workflow.decoding import capture_texture, decode_capture
+from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
+from slviewer.workflow.models import Model, check_accepted, load_model, preferred, warn_if_stale
+from slviewer.workflow.opening import SessionLike, opened
+from slviewer.workflow.scaling import corrected_cloud, scale_factor
+from slviewer.workflow.trust import told
+
+Place = tuple[int, int] | int
+"""A point of a surface: pixel (u, v) of a scan, or the index of a merged surface's point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was measured.
+
+    ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along ``normals`` for a
+    merged surface. ``faces`` (m, 3): of a merged mesh. ``source`` is the capture or result that it came from, ``model``
+    the calibration, ``inputs`` the hashes of both; ``shared``: what the calibration leaves uncertain, where that is
+    known, and ``calibration`` its hash.
+    """
+
+    points: np.ndarray
+    sigma_mm: np.ndarray
+    source: str
+    model: str
+    inputs: Mapping[str, str]
+    normals: np.ndarray | None = None
+    faces: np.ndarray | None = None
+    shared: Shared | None = None
+    calibration: str = ""
+    texture: np.ndarray | None = None
+    scale: float = 1.0
+
+    @property
+    def organised(self) -> bool:
+        """Whether it is a scan, pixel by pixel."""
+        return self.points.ndim == 3
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Bool like the points: those that there are."""
+        return np.asarray(np.isfinite(self.points).all(axis=-1))
+
+    def within(self, region: Region) -> np.ndarray:
+        """(n, 3) float64: the points of a region."""
+        return np.asarray(self.points[region.within(self.points)], np.float64)
+
+    def picked(self, place: Place) -> tuple[Feature, Spread]:
+        """A point, with its uncertainty. Raises InputError where nothing was measured there."""
+        if self.organised != isinstance(place, tuple):
+            raise InputError(
+                f"{place} is no place on {self.source}: give {'pixel (u, v)' if self.organised else 'an index'}"
+            )
+        index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
+        if not all(0 <= i < n for i, n in zip(index, self.points.shape, strict=False)):
+            raise InputError(f"{place} lies outside {self.source}: pick a point of it")
+        point = np.asarray(self.points[index], np.float64)
+        if not np.isfinite(point).all():
+            raise InputError(f"nothing was measured at {place} of {self.source}: pick another point")
+        sigma = float(np.nan_to_num(self.sigma_mm[index]))
+        if self.organised:
+            away = sigma * point / point[2]
+        else:
+            away = np.zeros(3) if self.normals is None else sigma * np.asarray(self.normals[index], np.float64)
+        feature = Feature("point", point)
+        if self.shared is None:
+            return feature, Spread(np.outer(away, away))
+        return feature, Spread(np.outer(away, away), self.shared(point[None], np.eye(3)[:, None]), self.calibration)
+
+    def sigma_along(self, normals: np.ndarray) -> np.ndarray:
+        """(n,) mm: standard deviation of the measured points along unit normals (n, 3), noise alone."""
+        sigma = self.sigma_mm[self.measured].astype(np.float64)
+        if not self.organised:
+            return sigma
+        points = self.points[self.measured].astype(np.float64)
+        return sigma * np.abs(np.sum(points / points[:, 2:] * normals, axis=1))
+
+
+def surface(
+    session: SessionLike,
+    scan: str,
+    *,
+    model: str | None = None,
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Surface:
+    """Reconstruct a capture to measure on it."""
+    with opened(session) as store:
+        check_accepted(store, accept_rejected)
+        fitted = load_model(store, model or preferred(store))
+        warn_if_stale(store, warn)
+        shot = store.load_capture(scan)
+        progress(0.1, "reading frames")
+        frames = shot.stack()
+        for sentence in told(store, scan, frames):
+            warn(f"{scan}: {sentence}")
+        progress(0.3, "decoding")
+        phases = decode_capture(shot, frames)
+        progress(0.6, "reconstructing")
+        cloud = corrected_cloud(store, fitted, phases, texture=capture_texture(shot, frames))
+        found = surface_of(store, scan, cloud, fitted)
+        progress(1.0, "reconstructed")
+    return found
+
+
+def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surface:
+    """A capture's cloud, made with one of the session's calibrations, as a surface to measure on."""
+    calibration = f"calibration/{fitted.name}"
+    names = [scan, calibration]
+    if store.state_of(f"scale/{fitted.name}") == "fresh":
+        names.append(f"scale/{fitted.name}")
+    inputs, scale = store.input_hashes(*names), scale_factor(store, fitted.name)
+    sure = isinstance(fitted, SplinedModel)
+    return Surface(
+        cloud.points,
+        cloud.sigma_z,
+        scan,
+        fitted.name,
+        inputs,
+        normals=grid_normals(cloud.points),
+        shared=splined_shared(fitted.bundle, cloud.axis, scale) if isinstance(fitted, SplinedModel) else None,
+        calibration=inputs[calibration] if sure else "",
+        texture=cloud.texture,
+        scale=scale,
+    )
