@@ -24,8 +24,8 @@ def deviation_colours(signed: np.ndarray, limit: float) -> np.ndarray:
 
 
 def colour_limit(signed: np.ndarray, tolerance_mm: float | None = None) -> float:
-    """Half the range that the colours cover, mm: twice the tolerance, else where 99.5 % of the points lie."""
+    """Half the range that the colours cover, mm: the tolerance, else where 99.5 % of the points lie."""
     if tolerance_mm is not None:
-        return 2 * tolerance_mm
+        return tolerance_mm
     known = np.abs(signed[np.isfinite(signed)])
     return max(float(np.percentile(known, 99.5)), 1e-6) if known.size else 1.0

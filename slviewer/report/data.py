@@ -258,6 +258,59 @@ class DriftRow:
     current: bool = True
 
 
+@dataclass(frozen=True)
+class Reading:
+    """One number that was measured: ``unit`` as it is printed; ``U`` its expanded uncertainty (k = 2), None where it
+    has none; ``whole``: whether U holds the calibration's part."""
+
+    name: str
+    value: float
+    unit: str
+    U: float | None = None
+    whole: bool = True
+
+
+@dataclass(frozen=True)
+class MeasurementRow:
+    """A distance, a fit, an angle, … on the scan ``source``; ``where``: the region or what it lies between; ``notes``
+    are sentences."""
+
+    name: str
+    kind: str
+    source: str
+    readings: Sequence[Reading]
+    where: str = ""
+    notes: Sequence[str] = ()
+    stale: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class SectionView:
+    """A surface cut by a plane: ``lines`` (k, 2) mm, along and up."""
+
+    name: str
+    lines: Sequence[np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class DeviationView:
+    """A scan against a nominal model: some of its ``points`` (n, 3) with the nominal's ``normals`` there and how far
+    they lie off it, ``signed`` (n,) mm; ``uncovered`` (k, 3): places of the nominal that were not measured; a histogram
+    of all points, ``edges`` (m + 1,) mm and ``counts`` (m,); ``found`` as ``compare --json`` gives it."""
+
+    name: str
+    source: str
+    nominal: str
+    points: np.ndarray
+    normals: np.ndarray
+    signed: np.ndarray
+    uncovered: np.ndarray
+    edges: np.ndarray
+    counts: np.ndarray
+    found: Mapping[str, Any]
+    stale: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class SessionData:
     """A session's captures, its calibrations, and what was measured with them.
@@ -280,3 +333,6 @@ class SessionData:
     models: ModelsView | None = None
     acceptances: Sequence[AcceptanceView] = ()
     drifts: Sequence[DriftRow] = ()
+    measurements: Sequence[MeasurementRow] = ()
+    sections: Sequence[SectionView] = ()
+    deviations: Sequence[DeviationView] = ()

@@ -6,6 +6,7 @@ from slviewer.report.canvas import percentile
 from slviewer.report.clouds import clouds, merged_cloud
 from slviewer.report.data import CalibrationView, DeviceParameters, SessionData, VerificationView
 from slviewer.report.maps import error_maps, rms_maps
+from slviewer.report.measurements import deviations_section, measurements_section
 from slviewer.report.page import Cell, Column, Headline, Item, Mark, Notice, Section, Table
 from slviewer.report.quality import (
     acceptance_section,
@@ -105,6 +106,10 @@ def session_sections(data: SessionData) -> list[Section]:
         sections.append(drift_section(data.drifts))
     if data.clouds or data.merged is not None:
         sections.append(_clouds(data))
+    if data.measurements or data.sections:
+        sections.append(measurements_section(data.measurements, data.sections))
+    if data.deviations:
+        sections.append(deviations_section(data.deviations))
     return [*sections, _captures(data)]
 
 

@@ -164,10 +164,11 @@ def compare_surface(
     )
     if found.coverage < LIKELY_COVERAGE:
         warn(f"only {100 * found.coverage:.1f} % of {nominal.name} were measured: see that it is the same part")
-    along = on.sigma_along(np.nan_to_num(found.normals.astype(np.float64)))
+    towards = np.nan_to_num(found.normals.astype(np.float64))
+    along = on.sigma_along(towards)
     kept = found.counted
     noise = float(np.sqrt(np.nanmean(along[kept] ** 2))) if np.isfinite(along[kept]).any() else float("nan")
-    verdict = None if tolerance is None else judged(found, along, tolerance)
+    verdict = None if tolerance is None else judged(found, on.sigma_along(towards, whole=True), tolerance)
     progress(0.9, "writing")
     ply = None
     if out is not None:
@@ -188,8 +189,8 @@ def _rows(numbers: dict[str, float], noise: float) -> list[Row]:
             ("RMS", numbers["rms"], False),
             ("RMS of noise alone", noise, False),
             ("95 % are off by less than", numbers["within_95"], False),
-            ("99.7 % lie above", numbers["p_low"], True),
-            ("99.7 % lie below", numbers["p_high"], True),
+            ("range of 99.7 %, lower end", numbers["p_low"], True),
+            ("range of 99.7 %, upper end", numbers["p_high"], True),
             ("lowest", numbers["lowest"], True),
             ("highest", numbers["highest"], True),
         )
@@ -233,8 +234,8 @@ def _kept(
         Quantity("mean", numbers["mean"], "mm"),
         Quantity("RMS", numbers["rms"], "mm"),
         Quantity("95 % off by less than", numbers["within_95"], "mm"),
-        Quantity("99.7 % above", numbers["p_low"], "mm"),
-        Quantity("99.7 % below", numbers["p_high"], "mm"),
+        Quantity("range of 99.7 %, lower end", numbers["p_low"], "mm"),
+        Quantity("range of 99.7 %, upper end", numbers["p_high"], "mm"),
         Quantity("area measured", 100 * found.coverage, "%"),
     ]
     if verdict is not None:

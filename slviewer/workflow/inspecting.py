@@ -2,6 +2,7 @@
 
 from slviewer.session.capture import Capture
 from slviewer.workflow.diagnosing import last_verdict
+from slviewer.workflow.measuring import in_words, measurements
 from slviewer.workflow.models import available, load_stereo, preferred
 from slviewer.workflow.opening import SessionLike, opened
 
@@ -28,6 +29,10 @@ def inspect(session: SessionLike) -> str:
         verdict = last_verdict(store)
         if verdict is not None:
             lines.append(verdict.text())
+        measured = measurements(store)
+        if measured:
+            lines.append(f"{len(measured)} measurement{'s' * (len(measured) != 1)}:")
+            lines += [f"  {in_words(each)}" for each in measured]
         if not available(store):
             lines.append("no calibration yet: run `slviewer calibrate`")
     return "\n".join(lines)

@@ -29,9 +29,9 @@ class Surface:
     """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was measured.
 
     ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along ``normals`` for a
-    merged surface. ``faces`` (m, 3): of a merged mesh. ``source`` is the capture or result that it came from, ``model``
-    the calibration, ``inputs`` the hashes of both; ``shared``: what the calibration leaves uncertain, where that is
-    known, and ``calibration`` its hash.
+    merged surface; ``left_mm`` likewise: what the calibration leaves uncertain, where that is known. ``faces`` (m, 3):
+    of a merged mesh. ``source`` is the capture or result that it came from, ``model`` the calibration, ``inputs`` the
+    hashes of both; ``shared``: how errors of that ``calibration``, by its hash, go together, where that is known.
     """
 
     points: np.ndarray
@@ -39,6 +39,7 @@ class Surface:
     source: str
     model: str
     inputs: Mapping[str, str]
+    left_mm: np.ndarray | None = None
     normals: np.ndarray | None = None
     faces: np.ndarray | None = None
     shared: Shared | None = None
@@ -82,9 +83,12 @@ class Surface:
             return feature, Spread(np.outer(away, away))
         return feature, Spread(np.outer(away, away), self.shared(point[None], np.eye(3)[:, None]), self.calibration)
 
-    def sigma_along(self, normals: np.ndarray) -> np.ndarray:
-        """(n,) mm: standard deviation of the measured points along unit normals (n, 3), noise alone."""
+    def sigma_along(self, normals: np.ndarray, whole: bool = False) -> np.ndarray:
+        """(n,) mm: standard deviation of the measured points along unit normals (n, 3), of noise alone, or on the
+        ``whole``, with what the calibration leaves uncertain."""
         sigma = self.sigma_mm[self.measured].astype(np.float64)
+        if whole and self.left_mm is not None:
+            sigma = np.hypot(sigma, self.left_mm[self.measured])
         if not self.organised:
             return sigma
         points = self.points[self.measured].astype(np.float64)
@@ -133,6 +137,7 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surfac
         scan,
         fitted.name,
         inputs,
+        left_mm=cloud.sigma_calibration,
         normals=grid_normals(cloud.points),
         shared=splined_shared(fitted.bundle, cloud.axis, scale) if isinstance(fitted, SplinedModel) else None,
         calibration=inputs[calibration] if sure else "",

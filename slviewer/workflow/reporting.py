@@ -36,6 +36,7 @@ from slviewer.session.store import Session
 from slviewer.workflow.diagnosing import last_verdict
 from slviewer.workflow.drifting import history
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
+from slviewer.workflow.measured_views import measured_views
 from slviewer.workflow.models import (
     available,
     load_model,
@@ -98,6 +99,7 @@ def _data(store: Session) -> SessionData:
         models=_models(store),
         acceptances=_acceptances(store),
         drifts=_drifts(store),
+        **measured_views(store),
     )
 
 

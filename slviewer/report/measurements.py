@@ -1,0 +1,212 @@
+"""What was measured on scans, and how far they lie off their nominal models: tables, sections, coloured surfaces."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
+from slviewer.inspection.tolerance import DECIDED, RULE
+from slviewer.report.canvas import (
+    DENSITY,
+    FULL,
+    INK,
+    SMALL_PT,
+    SOFT,
+    TEXT_PT,
+    bare,
+    colour_bar,
+    finish,
+    legend,
+    new_figure,
+    rounded_up,
+    tidy,
+)
+from slviewer.report.data import DeviationView, MeasurementRow, SectionView
+from slviewer.report.page import Cell, Column, Figure, Item, Mark, Notice, Section, Table
+from slviewer.report.shaded import render, view_rotation
+from slviewer.report.tables import UNKNOWN, number
+
+YAW_DEG, PITCH_DEG = 12.0, 10.0
+PICTURE = (560, 420)
+LINE = "#2270b8"
+TOLERANCE = "#b3261e"
+MARKS: dict[str, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
+LEAST_HIGH, MOST_HIGH = 220, 460
+MOST_DRAWN = 4000
+
+
+def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[SectionView]) -> Section:
+    """Every measurement with its units and uncertainties, and each section as it was cut."""
+    items: list[Item] = [
+        Notice(f"{row.name} was measured on what has since changed: measure it again.") for row in rows if row.stale
+    ]
+    items += [Notice(f"{row.name}: {note}.") for row in rows for note in row.notes]
+    body: list[list[str | Cell]] = []
+    for row in rows:
+        for i, reading in enumerate(row.readings):
+            digits = 1 if reading.unit == "%" else 4
+            U: str | Cell = UNKNOWN if reading.U is None else f"{reading.U:.{digits}f}"
+            if reading.U is not None and not reading.whole:
+                U = f"{U} *"
+            named: list[str | Cell] = [row.name, row.kind, row.source] if not i else ["", "", ""]
+            if not i and row.stale:
+                named[0] = Cell(f"{row.name} (stale)", "worse")
+            where = row.where if not i else ""
+            body.append([*named, reading.name, number(reading.value, digits), reading.unit, U, where])
+    columns = [Column("measurement", align="left"), Column("kind", align="left"), Column("scan", align="left")]
+    columns += [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
+    columns += [Column("U, k = 2"), Column("of", align="left")]
+    notes = [
+        "U is the expanded uncertainty. It holds the scatter of the points and what the calibration leaves uncertain. –: a residual, which has none."
+    ]
+    if any(reading.U is not None and not reading.whole for row in rows for reading in row.readings):
+        notes.append("* without the calibration's part, which this calibration does not know.")
+    if body:
+        items.append(Table(columns, body, "Measured on the scans", notes))
+    items += [section_plot(view) for view in sections]
+    return Section("Measurements", "Distances, fitted shapes, and what lies between them.", items)
+
+
+def section_plot(view: SectionView) -> Figure:
+    """The lines of a section, to scale."""
+    every = np.concatenate(view.lines)
+    width, height = np.maximum(np.ptp(every, axis=0), 1e-6)
+    high = int(np.clip(FULL * height / width + 90, LEAST_HIGH, MOST_HIGH))
+    drawing = new_figure(FULL, high)
+    axes = drawing.subplots()
+    tidy(axes, view.name, "along, mm", "height, mm")
+    for line in view.lines:
+        axes.plot(*_thinned(line).T, color=LINE, linewidth=1.3)
+    # flat sections are raised, and it is said: to scale nothing would be seen of them
+    raised = FULL / high * height / width < 0.15
+    axes.set_aspect("auto" if raised else "equal", adjustable="datalim")
+    told = "heights are drawn larger than lengths" if raised else "lengths and heights are drawn alike"
+    return finish(
+        drawing,
+        f"{view.name}: the surface where a plane cuts it; {told}.",
+        f"Section {view.name}, {width:.1f} mm long and {height:.2f} mm high",
+    )
+
+
+def _thinned(line: np.ndarray) -> np.ndarray:
+    """A line without the points that a picture of it cannot show."""
+    return line[:: max(1, len(line) // MOST_DRAWN)]
+
+
+def deviations_section(views: Sequence[DeviationView]) -> Section:
+    """Each comparison with a nominal model: verdict, picture and figures."""
+    items: list[Item] = []
+    for view in views:
+        items += _deviation(view)
+    text = (
+        "Scans against nominal models, after the best fit of the one to the other: distances from the nominal surface, "
+        "positive outside it. The tolerance is " + RULE + "."
+    )
+    return Section("Deviation from nominal", text, items)
+
+
+def _deviation(view: DeviationView) -> list[Item]:
+    verdict = view.found["verdict"]
+    items: list[Item] = []
+    if verdict is not None:
+        words = DECIDED[verdict["decision"]]
+        kind = {"pass": "good", "fail": "warning", "undecided": "warning"}[verdict["decision"]]
+        items.append(
+            Notice(f"{view.name}, tolerance ± {verdict['tolerance_mm']:g} mm: {words}.", kind)  # type: ignore[arg-type]
+        )
+    if view.stale:
+        items.append(Notice(f"{view.name}: the scan or its calibration has changed since; compare it again."))
+    items += [deviation_picture(view), _table(view)]
+    return items
+
+
+def _table(view: DeviationView) -> Table:
+    found, verdict = view.found, view.found["verdict"]
+    numbers = found["statistics_mm"]
+    columns = [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
+    columns.append(Column("decision", align="left"))
+
+    def end(key: str) -> str | Cell:
+        return "" if verdict is None else _decided(verdict[key][1])
+
+    rows: list[list[str | Cell]] = [
+        ["mean", number(numbers["mean"], 4, signed=True), "mm", ""],
+        ["RMS", number(numbers["rms"], 4), "mm", ""],
+        ["RMS of the scan's noise alone", number(found["noise_mm"], 4), "mm", ""],
+        ["95 % of the points are off by less than", number(numbers["within_95"], 4), "mm", ""],
+        ["range of 99.7 % of the points, lower end", number(numbers["p_low"], 4, signed=True), "mm", end("lowest")],
+        ["range of 99.7 % of the points, upper end", number(numbers["p_high"], 4, signed=True), "mm", end("highest")],
+        ["lowest, highest point", f"{numbers['lowest']:+.3f}, {numbers['highest']:+.3f}".replace("-", "−"), "mm", ""],
+    ]
+    if verdict is not None:
+        rows += [
+            ["expanded uncertainty U of a point, k = 2", number(verdict["U_mm"], 4), "mm", ""],
+            [f"within ± {verdict['tolerance_mm']:g} mm", number(verdict["within"], 2), "%", ""],
+            ["inside by more than U", number(verdict["inside"], 2), "%", ""],
+            ["outside by more than U", number(verdict["outside"], 2), "%", ""],
+            ["too close to tell", number(verdict["close"], 2), "%", ""],
+        ]
+    rows.append(["area of the nominal that was measured", number(100 * found["coverage"], 1), "%", ""])
+    share = 100 * numbers["left_out"] / max(numbers["points"] + numbers["left_out"], 1)
+    notes = [
+        f"{numbers['points']:,} points. {numbers['left_out']:,} ({share:.1f} %) lie farther than "
+        f"{found['reach_mm']:.3g} mm from the nominal or face another way, and are left out. The best fit adds "
+        f"{found['alignment_mm']:.4f} mm (1 sigma)."
+    ]
+    return Table(columns, rows, f"{view.source} against {view.nominal}", notes)
+
+
+def _decided(decision: str) -> Cell:
+    return Cell(DECIDED[decision], MARKS[decision])  # type: ignore[index]
+
+
+def deviation_picture(view: DeviationView) -> Figure:
+    """The scan coloured by its deviation, what of the nominal was not measured in grey, and the histogram."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
+    verdict = view.found["verdict"]
+    tolerance = None if verdict is None else float(verdict["tolerance_mm"])
+    limit = colour_limit(view.signed, tolerance)
+    limit = rounded_up(limit) if tolerance is None else limit
+    palette = ListedColormap(deviation_colours(np.linspace(-1, 1, 255), 1.0) / 255)
+    drawing = new_figure(FULL, 480)
+    left, right = drawing.subplots(1, 2, width_ratios=(1.35, 1))
+    width, height = PICTURE
+    points = np.concatenate([view.points, view.uncovered]).astype(np.float64)
+    normals = np.concatenate([view.normals, np.full(view.uncovered.shape, np.nan)])
+    grey = np.broadcast_to(np.array(LEFT_OUT, np.uint8), view.uncovered.shape)
+    colours = np.concatenate([deviation_colours(view.signed, limit), grey]) / 255.0
+    bare(left, f"{view.source} against {view.nominal}")
+    left.imshow(
+        render(points, normals, colours, (DENSITY * width, DENSITY * height), view_rotation(YAW_DEG, PITCH_DEG))
+    )
+    mapped = ScalarMappable(Normalize(-limit, limit), palette)
+    colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
+    numbers = view.found["statistics_mm"]
+    tidy(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
+    edges, counts = view.edges, view.counts
+    middles = (edges[1:] + edges[:-1]) / 2
+    right.bar(
+        middles,
+        100 * counts / max(counts.sum(), 1),
+        0.98 * np.diff(edges),
+        color=deviation_colours(middles, limit) / 255,
+        edgecolor="#9aa6b2",
+        linewidth=0.3,
+    )
+    if tolerance is not None:
+        for side in (-tolerance, tolerance):
+            right.axvline(side, color=TOLERANCE, linewidth=1.2, linestyle="--")
+        right.plot([], [], color=TOLERANCE, linewidth=1.2, linestyle="--", label=f"tolerance ± {tolerance:g} mm")
+        legend(right, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
+    far = max(edges[-1], 0.0 if tolerance is None else 1.15 * tolerance)
+    right.set_xlim(-far, far)
+    left.set_xlabel("grey: parts of the nominal that were not measured", fontsize=TEXT_PT, color=SOFT, loc="left")
+    return finish(
+        drawing,
+        f"{view.name}: red lies outside the nominal surface, blue inside it. Right: how many of the points lie how far "
+        "off.",
+        f"{view.source} coloured by its deviation from {view.nominal}, with a histogram of the deviations",
+        shaded=True,
+    )
