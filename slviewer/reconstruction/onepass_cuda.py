@@ -1,7 +1,7 @@
 """The one pass where there is a CUDA device: `one_pass` decides, and without one it is the processor's."""
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 
@@ -33,7 +33,7 @@ def one_pass(sequence: PatternSequence, model: Fast, axis: Axis) -> OnePass:
     return OnePass(sequence, model, axis)  # type: ignore[arg-type]
 
 
-def has_pass(model: object) -> bool:
+def has_pass(model: object) -> TypeGuard[Fast]:
     """Whether `one_pass` measures with a calibration here: pixelwise and splined always, stereo on a CUDA device."""
     if isinstance(model, StereoModel):
         return cuda_device.device() is not None

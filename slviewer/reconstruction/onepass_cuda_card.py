@@ -37,20 +37,23 @@ class Card:
         rules = spike_rules(found)
         self._plain, self._shaded = rules.plain, order.texture < 0
         others = len(order.others) if deep else 0
-        self._sweep = sweep_kernel(_plan(job, others), measure, deep, self._shaded)
+        self._sweep = sweep_kernel(_plan(job, others), pixels, measure, deep, self._shaded)
         self._mend = spike_kernels(rules, job.shape, measure)
 
         self.stream = cuda.stream()
         self._grid = -(-pixels // THREADS), THREADS, self.stream
         self._c = cuda.to_device(np.ascontiguousarray(c.reshape(len(c), pixels)))
         self._extra = cuda.to_device(np.ascontiguousarray(extra.ravel()))
-        self._frames = cuda.device_array((len(slots), pixels), dtype)
-        self._runs = [(first, last, self._frames[at : at + last - first]) for at, first, last in _runs(slots)]
+        self._frames = cuda.device_array(len(slots) * pixels, dtype)
+        self._runs = [
+            (first, last, self._frames[at * pixels : (at + last - first) * pixels]) for at, first, last in _runs(slots)
+        ]
         self._phase, self._modulation, self._sigma_z = (cuda.device_array(pixels, np.float32) for _ in range(3))
         self._points = cuda.device_array((pixels, 3), np.float32)
         self._reason, self._words = (cuda.device_array(pixels, np.uint8) for _ in range(2))
         self._texture = cuda.device_array(pixels if self._shaded else 1, dtype)
-        self._highest, self._none = cuda.device_array(1, np.int32), np.zeros(1, np.int32)
+        self._deep, self._none = deep, np.zeros(1, np.int32)
+        self._highest = cuda.to_device(self._none)
 
     @property
     def bytes_moved(self) -> int:
@@ -62,11 +65,12 @@ class Card:
     def load(self, frames: np.ndarray) -> None:
         """Copy the frames (n, h, w) that are read, each once."""
         for first, last, room in self._runs:
-            room.copy_to_device(frames[first:last].reshape(last - first, -1), stream=self.stream)
+            room.copy_to_device(frames[first:last].reshape(-1), stream=self.stream)
 
     def sweep(self, light: Light) -> None:
         """The first pass over the frames that were loaded."""
-        self._highest.copy_to_device(self._none, stream=self.stream)
+        if self._deep:
+            self._highest.copy_to_device(self._none, stream=self.stream)
         numbers = (*light.noise, limits.DARK_LEVELS * light.white / 255, self._dark_sigmas, light.white, light.mean)
         self._sweep[self._grid](
             self._frames, tuple(np.float32(number) for number in numbers), self._c, self._extra, self._phase,

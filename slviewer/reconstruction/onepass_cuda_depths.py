@@ -1,7 +1,8 @@
 """Depth of one pixel from its phase, as a CUDA device measures it: each model's own function, compiled for one camera.
 
 A function takes (pixel, phase, c, extra) and returns (x, y, z, |dz/dphi|), mm and mm/rad; points that are not measured
-are NaN. ``c`` (m, n) and ``extra`` (k,) lie on the device. Imported only where there is one.
+are NaN. The pixel is a uint64, as unsigned indices are taken as they are; ``c`` (m, n) and ``extra`` (k,) lie on the
+device. Imported only where there is one.
 """
 
 import math
@@ -18,7 +19,7 @@ ZERO, ONE, NONE = np.float32(0), np.float32(1), np.float32(math.nan)
 
 def pixelwise(pixels: int, gain: float, centre: float) -> Callable[..., Any]:
     """``c`` (5, n) and ``extra`` (2 n,) float32 are `onepass_kernels.Depths`' coefficients and bounds."""
-    per_rad, middle = np.float32(gain), np.float32(centre)
+    per_rad, middle, largest_at = np.float32(gain), np.float32(centre), np.uint64(pixels)
 
     @cuda.jit(device=True)
     def measure(i, phase, c, extra):
@@ -26,7 +27,7 @@ def pixelwise(pixels: int, gain: float, centre: float) -> Callable[..., Any]:
         c0, c1, c2 = c[0, i], c[1, i], c[2, i]
         per = ONE / (ONE + c2 * s)
         z = (c0 + c1 * s) * per
-        if not (s >= extra[i] and s <= extra[pixels + i] and z > ZERO):
+        if not (s >= extra[i] and s <= extra[largest_at + i] and z > ZERO):
             z = NONE
         return c[3, i] * z, c[4, i] * z, z, abs(c1 - c0 * c2) * per * per * per_rad
 
@@ -40,6 +41,7 @@ def splined(
     _, columns, layers = grid
     per_rad, middle, begin, scale = (np.float32(number) for number in (gain, centre, near, per_mm))
     deepest, per_px = np.float32(layers - 1.0001), np.float32(1.0 / step)
+    one, aside, lower = np.uint64(1), np.uint64(layers), np.uint64(columns * layers)
 
     @cuda.jit(device=True)
     def measure(i, phase, c, extra):
@@ -51,21 +53,21 @@ def splined(
         depth = (z - begin) * scale
         if not (depth >= ZERO and depth <= deepest):
             return NONE, NONE, NONE, slope
-        v = i // width
-        u = i - v * width
+        at = np.int64(i)
+        v = at // width
+        u = at - v * width
         j, q = v // step, u // step
         k = int(depth)
         down, right = np.float32(v - j * step) * per_px, np.float32(u - q * step) * per_px
         rest = depth - np.float32(k)
-        above = (j * columns + q) * layers + k
-        below = above + columns * layers
+        above = np.uint64((j * columns + q) * layers + k)
+        below = above + lower
         a = extra[above] + down * (extra[below] - extra[above])
-        b = extra[above + 1] + down * (extra[below + 1] - extra[above + 1])
+        b = extra[above + one] + down * (extra[below + one] - extra[above + one])
         here = a + rest * (b - a)
-        above += layers
-        below += layers
+        above, below = above + aside, below + aside
         a = extra[above] + down * (extra[below] - extra[above])
-        b = extra[above + 1] + down * (extra[below + 1] - extra[above + 1])
+        b = extra[above + one] + down * (extra[below + one] - extra[above + one])
         there = a + rest * (b - a)
         z = z + (here + right * (there - here))
         return c[3, i] * z, c[4, i] * z, z, slope

@@ -97,10 +97,10 @@ def spike_kernels(rules: SpikeRules, shape: tuple[int, int], measure: Callable[.
         i = cuda.grid(1)
         if i >= phase.shape[0] or words[i] == NOTHING:
             return
-        before = phase[i]
+        before, at = phase[i], np.uint64(i)
         after = before + (ONE_TURN if words[i] == UP else -ONE_TURN)
-        _, _, _, old_slope = measure(i, before, c, extra)
-        x, y, z, slope = measure(i, after, c, extra)
+        _, _, _, old_slope = measure(at, before, c, extra)
+        x, y, z, slope = measure(at, after, c, extra)
         phase[i] = after
         points[i, 0] = x
         points[i, 1] = y

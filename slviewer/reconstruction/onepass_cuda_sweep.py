@@ -51,28 +51,30 @@ class Plan(NamedTuple):
     misfit: float
 
 
-def sweep_kernel(plan: Plan, measure: Callable[..., Any], deep: bool, shaded: bool) -> Any:
+def sweep_kernel(plan: Plan, pixels: int, measure: Callable[..., Any], deep: bool, shaded: bool) -> Any:
     """The kernel for one plan and one of `onepass_cuda_depths`.
 
     ``deep``: the largest grey level is sought, as uint16 frames need. ``shaded``: texture is the fringes' background.
-    It takes frames (slots, n) of n pixels, the light, two arrays and what it writes, (n,) each, points (n, 3), and the
-    largest grey level (1,) int32.
+    It takes frames of n ``pixels``, (slots n,), the light, the two arrays of ``measure`` and what it writes: maps (n,),
+    points (n, 3), and the largest grey level (1,) int32.
     """
-    decode = _coded(plan) if plan.bits else _levels(plan)
+    decode = _coded(plan, pixels) if plan.bits else _levels(plan, pixels)
     count = plan.starts[-1] + plan.bits + plan.inverses + plan.complementary + plan.others
     per_step = np.float32(2.0 / (plan.starts[-1] - plan.starts[-2]))
-    least = np.float32(1e-6)
+    least, stride = np.float32(1e-6), np.uint64(pixels)
 
     @cuda.jit
     def sweep(stack, light, c, extra, phase, reason, modulation, points, sigma_z, texture, highest):
-        i = cuda.grid(1)
-        if i >= phase.shape[0]:
+        i = np.uint64(cuda.grid(1))  # signed indices would be tested for counting from the end
+        if i >= stride:
             return
         absolute, why, B, A = decode(stack, i, light)
         if deep:
             brightest = np.int32(0)
-            for k in range(count):
-                brightest = max(brightest, np.int32(stack[k, i]))
+            at = i
+            for _ in range(count):
+                brightest = max(brightest, np.int32(stack[at]))
+                at = at + stride
             if brightest > highest[0]:  # perhaps an old value; the next line settles it
                 cuda.atomic.max(highest, 0, brightest)
         x, y, z, sigma = NONE, NONE, NONE, NONE
@@ -93,17 +95,19 @@ def sweep_kernel(plan: Plan, measure: Callable[..., Any], deep: bool, shaded: bo
     return sweep
 
 
-def _shift(plan: Plan) -> Any:
+def _shift(plan: Plan, pixels: int) -> Any:
     """Device function: wrapped phase, modulation, background and largest sample of the period in some frames."""
-    cosines, sines = plan.cosines.astype(np.float32), plan.sines.astype(np.float32)
+    cosines, sines, stride = plan.cosines.astype(np.float32), plan.sines.astype(np.float32), np.uint64(pixels)
 
     @cuda.jit(device=True)
     def shift(stack, i, first, last):
         cosine_of, sine_of = cuda.const.array_like(cosines), cuda.const.array_like(sines)
-        base = np.float32(stack[first, i])
+        at = i + np.uint64(first) * stride
+        base = np.float32(stack[at])
         cosine, sine, total, peak = ZERO, ZERO, ZERO, base
         for k in range(first + 1, last):
-            value = np.float32(stack[k, i])
+            at = at + stride
+            value = np.float32(stack[at])
             peak = max(peak, value)
             value = value - base
             cosine = cosine + cosine_of[k] * value
@@ -128,20 +132,22 @@ def _verdict(B, A, clipped, inconsistent, light):
     return INCONSISTENT if inconsistent else VALID
 
 
-def _coded(plan: Plan) -> Any:
+def _coded(plan: Plan, pixels: int) -> Any:
     """Device function: (absolute phase, reason, modulation, background) of a pixel by Gray code."""
-    shift = _shift(plan)
+    shift = _shift(plan, pixels)
     steps, bits, inverses, complementary = plan.starts[-1], plan.bits, plan.inverses > 0, plan.complementary > 0
-    inverse_from, extra_at = steps + bits, steps + bits + plan.inverses
+    stride, code_from, inverse_from = (np.uint64(number) for number in (pixels, steps, steps + bits))
+    extra_at = np.uint64(steps + bits + plan.inverses)
     origin, undecided = np.float32(plan.origin_turns), np.float32(plan.undecided)
     edge, far_edge = np.float32(plan.edge), np.float32(1 - plan.edge)
     half_weak, weaker = np.float32(plan.weak / 2), np.float32(plan.weaker)
 
     @cuda.jit(device=True)
     def height_of(stack, i, bit, threshold):
-        value = np.float32(stack[steps + bit, i])
+        slot = np.uint64(bit)
+        value = np.float32(stack[(code_from + slot) * stride + i])
         if inverses:
-            return (value - np.float32(stack[inverse_from + bit, i])) * HALF
+            return (value - np.float32(stack[(inverse_from + slot) * stride + i])) * HALF
         return value - threshold
 
     @cuda.jit(device=True)
@@ -179,7 +185,7 @@ def _coded(plan: Plan) -> Any:
         whole = np.float32(math.floor(turns))
         part = turns - whole
         if complementary:
-            last = np.float32(stack[extra_at, i]) - A
+            last = np.float32(stack[extra_at * stride + i]) - A
             half = 2 * code + (digit ^ (1 if last > ZERO else 0))
             middle = NEAR_EDGE <= part < FAR_EDGE
             order = half >> 1 if middle else ((half + 1) >> 1) - (1 if part >= FAR_EDGE else 0)
@@ -198,9 +204,9 @@ def _coded(plan: Plan) -> Any:
     return decode
 
 
-def _levels(plan: Plan) -> Any:
+def _levels(plan: Plan, pixels: int) -> Any:
     """Device function: (absolute phase, reason, modulation, background) of a pixel by several periods."""
-    shift = _shift(plan)
+    shift = _shift(plan, pixels)
     count, levels = len(plan.starts) - 1, len(plan.periods)
     starts = np.array(plan.starts, np.int32)
     weights, periods = plan.weights.astype(np.float64), plan.periods.astype(np.float64)

@@ -25,6 +25,7 @@ from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.workflow.benchmarking_floors import beside, median, megabytes, row, through
+from slviewer.workflow.benchmarking_gpu import gpu_rows
 from slviewer.workflow.benchmarking_peers import fringes_row, icp_rows, missing
 from slviewer.workflow.calibrating import calibrate
 from slviewer.workflow.feedback import Progress, part, unheard
@@ -112,6 +113,7 @@ def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
     light = one.light(frames)
     scan = one.run(frames, light)
     rows.append(_one_pass(one, frames, 7))
+    rows += gpu_rows(sequence, pixelwise, frames)
     rows.append(row("second pass, over spikes", median(lambda: one.mend(scan), 9), megabytes(scan.phase)))
     rows.append(row("noise and fringe mean of a capture, sampled", median(lambda: one.light(frames), 5)))
     rows.append(_file(scan.cloud()))

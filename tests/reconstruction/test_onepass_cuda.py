@@ -27,6 +27,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.reconstruction.onepass_cuda import CudaPass, has_pass, one_pass
+from slviewer.workflow import benchmarking_gpu
 
 ROOT = Path(__file__).parents[2]
 PROJECTOR = (912, 1140)
@@ -123,6 +124,8 @@ def scans_to(folder):
         assert cuda_device.device() is not None
         maps = {key: value for key, value in vars(scan).items() if isinstance(value, np.ndarray)}
         np.savez(folder / f"{number}.npz", **maps)
+    benchmarking_gpu.TIMES = benchmarking_gpu.AHEAD = 1
+    (folder / "rows.json").write_text(json.dumps(benchmarking_gpu.gpu_rows(*made("complementary code, splined"))))
     for case in list(CASES)[::2]:
         sequence, model, frames = made(case)
         one = CudaPass(sequence, model, "x")
@@ -175,6 +178,13 @@ def test_a_device_measures_what_the_definition_says(scans, case):
         np.testing.assert_allclose(found["points"], points, rtol=0, atol=3e-4)
         np.testing.assert_allclose(found["sigma_z"][seen], sigma[seen], rtol=1e-3)
         np.testing.assert_array_equal(found["texture"], texture(sequence, frames))
+
+
+def test_the_benchmark_has_rows_of_a_device(scans):
+    kernel, *copies = json.loads((scans / "rows.json").read_text())
+    pixels, frames = HEIGHT * WIDTH, 2 * (3 + 6)  # uint16, without the texture
+    assert kernel["MB"] * 1e6 > pixels * (frames + 20 + 25) and "GB/s of a copy on the device" in kernel["note"]
+    assert len(copies) == 2 and all(row["ms"] > 0 and "clouds/s" in row["note"] for row in copies)
 
 
 def test_a_device_that_fails_is_told_once_and_the_processor_goes_on(scans):
@@ -241,12 +251,12 @@ def test_kernels_compile_for_real_devices(monkeypatch, cc):
     monkeypatch.setattr(there, "get_current_device", lambda: SimpleNamespace(compute_capability=cc))
     one = CudaPass(SEQUENCES["short"], splined(), "x")
     measure, _, _ = card._depths(one._job())
-    kernel = sweep.sweep_kernel(card._plan(one._job(), 0), measure, True, False)
+    kernel = sweep.sweep_kernel(card._plan(one._job(), 0), HEIGHT * WIDTH, measure, True, False)
     single, whole = types.float32, types.uint16
     ptx, _ = cuda.compile_ptx(
         kernel.py_func,
         (
-            whole[:, ::1], types.UniTuple(single, 6), single[:, ::1], single[::1], single[::1], types.uint8[::1],
+            whole[::1], types.UniTuple(single, 6), single[:, ::1], single[::1], single[::1], types.uint8[::1],
             single[::1], single[:, ::1], single[::1], whole[::1], types.int32[::1],
         ),
         cc=cc,

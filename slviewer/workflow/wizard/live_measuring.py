@@ -4,11 +4,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slviewer.calibration.pixelwise import PixelwiseModel
-from slviewer.calibration.splined.model import SplinedModel
 from slviewer.fringe.decode import decode
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.reconstruction.onepass import OnePass, Scan
+from slviewer.reconstruction.onepass_cuda import has_pass, one_pass
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.workflow.wizard.live_motion import hide_moved
 
@@ -25,8 +24,8 @@ class Measuring:
     _before: Scan | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        if isinstance(self.model, PixelwiseModel | SplinedModel):
-            self._fast = OnePass(self.sequence, self.model, self.axis)
+        if has_pass(self.model):
+            self._fast = one_pass(self.sequence, self.model, self.axis)
 
     def cloud(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(points (h, w, 3) float32 mm, texture (h, w)) of the frames (n, h, w); both are new arrays.
