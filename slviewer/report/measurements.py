@@ -9,8 +9,6 @@ from slviewer.inspection.tolerance import DECIDED, RULE
 from slviewer.report.canvas import (
     DENSITY,
     FULL,
-    INK,
-    SMALL_PT,
     SOFT,
     TEXT_PT,
     bare,
