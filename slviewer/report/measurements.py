@@ -55,7 +55,8 @@ def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[Sect
     columns += [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns += [Column("U, k = 2"), Column("of", align="left")]
     notes = [
-        "U is the expanded uncertainty. It holds the scatter of the points and what the calibration leaves uncertain. –: a residual, which has none."
+        "U is the expanded uncertainty: the scatter of the points, and what the calibration leaves uncertain. –: a "
+        "residual or a plain reading, which has none."
     ]
     if any(reading.U is not None and not reading.whole for row in rows for reading in row.readings):
         notes.append("* without the calibration's part, which this calibration does not know.")
