@@ -45,6 +45,8 @@ _CALIBRATION = {
     "reprojection_rms_px_camera": "the camera's alone, px",
     "reprojection_rms_px_projector": "the projector's alone, px",
 }
+_FIGURES = ("rms_mm", "overlap", "sigma_shift_mm", "sigma_turn_deg")
+"""Of a scan's registration: its RMS, the share of it that overlaps, and how sure its place is."""
 _POSES = {
     "frames": _FRAMES,
     "model": "the calibration that the projector's pose is of",
@@ -183,7 +185,7 @@ def _merge(store: Session, name: str) -> dict[str, Any]:
     for scan in meta["scans"]:
         pair = meta["pairs"].get(scan)
         T = np.eye(4) if pair is None else np.array(pair["T_reference_scan"], float)
-        figures = {key: float(pair[key]) for key in ("rms_mm", "overlap") if pair is not None and key in pair}
+        figures = {key: float(pair[key]) for key in _FIGURES if pair is not None and key in pair}
         scans.append({"name": scan, "T_reference_scan": T, "T_reference_projector": T @ projector, **figures})
     return {"name": name.removeprefix("merge/"), "reference": meta["reference"], "model": used, "scans": scans}
 

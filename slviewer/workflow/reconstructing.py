@@ -115,7 +115,8 @@ def reconstruct(
         progress(0.8, "writing")
         ply.parent.mkdir(parents=True, exist_ok=True)
         faces = triangles(cloud.points, keep) if mesh else None
-        write_ply(ply, cloud.points[keep], colours=texture[keep], scalars=cloud.sigmas(keep), faces=faces)
+        notes = (f"scan {capture}, frame: the camera's", f"calibration {name}")
+        write_ply(ply, cloud.points[keep], texture[keep], scalars=cloud.sigmas(keep), faces=faces, notes=notes)
         if grid is not None:
             write_grid(Path(grid), cloud.points)
         scale, fitted = told_scale(store, name), chosen[name]
