@@ -4,14 +4,14 @@ For every camera pixel ``z = (c0 + c1 phi)/(1 + c2 phi)`` (eq. 9), ``x = c3 z`` 
 to target poses that stereo reconstructed and that were projected onto their ideal planes (eq. 12, 13).
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import prange
 
-from slviewer.calibration.moments import RationalMoments
+from slviewer.calibration.moments import fit_rational
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected
@@ -19,8 +19,12 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.shapes import Plane, fit_plane
-from slviewer.geometry.triangulation import depth_per_px, triangulate, triangulate_pixels
+from slviewer.geometry.triangulation import MARGIN, depth_per_px, ray_depth, triangulate_pixels
 
+PLANE_PIXELS = 30_000
+"""About how many pixels of a pose its plane is fitted to: their phase is smooth, and more do not move the plane."""
+BAND_BYTES = 2**27
+"""What the fit holds of all poses at a time: a band of image rows, the narrower the more poses there are."""
 MIN_POSES = 4
 """Three coefficients and one pose more, so that the fit's RMS says something."""
 REACH = 1.5
@@ -121,33 +125,20 @@ def calibrate_pixelwise(
     width, height = used[0].size
     axes = [axis for axis in stereo.axes if all(axis in o.surfaces for o in used)]
     periods = {axis: used[0].periods_px[axis] for axis in axes}
-    moments = {
-        axis: RationalMoments(_reference_phase(stereo, axis, period, z_ref), z_ref) for axis, period in periods.items()
-    }
-    rays = _RayMoments((height, width))
-    total, done = 2 * len(used), 0
-    for refine in (False, True):
-        for o in used:
-            origin = (o.box[1], o.box[0])
-            phases = {axis: o.smoothed_phase(axis) for axis in axes}
-            points = ideal_points(o, stereo, depth_axis, phases[depth_axis], planes[o.name])
-            for axis in axes:
-                add = moments[axis].add_refinement if refine else moments[axis].add
-                add(phases[axis] * (o.periods_px[axis] / periods[axis]), points[..., 2], origin)
-            if not refine:
-                rays.add(points, origin)
-            done += 1
-            if progress:
-                progress(done / total)
-        if not refine:
-            for axis in axes:
-                moments[axis].solve(MIN_POSES)
-    if not any((m.poses >= MIN_POSES).any() for m in moments.values()):
+    fits = {axis: _empty_fit(height, width) for axis in axes}
+    band = max(1, min(height, BAND_BYTES // (8 * len(used) * width * (len(axes) + 1))))
+    for first in range(0, height, band):
+        rows = slice(first, min(first + band, height))
+        phases, z, rays = _ideal_rows(used, stereo, planes, axes, periods, depth_axis, rows)
+        for axis in axes:
+            reference = _reference_phase(stereo, axis, periods[axis], z_ref, rows)
+            _fit_rows(phases[axis], z, reference, z_ref, rays, rows, fits[axis])
+        if progress:
+            progress(rows.stop / height)
+    if not any((fit.poses >= MIN_POSES).any() for fit in fits.values()):
         raise CalibrationRejected(
             f"no pixel saw the board in {MIN_POSES} poses or more: let the poses overlap in the image"
         )
-    c3, c4, rms_x, rms_y = rays.solve(MIN_POSES)
-    fits = {axis: _pixel_fit(m, c3, c4, rms_x, rms_y) for axis, m in moments.items()}
     return PixelwiseModel(fits, periods, planes, depth_axis)
 
 
@@ -190,8 +181,13 @@ def best_axis(observations: Sequence[Observation], stereo: StereoModel) -> Axis:
 
 def ideal_plane(observation: Observation, stereo: StereoModel, axis: Axis) -> Plane:
     """The plane of the stereo reconstruction of a pose's smoothed phase (step 3, eq. 12)."""
-    points = _stereo_points(observation, stereo, axis, observation.smoothed_phase(axis))
-    finite = points[np.isfinite(points[..., 2])]
+    u0, v0, u1, v1 = observation.box
+    step = max(1, int(((u1 - u0) * (v1 - v0) / PLANE_PIXELS) ** 0.5))
+    v, u = np.nonzero(observation.region[::step, ::step])
+    v, u = v0 + v * step, u0 + u * step
+    coordinate = observation.surfaces[axis].evaluate(u, v) * (observation.periods_px[axis] / (2 * np.pi))
+    points = triangulate_pixels(stereo.rig, np.column_stack([u, v]).astype(float), coordinate, axis)
+    finite = points[np.isfinite(points[:, 2])]
     if len(finite) < 100:
         raise CalibrationRejected(
             f"{observation.name}: stereo reconstructs {len(finite)} points of the board: leave this pose out"
@@ -199,78 +195,120 @@ def ideal_plane(observation: Observation, stereo: StereoModel, axis: Axis) -> Pl
     return fit_plane(finite)
 
 
-def ideal_points(
-    observation: Observation, stereo: StereoModel, axis: Axis, phase: np.ndarray, plane: Plane
-) -> np.ndarray:
-    """(h', w', 3) mm: reconstructed points moved along the plane's normal onto it (step 4, eq. 13)."""
-    points = _stereo_points(observation, stereo, axis, phase)
-    return points - (points @ plane.normal - plane.offset)[..., None] * plane.normal
+def _ideal_rows(
+    used: Sequence[Observation],
+    stereo: StereoModel,
+    planes: Mapping[str, Plane],
+    axes: Sequence[Axis],
+    periods: Mapping[Axis, float],
+    depth_axis: Axis,
+    rows: slice,
+) -> tuple[dict[Axis, np.ndarray], np.ndarray, np.ndarray]:
+    """What all poses say of some image rows: each axis' phase (n, h', w) rad in ``periods``, depth (n, h', w) mm, and
+    sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11).
+
+    Stereo's points are moved along the plane's normal onto it (step 4, eq. 13); NaN where a pose's board is not.
+    """
+    rig, width = stereo.rig, used[0].size[0]
+    shape = len(used), rows.stop - rows.start, width
+    phases = {axis: np.full(shape, np.nan) for axis in axes}
+    z, sums = np.full(shape, np.nan), np.zeros((*shape[1:], 6))
+    extent = np.array(rig.projector.size, float)
+    for i, o in enumerate(used):
+        u0, v0, u1, v1 = o.box
+        first, last = max(rows.start, v0), min(rows.stop, v1)
+        if first >= last:
+            continue
+        here, box = (last - first, u1 - u0), (slice(first - rows.start, last - rows.start), slice(u0, u1))
+        region = _region_rows(o, first - v0, last - v0)
+        smooth = {axis: o.surfaces[axis].evaluate_grid(here, (u0, first)) for axis in {*axes, depth_axis}}
+        for axis in axes:
+            np.multiply(smooth[axis], o.periods_px[axis] / periods[axis], out=phases[axis][i][box], where=region)
+        plane = planes[o.name]
+        _put_on_plane(
+            smooth[depth_axis], region, o.periods_px[depth_axis] / (2 * np.pi), rig.camera.rays(), first, u0,
+            rig.R.copy(), rig.t.copy(), rig.projector.parameters, 0 if depth_axis == "x" else 1, extent,
+            plane.normal, plane.offset, z[i], sums, first - rows.start,
+        )  # fmt: skip
+    return phases, z, sums
 
 
-def _stereo_points(observation: Observation, stereo: StereoModel, axis: Axis, phase: np.ndarray) -> np.ndarray:
-    u0, v0, u1, v1 = observation.box
-    coordinate = np.full(observation.size[::-1], np.nan)
-    coordinate[v0:v1, u0:u1] = phase * (observation.periods_px[axis] / (2 * np.pi))
-    z = triangulate(stereo.rig, coordinate, axis)[v0:v1, u0:u1]
-    return np.dstack([stereo.rig.camera.rays()[v0:v1, u0:u1] * z[..., None], z])
+def _region_rows(o: Observation, first: int, last: int) -> np.ndarray:
+    """Rows ``first`` to ``last`` of an observation's region; only their bits are unpacked."""
+    width = o.box[2] - o.box[0]
+    start, stop = first * width, last * width
+    bits = np.unpackbits(o.packed_region[start // 8 : -(-stop // 8)])
+    return bits[start % 8 :][: stop - start].view(bool).reshape(last - first, width)
 
 
-def _reference_phase(stereo: StereoModel, axis: Axis, period_px: float, z: float) -> np.ndarray:
-    """(h, w) rad: the phase that stereo expects at depth z; 0 where the projector does not reach."""
-    rays = stereo.rig.camera.rays()
+def _reference_phase(stereo: StereoModel, axis: Axis, period_px: float, z: float, rows: slice) -> np.ndarray:
+    """(h', w) rad: the phase that stereo expects at depth z; 0 where the projector does not reach."""
+    rays = stereo.rig.camera.rays()[rows]
     points = np.dstack([rays * z, np.full(rays.shape[:2], z)])
     coordinate = stereo.rig.project(points)[..., 0 if axis == "x" else 1]
     return np.nan_to_num(2 * np.pi * coordinate / period_px)
 
 
-class _RayMoments:
-    """Sums for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11)."""
-
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self.sums = np.zeros((*shape, 6))
-
-    def add(self, points: np.ndarray, origin: tuple[int, int]) -> None:
-        _add_rays(points, origin[0], origin[1], self.sums)
-
-    def solve(self, min_poses: int) -> Iterator[np.ndarray]:
-        """c3, c4 (h, w), then the RMS of both fits in mm."""
-        n, zz, xz, yz, xx, yy = np.moveaxis(self.sums, -1, 0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            few = n < min_poses
-            c3, c4 = (np.where(few, np.nan, s / zz) for s in (xz, yz))
-            rms_x = np.sqrt(np.maximum(xx - c3 * xz, 0) / n).astype(np.float32)
-            rms_y = np.sqrt(np.maximum(yy - c4 * yz, 0) / n).astype(np.float32)
-        yield from (c3, c4, rms_x, rms_y)
+def _empty_fit(height: int, width: int) -> PixelFit:
+    shape = height, width
+    poses, coefficients = np.zeros(shape, np.uint16), np.empty((5, *shape))
+    rms, least, most, condition = (np.empty((*n, *shape), np.float32) for n in ((3,), (), (), ()))
+    return PixelFit(coefficients, rms, poses, least, most, condition)
 
 
-def _pixel_fit(m: RationalMoments, c3: np.ndarray, c4: np.ndarray, rms_x: np.ndarray, rms_y: np.ndarray) -> PixelFit:
-    rms_z = m.refine(MIN_POSES)
-    a0, a1, a2 = m.coefficients
+def _fit_rows(
+    phase: np.ndarray, z: np.ndarray, phase_ref: np.ndarray, z_ref: float, rays: np.ndarray, rows: slice, fit: PixelFit
+) -> None:
+    """Fill the ``rows`` of a fit (step 5)."""
+    a, rms_z = np.empty((3, *phase.shape[1:])), np.empty(phase.shape[1:])
+    poses, least, most = fit.poses[rows], fit.phase_min[rows], fit.phase_max[rows]
+    fit_rational(phase, z, phase_ref, z_ref, MIN_POSES, a, rms_z, poses, least, most, fit.condition[rows])
+    a0, a1, a2 = a
     # zeta = (a0 + a1 s)/(1 + a2 s) with s = phi - r and z = z_ref + zeta, back in the Letter's own terms
-    b0, b1 = a0 + m.z_ref, a1 + m.z_ref * a2
-    scale = 1 - a2 * m.phase_ref
+    b0, b1 = a0 + z_ref, a1 + z_ref * a2
+    scale = 1 - a2 * phase_ref
+    n, zz, xz, yz, xx, yy = np.moveaxis(rays, -1, 0)
+    c, rms = fit.coefficients[:, rows], fit.rms_mm[:, rows]
     with np.errstate(invalid="ignore", divide="ignore"):
-        c = np.stack([(b0 - b1 * m.phase_ref) / scale, b1 / scale, a2 / scale, c3, c4])
+        c[0], c[1], c[2], c[3], c[4] = (b0 - b1 * phase_ref) / scale, b1 / scale, a2 / scale, xz / zz, yz / zz
+        rms[0], rms[1], rms[2] = (
+            rms_z, np.sqrt(np.maximum(xx - c[3] * xz, 0) / n), np.sqrt(np.maximum(yy - c[4] * yz, 0) / n)
+        )  # fmt: skip
     missing = ~np.isfinite(c).all(0)
     c[:, missing] = np.nan
-    rms = np.stack([rms_z, rms_x, rms_y])
     rms[:, missing] = np.nan
-    return PixelFit(c, rms, m.poses, m.phase_min, m.phase_max, m.condition)
 
 
-@kernel()
-def _add_rays(points, v0, u0, sums):  # type: ignore[no-untyped-def]
-    for i in range(points.shape[0]):
-        for j in range(points.shape[1]):
-            x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]
-            if np.isfinite(z):
-                a = sums[v0 + i, u0 + j]
-                a[0] += 1.0
-                a[1] += z * z
-                a[2] += x * z
-                a[3] += y * z
-                a[4] += x * x
-                a[5] += y * y
+@kernel(parallel=True)
+def _put_on_plane(  # type: ignore[no-untyped-def]
+    phase, region, px_per_rad, rays, v0, u0, R, t, parameters, row, extent, normal, offset, z, sums, first
+):
+    """Depths of stereo's points moved along the ``normal`` onto their plane; phase and region begin at pixel (u0, v0)
+    and, in ``z`` and ``sums``, at row ``first``."""
+    low, high = -0.5 - MARGIN * extent[row], (1.0 + MARGIN) * extent[row] - 0.5
+    for i in prange(phase.shape[0]):
+        shift = 0.0  # the neighbour's distortion is a guess that saves a step or two
+        for j in range(phase.shape[1]):
+            measured = phase[i, j] * px_per_rad
+            if not (region[i, j] and low <= measured <= high):
+                continue
+            uc, vc = rays[v0 + i, u0 + j, 0], rays[v0 + i, u0 + j, 1]
+            depth, new = ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent)
+            if np.isnan(depth) and shift != 0.0:
+                depth, new = ray_depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
+            shift = new
+            if np.isnan(depth):
+                continue
+            off = depth * (uc * normal[0] + vc * normal[1] + normal[2]) - offset
+            X, Y, Z = uc * depth - off * normal[0], vc * depth - off * normal[1], depth - off * normal[2]
+            z[first + i, u0 + j] = Z
+            a = sums[first + i, u0 + j]
+            a[0] += 1.0
+            a[1] += Z * Z
+            a[2] += X * Z
+            a[3] += Y * Z
+            a[4] += X * X
+            a[5] += Y * Y
 
 
 @kernel(parallel=True)

@@ -141,7 +141,7 @@ def _projection(z, a0, a1, a2, t, parameters, row):
 
 
 @kernel()
-def _depth(uc, vc, measured, shift, R, t, parameters, row, extent):
+def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
     """(depth of one ray, undistorted minus distorted normalised coordinate there); NaN as ``triangulate`` says.
 
     ``shift``: a guess of the latter.
@@ -191,9 +191,9 @@ def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
             uc, vc, measured = rays[i, 0], rays[i, 1], coordinate[i]
             z[i] = np.nan
             if low <= measured <= high:  # False for NaN
-                z[i], new = _depth(uc, vc, measured, shift, R, t, parameters, row, extent)
+                z[i], new = ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent)
                 if np.isnan(z[i]) and shift != 0.0:
-                    z[i], new = _depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
+                    z[i], new = ray_depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
                 shift = new
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from analytic_rig import BOARD, PERIOD, PROJECTOR, board_poses, cv_project, observation, rig
 
-from slviewer.calibration.moments import RationalMoments
+from slviewer.calibration.moments import fit_rational
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise, pixel_samples
 from slviewer.calibration.stereo import calibrate_stereo
@@ -115,13 +115,11 @@ def test_moments_find_an_exact_rational_function() -> None:
     phi = np.linspace(100, 130, 9)
     c0, c1, c2 = 900.0, -1.5, 3e-3
     z = (c0 + c1 * phi) / (1 + c2 * phi)
-    moments = RationalMoments(np.full((1, 1), 118.0), 600.0)
-    for p, depth in zip(phi, z, strict=True):
-        moments.add(np.array([[p]]), np.array([[depth]]), (0, 0))
-    moments.solve(4)
-    for p, depth in zip(phi, z, strict=True):
-        moments.add_refinement(np.array([[p]]), np.array([[depth]]), (0, 0))
-    assert moments.refine(4)[0, 0] < 1e-6
-    a0, a1, a2 = moments.coefficients[:, 0, 0]
+    a, rms, condition = np.empty((3, 1, 1)), np.empty((1, 1)), np.empty((1, 1), np.float32)
+    poses, low, high = np.empty((1, 1), np.uint16), np.empty((1, 1), np.float32), np.empty((1, 1), np.float32)
+    reference = np.full((1, 1), 118.0)
+    fit_rational(phi.reshape(9, 1, 1), z.reshape(9, 1, 1), reference, 600.0, 4, a, rms, poses, low, high, condition)
+    assert rms[0, 0] < 1e-6 and poses[0, 0] == 9 and (low[0, 0], high[0, 0]) == (100, 130)
+    a0, a1, a2 = a[:, 0, 0]
     s = phi - 118.0
     assert np.allclose(600 + (a0 + a1 * s) / (1 + a2 * s), z, atol=1e-7)
