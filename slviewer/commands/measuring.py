@@ -137,20 +137,37 @@ def merge(
     reference: str,
     out: Path,
     model: ModelName | None = None,
+    start: Literal["features", "turntable", "identity"] = "features",
+    angle: float | None = None,
     json: Path | None = None,
     accept_rejected: bool = False,
 ) -> None:
-    """Register scans to a reference scan by ICP, and merge them into one cloud.
+    """Register scans to a reference scan, close their loops, and fuse them into one surface.
+
+    Says how surely each pair lies, how well loops close, and what was left out, and why.
 
     Args:
         session: Session folder.
-        captures: Names of the captures.
+        captures: Names of the captures, in the order in which they were taken.
         reference: The capture whose frame the merged cloud takes.
         out: PLY file.
+        start: Where registration starts from: the surfaces' features, a turntable's angle, or where the scans lie
+            already.
+        angle: Degrees that the turntable turns from each capture to the next, with --start turntable.
         model: Which calibration to use; by default the best one available.
         json: Write the registrations to this file too.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
-    result = workflow.merge(session, captures, reference, out, model=model, accept_rejected=accept_rejected, **ui())
+    result = workflow.merge(
+        session,
+        captures,
+        reference,
+        out,
+        model=model,
+        start=start,
+        angle=angle,
+        accept_rejected=accept_rejected,
+        **ui(),
+    )
     write_json(json, result.to_json())
     print(result.text())

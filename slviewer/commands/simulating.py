@@ -12,16 +12,19 @@ from slviewer.commands.parsing import deferred, ui, write_json
 @deferred
 def simulate(
     session: Positional[Path],
-    preset: Literal["letter"] = "letter",
+    preset: Literal["letter", "turn"] = "letter",
     scale: float = 1.0,
     poses: int = 25,
     seed: int = 0,
 ) -> None:
     """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object at three depths.
 
+    The preset turn has, beside target poses, the object turned by up to 15 degrees between its three depths, and
+    another on a turntable, in twelve steps round.
+
     Args:
         session: Session folder to make.
-        preset: Which rig.
+        preset: letter, or turn.
         scale: Resolution of the camera, as a share of the preset's.
         poses: How many target poses.
         seed: Another seed is another rig of the same kind.

@@ -1,8 +1,9 @@
 """Aligning one scan with another: point-to-plane ICP, coarse to fine, and a judgement of the result.
 
 ICP always ends somewhere. Whether it ended at the truth is judged afterwards: where the aligned surfaces face each
-other they must agree, enough of the scan must have a counterpart, and the overlapping shape must hold all six degrees
-of freedom (a plane slides on a plane, a sphere turns in a sphere). What fails is refused.
+other they must agree, enough of the scan must have a counterpart, the overlapping shape must hold all six degrees
+of freedom (a plane slides on a plane, a sphere turns in a sphere), and no other pose may fit as well. What fails is
+refused, with the reason.
 """
 
 from collections.abc import Callable
@@ -10,21 +11,26 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from slviewer.errors import InputError, SlviewerError
+from slviewer.errors import InputError
+from slviewer.registration.freedom import WORDS, Freedom, freedom
 from slviewer.registration.open3d_loader import open3d
-from slviewer.registration.start import Start, ranked_starts
+from slviewer.registration.prepared import Prepared, prepared, scale_of
+from slviewer.registration.refine import Uncertainty, refined
+from slviewer.registration.refusal import Refused
+from slviewer.registration.start import SEARCHED, Candidate, Start, apart, ranked_starts
 
 Progress = Callable[[float], None]
 
 LEVELS_MM = ((2.0, 8.0), (1.0, 2.0), (0.5, 1.0))  # voxel and gate for objects of 75 to 300 mm, coarse to fine
-LEAST_POINTS = 500
+LAST_GATE_MM = 1.0
 LEAST_OVERLAP = 0.15
 LEAST_AGREEMENT = 0.8
 MOST_ATTEMPTS = 3
 MOST_SLACK = 1 / 30  # of the object's size
-_STATISTICS_POINTS = 200_000
+RIVAL_SCORE, RIVAL_OVERLAP, RIVAL_RMS = 0.7, 0.6, 1.25
+"""A rival comes to so much of the best pose's score and overlap, and to at most so many times its RMS."""
+_STATISTICS_POINTS = 100_000
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,7 @@ class Registration:
     ``gate_mm``; ``overlap`` is their share. ``agreement`` is the share, among the scan points that face the reference
     within four gates, of those within one. ``slack_mm`` says how well the shape holds the pose: how far the scan would
     have to slide or turn (at the overlap's rim) in its loosest direction until the surfaces come apart by ``rms_mm``.
-    It is large for planes and spheres, and always far larger than the pose's error.
+    It is large for planes and spheres, and always far larger than the pose's error, which ``uncertainty`` estimates.
     """
 
     T_reference_scan: np.ndarray
@@ -49,6 +55,7 @@ class Registration:
     slack_mm: float
     gate_mm: float
     start: Start
+    uncertainty: Uncertainty
 
 
 def register(
@@ -58,180 +65,178 @@ def register(
     scan_normals: np.ndarray | None = None,
     reference_normals: np.ndarray | None = None,
     sigma_mm: float | None = None,
-    initial: np.ndarray | None = None,
+    initial: np.ndarray | Candidate | None = None,
     progress: Progress | None = None,
 ) -> Registration:
     """Align a scan with a reference that shows part of the same object.
 
     Points are ``(n, 3)`` mm without NaN, each in the frame of the camera that took it; normals ``(n, 3)`` point to that
     camera, and are estimated where missing. ``sigma_mm`` is the expected error of one point, when it is known: gates
-    are never narrower than noise. ``initial`` (4, 4) replaces the search for a start. ``progress`` receives the
-    share of the work done, 0 to 1, and may raise to cancel.
+    are never narrower than noise. ``initial`` replaces the search for a start: the last pose (4, 4), or a ``Candidate``
+    such as ``picked.picked_start`` and ``turntable.Axis.start`` give. ``progress`` receives the share of the work done,
+    0 to 1, and may raise to cancel.
 
-    Raises ``SlviewerError`` where nothing aligns, where too little overlaps, or where the shape does not hold the pose.
+    Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not hold the pose, or where
+    a second pose fits alike.
     """
-    for name, points, normals in (
-        ("scan", scan_points, scan_normals),
-        ("reference", reference_points, reference_normals),
-    ):
-        _check(name, points, normals)
-    if initial is not None and np.shape(initial) != (4, 4):
-        raise InputError(f"The initial pose has shape {np.shape(initial)}: give a (4, 4) matrix.")
     say = progress or (lambda share: None)
-
     say(0.0)
-    size = min(_size(scan_points), _size(reference_points))
-    scale = 1.0 if 75.0 <= size <= 300.0 else size / (75.0 if size < 75.0 else 300.0)
-    tree = cKDTree(reference_points, balanced_tree=False, compact_nodes=False)
-    spacing = _spacing(tree, reference_points)
-    floor = max(2.0 * spacing, 0.0 if sigma_mm is None else 4.0 * sigma_mm)
-    levels = [(voxel * scale, max(gate * scale, floor)) for voxel, gate in LEVELS_MM]
-    finest = max(levels[-1][0], 0.5 * spacing)
-    scan = _cloud(scan_points, scan_normals, finest)
-    reference = _cloud(reference_points, reference_normals, finest)
-
+    scan = prepared("scan", scan_points, scan_normals, sigma_mm)
+    reference = prepared("reference", reference_points, reference_normals, sigma_mm)
     say(0.3)
-    coarse = max(size / 40.0, 2.0 * spacing)
-    starts = ranked_starts(scan.voxel_down_sample(coarse), reference.voxel_down_sample(coarse), coarse, initial)
-    refusal: SlviewerError | None = None
+    return register_prepared(scan, reference, initial=initial, progress=lambda share: say(0.3 + 0.7 * share))
+
+
+def register_prepared(
+    scan: Prepared,
+    reference: Prepared,
+    *,
+    size: float | None = None,
+    initial: np.ndarray | Candidate | None = None,
+    starts: list[Candidate] | None = None,
+    progress: Progress | None = None,
+) -> Registration:
+    """As ``register``, of scans that were made ready before; ``starts`` are those of ``searched``, where they are
+    known. ``size`` in mm is the object's, by default that of the smaller scan."""
+    say = progress or (lambda share: None)
+    size = min(scan.size, reference.size) if size is None else size
+    if starts is None:
+        starts = searched(scan, reference, size, initial)
+    refusal: Refused | None = None
     for attempt, start in enumerate(starts[:MOST_ATTEMPTS]):
-        say(0.5 + 0.15 * attempt)
-        T = start.T
-        for voxel, gate in levels:
-            thin = [scan, reference] if voxel <= finest else [c.voxel_down_sample(voxel) for c in (scan, reference)]
-            T = _icp(thin[0], thin[1], T, gate)
-        result = _judge(scan_points, reference_points, tree, reference, T, levels[-1][1], spacing, size, start.start)
+        say(0.4 + 0.15 * attempt)
         try:
-            _refuse_if_doubtful(result, size)
-        except SlviewerError as error:
+            result = _judged(scan, reference, start, size)
+        except Refused as error:
             refusal = refusal or error  # the best start's refusal says most
+            if error.reason in WORDS:  # the surfaces agree, and every other start would slide or turn as well
+                break
             continue
+        if start.start in SEARCHED:
+            _refuse_rivals(scan, reference, result, start, starts[attempt + 1 : MOST_ATTEMPTS + 1], size)
         say(1.0)
         return result
-    assert refusal is not None
-    raise refusal
+    raise refusal or Refused("overlap", "The scan and the reference share nothing to start from: pick point pairs.")
 
 
-def _check(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
-    if len(points) < LEAST_POINTS:
-        raise InputError(f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it.")
-    if not np.isfinite(points).all():
-        raise InputError(f"The {name} holds points that are not finite: leave out its invalid pixels first.")
-    if normals is not None and normals.shape != points.shape:
-        raise InputError(f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one each.")
+def searched(
+    scan: Prepared, reference: Prepared, size: float, initial: np.ndarray | Candidate | None = None
+) -> list[Candidate]:
+    """The poses to start from, the best first; ``initial`` alone, brought near, where it is given."""
+    if initial is not None and not isinstance(initial, Candidate):
+        if np.shape(initial) != (4, 4):
+            raise InputError(f"The initial pose has shape {np.shape(initial)}: give a (4, 4) matrix.")
+        initial = Candidate(np.asarray(initial, dtype=np.float64), "initial")
+    coarse = max(size / 40.0, 2.0 * reference.spacing, 2.0 * scan.spacing)
+    return ranked_starts(scan, reference, float(f"{coarse:.3g}"), initial)
 
 
-def _size(points: np.ndarray) -> float:
-    """The longest side in mm of the box around the points, stray ones (1 % at each end) left out."""
-    low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
-    return float((high - low).max())
+def _judged(scan: Prepared, reference: Prepared, start: Candidate, size: float) -> Registration:
+    """ICP from a start to the end, and its figures; raises ``Refused`` where they do not convince."""
+    scale = scale_of(size)
+    T = start.T
+    for voxel, gate in LEVELS_MM:
+        widest = max(gate * scale, 2.0 * max(scan.spacing, reference.spacing), 3.0 * _noise(scan, reference))
+        T = _icp(scan.thinned(voxel * scale), reference.thinned(voxel * scale), T, widest)
+    narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * _noise(scan, reference))
+    end = refined(scan, reference, T, widest, narrowest)
+    result, held = _figures(scan, reference, end.T, end.gate_mm, end.uncertainty, start.start)
+    _refuse_if_doubtful(result, held, size)
+    return result
 
 
-def _spacing(tree: cKDTree, points: np.ndarray) -> float:
-    """Median distance in mm of a point to its nearest neighbour."""
-    distance, _ = tree.query(points[:: max(1, len(points) // 2000)], k=2)
-    return float(np.median(distance[:, 1]))
-
-
-def _cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
-    """An Open3D cloud thinned to ``voxel`` mm, with unit normals towards the camera at the origin."""
-    o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, dtype=np.float64)))
-    if normals is not None:
-        finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))  # a NaN normal weighs nothing in a voxel's mean
-        cloud.normals = o3d.utility.Vector3dVector(finite)
-        cloud = cloud.voxel_down_sample(voxel)
-        known = np.linalg.norm(np.asarray(cloud.normals), axis=1) > 0.1
-        cloud = cloud.select_by_index(np.flatnonzero(known))
-        cloud.normalize_normals()
-        return cloud
-    cloud = cloud.voxel_down_sample(voxel)
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(30))
-    cloud.orient_normals_towards_camera_location(np.zeros(3))
-    return cloud
+def _noise(scan: Prepared, reference: Prepared) -> float:
+    """Of the distance of two points that lie on each other, mm, as far as it is known."""
+    return float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
 
 
 def _icp(scan: Any, reference: Any, T: np.ndarray, gate: float) -> np.ndarray:
     pipeline = open3d().pipelines.registration
     method = pipeline.TransformationEstimationPointToPlane(pipeline.TukeyLoss(0.5 * gate))
-    criteria = pipeline.ICPConvergenceCriteria(1e-7, 1e-7, 60)
+    criteria = pipeline.ICPConvergenceCriteria(1e-6, 1e-6, 40)
     return np.array(pipeline.registration_icp(scan, reference, gate, T, method, criteria).transformation)
 
 
-def _judge(
-    scan_points: np.ndarray,
-    reference_points: np.ndarray,
-    tree: cKDTree,
-    reference: Any,
-    T: np.ndarray,
-    gate: float,
-    spacing: float,
-    size: float,
-    start: Start,
-) -> Registration:
-    """The figures of a pose, from up to 200,000 scan points against every reference point."""
-    points = scan_points[:: -(-len(scan_points) // _STATISTICS_POINTS)] @ T[:3, :3].T + T[:3, 3]
-    distance, nearest = tree.query(points, distance_upper_bound=4.0 * gate, workers=-1)
+def _figures(
+    scan: Prepared, reference: Prepared, T: np.ndarray, gate: float, uncertainty: Uncertainty | None, start: Start
+) -> tuple[Registration, Freedom]:
+    """The figures of a pose, from up to 100,000 scan points against every reference point."""
+    spacing = reference.spacing
+    gate = max(gate, 2.0 * spacing)
+    points = scan.points[:: -(-len(scan.points) // _STATISTICS_POINTS)] @ T[:3, :3].T + T[:3, 3]
+    distance, nearest = reference.tree.query(points, distance_upper_bound=4.0 * gate, workers=-1)
     near = np.isfinite(distance)
-    points, distance, counterpart = points[near], distance[near], reference_points[nearest[near]]
-    _, plane = cKDTree(np.asarray(reference.points)).query(counterpart, workers=-1)
-    normals = np.asarray(reference.normals)[plane]
-    height = np.abs(np.sum(normals * (points - counterpart), axis=1))
+    points, distance, counterpart = points[near], distance[near], reference.points[nearest[near]]
+    _, plane = reference.fine_tree.query(counterpart, workers=-1)
+    height = np.abs(np.sum(reference.fine_normals[plane] * (points - counterpart), axis=1))
 
     overlapping = distance < gate
     aside = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
     facing = aside < spacing + 0.25 * height  # a point beyond the reference's rim faces nothing
     rms = _rms(height[overlapping])
-    return Registration(
+    held = freedom(scan, reference, T, counterpart[overlapping], rms)
+    nowhere = Uncertainty(np.full((6, 6), np.inf), np.full(3, np.nan))
+    figures = Registration(
         T_reference_scan=T,
         rms_mm=rms,
         inlier_rmse_mm=_rms(distance[overlapping]),
         overlap=float(overlapping.sum() / near.size),
         agreement=float((facing & (height < gate)).sum() / max(1, facing.sum())),
-        slack_mm=_slack(reference.voxel_down_sample(size / 80.0), counterpart[overlapping], rms),
+        slack_mm=held.loosest_mm,
         gate_mm=gate,
         start=start,
+        uncertainty=uncertainty or nowhere,
     )
+    return figures, held
 
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
 
 
-def _slack(surface: Any, points: np.ndarray, rms: float) -> float:
-    """``rms`` over the root of the smallest eigenvalue of the point-to-plane information at ``points``, in mm.
-
-    The information is the mean over points, with lengths divided by the overlap's radius. Normals come from the
-    thinned ``surface``, over some ten of its voxels: the noise of finer ones would pass for relief.
-    """
-    if len(points) < 6:
-        return float("inf")
-    surface.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
-    points = points[:: -(-len(points) // 20_000)]
-    _, nearest = cKDTree(np.asarray(surface.points)).query(points)
-    normals = np.asarray(surface.normals)[nearest]
-    arm = points - points.mean(axis=0)
-    arm /= _rms(np.linalg.norm(arm, axis=1))
-    J = np.hstack([np.cross(arm, normals), normals])
-    return rms / float(np.sqrt(max(np.linalg.eigvalsh(J.T @ J / len(J))[0], 1e-12)))
-
-
-def _refuse_if_doubtful(result: Registration, size: float) -> None:
+def _refuse_if_doubtful(result: Registration, held: Freedom, size: float) -> None:
     if not result.overlap >= LEAST_OVERLAP:
-        raise SlviewerError(
+        raise Refused(
+            "overlap",
             f"Only {100 * result.overlap:.0f} % of the scan lies on the reference within {result.gate_mm:.2g} mm: "
-            f"take scans that share at least {100 * LEAST_OVERLAP:.0f} % of the surface, or choose another reference."
+            f"take scans that share at least {100 * LEAST_OVERLAP:.0f} % of the surface, or choose another reference.",
         )
     if not result.agreement >= LEAST_AGREEMENT:
-        raise SlviewerError(
+        raise Refused(
+            "disagree",
             f"No pose found in which the two scans agree: where they face each other only "
             f"{100 * result.agreement:.0f} % of the points come within {result.gate_mm:.2g} mm; check that both show "
-            "the same object, and that it did not change between the scans."
+            "the same object, and that it did not change between the scans.",
         )
-    if not result.slack_mm <= MOST_SLACK * size:
-        raise SlviewerError(
-            "The surface that the two scans share is so flat or so evenly round that they can slide on each other: "
-            "let them share edges, corners or bumps too, or put something with relief beside the object."
+    shape = held.shape(MOST_SLACK * size)
+    if shape is not None or not np.isfinite(result.uncertainty.shift_mm):
+        shape = shape or "plane"
+        raise Refused(
+            shape,
+            f"The surface that the two scans share {WORDS[shape]}, so that nothing holds the pose: let them share "
+            "edges, corners or bumps too, or put something with relief beside the object.",
         )
+
+
+def _refuse_rivals(
+    scan: Prepared, reference: Prepared, result: Registration, start: Candidate, others: list[Candidate], size: float
+) -> None:
+    """Raise where another pose fits alike."""
+    for other in others:
+        if not other.score >= RIVAL_SCORE * start.score:
+            continue
+        try:
+            rival = _judged(scan, reference, other, size)
+        except Refused:
+            continue
+        gap = apart(scan.fine_points, result.T_reference_scan, rival.T_reference_scan)
+        distinct = gap > max(5.0 * result.gate_mm, 10.0 * result.uncertainty.shift_mm)
+        alike = rival.overlap >= RIVAL_OVERLAP * result.overlap and rival.rms_mm <= RIVAL_RMS * result.rms_mm
+        if distinct and alike:
+            raise Refused(
+                "ambiguous",
+                f"Two poses fit alike, with an RMS of {result.rms_mm:.3f} and {rival.rms_mm:.3f} mm over "
+                f"{100 * result.overlap:.0f} and {100 * rival.overlap:.0f} % of the scan, and they lie {gap:.0f} mm "
+                "apart: pick three point pairs, give the turntable's angle, or put something beside the object that "
+                "tells one side from the other.",
+            )

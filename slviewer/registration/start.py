@@ -1,4 +1,4 @@
-"""Where to start ICP from: candidate poses from matched FPFH features, and from the centroids.
+"""Where to start ICP from: candidate poses from matched FPFH features, and from the centroids; or one that is known.
 
 RANSAC is our own, in NumPy, because Open3D's parallel one gives another answer at every call.
 """
@@ -11,50 +11,59 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.prepared import Prepared
 
-Start = Literal["features", "centroids", "initial"]
+Start = Literal["features", "centroids", "initial", "picked", "turntable"]
+"""How a start was found: searched for (the first two); the last pose, picked points, the turntable's angle."""
+SEARCHED: tuple[Start, ...] = ("features", "centroids")
 
 _TRIPLETS = 60_000
 _SEED = 0
 _CANDIDATES = 6
+_LEAST_VOTES = 0.15  # of those for the best pose
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A pose to start from: ``T`` (4, 4) maps the scan into the reference frame, ``start`` says how it was found."""
+    """A pose to start from: ``T`` (4, 4) maps the scan into the reference frame, ``start`` says how it was found.
+    ``score``, 0 to 1: how well the scan lies on the reference there, as far as thinned clouds tell; NaN if not tried.
+    """
 
     T: np.ndarray
     start: Start
+    score: float = float("nan")
 
 
-def candidates(scan: Any, reference: Any, voxel: float) -> Iterator[Candidate]:
-    """The poses worth trying, features first, for two Open3D clouds with normals, thinned to ``voxel`` mm."""
+def candidates(scan: Prepared, reference: Prepared, voxel: float) -> Iterator[Candidate]:
+    """The poses worth trying, features first, from the clouds thinned to ``voxel`` mm."""
     for T in _feature_poses(scan, reference, voxel):
         yield Candidate(T, "features")
     T = np.eye(4)
-    T[:3, 3] = np.median(np.asarray(reference.points), axis=0) - np.median(np.asarray(scan.points), axis=0)
+    T[:3, 3] = np.median(reference.fine_points, axis=0) - np.median(scan.fine_points, axis=0)
     yield Candidate(T, "centroids")
 
 
-def ranked_starts(scan: Any, reference: Any, voxel: float, initial: np.ndarray | None = None) -> list[Candidate]:
+def ranked_starts(
+    scanned: Prepared, referred: Prepared, voxel: float, initial: Candidate | None = None
+) -> list[Candidate]:
     """The candidates after a coarse ICP, each pose once, that with the largest part of the scan on the reference first.
 
-    ``scan`` and ``reference`` are Open3D clouds with normals, thinned to ``voxel`` mm. A pose handed in as ``initial``
-    is the only candidate then.
+    ICP takes the clouds thinned to ``voxel`` mm. A pose handed in as ``initial`` is the only candidate then.
     """
-    tried = candidates(scan, reference, voxel) if initial is None else iter([Candidate(np.asarray(initial), "initial")])
+    tried = candidates(scanned, referred, voxel) if initial is None else iter([initial])
+    scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
     tree = cKDTree(np.asarray(reference.points))
-    found: list[tuple[float, Candidate]] = []
+    found: list[Candidate] = []
     for candidate in tried:
         T = candidate.T
         for gate in (6.0 * voxel, 3.0 * voxel, 1.5 * voxel):
             T = _icp(scan, reference, T, gate)
-        if all(_apart(np.asarray(scan.points), T, other.T) > 0.5 * voxel for _, other in found):
-            found.append((_score(scan, reference, tree, T, voxel), Candidate(T, candidate.start)))
-    return [candidate for _, candidate in sorted(found, key=lambda pair: -pair[0])]
+        if all(apart(np.asarray(scan.points), T, other.T) > 0.5 * voxel for other in found):
+            found.append(Candidate(T, candidate.start, _score(scan, reference, tree, T, voxel)))
+    return sorted(found, key=lambda candidate: -candidate.score)
 
 
-def _apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
+def apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
     """How far, in mm, two poses put some 20 of the points from each other at most."""
     probe = points[:: max(1, len(points) // 20)]
     return float(np.abs(probe @ (T - other)[:3, :3].T + (T - other)[:3, 3]).max())
@@ -82,10 +91,11 @@ def _score(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float
     return float(on.sum() / len(points) * on.sum() / near.sum())
 
 
-def _feature_poses(scan: Any, reference: Any, voxel: float) -> list[np.ndarray]:
+def _feature_poses(scanned: Prepared, referred: Prepared, voxel: float) -> list[np.ndarray]:
     """Up to six different poses, those on which most feature matches agree; none where there is nothing to match."""
-    pipeline, search = open3d().pipelines.registration, open3d().geometry.KDTreeSearchParamHybrid(5.0 * voxel, 100)
-    features = [pipeline.compute_fpfh_feature(cloud, search) for cloud in (scan, reference)]
+    scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
+    features = [one.features(voxel) for one in (scanned, referred)]
+    pipeline = open3d().pipelines.registration
     matches = np.asarray(pipeline.correspondences_from_features(features[0], features[1], mutual_filter=True))
     if len(matches) < 10:
         return []
@@ -107,11 +117,11 @@ def _feature_poses(scan: Any, reference: Any, voxel: float) -> list[np.ndarray]:
 
     poses: list[np.ndarray] = []
     for k in np.argsort(-votes, kind="stable"):
-        if len(poses) == _CANDIDATES or votes[k] < 4:
+        if len(poses) == _CANDIDATES or votes[k] < max(4.0, _LEAST_VOTES * votes.max()):
             break
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R[k], t[k]
-        if all(_apart(p, T, other) > 5.0 * voxel for other in poses):
+        if all(apart(p, T, other) > 5.0 * voxel for other in poses):
             poses.append(T)
     return poses
 

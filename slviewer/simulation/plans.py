@@ -47,6 +47,12 @@ _OBJECTS = {
     "object_r3": ((6.0, 2.0, 752.0), (1.5, 0.5, 1.0)),
 }
 
+_MOVED_OBJECTS = {
+    "object_r1": ((-1.0, 2.0, 455.0), (7.0, -4.0, 4.0)),
+    "object_r2": ((6.0, -5.0, 600.0), (-4.0, 3.5, -3.0)),
+    "object_r3": ((-4.0, 6.0, 752.0), (2.0, -3.0, -6.0)),
+}
+
 
 def letter_plan(
     rig: SimulatedRig, board: Board | None = None, poses: int = 25, shape: Shape = FLAT
@@ -105,6 +111,14 @@ def objects() -> dict[str, MeshScene]:
     return {
         name: demo_object(Pose(rotation(np.radians(turns)), np.array(middle)))
         for name, (middle, turns) in _OBJECTS.items()
+    }
+
+
+def moved_objects() -> dict[str, MeshScene]:
+    """As ``objects``, turned by up to 15 degrees from one to the next, and set down beside the axis."""
+    return {
+        name: demo_object(Pose(rotation(np.radians(turns)), np.array(middle)))
+        for name, (middle, turns) in _MOVED_OBJECTS.items()
     }
 
 

@@ -1,17 +1,21 @@
-"""Registering scans taken at different depths, and merging them."""
+"""Registering scans of one object, and fusing them into one surface."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from slviewer.errors import UsageError
+from slviewer.evaluation import letter
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.registration.merge import Merged
-from slviewer.registration.merge import merge as merge_clouds
+from slviewer.registration.multiway import Alignment, Pair, Starts, register_all
+from slviewer.registration.pairwise import Registration
+from slviewer.registration.picked import picked_start
+from slviewer.registration.turntable import Axis
 from slviewer.session.ply import write_ply
+from slviewer.surface.fuse import Fused, fuse
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_model, preferred, warn_if_stale
@@ -19,41 +23,90 @@ from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.scaling import corrected_cloud, told_scale
 from slviewer.workflow.trust import told
 
+StartKind = Literal["features", "turntable", "identity"]
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Merge:
-    """A merged cloud, how its scans were registered, and the file it went to. ``scale`` says, in words, what correction
-    of scale is in it."""
+    """How scans lie on one of them, the one surface that they were fused to, and the file it went to. ``scale`` says,
+    in words, what correction of scale is in it."""
 
-    merged: Merged
+    alignment: Alignment
+    fused: Fused
     clouds: Mapping[str, Cloud]
-    reference: str
     out: Path
     scale: str = ""
+
+    @property
+    def reference(self) -> str:
+        """The scan whose frame the surface is in."""
+        return self.alignment.reference
+
+    @property
+    def pairs(self) -> Mapping[str, Registration]:
+        """How every scan but the reference lies on it, by name."""
+        return self.alignment.on_reference()
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``merge --json``."""
         return {
-            "reference": self.reference,
-            "pairs": {
-                name: {
-                    "rms_mm": pair.rms_mm,
-                    "overlap": pair.overlap,
-                    "T_reference_scan": pair.T_reference_scan.tolist(),
-                }
-                for name, pair in self.merged.pairs.items()
-            },
+            **alignment_json(self.alignment),
+            "letter_rms_mm": dict(letter.EXPERIMENT_3_ICP_RMS_MM),
+            "points": len(self.fused.surface),
+            "shared": self.fused.shared,
+            "left_out": self.fused.left_out,
         }
 
     def text(self) -> str:
         """For people."""
-        lines = [
-            f"{name} -> {self.reference}: RMS {pair.rms_mm:.3f} mm, overlap {100 * pair.overlap:.0f} %"
-            for name, pair in self.merged.pairs.items()
-        ]
+        lines = [alignment_text(self.alignment)]
         if self.scale:
             lines.append(self.scale)
-        return "\n".join([*lines, f"{len(self.merged.points)} points -> {self.out}"])
+        seen = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
+        return "\n".join([*lines, f"{len(self.fused.surface)} points, {seen} -> {self.out}"])
+
+
+def alignment_json(alignment: Alignment) -> dict[str, Any]:
+    """Plain values: every scan on the reference, every registered pair, the loops, what was dropped or refused."""
+    return {
+        "reference": alignment.reference,
+        "pairs": {name: _figures(pair) for name, pair in alignment.on_reference().items()},
+        "registered": [{"scan": a, "onto": b, **_figures(found)} for (a, b), found in alignment.pairs.items()],
+        "loops": [
+            {
+                "scans": list(loop.names),
+                "error_mm": loop.before.shift_mm,
+                "error_deg": loop.before.turn_deg,
+                "left_mm": loop.after.shift_mm,
+                "left_deg": loop.after.turn_deg,
+            }
+            for loop in alignment.loops
+        ],
+        "dropped": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.dropped.items()],
+        "refused": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.refused.items()],
+    }
+
+
+def alignment_text(alignment: Alignment) -> str:
+    """A line a pair, the loop that closes worst, and what was left out, for people."""
+    r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
+    lines = [
+        f"{a} -> {b}: RMS {found.rms_mm:.3f} mm, point to point {found.inlier_rmse_mm:.3f} mm, "
+        f"overlap {100 * found.overlap:.0f} %, sure to {1000 * found.uncertainty.shift_mm:.1f} um "
+        f"and {found.uncertainty.turn_deg:.4f} degrees"
+        for (a, b), found in alignment.pairs.items()
+    ]
+    lines.append(f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)")
+    if alignment.loops:
+        worst = alignment.loops[0]
+        lines.append(
+            f"loop error, the worst of {len(alignment.loops)}: {worst.before.shift_mm:.3f} mm and "
+            f"{worst.before.turn_deg:.4f} degrees round {len(worst.names) - 1} pairs ({' - '.join(worst.names)}); "
+            f"{max(loop.after.shift_mm for loop in alignment.loops):.3f} mm at most once closed"
+        )
+    lines += [f"left out: {why}" for why in alignment.dropped.values()]
+    lines += [f"not registered: {a} -> {b}: {why}" for (a, b), why in alignment.refused.items()]
+    return "\n".join(lines)
 
 
 def merge(
@@ -63,14 +116,27 @@ def merge(
     out: Path | str,
     *,
     model: str | None = None,
+    start: StartKind = "features",
+    angle: float | None = None,
+    axis: Axis | None = None,
+    poses: Mapping[str, np.ndarray] | None = None,
+    picked: Mapping[Pair, tuple[np.ndarray, np.ndarray]] | None = None,
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Merge:
-    """Reconstruct scans, register each to ``reference`` by point-to-plane ICP, and write them as one PLY."""
-    names = list(dict.fromkeys([*captures, reference]))
+    """Reconstruct scans, register them into the frame of ``reference``, fuse them, and write the surface as one PLY.
+
+    Scans are given in the order in which they were taken. ``start``: where registration starts from; "turntable" needs
+    the ``angle`` in degrees from each scan to the next and finds the ``axis`` where it is not given; "identity" takes
+    scans to lie in one frame already, or as ``poses`` (4, 4) by name say. ``picked``: of a pair (scan, onto), three or
+    more points (n, 3) mm on either, in their cameras' frames; these pairs start from there.
+    """
+    given = list(dict.fromkeys(captures))
+    names = given if reference in given else [*given, reference]
     if len(names) < 2:
         raise UsageError(f"only {reference} was named: name the scans to merge with it")
+    starts = _starts(names, start, angle, axis, poses, picked, warn)
     with opened(session) as store:
         check_accepted(store, accept_rejected)
         fitted = load_model(store, model or preferred(store))
@@ -79,14 +145,55 @@ def merge(
         for i, (shot, frames, phases) in enumerate(decoded(store, names)):
             for sentence in told(store, shot.name, frames):
                 warn(f"{shot.name}: {sentence}")
-            progress(0.5 * i / len(names), f"reconstructing {shot.name}")
+            progress(0.4 * i / len(names), f"reconstructing {shot.name}")
             clouds[shot.name] = corrected_cloud(store, fitted, phases, texture=capture_texture(shot, frames))
-    registering = part(progress, 0.5, 0.9)
-    merged = merge_clouds(clouds, reference, lambda done: registering(done, "registering"))
+    registering, fusing = part(progress, 0.4, 0.75), part(progress, 0.75, 0.9)
+    alignment = register_all(clouds, reference, starts, lambda done: registering(done, "registering"))
+    for why in alignment.dropped.values():
+        warn(why)
+    fused = fuse(clouds, alignment.T_reference_scan, lambda done: fusing(done, "fusing"))
     progress(0.9, "writing")
     Path(out).parent.mkdir(parents=True, exist_ok=True)
-    each = [cloud.sigmas(cloud.mask) for cloud in (clouds[name] for name in merged.names)]
-    scalars = {what: np.concatenate([sigmas[what] for sigmas in each]) for what in each[0]}
-    write_ply(Path(out), merged.points, colours=merged.colours, normals=merged.normals, scalars=scalars)
+    surface = fused.surface
+    scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
+    scalars["seen_by"] = fused.seen_by
+    write_ply(Path(out), surface.points, colours=surface.colours, normals=surface.normals, scalars=scalars)
     progress(1.0, "merged")
-    return Merge(merged, clouds, reference, Path(out), scale)
+    return Merge(alignment, fused, clouds, Path(out), scale)
+
+
+def _starts(
+    names: Sequence[str],
+    start: StartKind,
+    angle: float | None,
+    axis: Axis | None,
+    poses: Mapping[str, np.ndarray] | None,
+    picked: Mapping[Pair, tuple[np.ndarray, np.ndarray]] | None,
+    warn: Warn,
+) -> Starts:
+    if (start == "turntable") != (angle is not None):
+        raise UsageError("a turntable's start needs its angle from scan to scan: give both, or neither")
+    if start == "identity" and poses is None:
+        poses = {name: np.eye(4) for name in names}
+    picks = {}
+    for (scan, onto), (there, here) in (picked or {}).items():
+        if not {scan, onto} <= set(names):
+            raise UsageError(f"points were picked on {scan} and {onto}, which are not both among the scans to merge")
+        picks[scan, onto], apart = picked_start(there, here)
+        warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
+    return Starts(poses=poses, step_deg=angle, axis=axis, picked=picks)
+
+
+def _figures(found: Registration) -> dict[str, Any]:
+    return {
+        "rms_mm": found.rms_mm,
+        "point_to_point_rms_mm": found.inlier_rmse_mm,
+        "overlap": found.overlap,
+        "agreement": found.agreement,
+        "slack_mm": found.slack_mm,
+        "gate_mm": found.gate_mm,
+        "start": found.start,
+        "sigma_shift_mm": found.uncertainty.shift_mm,
+        "sigma_turn_deg": found.uncertainty.turn_deg,
+        "T_reference_scan": found.T_reference_scan.tolist(),
+    }

@@ -68,7 +68,7 @@ class Reproduction:
         pairs = [
             f"  {name}: RMS {pair.inlier_rmse_mm:.3f} mm point to point (the Letter: {icp[name[-2:].upper()]:.2f}), "
             f"{pair.rms_mm:.3f} mm point to plane, overlap {100 * pair.overlap:.0f} %"
-            for name, pair in self.merged.merged.pairs.items()
+            for name, pair in self.merged.pairs.items()
         ]
         size = "x".join(map(str, self.stereo.rig.camera.size))
         return "\n".join(

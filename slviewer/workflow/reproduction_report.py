@@ -43,7 +43,7 @@ def _data(
     stereo, pixelwise, merged = result.stereo, result.pixelwise, result.merged
     fit = pixelwise.fits[pixelwise.depth_axis]
     clouds = [CloudView(name, cloud.points) for name, cloud in merged.clouds.items()]
-    whole = merged.merged
+    whole = merged.fused
     return ReproductionData(
         camera=stereo.rig.camera.size,
         projector=stereo.rig.projector.size,
@@ -67,7 +67,7 @@ def _data(
                 pair.overlap,
                 letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper(), float("nan")),
             )
-            for name, pair in whole.pairs.items()
+            for name, pair in merged.pairs.items()
         ],
         pixel_curve=curve_at(pixel, pixelwise, stereo, observations, pixelwise.depth_axis),
         rms_maps_mm=fit.rms_mm,
@@ -75,7 +75,7 @@ def _data(
         sphere_maps=[error_maps(name, c) for name, c in result.spheres.items()],
         plane_outlines={name: _outline(c, stereo.rig.camera.rays()) for name, c in result.planes.items()},
         clouds=clouds,
-        merged=CloudView("merged", whole.points, whole.normals, whole.source, whole.names),
+        merged=CloudView("merged", whole.surface.points, whole.surface.normals, whole.source, whole.names),
         poses_left_out=stereo.left_out,
         letter_points=letter.EXPERIMENT_3_POINTS,
     )

@@ -10,9 +10,10 @@ from slviewer.registration.pairwise import Registration
 CENTRE = np.array([0.0, 0.0, 600.0])
 NOISE = 0.03
 POINTS = 20_000
+Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def bumpy(seed: int, relief: float = 12.0) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def bumpy(seed: int, relief: float = 12.0) -> Height:
     """A height field of nine Gaussians over a square of 150 mm, with no symmetry."""
     rng = np.random.default_rng(seed)
     centres, widths, heights = rng.uniform(-65, 65, (9, 2)), rng.uniform(9, 22, 9), rng.uniform(-1, 1, 9) * relief
@@ -35,7 +36,7 @@ def motion(deg: float, mm: float, seed: int = 0) -> np.ndarray:
 
 
 def view(
-    height: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    height: Height,
     x_range: tuple[float, float],
     seed: int,
     T_reference_scan: np.ndarray | None = None,
@@ -57,7 +58,7 @@ def error(result: Registration, T: np.ndarray) -> tuple[float, float]:
 
 
 def organised(
-    height: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    height: Height,
     T_reference_scan: np.ndarray,
     seed: int,
     size: tuple[int, int] = (200, 160),

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
-from bumpy_scans import NOISE, bumpy, error, motion, view
+from bumpy_scans import CENTRE, NOISE, Height, bumpy, error, motion, view
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.registration.pairwise import register
+from slviewer.registration.picked import picked_start
+from slviewer.registration.refusal import Refused
 
 
 @pytest.mark.parametrize(("deg", "mm"), [(1.0, 2.0), (10.0, 30.0), (60.0, 150.0)])
@@ -67,17 +69,82 @@ def test_no_common_surface_is_refused() -> None:
         register(view(bumpy(2), (10, 75), 1, motion(10, 30)), view(bumpy(2), (-75, -10), 2))
 
 
-def test_planes_are_refused_because_they_slide() -> None:
-    with pytest.raises(SlviewerError, match="slide"):
-        register(view(bumpy(2, 0.0), (-45, 75), 1, motion(5, 10)), view(bumpy(2, 0.0), (-75, 45), 2))
+def cap(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return -np.sqrt(110.0**2 - x**2 - y**2)
 
 
-def test_spheres_are_refused_because_they_turn() -> None:
-    def cap(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return -np.sqrt(110.0**2 - x**2 - y**2)
+def barrel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return -np.sqrt(90.0**2 - x**2) + 0.0 * y
 
-    with pytest.raises(SlviewerError, match="slide"):
-        register(view(cap, (-45, 75), 1, motion(5, 10)), view(cap, (-75, 45), 2))
+
+def moulding(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 5.0 * np.sin(x / 8.0) * np.exp(-((x - 10.0) ** 2) / 900.0) + 0.0 * y
+
+
+@pytest.mark.parametrize(
+    ("shape", "reason", "words"),
+    [
+        (bumpy(2, 0.0), "plane", "flat.*slides along itself and turns about its normal"),
+        (cap, "sphere", "turns about any axis through its centre"),
+        (barrel, "cylinder", "slides along its axis and turns about it"),
+        (moulding, "slides", "slides along it"),
+    ],
+)
+def test_a_shape_that_slides_or_turns_is_refused_by_its_name(shape: Height, reason: str, words: str) -> None:
+    with pytest.raises(Refused, match=words) as refusal:
+        register(view(shape, (-45, 75), 1, motion(5, 10)), view(shape, (-75, 45), 2))
+    assert refusal.value.reason == reason
+
+
+def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
+    def twice(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """The same from both sides: turned by half a turn, it fits again."""
+        height = bumpy(2)
+        return height(x, y) + height(-x, -y)
+
+    T = motion(5, 10)
+    scan, reference = view(twice, (-70, 70), 1, T), view(twice, (-75, 75), 2)
+    with pytest.raises(Refused, match=r"Two poses fit alike.* mm apart") as refusal:
+        register(scan, reference)
+    assert refusal.value.reason == "ambiguous"
+    corners = CENTRE + np.array([[50.0, 50.0, 0.0], [-50.0, 40.0, 0.0], [40.0, -50.0, 0.0]])
+    picks = (corners - T[:3, 3]) @ T[:3, :3] + np.random.default_rng(0).normal(0, 2.0, (3, 3))
+    start, apart = picked_start(picks, corners)
+    assert 0.1 < apart.max() < 6.0
+    found = register(scan, reference, initial=start)
+    assert found.start == "picked" and error(found, T)[0] < 0.03
+
+
+def test_picks_that_fix_no_pose_are_refused() -> None:
+    line = CENTRE + np.array([[0.0, 0, 0], [10, 0, 0], [30, 1, 0]])
+    triangle = CENTRE + np.array([[0.0, 0, 0], [40, 0, 0], [0, 30, 0]])
+    with pytest.raises(Refused, match="lie on one line"):
+        picked_start(line, line)
+    with pytest.raises(Refused, match=r"up to .* mm apart"):
+        picked_start(triangle, triangle[[1, 2, 0]])
+    with pytest.raises(InputError, match="pick 3 or more"):
+        picked_start(triangle[:2], triangle[:2])
+    with pytest.raises(InputError, match="no pairs"):
+        picked_start(triangle, triangle[:2])
+    with pytest.raises(InputError, match="nothing was measured"):
+        picked_start(np.where(triangle == 40, np.nan, triangle), triangle)
+
+
+def test_the_predicted_uncertainty_is_the_true_one() -> None:
+    T, shifts, turns, told = motion(10, 30), [], [], []
+    for seed in range(8):
+        scan = view(bumpy(seed), (-45, 75), 2 * seed, T, points=8000)
+        found = register(scan, view(bumpy(seed), (-75, 45), 2 * seed + 1, points=8000), initial=T)
+        assert found.uncertainty.covariance.shape == (6, 6)
+        D = found.T_reference_scan @ np.linalg.inv(T)
+        centre = found.uncertainty.centre
+        shifts.append(np.linalg.norm(D[:3, :3] @ centre + D[:3, 3] - centre))
+        turns.append(error(found, T)[1])
+        told.append((found.uncertainty.shift_mm, found.uncertainty.turn_deg))
+    predicted = np.sqrt(np.mean(np.square(told), axis=0))
+    true = np.sqrt(np.mean(np.square([shifts, turns]), axis=1))
+    print(predicted, true)
+    assert (predicted > 0.6 * true).all() and (predicted < 1.8 * true).all()
 
 
 def test_a_pose_handed_in_replaces_the_search() -> None:

@@ -178,13 +178,13 @@ def merge_scans(session: Session, names: list[str], reference: str, report: Repo
         calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
         meta = {
             **found.to_json(),
-            "scans": list(found.merged.names),
-            "points": len(found.merged.points),
+            "scans": list(found.fused.names),
+            "points": len(found.fused.surface),
             "ply": f"merged_{number}.ply",
             "model": model,
             "scale": found.scale,
             "scales": {model: scale_factor(session, model)},
-            "inputs": session.input_hashes(*found.merged.names, *calibrations),
+            "inputs": session.input_hashes(*found.fused.names, *calibrations),
         }
         session.guarded(report.saving).save_result(f"merge/{number}", meta, {})
     report(1.0, "merged")
@@ -193,5 +193,5 @@ def merge_scans(session: Session, names: list[str], reference: str, report: Repo
 
 def told_merge(reference: str, found: Merge) -> str:
     """How well the scans lie on each other, in a sentence."""
-    pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in found.merged.pairs.items())
+    pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in found.pairs.items())
     return f"merged on {reference}: {'; '.join(pairs)}"

@@ -1,0 +1,304 @@
+"""Many scans of one object brought into the frame of one of them: pairs, loops, and what contradicts them.
+
+Scans that follow one another are expected to overlap, and the last one with the first; where they do not, every other
+pair that could join what is apart is tried. Once every scan has a place, pairs that must overlap there are registered
+too: they close loops. A pair that the others contradict is dropped; the rest is adjusted together.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.registration import graph
+from slviewer.registration.agreeing import agreeing
+from slviewer.registration.graph import Edge, Gap
+from slviewer.registration.pairwise import Progress, Registration, register_prepared, searched
+from slviewer.registration.prepared import Prepared, prepared
+from slviewer.registration.refusal import Refused
+from slviewer.registration.scan import Scan
+from slviewer.registration.start import Candidate, Start
+from slviewer.registration.turntable import Axis, axis_of
+
+Pair = tuple[str, str]
+"""A scan, and the one that it lies on."""
+
+MOST_SCANS = 255
+ALL_PAIRS = 4
+"""So few scans are registered each with every other."""
+_MORE_PAIRS = 2
+"""For each scan, at most, once its place is known."""
+_OVERLAPPING = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Where to start from. ``poses`` (4, 4) by name are last poses: where each scan lies in any one frame (identity for
+    scans that were registered before). ``step_deg`` is a turntable's angle from each scan to the next, ``axis`` its
+    axis, found from the first pairs where it is None. ``picked`` starts, by pair. Where nothing is given: features."""
+
+    poses: Mapping[str, np.ndarray] | None = None
+    step_deg: float | None = None
+    axis: Axis | None = None
+    picked: Mapping[Pair, Candidate] | None = None
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Round ``names`` the poses should come back to where they began; ``before`` the adjustment and ``after``."""
+
+    names: tuple[str, ...]
+    before: Gap
+    after: Gap
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where every scan lies.
+
+    ``T_reference_scan`` (4, 4) by name, into the frame of ``reference``. ``pairs``: the registrations that it was made
+    from; ``loops`` that they close, the worst first. ``dropped``: pairs that registered and that the others
+    contradict, and ``refused`` ones that did not register, each with why.
+    """
+
+    reference: str
+    T_reference_scan: Mapping[str, np.ndarray]
+    pairs: Mapping[Pair, Registration]
+    loops: tuple[Loop, ...]
+    dropped: Mapping[Pair, str]
+    refused: Mapping[Pair, str]
+
+    def on_reference(self) -> dict[str, Registration]:
+        """For every scan but the reference: its pose in the reference's frame, after the adjustment, with the figures
+        of the surest pair that it is part of, that with the reference itself where there is one."""
+        found = {}
+        for name, T in self.T_reference_scan.items():
+            if name != self.reference:
+                own = [pair for pair in self.pairs if name in pair]
+                best = min(own, key=lambda p: (self.reference not in p, self.pairs[p].uncertainty.shift_mm))
+                found[name] = replace(self.pairs[best], T_reference_scan=T)
+        return found
+
+
+def register_all(
+    scans: Mapping[str, Scan | Cloud],
+    reference: str,
+    starts: Starts | None = None,
+    progress: Progress | None = None,
+) -> Alignment:
+    """Bring 2 to 255 scans, in the order in which they were taken, into the frame of the one called ``reference``.
+
+    ``progress`` receives the share of the work done, 0 to 1, and may raise to cancel.
+
+    Raises ``InputError`` for an unknown reference or too few scans, and ``Refused``, naming the scans, where one hangs
+    on nothing or where pairs contradict one another and nothing tells which is wrong.
+    """
+    if reference not in scans:
+        raise InputError(f"There is no scan called {reference!r}: choose the reference among {', '.join(scans)}.")
+    if not 2 <= len(scans) <= MOST_SCANS:
+        raise InputError(f"{len(scans)} scan(s) given: registering takes 2 to {MOST_SCANS} scans of one object.")
+    work = _Work(scans, reference, starts or Starts(), progress or (lambda share: None))
+    return work.done()
+
+
+class _Work:
+    """One call of ``register_all``: what was tried so far."""
+
+    def __init__(self, scans: Mapping[str, Scan | Cloud], reference: str, starts: Starts, say: Progress) -> None:
+        self.names, self.reference, self.starts, self.say = list(scans), reference, starts, say
+        self.root = self.names.index(reference)
+        self.found: dict[Pair, Registration] = {}
+        self.refused: dict[Pair, Refused] = {}
+        self.scans: list[Prepared] = []
+        for k, (name, scan) in enumerate(scans.items()):
+            say(0.2 * k / len(scans))
+            self.scans.append(_ready(name, scan if isinstance(scan, Scan) else Scan.from_cloud(scan)))
+        self.size = min(scan.size for scan in self.scans)
+        self.expected = len(self._first_pairs()) + (_MORE_PAIRS * len(scans) if len(scans) > ALL_PAIRS else 0)
+
+    def done(self) -> Alignment:
+        for pair, start in (self.starts.picked or {}).items():
+            self._try(*pair, start)
+        known = self._known_poses()
+        for scan, onto in self._first_pairs():
+            self._try(scan, onto, self._start(known, scan, onto))
+        self._join()
+        poses = self._tree()[0]
+        if len(self.names) > ALL_PAIRS:
+            self._close_loops(poses)
+        return self._adjusted()
+
+    # which pairs, and from where
+
+    def _first_pairs(self) -> list[Pair]:
+        names = self.names
+        if len(names) <= ALL_PAIRS:
+            pairs = [(a, b) for i, a in enumerate(names) for b in names[:i]]
+        else:
+            pairs = [(b, a) for a, b in pairwise(names)] + [(names[-1], names[0])]
+        return [(b, a) if a == self.reference else (a, b) for a, b in pairs]
+
+    def _known_poses(self) -> dict[str, tuple[np.ndarray, Start]]:
+        """Where scans lie in a frame of their own, as far as it is known before any search."""
+        if self.starts.poses is not None:
+            return {name: (np.asarray(T, dtype=np.float64), "initial") for name, T in self.starts.poses.items()}
+        step = self.starts.step_deg
+        if step is None:
+            return {}
+        axis = self.starts.axis or self._axis(step)
+        return {name: (axis.turned(-step * k), "turntable") for k, name in enumerate(self.names)}
+
+    def _axis(self, step_deg: float) -> Axis:
+        """Found from pairs in a row that register without knowing it."""
+        steps = []
+        for before, name in pairwise(self.names):
+            if (found := self._register(name, before, None)) is not None:
+                steps.append(found.T_reference_scan)
+            if len(steps) == 2:
+                break
+        if not steps:
+            raise Refused("overlap", "No two scans in a row register, so that the turntable's axis cannot be found: "
+                          "give the axis, or scan at smaller steps.")  # fmt: skip
+        return axis_of(steps, step_deg)
+
+    def _start(self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str) -> Candidate | None:
+        if scan not in known or onto not in known:
+            return None
+        return Candidate(np.linalg.inv(known[onto][0]) @ known[scan][0], known[scan][1])
+
+    def _join(self) -> None:
+        """Try what could join scans that are apart from the reference's, the most promising first."""
+        while lost := [k for k, pose in enumerate(self._tree()[0]) if not np.isfinite(pose).all()]:
+            there = [k for k in range(len(self.names)) if k not in lost]
+            waiting = []
+            for a in lost:
+                for b in there:
+                    pair = self.names[a], self.names[b]
+                    if not {pair, pair[::-1]} & {*self.found, *self.refused}:
+                        begun = searched(self.scans[a], self.scans[b], self.size)
+                        waiting.append((begun[0].score if begun else 0.0, pair, begun))
+            for _, pair, begun in sorted(waiting, key=lambda one: -one[0]):
+                if self._try(*pair, None, begun):
+                    break
+            else:
+                raise self._hanging([self.names[k] for k in lost])
+
+    def _hanging(self, lost: list[str]) -> Refused:
+        told = next(error for pair, error in self.refused.items() if set(pair) & set(lost))
+        if len(lost) == 1:
+            return told.about(f"{lost[0]} could not be merged: it hangs on nothing.")
+        return told.about(
+            f"{', '.join(lost)} could not be merged: they hang on nothing that leads to {self.reference}."
+        )
+
+    def _close_loops(self, poses: np.ndarray) -> None:
+        """Register pairs that must overlap where the scans lie now."""
+        count = dict.fromkeys(self.names, 0)
+        shares = []
+        for i, a in enumerate(self.names):
+            for j, b in enumerate(self.names[:i]):
+                if not {(a, b), (b, a)} & {*self.found, *self.refused}:
+                    T = np.linalg.inv(poses[j]) @ poses[i]
+                    shares.append((_overlap(self.scans[i], self.scans[j], T), (a, b), T))
+        for share, (a, b), T in sorted(shares, key=lambda one: -one[0]):
+            if share < _OVERLAPPING or max(count[a], count[b]) >= _MORE_PAIRS:
+                continue
+            count[a], count[b] = count[a] + 1, count[b] + 1
+            self._try(a, b, Candidate(T, "initial"))
+
+    # registering
+
+    def _try(self, scan: str, onto: str, start: Candidate | None, begun: list[Candidate] | None = None) -> bool:
+        if (scan, onto) in self.found or (onto, scan) in self.found:
+            return True
+        return self._register(scan, onto, start, begun) is not None
+
+    def _register(
+        self, scan: str, onto: str, start: Candidate | None, begun: list[Candidate] | None = None
+    ) -> Registration | None:
+        tried = len(self.found) + len(self.refused)
+        share = 0.2 + 0.7 * min(1.0, tried / (self.expected + 1))
+        one = 0.7 / (self.expected + 1)
+        a, b = (self.scans[self.names.index(name)] for name in (scan, onto))
+        try:
+            found = register_prepared(
+                a, b, size=self.size, initial=start, starts=begun, progress=lambda part: self.say(share + one * part)
+            )
+        except Refused as error:
+            self.refused[scan, onto] = error
+            return None
+        self.found[scan, onto] = found
+        self.refused.pop((scan, onto), None)
+        return found
+
+    # putting together
+
+    def _edges(self) -> list[Edge]:
+        return [
+            Edge(
+                self.names.index(scan), self.names.index(onto), found.T_reference_scan,
+                found.uncertainty.covariance, found.uncertainty.centre,
+            )
+            for (scan, onto), found in self.found.items()
+        ]  # fmt: skip
+
+    def _tree(self) -> tuple[np.ndarray, list[int]]:
+        return graph.tree(len(self.names), self._edges(), self.root)
+
+    def _adjusted(self) -> Alignment:
+        self.say(0.92)
+        pairs, edges = list(self.found), self._edges()
+        gates = [self.found[pair].gate_mm for pair in pairs]
+        kept, dropped = agreeing(len(self.names), edges, self.root, gates, self._fits)
+        told = {
+            pairs[k]: f"{pairs[k][0]} -> {pairs[k][1]} contradicts the other pairs by {shift:.1f} mm "
+            f"and {turn:.1f} degrees, and is left out"
+            for k, (shift, turn) in dropped.items()
+        }
+        edges, pairs = [edges[k] for k in kept], [pairs[k] for k in kept]
+        start, by = graph.tree(len(self.names), edges, self.root)
+        poses = graph.optimised(start, edges, self.root) if len(edges) >= len(self.names) else start
+        loops = []
+        for k, edge in enumerate(edges):
+            if k not in by:
+                expected = graph.expected_mm(edge, edges, by)
+                names = tuple(self.names[node] for node in graph.loop_of(edge, edges, by))
+                loops.append(Loop(names, graph.gap(edge, start, expected), graph.gap(edge, poses)))
+        self.say(1.0)
+        return Alignment(
+            self.reference,
+            dict(zip(self.names, poses, strict=True)),
+            {pair: self.found[pair] for pair in pairs},
+            tuple(sorted(loops, key=lambda loop: -loop.before.shift_mm)),
+            told,
+            {pair: str(error) for pair, error in self.refused.items()},
+        )
+
+    def _fits(self, edge: Edge, T: np.ndarray) -> bool:
+        """Whether the two scans of an edge also lie well on each other where ``T`` puts them."""
+        try:
+            found = register_prepared(
+                self.scans[edge.scan], self.scans[edge.onto], size=self.size, initial=Candidate(T, "initial")
+            )
+        except Refused:
+            return False
+        one = replace(edge, T=found.T_reference_scan)
+        left = graph.residuals([replace(one, scan=0, onto=1)], np.stack([T, np.eye(4)]))[0]
+        return bool(np.linalg.norm(left[3:]) < found.gate_mm)
+
+
+def _ready(name: str, scan: Scan) -> Prepared:
+    chosen = slice(None) if scan.trusted is None else scan.trusted
+    normals = None if scan.normals is None else scan.normals[chosen]
+    return prepared(name, scan.points[chosen], normals, scan.sigma_mm)
+
+
+def _overlap(scan: Prepared, reference: Prepared, T: np.ndarray) -> float:
+    """Share of the scan that lies on the reference where ``T`` puts it, as far as thinned clouds tell."""
+    voxel = reference.size / 80.0
+    points = np.asarray(scan.thinned(voxel).points)
+    distance, _ = reference.fine_tree.query(points @ T[:3, :3].T + T[:3, 3], distance_upper_bound=voxel)
+    return float(np.count_nonzero(np.isfinite(distance)) / len(points))

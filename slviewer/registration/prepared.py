@@ -1,0 +1,156 @@
+"""A scan made ready for registration, once for all the pairs that it is part of."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.errors import InputError
+from slviewer.registration.open3d_loader import open3d
+
+LEAST_POINTS = 500
+FINEST_MM = 0.5
+"""Thinned to one point in so many mm, of objects of 75 to 300 mm: the noise of several pixels is averaged."""
+_GRAZING = np.cos(np.radians(75.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """``points`` (n, 3) float64 mm in the frame of the scan's camera; ``fine``: Open3D's cloud of them, thinned to
+    ``voxel`` mm, with unit normals towards the camera, without what is seen at grazing angles; ``spacing``: median
+    distance in mm of a point to the next; ``size``: longest side in mm; ``sigma_mm``: expected error of a point."""
+
+    points: np.ndarray
+    fine: Any
+    voxel: float
+    spacing: float
+    size: float
+    sigma_mm: float | None
+    _thinned: dict[float, Any] = field(default_factory=dict)
+    _features: dict[float, Any] = field(default_factory=dict)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of all points."""
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+    @cached_property
+    def fine_points(self) -> np.ndarray:
+        """(m, 3) float64 mm, of the thinned cloud."""
+        return np.asarray(self.fine.points)
+
+    @cached_property
+    def fine_normals(self) -> np.ndarray:
+        """(m, 3) float64, of the thinned cloud."""
+        return np.asarray(self.fine.normals)
+
+    @cached_property
+    def fine_tree(self) -> cKDTree:
+        """Of the thinned cloud's points."""
+        return cKDTree(self.fine_points)
+
+    @cached_property
+    def fine_spacing(self) -> float:
+        """Median distance in mm between neighbours of the thinned cloud."""
+        return _spacing(self.fine_tree, self.fine_points)
+
+    @cached_property
+    def smooth(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points (k, 3) mm, thinned to an eightieth of the size, and normals (k, 3) fitted to some thirty of them,
+        which show the shape and not the noise; towards either side."""
+        cloud = self.thinned(self.size / 80.0)
+        cloud = open3d().geometry.PointCloud(cloud.points)
+        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
+        return np.asarray(cloud.points), np.asarray(cloud.normals)
+
+    @property
+    def scale(self) -> float:
+        """1 for objects of 75 to 300 mm; smaller and larger ones have voxels and gates in proportion."""
+        return scale_of(self.size)
+
+    def features(self, voxel: float) -> Any:
+        """Open3D's FPFH features of the cloud thinned to ``voxel``; kept for the next who asks."""
+        if voxel not in self._features:
+            pipeline, search = open3d().pipelines.registration, open3d().geometry.KDTreeSearchParamHybrid
+            self._features[voxel] = pipeline.compute_fpfh_feature(self.thinned(voxel), search(5.0 * voxel, 100))
+        return self._features[voxel]
+
+    def thinned(self, voxel: float) -> Any:
+        """Open3D's cloud thinned further, with unit normals; kept for the next who asks."""
+        if voxel <= self.voxel:
+            return self.fine
+        key = float(f"{voxel:.3g}")
+        if key not in self._thinned:
+            cloud = self.fine.voxel_down_sample(key)
+            cloud.normalize_normals()
+            self._thinned[key] = cloud
+        return self._thinned[key]
+
+
+def prepared(
+    name: str, points: np.ndarray, normals: np.ndarray | None = None, sigma_mm: float | None = None
+) -> Prepared:
+    """Make ready the points ``(n, 3)`` mm of one scan, in the frame of its camera.
+
+    ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for errors. Raises
+    ``InputError`` for points that cannot be used.
+    """
+    _check(name, points, normals)
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    size = _size(points)
+    voxel = FINEST_MM * scale_of(size)
+    fine = _cloud(points, normals, voxel)
+    if len(fine.points) < LEAST_POINTS // 5:
+        raise InputError(f"Nearly all of the {name} is seen at grazing angles: turn the object towards the camera.")
+    thinning = len(points) / len(fine.points)
+    spacing = _spacing(cKDTree(np.asarray(fine.points)), np.asarray(fine.points)) / np.sqrt(thinning)
+    return Prepared(points, fine, voxel, float(spacing), size, sigma_mm)
+
+
+def scale_of(size: float) -> float:
+    """The share by which voxels and gates differ from those for objects of 75 to 300 mm."""
+    return 1.0 if 75.0 <= size <= 300.0 else size / (75.0 if size < 75.0 else 300.0)
+
+
+def _check(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
+    if len(points) < LEAST_POINTS:
+        raise InputError(f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it.")
+    if not np.isfinite(points).all():
+        raise InputError(f"The {name} holds points that are not finite: leave out its invalid pixels first.")
+    if normals is not None and normals.shape != points.shape:
+        raise InputError(f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one each.")
+
+
+def _size(points: np.ndarray) -> float:
+    """The longest side in mm of the box around the points, stray ones (1 % at each end) left out."""
+    low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
+    return float((high - low).max())
+
+
+def _spacing(tree: cKDTree, points: np.ndarray) -> float:
+    distance, _ = tree.query(points[:: max(1, len(points) // 2000)], k=2)
+    return float(np.median(distance[:, 1]))
+
+
+def _cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
+    """Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the origin."""
+    o3d = open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    if normals is not None:
+        finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))  # a NaN normal weighs nothing in a voxel's mean
+        cloud.normals = o3d.utility.Vector3dVector(finite)
+        cloud = cloud.voxel_down_sample(voxel)
+        known = np.linalg.norm(np.asarray(cloud.normals), axis=1) > 0.1
+        cloud = cloud.select_by_index(np.flatnonzero(known))
+        cloud.normalize_normals()
+    else:
+        cloud = cloud.voxel_down_sample(voxel)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(30))
+        cloud.orient_normals_towards_camera_location(np.zeros(3))
+    seen = np.asarray(cloud.points)
+    facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / np.linalg.norm(seen, axis=1)
+    return cloud.select_by_index(np.flatnonzero(facing > _GRAZING))

@@ -1,0 +1,72 @@
+"""One scan as registration takes it: its points, and which of them can be trusted to lie on the surface."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_erosion
+
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import normals as grid_normals
+
+_RIM_PX = 2
+"""So near to the edge of the measured surface, a pixel may have seen two surfaces at once."""
+_STEEPEST = 6.0
+"""Rise over the pixels' pitch beyond which neighbours do not belong to one surface, or to one seen too obliquely."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """The valid points of one scan, in the frame of the camera that took it.
+
+    ``points`` (n, 3) mm and ``normals`` (n, 3) towards the camera, float32 without NaN in the points; a normal is NaN
+    where the grid gives none. ``colours`` (n, 3) uint8 or None; ``sigma_mm`` the median expected error of a point.
+    ``trusted`` (n,) bool: the points away from edges, which alone decide how the scan lies; None trusts all.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray | None = None
+    colours: np.ndarray | None = None
+    sigma_mm: float | None = None
+    trusted: np.ndarray | None = None
+
+    @classmethod
+    def from_cloud(cls, cloud: Cloud) -> "Scan":
+        """The measured pixels of an organised cloud, with the normals of its grid."""
+        mask = cloud.mask
+        sigma = cloud.sigma_z[mask]
+        sigma = sigma[np.isfinite(sigma)]
+        return cls(
+            points=cloud.points[mask],
+            normals=grid_normals(cloud.points)[mask],
+            colours=_rgb(cloud.colours()),
+            sigma_mm=float(np.median(sigma)) if sigma.size else None,
+            trusted=away_from_edges(cloud.points)[mask],
+        )
+
+
+def away_from_edges(points: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the pixels of an organised cloud (h, w, 3) mm that lie two pixels or more inside the surface.
+
+    Edges are invalid pixels, the image's border, and steps that are steep for the pixels' pitch.
+    """
+    valid = np.isfinite(points[..., 2])
+    inside = valid.copy()
+    for axis in (0, 1):
+        first, second = (
+            points[tuple(s if k == axis else slice(None) for k in (0, 1))] for s in (_BUT_LAST, _BUT_FIRST)
+        )
+        pitch = np.linalg.norm((second - first)[..., :2], axis=-1)
+        known = pitch[np.isfinite(pitch)]
+        if not known.size:
+            continue
+        step = np.abs(second[..., 2] - first[..., 2]) > _STEEPEST * float(np.median(known))
+        for s in (_BUT_LAST, _BUT_FIRST):
+            inside[tuple(s if k == axis else slice(None) for k in (0, 1))] &= ~step
+    return np.asarray(binary_erosion(inside, np.ones((3, 3), bool), _RIM_PX))
+
+
+_BUT_LAST, _BUT_FIRST = slice(None, -1), slice(1, None)
+
+
+def _rgb(colours: np.ndarray | None) -> np.ndarray | None:
+    return np.repeat(colours[:, None], 3, axis=1) if colours is not None and colours.ndim == 1 else colours

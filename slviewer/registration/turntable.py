@@ -1,0 +1,51 @@
+"""Scans of an object on a turntable: what the angle says of where they lie."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slviewer.errors import InputError
+
+_OFF_DEG = 3.0
+"""A step that was found and one that was told differ by less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """The table's axis in the camera's frame: a ``point`` (3,) mm on it, and its ``direction`` (3,), about which the
+    table turns the right-handed way."""
+
+    point: np.ndarray
+    direction: np.ndarray
+
+    def turned(self, deg: float) -> np.ndarray:
+        """(4, 4): where the table, turned by so much, has brought what it carries."""
+        unit = np.asarray(self.direction, dtype=np.float64) / np.linalg.norm(self.direction)
+        M = np.eye(4)
+        M[:3, :3] = Rotation.from_rotvec(np.radians(deg) * unit).as_matrix()
+        M[:3, 3] = self.point - M[:3, :3] @ self.point
+        return M
+
+
+def axis_of(steps: Sequence[np.ndarray], step_deg: float) -> Axis:
+    """The axis, from how scans lie on the ones before them (``T`` (4, 4) each), one step of ``step_deg`` apart.
+
+    It points so that the table turns by ``step_deg`` from each scan to the next. Raises ``InputError`` where a step
+    that was found is not of that angle.
+    """
+    # what was scanned one step later lies turned back on the scan before
+    turns = np.array([-np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec()) for T in steps])
+    angles = np.linalg.norm(turns, axis=1)
+    for angle in angles:
+        if abs(angle - abs(step_deg)) > _OFF_DEG:
+            raise InputError(
+                f"Two scans in a row lie {angle:.1f} degrees apart and the turntable is said to step by "
+                f"{abs(step_deg):g}: check the angle and the order of the scans, or start from features."
+            )
+    direction = (turns / angles[:, None]).mean(axis=0) * np.sign(step_deg)
+    left = np.vstack([np.eye(3) - T[:3, :3] for T in steps])
+    right = np.concatenate([T[:3, 3] for T in steps])
+    # nothing fixes the place along the axis: the one nearest the camera is as good as any
+    return Axis(np.linalg.lstsq(left, right, rcond=1e-3)[0], direction / np.linalg.norm(direction))

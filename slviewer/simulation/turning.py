@@ -1,0 +1,78 @@
+"""An object to be seen all round, and the turntable that turns it before the rig."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.mesh import MeshScene
+from slviewer.simulation.plans import rotation
+
+STEPS = 12
+STEP_DEG = 360.0 / STEPS
+AXIS_POINT = np.array([3.0, 6.0, 600.0])
+"""On the table's axis, mm in the camera's frame."""
+LOOKING_DOWN_DEG = 30.0
+AXIS = np.array([0.02, -np.cos(np.radians(LOOKING_DOWN_DEG)), -np.sin(np.radians(LOOKING_DOWN_DEG))])
+AXIS /= np.linalg.norm(AXIS)
+"""Up from the table, in the camera's frame; the table turns the right-handed way about it."""
+_BESIDE = np.array([6.0, -4.0, 0.0])  # the object does not stand in the table's middle
+
+_RADIUS_MM, _FOOT_MM = 56.0, 27.0
+_SUBDIVISIONS = 7  # edges of about half a millimetre
+
+
+def turning() -> dict[str, MeshScene]:
+    """The worn stone in twelve steps of the table, turn_01 ... turn_12: the camera sees all of it but its flat foot."""
+    vertices, triangles = stone()
+    side = np.cross(AXIS, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    upright = np.stack([side, np.cross(AXIS, side), AXIS], axis=1)
+    scenes = {}
+    for k in range(STEPS):
+        R = rotation(np.radians(STEP_DEG * k) * AXIS) @ upright
+        scenes[f"turn_{k + 1:02d}"] = MeshScene(vertices, triangles, Pose(R, AXIS_POINT + R @ _BESIDE))
+    return scenes
+
+
+@lru_cache(1)
+def stone() -> tuple[np.ndarray, np.ndarray]:
+    """A worn stone on a flat foot, watertight: vertices (n, 3) float64 mm with z up, triangles (m, 3) int32 that are
+    counter-clockwise seen from outside. About 120 mm wide, 90 mm high, without symmetry."""
+    directions, triangles = _sphere(_SUBDIVISIONS)
+    rng = np.random.default_rng(12)
+    radius = np.full(len(directions), _RADIUS_MM)
+    for _ in range(6):  # the lopsided whole
+        wave = rng.normal(size=3) * rng.uniform(0.8, 2.0)
+        radius += 1.2 * np.cos(directions @ wave + rng.uniform(0, 2 * np.pi))
+    middles = rng.normal(size=(90, 3))
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    widths = np.radians(rng.uniform(5.0, 12.0, len(middles)))
+    heights = rng.uniform(0.15, 0.35, len(middles)) * widths * _RADIUS_MM * rng.choice([-1.0, 1.0], len(middles))
+    for middle, width, height in zip(middles, widths, heights, strict=True):
+        radius += height * np.exp((directions @ middle - 1.0) / width**2)
+    down = np.maximum(-directions[:, 2], 1e-9)
+    radius = np.minimum(radius, _FOOT_MM / down)
+    return directions * radius[:, None], triangles
+
+
+def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """An icosahedron whose triangles are divided in four so often: unit vertices (n, 3), triangles (m, 3) int32."""
+    golden = (1 + 5**0.5) / 2
+    corners = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
+    vertices = np.array([np.roll(corner, k) for k in (0, 1, 2) for corner in corners], dtype=float)
+    triangles = np.array([
+        (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
+        (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7),
+        (9, 8, 1),
+    ])  # fmt: skip
+    for _ in range(subdivisions):
+        edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        ends, which = np.unique(edges, axis=0, return_inverse=True)
+        halves = which.reshape(-1, 3) + len(vertices)
+        vertices = np.concatenate([vertices, vertices[ends].sum(axis=1)])
+        (a, b, c), (ab, bc, ca) = triangles.T, halves.T
+        parts = [np.stack(corners, axis=1) for corners in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+        triangles = np.concatenate(parts)
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, triangles.astype(np.int32)
