@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from slviewer.errors import InputError
 from slviewer.session.atomic import megabytes
-from slviewer.session.mesh_files import IN_WORDS, MESH_FORMATS, POINT_FORMATS, write_shape
+from slviewer.session.mesh_files import IN_WORDS, MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
 from slviewer.session.store import Session
 from slviewer.workflow.exporting_documents import (
     write_calibration_file,
@@ -36,13 +36,14 @@ FORMATS: dict[What, tuple[str, ...]] = {
 }
 """The first is the one that is written where none is asked for."""
 DOCUMENTS = {
-    "yml": "OpenCV's YAML, mm and px, meanings in comments",
-    "xml": "OpenCV's XML, mm and px, meanings in comments",
-    "json": "JSON, mm and px, meanings in words",
-    "npz": "NumPy, mm and rad, meanings in words",
+    "yml": "OpenCV's YAML in mm and px, explained in comments",
+    "xml": "OpenCV's XML in mm and px, explained in comments",
+    "json": "JSON in mm and px, explained beside the numbers",
+    "npz": "NumPy's arrays in mm, px and rad, explained in the one called about",
     "html": "one page that needs nothing else",
-    "csv": "for a spreadsheet, mm",
+    "csv": "for a spreadsheet, in mm",
 }
+"""What the other formats are, and in which units."""
 _ALIASES = {"yaml": "yml", "htm": "html"}
 
 
@@ -67,6 +68,15 @@ def size(count: int) -> str:
 def units(file_format: str) -> str:
     """What a format holds and in which units, in words."""
     return IN_WORDS.get(file_format) or DOCUMENTS.get(file_format, "")
+
+
+def foreseen_bytes(what: What, file_format: str, points: int, model: str = "", coloured: bool = True) -> int | None:
+    """About how large a file of a scan or a merge of so many points becomes; None where that is not known before."""
+    if what not in ("cloud", "mesh", "merge"):
+        return None
+    faces = 2 * points if what == "mesh" else 0  # between neighbouring pixels, all but those at borders
+    scalars = 3 if model == "splined" else 1
+    return estimated_bytes(file_format, points, faces, colours=coloured, scalars=scalars)
 
 
 def check_export(what: What, file_format: str) -> None:

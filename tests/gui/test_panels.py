@@ -1,5 +1,6 @@
 """From a calibration to a file: the panels that measure, in a browser, over a recorded session."""
 
+import json
 import re
 import threading
 from collections.abc import Iterator
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from playwright.sync_api import Browser, Page, expect
 from wizard_page import SIZE, Opened, button, field
 
@@ -159,8 +161,25 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     snapshot = operator.snapshot()
     assert snapshot.session is not None and snapshot.session.merge is not None
     assert len(merged.points) == snapshot.session.merge.points and np.isfinite(merged.points).all()
+    choose(page, "Of", "Lion <b>1</b> (object_r2)")
+    choose(page, "As", "mesh")
+    choose(page, "File type", "GLB")
+    expect(page.get_by_text(re.compile(r"In metres, as glTF demands.*About \d"))).to_be_visible()
+    button(page, "Write file").click()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download object_r2_mesh.glb").click(timeout=40_000)
+    download.value.save_as(tmp_path / "part.glb")
+    part = trimesh.load(tmp_path / "part.glb", force="mesh")
+    assert len(part.faces) > 10_000 and 0.08 < part.extents.max() < 0.2  # the ammonite, 140 mm wide
     button(page, "Write calibration").click()
     expect(page.get_by_text("calibration.yml").first).to_be_visible()
+    choose(page, "What", "poses")
+    choose(page, "Format", "JSON")
+    button(page, "Write poses").click()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download poses.json").click(timeout=40_000)
+    poses = json.loads(Path(download.value.path()).read_text())
+    assert len(poses["targets"]) == 8 and len(poses["merges"][0]["scans"]) == 2
 
     button(page, "7. Merge").click()
     button(page, "Undo this merge").click()

@@ -1,7 +1,7 @@
-"""Export: what other programs can read, with its size, at one click."""
+"""Export: what other programs can read, with its units and size, to download at one click."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
@@ -12,17 +12,33 @@ from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
 from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, block, cell, link, table, toned
+from slviewer.workflow.exporting import FORMATS, What, file_name, foreseen_bytes, size, units
 from slviewer.workflow.wizard import looking
 from slviewer.workflow.wizard.snapshot import ExportView, SessionView, Snapshot
 
 LAYER = "export"
-LIST_PX = 330
+LIST_PX = 250
 """Height of the list of files, so that what writes others stays in view."""
 MERGED = "merged"
-CLOUD, MESH = "points, PLY", "mesh, "
-SHAPES = (CLOUD, *(f"{MESH}{kind}" for kind in ("PLY", "STL", "OBJ", "GLB")))
-CALIBRATIONS = {"OpenCV YAML": "yml", "OpenCV XML": "xml", "JSON": "json"}
-_SHAPED = {"ply", "stl", "obj", "glb"}
+POINTS, MESH = "points", "mesh"
+FORMAT_NAMES = {
+    "ply": "PLY",
+    "stl": "STL",
+    "obj": "OBJ",
+    "glb": "GLB",
+    "xyz": "XYZ text",
+    "yml": "OpenCV YAML",
+    "xml": "OpenCV XML",
+    "json": "JSON",
+    "npz": "NumPy",
+}
+NUMBERS: dict[What, tuple[str, str]] = {
+    "calibration": ("calibration", "Lenses of camera and projector, how they stand, and the reprojection errors"),
+    "poses": ("poses", "Camera, projector, target and merged scans as 4x4 matrices"),
+    "coefficients": ("each pixel's coefficients", "The rational function of every camera pixel"),
+}
+"""What there is beside shapes: as a choice, and what it holds."""
+_SHAPED = {"ply", "stl", "obj", "glb", "xyz"}
 
 
 class Panel:
@@ -33,9 +49,7 @@ class Panel:
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
         self._painter = Painter(stage.failed)
-        self._merge = ""
-        self._made: tuple[str, ...] = ()
-        self._clouds: dict[str, Any] = {}
+        self._snapshot: Snapshot | None = None
         self._points: np.ndarray | None = None
         self._visible = False
 
@@ -43,19 +57,22 @@ class Panel:
         gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
         with gui.add_folder("Files to download"):
             self._files = Words(gui)
-        with gui.add_folder("Cloud or mesh") as self._shape_folder:
-            self._what = Choice(gui, "Of")
-            self._shape = gui.add_dropdown("As", SHAPES)
-            bring_button(self._stage, lambda: self._points)
-            self._hint = Words(gui)
+        with gui.add_folder("Cloud or mesh"):
+            self._of = Choice(gui, "Of")
+            self._as = gui.add_dropdown("As", (POINTS, MESH))
+            self._shape_format = Choice(gui, "File type")
+            self._shape_hint = Words(gui)
+            self._shape_link = Words(gui)
             self._write = gui.add_button("Write file", icon=viser.Icon.FILE_EXPORT)
             self._write.on_click(safely(self._ask_shape))
-        with gui.add_folder("Calibration"):
-            self._format = gui.add_dropdown("For", tuple(CALIBRATIONS))
-            self._calibration = gui.add_button("Write calibration", icon=viser.Icon.FILE_EXPORT)
-            self._calibration.on_click(
-                safely(lambda: operator.export("calibration", "", CALIBRATIONS[self._format.value]))
-            )
+            bring_button(self._stage, lambda: self._points)
+        with gui.add_folder("Calibration and poses"):
+            self._numbers = Choice(gui, "What")
+            self._number_format = Choice(gui, "Format")
+            self._number_hint = Words(gui)
+            self._number_link = Words(gui)
+            self._write_numbers = gui.add_button("Write calibration", icon=viser.Icon.FILE_EXPORT)
+            self._write_numbers.on_click(safely(self._ask_numbers))
         with gui.add_folder("Report and more"):
             self._report = gui.add_button("Write report", icon=viser.Icon.REPORT)
             self._report.on_click(safely(lambda: operator.report()))
@@ -68,26 +85,28 @@ class Panel:
                 hint="Versions, settings, logs and small pictures, to send when asking for help; no frames",
             )
             bundle.on_click(safely(lambda: operator.diagnostic_bundle()))
-        self._shape.on_update(safely(self._say))
-        self._what.on_change(safely(self._say))
+        self._as.on_update(safely(self._say))
+        for choice in (self._of, self._shape_format, self._numbers, self._number_format):
+            choice.on_change(safely(self._say))
 
     def draw(self, snapshot: Snapshot) -> None:
+        self._snapshot = snapshot
         session = snapshot.session
-        ready = session is not None and snapshot.step(self.key).state != "blocked"
         busy = snapshot.job is not None and not snapshot.job.background
+        ready = session is not None and snapshot.step(self.key).state != "blocked"
         self._files.set(self._listed(session))
         if session is None:
             return
-        self._merge = session.merge.name if session.merge else ""
         things = [(MERGED, "the merged scans")] if session.merge else []
         things += [(scan.name, titled(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"]
-        self._what.offer(things)
-        self._made = tuple(export.name for export in session.exports)
-        self._clouds = {scan.name: (scan.points, scan.model) for scan in session.scans}
+        self._of.offer(things)
+        models = session.calibration.models if session.calibration else ()
+        coefficients = bool({"pixelwise", "splined"} & set(models))
+        self._numbers.offer([(k, said) for k, (said, _) in NUMBERS.items() if k != "coefficients" or coefficients])
         refused = session.calibration is not None and bool(session.calibration.refused)
         change(self._report, disabled=busy or not ready)
-        change(self._calibration, disabled=busy or not ready or refused)
-        change(self._write, disabled=busy or not things)
+        change(self._write_numbers, disabled=busy or not ready or refused)
+        change(self._write, disabled=busy or not things or refused)
         change(self._table, disabled=busy or not session.verifications)
         self._say()
 
@@ -96,30 +115,50 @@ class Panel:
         self._stage.scene.show(LAYER, visible)
         self._show_closely()
 
-    def _say(self) -> None:
-        """What the file will be, whether it is there already, and how it looks."""
-        self._look()
-        merged_points = self._what.value == MERGED and self._shape.value == CLOUD
-        there = merged_points and f"merged_{self._merge}.ply" in self._made
-        change(self._write, visible=not there)
-        if not self._what.value:
-            self._hint.say("Nothing is reconstructed yet: scan an object first.", "warning")
-        elif there:
-            self._hint.say(f"merged_{self._merge}.ply is above, with colours and normals.", "good")
-        elif self._what.value == MERGED and self._shape.value != CLOUD:
-            self._hint.say("One closed surface through all scans, cut off where nothing was measured.", "dim")
-        elif self._shape.value != CLOUD:
-            self._hint.say("Triangles between neighbouring pixels; depth jumps stay open.", "dim")
-        else:
-            self._hint.say("Every measured point in mm, with its colour.", "dim")
+    # what would be written
 
-    def _look(self) -> None:
+    def _shape(self) -> tuple[What, str]:
+        """What is chosen, and its name; empty where there is nothing to choose."""
+        name, mesh, session = self._of.value, self._as.value == MESH, self._snapshot and self._snapshot.session
+        if name == MERGED:
+            return "merged-mesh" if mesh else "merge", session.merge.name if session and session.merge else ""
+        return "mesh" if mesh else "cloud", name
+
+    def _say(self) -> None:
+        """What the files will be, whether they are there already, and how the shape looks."""
+        session = self._snapshot.session if self._snapshot else None
+        if session is None:
+            return
+        self._look(session)
+        what, name = self._shape()
+        self._shape_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[what]])
+        if name:
+            chosen = self._shape_format.value
+            made = _made(session, file_name(what, name, chosen))
+            self._shape_hint.say(shape_words(session, what, name, chosen, foreseen=made is None), "dim")
+            self._shape_link.set(self._offered(made))
+            kept = made is not None and what == "merge" and chosen == "ply"  # the merge's own file
+            change(self._write, visible=not kept, label="Write again" if made else "Write file", color=_tone(made))
+        else:
+            self._shape_hint.say("Nothing is reconstructed yet: scan an object first.", "warning")
+            self._shape_link.set("")
+        numbers: What = self._numbers.value or "calibration"  # type: ignore[assignment]
+        self._number_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[numbers]])
+        chosen = self._number_format.value
+        self._number_hint.say(f"{NUMBERS[numbers][1]}. {units(chosen)}.", "dim")
+        made = _made(session, file_name(numbers, "", chosen))
+        self._number_link.set(self._offered(made))
+        label = f"Write {numbers} again" if made else f"Write {numbers}"
+        change(self._write_numbers, label=label, color=_tone(made))
+
+    def _look(self, session: SessionView) -> None:
         """Show in 3D what would be written."""
-        name, merge, operator = self._what.value, self._merge, self._stage.operator
+        name, merge, operator = self._of.value, session.merge.name if session.merge else "", self._stage.operator
         if not name:
             self._painter.forget("cloud")
             self._stage.scene.clear(LAYER)
             return
+        clouds = {scan.name: (scan.points, scan.model) for scan in session.scans}
 
         def load() -> tuple[np.ndarray, np.ndarray | None]:
             if name == MERGED:
@@ -129,7 +168,8 @@ class Panel:
             rows, columns = cloud.thinned(120_000)
             return cloud.points[rows, columns], cloud.texture[rows, columns]
 
-        self._painter.ask("cloud", (name, merge if name == MERGED else self._clouds.get(name)), load, self._draw_cloud)
+        key: Any = merge if name == MERGED else clouds.get(name)
+        self._painter.ask("cloud", (name, key), load, self._draw_cloud)
 
     def _draw_cloud(self, made: tuple[np.ndarray, np.ndarray | None]) -> None:
         points, colours = made
@@ -142,17 +182,19 @@ class Panel:
 
     def _show_closely(self) -> None:
         if self._visible:
-            self._stage.eyes.at(f"{LAYER} {self._what.value}", self._points)
+            self._stage.eyes.at(f"{LAYER} {self._of.value}", self._points)
+
+    # requests
 
     def _ask_shape(self) -> None:
-        name, shape = self._what.value, self._shape.value
-        kind = shape.removeprefix(MESH).lower()
-        if name == MERGED:
-            self._stage.operator.export("merged-mesh", "", kind)
-        elif shape == CLOUD:
-            self._stage.operator.export("cloud", name, "ply")
-        elif name:
-            self._stage.operator.export("mesh", name, kind)
+        what, name = self._shape()
+        if name:
+            self._stage.operator.export(what, name, self._shape_format.value)
+
+    def _ask_numbers(self) -> None:
+        self._stage.operator.export(self._numbers.value, "", self._number_format.value)
+
+    # files
 
     def _listed(self, session: SessionView | None) -> Html:
         exports = session.exports if session else ()
@@ -161,23 +203,48 @@ class Panel:
         rows = [
             (
                 Html(f'<span style="overflow-wrap:anywhere">{cell(export.name)}</span>'),
-                size(export.bytes),
-                self._link(export),
+                Html(f'<span style="white-space:nowrap">{size(export.bytes)}</span>'),
+                self._link(export, "Download", quiet=True),
             )
             for export in sorted(exports, key=_rank)
         ]
         return Html(f'<div style="max-height:{LIST_PX}px;overflow-y:auto">{table(("File", "size", ""), rows)}</div>')
 
-    def _link(self, export: ExportView) -> Html:
+    def _offered(self, export: ExportView | None) -> str:
+        """A link to what was written already; empty where it was not."""
+        return "" if export is None else block(self._link(export, f"Download {export.name}, {size(export.bytes)}"))
+
+    def _link(self, export: ExportView, words: str, quiet: bool = False) -> Html:
         try:
-            return link(self._stage.offer(export.path), "Download")
+            address = self._stage.offer(export.path)
+            return Html(f'<a href="{cell(address)}" download>{words}</a>') if quiet else link(address, words)
         except SlviewerError:  # taken away since the snapshot was made: the next one will not list it
             return cell("")
 
 
-def size(count: int) -> str:
-    """Bytes as people read them."""
-    return f"{count / 1e6:.1f} MB" if count >= 100_000 else f"{count / 1e3:.1f} kB"
+def shape_words(session: SessionView, what: What, name: str, file_format: str, foreseen: bool = True) -> str:
+    """What a file of a scan or a merge will be: how it is made, its units, and if `foreseen` about how large."""
+    scan = next((each for each in session.scans if each.name == name), None)
+    points, model = (session.merge.points, "") if scan is None and session.merge else (0, "")
+    if scan is not None:
+        points, model = scan.points, scan.model
+    made = {
+        "cloud": f"Every measured point, {points:,}".replace(",", " "),
+        "mesh": "Triangles between neighbouring pixels; depth jumps stay open",
+        "merge": f"The {points:,} points of all scans".replace(",", " "),
+        "merged-mesh": "One surface through all scans, cut off where nothing was measured",
+    }[what]
+    about = foreseen_bytes(what, file_format, points, model) if foreseen else None
+    return f"{made}. In {units(file_format)}.{'' if about is None else f' About {size(about)}.'}"
+
+
+def _made(session: SessionView, name: str) -> ExportView | None:
+    return next((export for export in session.exports if export.name == name), None)
+
+
+def _tone(made: ExportView | None) -> Literal["gray"] | None:
+    """Of a button that writes: what is there already is rather downloaded."""
+    return None if made is None else "gray"
 
 
 def _rank(export: ExportView) -> tuple[int, str]:
