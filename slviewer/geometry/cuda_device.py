@@ -15,6 +15,7 @@ import numpy as np
 
 _LOG = logging.getLogger("slviewer.cuda")
 _LOCK = threading.Lock()
+_NO_DEVICE = 100  # CUDA_ERROR_NO_DEVICE
 _found: list[str | None] = []  # empty until somebody asks
 
 
@@ -55,8 +56,9 @@ def _look() -> str | None:
     if not simulated:
         if importlib.util.find_spec("numba_cuda") is None:
             return None
-        if reason := _driver_fails():
-            _LOG.info("no CUDA device is used: %s", reason)
+        count, reason, level = _asked_driver()
+        if count == 0:
+            _LOG.log(level, "no CUDA device is used: %s", reason)
             return None
     try:
         from numba import cuda
@@ -72,19 +74,17 @@ def _look() -> str | None:
     return name
 
 
-def _driver_fails() -> str:
-    """What the driver lacks, in words; empty where it has a device. Some milliseconds without one."""
+def _asked_driver() -> tuple[int, str, int]:
+    """How many devices the driver has; if none, why, and whether that is a matter for the log's INFO or WARNING."""
+    count = ctypes.c_int()
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-        code = driver.cuInit(0)
-        count = ctypes.c_int()
-        if code == 0:
-            code = driver.cuDeviceGetCount(ctypes.byref(count))
+        code = driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count))
     except (OSError, AttributeError) as error:
-        return f"there is no driver ({_first_line(error)})"
-    if code != 0:
-        return f"the driver answers with error {code}"
-    return "" if count.value else "the driver has no device"
+        return 0, f"there is no driver ({_first_line(error)})", logging.INFO
+    if code not in (0, _NO_DEVICE):
+        return 0, f"its driver answers with error {code}: install the graphics card's driver anew", logging.WARNING
+    return count.value, "the driver has none", logging.INFO
 
 
 def _first_line(error: Exception) -> str:
