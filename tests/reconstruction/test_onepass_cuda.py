@@ -200,15 +200,10 @@ def test_a_device_that_fails_is_told_once_and_the_processor_goes_on(scans):
     ]
 
 
-class BrokenDriver:
-    """What a driver says whose kernel module is another version's."""
-
-    cuInit = staticmethod(lambda flags: 803)
-
-
 def test_without_a_device_all_is_the_processors(monkeypatch, caplog):
     monkeypatch.setattr(cuda_device, "_found", [])
-    monkeypatch.setattr(cuda_device.ctypes, "CDLL", lambda name: BrokenDriver)
+    broken = SimpleNamespace(cuInit=lambda flags: 803)  # as if the kernel's module were another version's
+    monkeypatch.setattr(cuda_device.ctypes, "CDLL", lambda name: broken)
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "numba_cuda" or real(name))
     assert type(one_pass(SEQUENCES["p18"], pixelwise(), "x")) is OnePass
