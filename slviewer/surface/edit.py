@@ -1,0 +1,92 @@
+"""Changes of a mesh, each with what it did in numbers: small parts dropped, holes filled, smoothed, thinned."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.surface.shapes import Mesh
+from slviewer.surface.tools import carried, compact, legacy, moved
+from slviewer.surface.topology import areas, extent_across, face_groups, rims
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """Parts that were dropped, and the largest of them in mm2."""
+
+    parts: int
+    largest_mm2: float
+
+
+@dataclass(frozen=True)
+class Filled:
+    """Holes that were filled, the largest in mm across, and how many openings are left."""
+
+    holes: int
+    largest_mm: float
+    left: int
+
+
+@dataclass(frozen=True)
+class Moved:
+    """How far a change moved the surface (of the vertices before, to the surface after), and its triangles."""
+
+    rms_mm: float
+    max_mm: float
+    before: int
+    after: int
+
+
+def without_small_parts(mesh: Mesh, least_share: float = 0.01) -> tuple[Mesh, Dropped]:
+    """The mesh without the parts that have less than a share of the largest part's area."""
+    if not len(mesh.faces):
+        return mesh, Dropped(0, 0.0)
+    groups = face_groups(mesh.faces, len(mesh.vertices))
+    sizes = np.bincount(groups, weights=areas(mesh))
+    small = sizes < least_share * sizes.max()
+    largest = float(sizes[small].max()) if small.any() else 0.0
+    return compact(mesh, ~small[groups]), Dropped(int(small.sum()), largest)
+
+
+def fill_holes(mesh: Mesh, size_mm: float) -> tuple[Mesh, Filled]:
+    """The mesh with the openings that are up to ``size_mm`` across closed, each by a fan around its middle."""
+    if not size_mm >= 0:
+        raise InputError(f"Holes of up to {size_mm} mm cannot be filled: give 0 or more.")
+    vertices, faces, sizes, left = [mesh.vertices], [mesh.faces], [], 0
+    for loop in rims(mesh.faces):
+        corners = mesh.vertices[loop]
+        across = extent_across(corners)
+        if across > size_mm:
+            left += 1
+            continue
+        sizes.append(across)
+        if len(loop) == 3:
+            faces.append(loop[None, ::-1])
+            continue
+        middle = len(mesh.vertices) + len(vertices) - 1
+        vertices.append(corners.mean(axis=0, keepdims=True))
+        faces.append(np.stack([np.roll(loop, -1), loop, np.full(len(loop), middle)], axis=1))
+    if not sizes:
+        return mesh, Filled(0, 0.0, left)
+    filled = carried(mesh, np.concatenate(vertices), np.concatenate(faces))
+    return filled, Filled(len(sizes), max(sizes), left)
+
+
+def smooth(mesh: Mesh, rounds: int) -> tuple[Mesh, Moved]:
+    """The mesh after rounds of Taubin's smoothing, which does not shrink it."""
+    if rounds < 1:
+        raise InputError(f"{rounds} rounds of smoothing were asked for: give 1 or more.")
+    calm = legacy(mesh).filter_smooth_taubin(number_of_iterations=rounds)
+    smoothed = carried(mesh, np.asarray(calm.vertices), mesh.faces)
+    return smoothed, Moved(*moved(mesh, smoothed), len(mesh.faces), len(smoothed.faces))
+
+
+def thin(mesh: Mesh, triangles: int) -> tuple[Mesh, Moved]:
+    """The mesh with no more than a number of triangles, merged where that moves the surface least."""
+    if triangles < 4:
+        raise InputError(f"{triangles} triangles make no mesh: ask for at least 4.")
+    if len(mesh.faces) <= triangles:
+        return mesh, Moved(0.0, 0.0, len(mesh.faces), len(mesh.faces))
+    fewer = legacy(mesh).simplify_quadric_decimation(triangles)
+    thinned = carried(mesh, np.asarray(fewer.vertices), np.asarray(fewer.triangles))
+    return thinned, Moved(*moved(mesh, thinned), len(mesh.faces), len(thinned.faces))

@@ -1,0 +1,178 @@
+"""From scans or merged points to a mesh that a program or a printer takes: the whole chain, and what it did."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.errors import InputError, SlviewerError
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.surface.edit import Dropped, Filled, Moved, fill_holes, smooth, thin, without_small_parts
+from slviewer.surface.fuse import fuse
+from slviewer.surface.grid import grid_mesh
+from slviewer.surface.poisson import Trimmed, poisson, trimmed
+from slviewer.surface.shapes import Mesh, PointSet
+from slviewer.surface.topology import Topology, topology
+from slviewer.surface.volume import volume
+
+Method = Literal["grid", "poisson", "volume"]
+Progress = Callable[[float, str], None]
+
+SMALL_HOLE = 5.0
+"""Spacings of the points: holes of that size are filled where no size is given."""
+MOST_IMAGINED = 0.25
+"""Share of a watertight surface that may be filled in where nothing was measured."""
+
+
+@dataclass(frozen=True)
+class MeshingPlan:
+    """How to mesh. Nothing needs to be given.
+
+    ``method``: triangles between the pixels of one scan (grid), one closed surface fitted to all points (poisson), or
+    the mean surface in small cells (volume); by default grid for a scan, poisson for merged points. ``fill_holes_mm``:
+    holes up to that far across are filled; by default a few spacings of the points, and with poisson any if it is to be watertight.
+    ``triangles``: no more than so many. ``smooth``: rounds of smoothing. ``watertight``: closed, or refused.
+    """
+
+    method: Method | None = None
+    fill_holes_mm: float | None = None
+    triangles: int | None = None
+    smooth: int = 0
+    watertight: bool = False
+
+    def __post_init__(self) -> None:
+        if self.fill_holes_mm is not None and not self.fill_holes_mm >= 0:
+            raise InputError(f"Holes of up to {self.fill_holes_mm} mm cannot be filled: give 0 or more.")
+        if self.triangles is not None and self.triangles < 4:
+            raise InputError(f"{self.triangles} triangles make no mesh: ask for at least 4.")
+        if self.smooth < 0:
+            raise InputError(f"{self.smooth} rounds of smoothing were asked for: give 0 or more.")
+
+
+@dataclass(frozen=True, eq=False)
+class Meshed:
+    """A mesh and how it was made; what was not done is None. ``cell_mm``: the spacing of the points."""
+
+    mesh: Mesh
+    method: Method
+    cell_mm: float
+    dropped: Dropped
+    trimmed: Trimmed | None
+    filled: Filled | None
+    smoothed: Moved | None
+    thinned: Moved | None
+    topology: Topology
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        found: dict[str, Any] = {
+            name: None if (step := getattr(self, name)) is None else asdict(step)
+            for name in ("dropped", "trimmed", "filled", "smoothed", "thinned")
+        }
+        return {
+            "method": self.method,
+            "cell_mm": self.cell_mm,
+            "vertices": len(self.mesh.vertices),
+            "triangles": len(self.mesh.faces),
+            **found,
+            "watertight": self.topology.watertight,
+            "openings_mm": list(self.topology.openings_mm),
+            "volume_mm3": self.topology.volume_mm3 if self.topology.watertight else None,
+        }
+
+    def text(self) -> str:
+        """For people."""
+        lines = [f"{len(self.mesh.faces)} triangles by {self.method}, points {self.cell_mm:.2f} mm apart"]
+        if self.dropped.parts:
+            lines.append(f"{self.dropped.parts} floating parts left out, up to {self.dropped.largest_mm2:.1f} mm2")
+        for done, holes in ((self.trimmed, "filled"), (self.filled, "holes")):
+            if done is not None and (n := getattr(done, holes)):
+                lines.append(f"{n} hole{'s' * (n > 1)} filled, up to {done.largest_mm:.1f} mm across")
+        if self.trimmed is not None and self.trimmed.imagined:
+            lines.append(f"{100 * self.trimmed.imagined:.1f} % of the surface was not measured: it closes those holes")
+        for what, change in (("smoothing", self.smoothed), ("thinning", self.thinned)):
+            if change is not None:
+                lines.append(
+                    f"{what} moved the surface by {change.rms_mm:.4f} mm RMS, {change.max_mm:.3f} mm at most "
+                    f"({change.before} -> {change.after} triangles)"
+                )
+        if self.topology.watertight:
+            lines.append(f"watertight, {self.topology.volume_mm3 / 1000:.2f} cm3")
+        else:
+            lines.append(f"not watertight: {self.topology.faults()}")
+        return "\n".join(lines)
+
+
+def mesh_of(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: Progress | None = None) -> Meshed:
+    """Mesh one scan's organised cloud, or the points of a merge (with normals), as planned.
+
+    ``progress`` receives the share of the work done, 0 to 1, and what is being done; it may raise to cancel.
+
+    Raises InputError for a plan that does not go with the shape, and SlviewerError where there is no surface, or none
+    that can be closed as asked.
+    """
+    plan, say = plan or MeshingPlan(), progress or (lambda share, doing: None)
+    method = plan.method or ("grid" if isinstance(shape, Cloud) and not plan.watertight else "poisson")
+    if method == "grid" and not isinstance(shape, Cloud):
+        raise InputError("Merged points have no pixels: the method grid takes a single scan; use poisson or volume.")
+    say(0.0, "finding the surface")
+    points = shape if isinstance(shape, PointSet) else fuse({"scan": shape}, {"scan": np.eye(4)}).surface
+    cell = spacing(points)
+    limit = plan.fill_holes_mm
+    if limit is None:  # only poisson knows how to go on where there is nothing
+        limit = np.inf if plan.watertight and method == "poisson" else SMALL_HOLE * cell
+    say(0.1, f"meshing by {method}")
+    cut = None
+    if method == "poisson":
+        mesh = poisson(points, cell)
+        say(0.5, "cutting off what was not measured")
+        mesh, cut = trimmed(mesh, points, cell, limit)
+    elif method == "volume":
+        mesh = volume(points, cell)
+    else:
+        assert isinstance(shape, Cloud)
+        mesh = grid_mesh(shape)
+    if not len(mesh.faces):
+        raise SlviewerError("No surface could be laid through the points: merge scans that overlap more.")
+    say(0.6, "leaving out floating parts")
+    mesh, dropped = without_small_parts(mesh)
+    filled = smoothed = thinned = None
+    if method != "poisson" and limit > 0:
+        say(0.65, "filling holes")
+        mesh, filled = fill_holes(mesh, limit)
+    if plan.smooth:
+        say(0.7, "smoothing")
+        mesh, smoothed = smooth(mesh, plan.smooth)
+    if plan.triangles is not None:
+        say(0.8, f"thinning to {plan.triangles} triangles")
+        mesh, thinned = thin(mesh, plan.triangles)
+    say(0.95, "checking")
+    found = topology(mesh)
+    if plan.watertight:
+        _refuse_if_open(found, cut, method)
+    say(1.0, "meshed")
+    return Meshed(mesh, method, cell, dropped, cut, filled, smoothed, thinned, found)
+
+
+def spacing(points: PointSet) -> float:
+    """Median distance in mm of a point to its nearest neighbour."""
+    if len(points) < 2:
+        raise InputError(f"{len(points)} points make no surface.")
+    distance, _ = cKDTree(points.points).query(points.points[:: max(1, len(points) // 20_000)], k=2)
+    found = float(np.median(distance[:, 1]))
+    if not found > 0:
+        raise InputError("Most points are there twice: merge the scans instead of joining them.")
+    return found
+
+
+def _refuse_if_open(found: Topology, cut: Trimmed | None, method: Method) -> None:
+    if not found.watertight:
+        remedy = "fill larger holes, or scan there" if method == "poisson" else "fill larger holes, or use poisson"
+        raise SlviewerError(f"The surface does not close: {found.faults()}; {remedy}.")
+    if cut is not None and cut.imagined > MOST_IMAGINED:
+        raise SlviewerError(
+            f"{100 * cut.imagined:.0f} % of the closed surface would be imagined, not measured: scan the object from "
+            "more sides, or do without watertight."
+        )

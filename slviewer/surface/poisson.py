@@ -1,0 +1,81 @@
+"""One surface through the points of merged scans, by screened Poisson, and kept only where something was measured."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.errors import InputError
+from slviewer.registration.open3d_loader import open3d
+from slviewer.surface.shapes import Mesh, PointSet
+from slviewer.surface.tools import carried, compact
+from slviewer.surface.topology import areas, extent_across, face_groups
+
+LEAST_POINTS = 100
+DEEPEST = 11
+"""Halvings of the box around the points: 2048 cells along its longest side, 80 um of 150 mm."""
+REACH = 3.0
+"""Spacings of the points beyond which the surface is not measured, but imagined."""
+
+
+@dataclass(frozen=True)
+class Trimmed:
+    """What became of the surface where nothing was measured: ``filled`` patches stayed (the largest ``largest_mm``
+    across, together the share ``imagined`` of the whole area), ``cut`` went."""
+
+    filled: int
+    largest_mm: float
+    imagined: float
+    cut: int
+
+
+def poisson(points: PointSet, cell_mm: float) -> Mesh:
+    """A closed surface through points with normals, no finer than cells of ``cell_mm``, also where there are none.
+
+    Raises InputError for points without normals, or too few.
+    """
+    if points.normals is None:
+        raise InputError("These points have no normals: a surface through them needs to know its outside; merge again.")
+    if len(points) < LEAST_POINTS:
+        raise InputError(f"{len(points)} points make no surface: at least {LEAST_POINTS} are needed.")
+    o3d = open3d()
+    known = np.isfinite(points.normals).all(axis=1)
+    middle = points.points.mean(axis=0, dtype=np.float64)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.points[known] - middle))
+    cloud.normals = o3d.utility.Vector3dVector(points.normals[known].astype(np.float64))
+    extent = float(np.ptp(points.points, axis=0).max())
+    depth = int(np.clip(np.ceil(np.log2(1.1 * extent / cell_mm)), 4, DEEPEST))
+    # one thread: its own pool spins, and where other programs hold the cores it takes a hundred times as long
+    surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    # the box cuts the surface where it leaves it: those cells may hold degenerate triangles
+    surface.remove_degenerate_triangles()
+    return carried(points, np.asarray(surface.vertices) + middle, np.asarray(surface.triangles))
+
+
+def trimmed(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> tuple[Mesh, Trimmed]:
+    """The mesh without the patches that lie far from all points and whose rims are more than ``fill_mm`` across.
+
+    Smaller ones stay: holes filled by the surface that fits around them best.
+    """
+    distance, _ = cKDTree(points.points).query(mesh.vertices, distance_upper_bound=REACH * spacing_mm)
+    far = ~np.isfinite(distance)
+    imagined = far[mesh.faces].any(axis=1)
+    if not imagined.any():
+        return mesh, Trimmed(0, 0.0, 0.0, 0)
+    groups = face_groups(mesh.faces, len(mesh.vertices), imagined)
+    measured = np.zeros(len(mesh.vertices), bool)
+    measured[mesh.faces[~imagined]] = True
+    kept, filled, largest = ~imagined, 0, 0.0
+    order = np.argsort(groups, kind="stable")
+    starts = np.searchsorted(groups[order], np.arange(groups.max() + 2))
+    for k in range(groups.max() + 1):
+        patch = order[starts[k] : starts[k + 1]]
+        corners = np.unique(mesh.faces[patch])
+        rim = corners[measured[corners]]
+        across = extent_across(mesh.vertices[rim]) if len(rim) else np.inf  # no rim: it floats by itself
+        if across <= fill_mm:
+            kept[patch] = True
+            filled, largest = filled + 1, max(largest, across)
+    area = areas(mesh)
+    share = float(area[kept & imagined].sum() / max(area[kept].sum(), 1e-12))
+    return compact(mesh, kept), Trimmed(filled, largest, share, int(groups.max() + 1 - filled))

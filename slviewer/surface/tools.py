@@ -1,0 +1,71 @@
+"""What every change of a mesh needs: colours and sigmas carried along, unused vertices dropped, normals, distances."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slviewer.registration.open3d_loader import open3d
+from slviewer.surface.shapes import Mesh, PointSet
+
+
+def carried(known: Mesh | PointSet, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """A mesh of new vertices (n, 3) and faces (m, 3) with the colours and sigmas of the nearest known points, and its
+    own normals."""
+    mesh = Mesh(vertices, faces)
+    points = known.vertices if isinstance(known, Mesh) else known.points
+    colours = sigma = None
+    if len(mesh.vertices) and (known.colours is not None or known.sigma_mm is not None):
+        _, nearest = cKDTree(points).query(mesh.vertices)
+        colours = None if known.colours is None else known.colours[nearest]
+        sigma = None if known.sigma_mm is None else known.sigma_mm[nearest]
+    return replace(mesh, colours=colours, sigma_mm=sigma, normals=vertex_normals(mesh))
+
+
+def compact(mesh: Mesh, kept: np.ndarray) -> Mesh:
+    """The faces ``kept`` (m,) bool, and the vertices that they use."""
+    faces = mesh.faces[kept]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    number = np.cumsum(used, dtype=np.int32) - 1
+    fields = {name: getattr(mesh, name) for name in ("normals", "colours", "sigma_mm")}
+    return Mesh(
+        mesh.vertices[used],
+        number[faces] if len(faces) else np.zeros((0, 3), np.int32),
+        **{name: None if value is None else value[used] for name, value in fields.items()},
+    )
+
+
+def vertex_normals(mesh: Mesh) -> np.ndarray:
+    """(n, 3) float32: the mean normal of the faces around each vertex, by their area; 0, 0, 1 where there are none."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    flat = np.cross(b - a, c - a)
+    normals = np.stack(
+        [
+            np.bincount(mesh.faces.ravel(), weights=np.repeat(flat[:, k], 3), minlength=len(mesh.vertices))
+            for k in range(3)
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0]).astype(np.float32)
+
+
+def moved(before: Mesh, after: Mesh) -> tuple[float, float]:
+    """How far the vertices of a mesh lie from the surface that it became, mm: root mean square and largest."""
+    o3d = open3d()
+    middle = before.vertices.mean(axis=0)
+    scene = o3d.t.geometry.RaycastingScene()
+    core = o3d.core
+    scene.add_triangles(core.Tensor(after.vertices - middle), core.Tensor(after.faces.astype(np.uint32)))
+    distance = scene.compute_distance(core.Tensor(before.vertices - middle)).numpy().astype(np.float64)
+    return float(np.sqrt(np.mean(distance**2))), float(distance.max())
+
+
+def legacy(mesh: Mesh) -> Any:
+    """Open3D's triangle mesh of the same vertices and faces."""
+    o3d = open3d()
+    return o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), o3d.utility.Vector3iVector(mesh.faces)
+    )

@@ -1,0 +1,123 @@
+"""Whether a mesh is closed, and where not: edges, openings, parts, the volume inside."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from slviewer.surface.shapes import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """What holds a mesh together.
+
+    ``openings_mm``: how far across each opening is, largest first. ``crowded``: edges of more than two triangles;
+    ``turned``: edges whose two triangles wind against each other. ``volume_mm3``: inside, if it is closed.
+    """
+
+    openings_mm: tuple[float, ...]
+    crowded: int
+    turned: int
+    volume_mm3: float
+
+    @property
+    def watertight(self) -> bool:
+        """Closed, every edge between two triangles that wind alike, and the outside outside."""
+        return not self.openings_mm and not self.crowded and not self.turned and self.volume_mm3 > 0
+
+    def faults(self) -> str:
+        """What keeps it from being watertight, in words; empty where nothing does."""
+        found = []
+        if self.openings_mm:
+            n, largest = len(self.openings_mm), self.openings_mm[0]
+            found.append(f"{n} opening{'s' * (n > 1)}, the largest {largest:.1f} mm across")
+        if self.crowded:
+            found.append(f"{self.crowded} edges where more than two triangles meet")
+        if self.turned:
+            found.append(f"{self.turned} edges whose triangles wind against each other")
+        if not found and not self.volume_mm3 > 0:
+            found.append("its inside is outside")
+        return ", ".join(found)
+
+
+def topology(mesh: Mesh) -> Topology:
+    """Judge a mesh."""
+    if not len(mesh.faces):
+        return Topology((), 0, 0, 0.0)
+    half = half_edges(mesh.faces)
+    low, high = half.min(axis=1).astype(np.int64), half.max(axis=1).astype(np.int64)
+    forth = np.where(half[:, 0] < half[:, 1], 1, -1)
+    _, which, count = np.unique(low * len(mesh.vertices) + high, return_inverse=True, return_counts=True)
+    balance = np.bincount(which, weights=forth)
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    corners -= mesh.vertices.mean(axis=0, dtype=np.float64)
+    volume = float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+    return Topology(
+        openings_mm=tuple(sorted((extent_across(mesh.vertices[loop]) for loop in rims(mesh.faces)), reverse=True)),
+        crowded=int((count > 2).sum()),
+        turned=int(((count == 2) & (balance != 0)).sum()),
+        volume_mm3=volume,
+    )
+
+
+def half_edges(faces: np.ndarray) -> np.ndarray:
+    """(3 m, 2): the sides of faces (m, 3) in their own direction; all first sides, then all second, then all third."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def face_groups(faces: np.ndarray, n_vertices: int, chosen: np.ndarray | None = None) -> np.ndarray:
+    """(m,) int: to which connected part each face belongs; faces not ``chosen`` (m,) bool connect nothing: -1."""
+    picked = faces if chosen is None else faces[chosen]
+    a, b = picked[:, [0, 1]].T, picked[:, [1, 2]].T
+    rows, columns = np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
+    graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(n_vertices, n_vertices))
+    _, labels = connected_components(graph, directed=False)
+    groups = np.full(len(faces), -1)
+    where = slice(None) if chosen is None else chosen
+    _, groups[where] = np.unique(labels[picked[:, 0]], return_inverse=True)
+    return groups
+
+
+def areas(mesh: Mesh) -> np.ndarray:
+    """(m,) mm2 of each face."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+
+
+def extent_across(points: np.ndarray) -> float:
+    """The largest distance in mm between points (n, 3) on both sides of a loop, to within a few percent."""
+    directions = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1],
+                           [0, 1, -1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)  # fmt: skip
+    along = points.astype(np.float64) @ (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
+    return float(np.ptp(along, axis=0).max())
+
+
+def rims(faces: np.ndarray) -> list[np.ndarray]:
+    """The loops around openings: vertices (k,) in the order in which the faces (m, 3) beside them run.
+
+    Where a vertex is on several openings, or on one twice, its loops are told apart; what closes no loop is left out.
+    """
+    half = half_edges(faces)
+    a, b = half[:, 0].astype(np.int64), half[:, 1].astype(np.int64)
+    n = int(faces.max(initial=0)) + 1
+    _, first, count = np.unique(np.minimum(a, b) * n + np.maximum(a, b), return_index=True, return_counts=True)
+    onwards: dict[int, list[int]] = {}
+    for start, end in half[first[count == 1]].tolist():
+        onwards.setdefault(start, []).append(end)
+    loops = []
+    for begin in list(onwards):
+        path, place = [begin], {begin: 0}
+        while onwards.get(path[-1]):
+            step = onwards[path[-1]].pop()
+            if step in place:
+                k = place[step]
+                loops.append(np.array(path[k:]))
+                for gone in path[k + 1 :]:
+                    del place[gone]
+                del path[k + 1 :]
+            else:
+                place[step] = len(path)
+                path.append(step)
+    return loops

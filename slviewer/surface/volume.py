@@ -1,0 +1,86 @@
+"""A surface from a volume: in each cell near the points the mean height above their tangent planes, then its zeros."""
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.jit import kernel
+from slviewer.registration.open3d_loader import open3d
+from slviewer.surface.shapes import Mesh, PointSet
+from slviewer.surface.tools import carried
+
+BLOCK = 8
+REACH = 2.0
+"""Cells around a point in which its tangent plane counts."""
+_MOST_BLOCKS = 20_000_000
+
+
+def volume(points: PointSet, cell_mm: float) -> Mesh:
+    """The surface of points with normals, in cells of ``cell_mm``; it ends where the points end, two cells further.
+
+    Points count by 1 / sigma2 where that is known. Takes memory by the surface's area, not by the box around it.
+    Raises InputError for points without normals, or too far apart for such cells.
+    """
+    if points.normals is None:
+        raise InputError("These points have no normals: a volume needs to know its outside; merge the scans again.")
+    o3d = open3d()
+    origin = points.points.min(axis=0).astype(np.float64) - 4 * cell_mm
+    at = (points.points - origin) / cell_mm
+    shape = np.ceil(at.max(axis=0) / BLOCK).astype(np.int64) + 2
+    if np.prod(shape) > _MOST_BLOCKS:
+        raise InputError(
+            f"The points fill {np.ptp(points.points, axis=0).max():.0f} mm, too much for cells of {cell_mm:.3g} mm: "
+            "leave out stray scans."
+        )
+    touched = np.zeros(tuple(shape), bool)
+    _touch(at, BLOCK, REACH, touched)
+    keys = np.argwhere(touched).astype(np.int32)
+    core, kinds = o3d.core, (o3d.core.float32, o3d.core.float32)
+    grid = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), kinds, ((1,), (1,)), 1.0, BLOCK, len(keys))
+    buffers, _ = grid.hashmap().activate(core.Tensor(keys))
+    lookup = np.full(tuple(shape), -1, np.int32)
+    lookup[tuple(keys.T)] = buffers.numpy()
+    height = grid.attribute("tsdf").numpy().reshape(-1, BLOCK**3)
+    weight = grid.attribute("weight").numpy().reshape(-1, BLOCK**3)
+    height[:], weight[:] = 0, 0
+    sigma = points.sigma_mm
+    share = np.ones(len(points)) if sigma is None else (np.median(sigma) / np.maximum(sigma, 1e-6)) ** 2
+    _spread(at, points.normals.astype(np.float64), share.astype(np.float64), BLOCK, REACH, lookup, height, weight)
+    known = weight > 0
+    height[known] /= weight[known]
+    weight[known] = 1.0
+    found = grid.extract_triangle_mesh(weight_threshold=0.5)
+    if not len(found.vertex.positions):
+        raise InputError("No surface was found between the points: the cells are too fine for them.")
+    vertices = found.vertex.positions.numpy().astype(np.float64) * cell_mm + origin
+    return carried(points, vertices, found.triangle.indices.numpy())
+
+
+@kernel()
+def _touch(at, block, reach, touched):
+    for i in range(len(at)):
+        x0, x1 = int(at[i, 0] - reach) // block, int(at[i, 0] + reach + 1) // block
+        y0, y1 = int(at[i, 1] - reach) // block, int(at[i, 1] + reach + 1) // block
+        z0, z1 = int(at[i, 2] - reach) // block, int(at[i, 2] + reach + 1) // block
+        for x in range(x0, x1 + 1):
+            for y in range(y0, y1 + 1):
+                for z in range(z0, z1 + 1):
+                    touched[x, y, z] = True
+
+
+@kernel()
+def _spread(at, normals, share, block, reach, lookup, height, weight):
+    """Adds each point's plane to the cells' corners around it, at (x, y, z) in cells from the origin."""
+    for i in range(len(at)):
+        p0, p1, p2 = at[i, 0], at[i, 1], at[i, 2]
+        for z in range(int(np.ceil(p2 - reach)), int(np.floor(p2 + reach)) + 1):
+            for y in range(int(np.ceil(p1 - reach)), int(np.floor(p1 + reach)) + 1):
+                for x in range(int(np.ceil(p0 - reach)), int(np.floor(p0 + reach)) + 1):
+                    d0, d1, d2 = x - p0, y - p1, z - p2
+                    near = 1.0 - (d0 * d0 + d1 * d1 + d2 * d2) / (reach * reach)
+                    if near <= 0.0:
+                        continue
+                    w = share[i] * near * near
+                    b = lookup[x // block, y // block, z // block]
+                    k = x % block + block * (y % block + block * (z % block))
+                    height[b, k] += w * (d0 * normals[i, 0] + d1 * normals[i, 1] + d2 * normals[i, 2])
+                    weight[b, k] += w
