@@ -17,6 +17,7 @@ from slviewer.commands.devices import capture, devices, preflight
 from slviewer.commands.exporting import export
 from slviewer.commands.importing import bring_in
 from slviewer.commands.measuring import calibrate, merge, reconstruct, validate, verify
+from slviewer.commands.meshing import mesh
 from slviewer.commands.parsing import union
 from slviewer.commands.proving import prove
 from slviewer.commands.simulating import reproduce, simulate
@@ -36,6 +37,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "reconstruct": reconstruct,
     "verify": verify,
     "merge": merge,
+    "mesh": mesh,
     "compare": compare,
     "export": export,
     "batch": batch,

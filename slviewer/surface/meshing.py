@@ -32,8 +32,8 @@ class MeshingPlan:
 
     ``method``: triangles between the pixels of one scan (grid), one closed surface fitted to all points (poisson), or
     the mean surface in small cells (volume); by default grid for a scan, poisson for merged points. ``fill_holes_mm``:
-    holes up to that far across are filled; by default a few spacings of the points, and with poisson any if it is to be watertight.
-    ``triangles``: no more than so many. ``smooth``: rounds of smoothing. ``watertight``: closed, or refused.
+    holes up to that far across are filled; by default a few spacings of the points, and with poisson any if it is to be
+    watertight. ``triangles``: at most so many. ``smooth``: rounds of smoothing. ``watertight``: closed, or refused.
     """
 
     method: Method | None = None

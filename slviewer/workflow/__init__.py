@@ -22,6 +22,7 @@ _HOMES = {
     "reconstruct": "reconstructing",
     "verify": "verifying",
     "merge": "merging",
+    "mesh": "meshing",
     "compare": "comparing",
     "surface": "measured_surface",
     "add_point": "measuring",
