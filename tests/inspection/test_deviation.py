@@ -1,0 +1,165 @@
+"""Deviation from a nominal model: against analytic truth, and against the simulated object's own mesh."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from slviewer.errors import InputError, SlviewerError
+from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
+from slviewer.inspection.deviation import Deviation, deviation
+from slviewer.inspection.nominal_surface import NominalSurface
+from slviewer.inspection.tolerance import Verdict, judged
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.mesh import MeshScene, demo_object
+from slviewer.simulation.plans import rotation
+from slviewer.surface.shapes import Mesh
+
+NOISE = 0.04
+POSE = Pose(rotation(np.radians([8.0, -5.0, 4.0])), np.array([-3.0, 4.0, 455.0]))
+
+
+def looked_at(scene: MeshScene, width: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """Exact points and normals (h, w, 3) that a camera sees."""
+    u, v = np.meshgrid(np.linspace(-0.2, 0.2, width), np.linspace(-0.16, 0.16, round(0.8 * width)))
+    seen = scene.trace(np.stack([u, v], -1))
+    return seen.points, seen.normals
+
+
+def noisy(points: np.ndarray, seed: int = 0) -> np.ndarray:
+    return (
+        points
+        + points / points[..., 2:] * (NOISE * np.random.default_rng(seed).normal(size=points.shape[:2]))[..., None]
+    )
+
+
+@pytest.fixture(scope="module")
+def ammonite() -> tuple[MeshScene, Mesh, np.ndarray, np.ndarray]:
+    scene = demo_object(POSE)
+    return scene, Mesh(scene.vertices, scene.triangles), *looked_at(scene)
+
+
+@pytest.fixture(scope="module")
+def found(ammonite) -> Deviation:
+    _, nominal, points, normals = ammonite
+    seen = np.isfinite(points[..., 0])
+    return deviation(noisy(points)[seen], nominal, normals=normals[seen], sigma_mm=NOISE)
+
+
+def test_the_simulated_object_deviates_from_its_own_mesh_by_its_noise(found, ammonite) -> None:
+    _, _, points, normals = ammonite
+    seen = np.isfinite(points[..., 0])
+    towards = np.abs(np.sum(points / points[..., 2:] * normals, -1))[seen]
+    expected = float(np.sqrt(np.mean((NOISE * towards) ** 2)))
+    numbers = found.statistics()
+    assert 0.93 * expected < numbers["rms"] < 1.05 * expected
+    assert abs(numbers["mean"]) < 0.003 and numbers["left_out"] < 0.02 * numbers["points"]
+    assert 1.8 * numbers["rms"] < numbers["within_95"] < 2.1 * numbers["rms"]
+    assert 0.4 < found.coverage < 0.65 and len(found.uncovered)  # its back was not seen
+    edges, counts = found.histogram()
+    assert edges[0] == -edges[-1] and 0.99 * numbers["points"] < counts.sum() <= numbers["points"]
+
+
+def test_the_best_fit_lies_within_microns_of_the_truth(found) -> None:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = POSE.R, POSE.t
+    wrong = found.T_nominal_scan @ T
+    assert np.linalg.norm(wrong[:3, 3]) < 0.02
+    assert np.degrees(np.arccos((np.trace(wrong[:3, :3]) - 1) / 2)) < 0.01
+    assert found.alignment_mm < 0.005
+
+
+def test_a_table_is_left_out_and_told(ammonite, found) -> None:
+    _, nominal, points, normals = ammonite
+    seen = np.isfinite(points[..., 0])
+    scan, facing = noisy(points)[seen], normals[seen]
+    rng = np.random.default_rng(1)
+    table = np.column_stack([rng.uniform(-150, 150, (4000, 2)), np.full(4000, 500.0)])
+    together = np.concatenate([scan, table])
+    normals = np.concatenate([facing, np.tile([0.0, 0.0, -1.0], (4000, 1))])
+    again = deviation(together, nominal, normals=normals, initial=found.T_nominal_scan)
+    assert again.statistics()["rms"] < 0.05
+    left_out = ~again.counted[len(scan) :]
+    assert left_out.mean() > 0.97 and again.reach_mm == pytest.approx(0.02 * NominalSurface(nominal).diagonal)
+
+
+def bumped(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A box's top with a bump 0.1 mm high."""
+    return 0.1 * np.clip(1.2 - np.hypot(x - 8, y - 4) / 4, 0, 1)
+
+
+def box_scan(noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Three sides of a box of 60 x 40 x 20 mm, with the bump on its top; points and normals."""
+    rng = np.random.default_rng(2)
+    a, b = rng.uniform(-0.5, 0.5, (2, 12_000))
+    top = np.column_stack([60 * a, 40 * b, np.full(12_000, 10.0)])
+    front, side = top[:4000] * [1, 0, 0], top[:4000] * [0, 1, 0]
+    front[:, 1:] = np.column_stack([np.full(4000, -20.0), 20 * b[4000:8000]])
+    side[:, [0, 2]] = np.column_stack([np.full(4000, 30.0), 20 * a[4000:8000]])
+    points = np.concatenate([top, front, side])
+    normals = np.repeat([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]], [12_000, 4000, 4000], axis=0)
+    height = np.zeros(len(points))
+    height[:12_000] = bumped(top[:, 0], top[:, 1])
+    return points + normals * (height + noise * rng.normal(size=len(points)))[:, None], normals
+
+
+def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
+    box = trimesh.creation.box((60, 40, 20))
+    points, normals = box_scan(0.01)
+    R, t = rotation(np.radians([160.0, 10.0, 20.0])), np.array([10.0, -5.0, 480.0])
+    found = deviation(
+        points @ R.T + t, Mesh(box.vertices, box.faces), normals=normals @ R.T, initial=np.linalg.inv(_pose(R, t))
+    )
+    x, y = points[:12_000, 0] - 8, points[:12_000, 1] - 4
+    plateau = np.hypot(x, y) < 0.7
+    away = np.hypot(x, y) > 6
+    height = np.nanmean(found.signed[:12_000][plateau]) - np.nanmean(found.signed[:12_000][away])
+    assert height == pytest.approx(0.1, abs=0.005)
+    verdict = judged(found, np.full(len(points), 0.01), 0.06)
+    assert verdict.decision == "fail" and verdict.highest[1] == "fail" and verdict.lowest[1] == "pass"
+    assert verdict.inside > 90 and 0.05 < verdict.outside < 5
+    assert verdict.inside + verdict.outside + verdict.close == pytest.approx(100)
+    assert Verdict.from_dict(verdict.to_dict()) == verdict
+    assert judged(found, np.full(len(points), 0.01), 0.3).decision == "pass"
+    assert judged(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
+
+
+def _pose(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+def test_signed_distances_are_those_of_a_box_inside_outside_and_round_its_corners() -> None:
+    box = trimesh.creation.box((60, 40, 20))
+    places = np.random.default_rng(0).uniform(-45, 45, (3000, 3))
+    beyond = np.abs(places) - [30, 20, 10]
+    true = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+    away, normals = NominalSurface(Mesh(box.vertices, box.faces)).signed(places)
+    assert np.abs(away - true).max() < 1e-3
+    assert np.abs(np.linalg.norm(normals, axis=1) - 1).max() < 1e-6
+    moved, _ = NominalSurface(Mesh(box.vertices, box.faces)).signed(places + 1e-2 * normals)
+    assert np.allclose((moved - away)[np.abs(away) > 0.1], 1e-2, atol=2e-3)
+
+
+def test_an_open_nominal_has_two_sides_and_nothing_beyond_its_rim() -> None:
+    sheet = Mesh([[-10, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]], [[0, 1, 2], [0, 2, 3]])
+    surface = NominalSurface(sheet)
+    away, _ = surface.signed(np.array([[0, 0, 0.3], [3, 4, -0.2], [12.0, 0, 0.1], [10.05, 0, 0.3]]))
+    assert away[:2] == pytest.approx([0.3, -0.2], abs=1e-5) and away[2] == np.inf and np.isfinite(away[3])
+
+
+def test_another_part_is_refused(ammonite) -> None:
+    _, _, points, normals = ammonite
+    seen = np.isfinite(points[..., 0])
+    other = trimesh.creation.box((120, 100, 70))
+    with pytest.raises(SlviewerError):
+        deviation(points[seen][::3], Mesh(other.vertices, other.faces), normals=normals[seen][::3])
+    with pytest.raises(InputError, match="no triangles"):
+        NominalSurface(Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)))
+
+
+def test_colours_run_from_blue_through_pale_to_red() -> None:
+    blue, pale, red, more, unknown = deviation_colours(np.array([-0.1, 0.0, 0.1, 0.5, np.nan]), 0.1).tolist()
+    assert blue[2] > 2 * blue[0] and min(pale) > 200 and red[0] > 3 * red[2]
+    assert more == red and tuple(unknown) == LEFT_OUT
+    assert colour_limit(np.array([np.nan, 1.0]), 0.2) == 0.2 and colour_limit(np.full(9, -0.3)) == pytest.approx(0.3)

@@ -1,0 +1,95 @@
+"""Regions that can be kept, and surfaces cut by planes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from slviewer.errors import InputError
+from slviewer.inspection.regions import Region
+from slviewer.inspection.section import CutPlane, between, nearest_on, radius_through, section
+
+
+def kept(region: Region) -> Region:
+    return Region.from_dict(json.loads(json.dumps(region.to_dict())))
+
+
+def test_regions_are_the_same_after_they_were_kept() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-5, 5, (30, 41, 3))
+    points[3] = np.nan
+    mask = rng.random((30, 41)) > 0.4
+    regions = [Region.of_mask(mask), Region.ball([0, 0, 0], 3.0), Region.box([1, 1, 1], [-2, -2, -2])]
+    for region in regions:
+        inside = kept(region).within(points)
+        assert np.array_equal(inside, region.within(points)) and inside.any() and not inside[3].any()
+        assert region.text() == kept(region).text()
+    assert np.array_equal(regions[0].within(points), mask & np.isfinite(points[..., 0]))
+    assert len(json.dumps(Region.of_mask(np.ones((1200, 1600), bool)).to_dict())) < 2000
+    chosen = Region.of_indices(np.array([2, 5]), 8)
+    assert np.flatnonzero(kept(chosen).within(np.zeros((8, 3)))).tolist() == [2, 5]
+
+
+def test_regions_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InputError, match="select it anew"):
+        Region.of_mask(np.ones((4, 5), bool)).within(np.zeros((5, 4, 3)))
+    with pytest.raises(InputError, match="of a surface of 3"):
+        Region.of_indices(np.array([3]), 3)
+    with pytest.raises(InputError, match="above 0 mm"):
+        Region.ball([0, 0, 0], 0.0)
+    with pytest.raises(InputError, match="no place"):
+        Region.ball([0, np.nan, 0], 1.0)
+    for damage in ({"bits": "!"}, {"shape": [1 << 20, 1 << 20]}, {"bits": "eJwDAAAAAAE="}):
+        with pytest.raises(InputError, match="damaged"):
+            Region.from_dict(Region.of_mask(np.ones((40, 50), bool)).to_dict() | damage)
+
+
+def ball(radius: float) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(4, radius)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def test_a_ball_is_cut_in_a_circle_that_its_cursors_read() -> None:
+    vertices, faces = ball(40.0)
+    plane = CutPlane.through([-1, 0, 24], [1, 0, 24], [0, 1, 0])
+    (line,) = section(vertices, faces, plane)
+    assert np.array_equal(line[0], line[-1])  # closed
+    radii = np.linalg.norm(line - [1, 0], axis=1)  # the first point is the drawing's origin
+    assert np.allclose(radii, 32.0, atol=0.15)
+    turns = np.diff(np.unwrap(np.arctan2(line[:, 1], line[:, 0] - 1)))
+    assert (turns > 0).all() or (turns < 0).all()  # one point after the other
+    a, b, c = line[[0, 40, 90]]
+    assert radius_through(a, b, c).value == pytest.approx(32.0, abs=0.3)
+    top = nearest_on([line], 1.0)
+    assert top[1] == pytest.approx(32.0, abs=0.2) and nearest_on([line], 1.0, -20)[1] == pytest.approx(-32.0, abs=0.2)
+    read = {q.name: q.value for q in between(np.array([0.0, 1.0]), np.array([3.0, 5.0]))}
+    assert read == {"distance": 5.0, "along": 3.0, "height difference": 4.0}
+
+
+def test_an_open_surface_is_cut_in_lines_from_left_to_right_the_longest_first() -> None:
+    u, v = np.meshgrid(np.arange(40.0), np.arange(30.0))
+    points = np.stack([u, v, 500 - 2 * np.sin(u / 5)], -1)
+    from slviewer.reconstruction.mesh import grid_triangles
+
+    points[:, 25] = np.nan  # a gap
+    faces, vertices = grid_triangles(points, 50.0), points[np.isfinite(points[..., 0])]
+    plane = CutPlane.through([0, 12.5, 500], [10, 12.5, 500], [0, 0, -1])
+    lines = section(vertices, faces, plane)
+    assert [len(line) > 5 for line in lines] == [True, True] and np.ptp(lines[0][:, 0]) == 24 > np.ptp(lines[1][:, 0])
+    for line in lines:
+        assert (np.diff(line[:, 0]) > 0).all() and np.allclose(line[:, 1], 2 * np.sin(line[:, 0] / 5), atol=0.03)
+    assert CutPlane.from_dict(json.loads(json.dumps(plane.to_dict()))).normal == pytest.approx(plane.normal)
+
+
+def test_sections_that_cannot_be_are_refused() -> None:
+    vertices, faces = ball(10.0)
+    with pytest.raises(InputError, match="does not meet"):
+        section(vertices, faces, CutPlane.through([0, 0, 11], [1, 0, 11], [0, 1, 0]))
+    with pytest.raises(InputError, match="are one"):
+        CutPlane.through([0, 0, 0], [0, 0, 0], [0, 1, 0])
+    with pytest.raises(InputError, match="above one another"):
+        CutPlane.through([0, 0, 0], [0, 5, 0], [0, 1, 0])
+    with pytest.raises(InputError, match="straight line"):
+        radius_through(np.zeros(2), np.ones(2), 3 * np.ones(2))

@@ -1,0 +1,210 @@
+"""Measurements of a session, and a scan against its nominal model, from the command line too."""
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.errors import InputError, SessionError
+from slviewer.evaluation.region import find_spheres
+from slviewer.fringe.presets import p18
+from slviewer.inspection.regions import Region
+from slviewer.session.ply import read_ply
+from slviewer.session.store import Session
+from slviewer.simulation.assets import asset
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.mesh import demo_object
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.scenes import Spheres
+from slviewer.simulation.truth import rig_record
+from slviewer.workflow import measuring
+from slviewer.workflow.measured_surface import Surface, surface
+from slviewer.workflow.models import save_imported_stereo
+from slviewer.workflow.reporting import report
+from slviewer.workflow.simulating import one_axis
+
+Run = Callable[..., tuple[int, str, str]]
+CENTRES = np.array([[-38.0, 0.0, 560.0], [42.0, 6.0, 570.0]])
+RADIUS = 25.0
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A session whose imported calibration is the truth, with a scan of the demo object and one of two balls."""
+    folder = tmp_path_factory.mktemp("measuring") / "session"
+    rig = letter(0.2, seed=2, local_distortion_px=0)
+    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    scenes = {
+        "object": demo_object(Pose(np.eye(3), np.array([0.0, 0.0, 520.0]))),
+        "balls": Spheres(CENTRES, RADIUS),
+    }
+    with Session.create(folder) as store:
+        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        for i, (name, scene) in enumerate(scenes.items()):
+            frames = Renderer(rig, scene).capture(sequence, i)
+            store.save_capture(name, "scan", sequence, frames, source="simulated")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def balls(made) -> Surface:
+    return surface(made, "balls")
+
+
+@pytest.fixture
+def folder(made, tmp_path) -> Path:
+    shutil.copytree(made, tmp_path / "session", symlinks=True)
+    return tmp_path / "session"
+
+
+def tops(on: Surface) -> list[tuple[int, int]]:
+    """The pixel of each ball that is nearest to the camera."""
+    found = []
+    for region in find_spheres(on.points, 2, on.sigma_mm, RADIUS):
+        z = np.where(region & on.measured, on.points[..., 2], np.inf)
+        v, u = np.unravel_index(np.argmin(z), z.shape)
+        found.append((int(u), int(v)))
+    return found
+
+
+def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_path) -> None:
+    a, b = tops(balls)
+    regions = find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)
+    first, second = (
+        measuring.add_fit(folder, balls, "sphere", Region.of_mask(r), n) for r, n in zip(regions, "LR", strict=True)
+    )
+    apart = measuring.add_relation(folder, first.id, second.id)
+    width = measuring.add_distance(folder, balls, a, b, "width")
+    cut = measuring.add_section(folder, balls, a, b)
+    point = measuring.add_point(folder, balls, a)
+    over = measuring.add_relation(folder, point.id, first.id)
+
+    radius = measuring.quantities_of(first)[0]
+    assert abs(radius.value - RADIUS) < max(3 * radius.sigma, 0.02) and 0 < radius.sigma < 0.1 and not radius.whole
+    true = np.linalg.norm(CENTRES[1] - CENTRES[0])
+    distance = measuring.quantities_of(apart)[0]
+    assert abs(distance.value - true) < max(3 * distance.sigma, 0.02) and apart.of == (first.id, second.id)
+    assert abs(measuring.quantities_of(width)[0].value - true) < 3 and measuring.quantities_of(width)[0].sigma > 0
+    assert abs(measuring.quantities_of(over)[1].value) < 0.3  # the point lies on the ball's surface
+    plane, lines = measuring.section_lines(folder, cut.id)
+    assert len(lines) >= 2 and max(np.ptp(line[:, 0]) for line in lines) < 2 * RADIUS
+    assert np.allclose(plane.drawn(balls.points[a[1], a[0]][None].astype(float)), 0, atol=1e-3)
+
+    listed = measuring.measurements(folder)
+    assert [each.id for each in listed] == ["m1", "m2", "m3", "m4", "m5", "m6", "m7"]
+    assert not any(each.stale for each in listed) and listed[2].name == "L – R"
+    status, said, _ = run("inspect", folder)
+    assert status == 0 and "7 measurements:" in said and "L (sphere on balls): radius 25.0" in said
+    assert measuring.export_measurements(folder, tmp_path / "m.csv") == 7
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "m.csv").read_text("utf-8-sig"))))
+    assert rows[0]["name"] == "L" and rows[0]["unit"] == "mm" and rows[0]["calibration in U"] == "no"
+    assert float(rows[0]["U (k = 2)"]) == pytest.approx(2 * radius.sigma, rel=1e-4)
+
+    report(folder, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert (
+        "Measurements" in page and "L – R" in page and "without the calibration" in page and "Section section 5" in page
+    )
+
+
+def test_measurements_are_renamed_deleted_and_brought_back(folder, balls) -> None:
+    a, b = tops(balls)
+    one = measuring.add_distance(folder, balls, a, b)
+    assert one.name == "distance 1"
+    assert measuring.rename(folder, one.id, "=width").name == "=width"
+    assert ",'=width," in measuring.measurements_csv(folder).replace("m1,'", "m1,'")  # no formula for a spreadsheet
+    assert measuring.rename(folder, one.id, "").name == "distance 1"
+    two = measuring.add_distance(folder, balls, b, a, "back")
+    measuring.remove(folder, two.id)
+    three = measuring.add_distance(folder, balls, a, b)
+    assert three.id == "m3"  # an id that was deleted can come back
+    assert measuring.restore(folder).name == "back"
+    assert [each.id for each in measuring.measurements(folder)] == ["m1", "m2", "m3"]
+    with pytest.raises(InputError, match="none to bring back"):
+        measuring.restore(folder)
+    with pytest.raises(InputError, match="no measurement 'm9': there are m1, m2, m3"):
+        measuring.rename(folder, "m9", "x")
+
+
+def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls) -> None:
+    regions = find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)
+    fits = [measuring.add_fit(folder, balls, "sphere", Region.of_mask(region)) for region in regions]
+    measuring.add_relation(folder, fits[0].id, fits[1].id)
+    measuring.remove(folder, fits[1].id)
+    assert [each.stale for each in measuring.measurements(folder)] == [False, True]
+    measuring.restore(folder, fits[1].id)
+    assert not any(each.stale for each in measuring.measurements(folder))
+    with Session.open(folder, write=True) as store:
+        other = store.load_capture("object")
+        store.save_capture("balls", "scan", other.sequence, other.frames[::1], source="again", force=True)
+    assert all(each.stale for each in measuring.measurements(folder))
+    assert "[stale" in measuring.in_words(measuring.measurements(folder)[0])
+    with pytest.raises(InputError, match="is stale"):
+        measuring.add_relation(folder, fits[0].id, fits[1].id)
+
+
+def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls) -> None:
+    with pytest.raises(InputError, match="nothing was measured at"):
+        measuring.add_distance(folder, balls, (0, 0), tops(balls)[0])
+    with pytest.raises(InputError, match="lies outside balls"):
+        measuring.add_point(folder, balls, (-1, 5))
+    with pytest.raises(InputError, match="is no place on balls"):
+        measuring.add_point(folder, balls, 7)
+    with pytest.raises(InputError, match="bends"):
+        measuring.add_fit(
+            folder, balls, "plane", Region.of_mask(find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)[0])
+        )
+    with pytest.raises(InputError, match="0 measured points"):
+        measuring.add_fit(folder, balls, "sphere", Region.ball([0, 0, 0], 5.0))
+    one = measuring.add_distance(folder, balls, *tops(balls))
+    with pytest.raises(InputError, match="choose a point, plane, sphere"):
+        point = measuring.add_point(folder, balls, tops(balls)[0])
+        measuring.add_relation(folder, one.id, point.id)
+    assert len(measuring.measurements(folder)) == 2
+
+
+def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: Run, tmp_path) -> None:
+    ammonite = asset("objects/ammonite.ply")
+    arguments = ("compare", folder, "object", ammonite, "--tolerance", 1.5, "--json", tmp_path / "c.json")
+    status, said, wrong = run(*arguments, "--out", tmp_path / "d.ply")
+    assert status == 0, wrong
+    assert "PASS: decided with a guard band" in said and "of the nominal's area was measured" in said
+    found = json.loads((tmp_path / "c.json").read_text())
+    assert found["noise_mm"] < found["statistics_mm"]["rms"] < 2.5 * found["noise_mm"]
+    assert found["tolerance"]["decision"] == "pass" and 0.3 < found["coverage"] < 0.7
+    written = read_ply(tmp_path / "d.ply")
+    assert written.faces is not None and len(written.faces) and written.colours is not None
+    assert len(written.points) == found["statistics_mm"]["points"]
+    assert np.sqrt(np.mean(written.scalars["deviation"] ** 2)) == pytest.approx(found["statistics_mm"]["rms"], rel=1e-3)
+
+    status, said, _ = run("inspect", folder)
+    assert "object against ammonite.ply (deviation on object): mean" in said
+    report(folder, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert "Deviation from nominal" in page and "coloured by its deviation from ammonite.ply" in page
+
+    small = read_ply(ammonite)
+    from trimesh import Trimesh
+
+    Trimesh(small.points / 25.4, small.faces, process=False).export(tmp_path / "inch.stl")
+    status, _, wrong = run("compare", folder, "object", tmp_path / "inch.stl")
+    assert status == 1 and "--units inch" in wrong and "Traceback" not in wrong
+    (tmp_path / "broken.stl").write_bytes(b"\0" * 300)
+    status, _, wrong = run("compare", folder, "object", tmp_path / "broken.stl")
+    assert status == 1 and "broken.stl" in wrong
+    assert len(measuring.measurements(folder)) == 1
+
+
+def test_a_damaged_measurement_is_told_not_guessed(folder, balls) -> None:
+    one = measuring.add_section(folder, balls, *tops(balls))
+    next((folder / "results" / "measurements" / one.id).rglob("lines.npy")).write_bytes(b"x")
+    with pytest.raises(SessionError, match="missing or damaged"):
+        measuring.section_lines(folder, one.id)
