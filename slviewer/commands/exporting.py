@@ -19,6 +19,11 @@ def export(
     out: Path | None = None,
     format: str = "",
     model: ModelName | None = None,
+    method: Literal["grid", "poisson", "volume"] | None = None,
+    fill_holes: float | None = None,
+    triangles: int | None = None,
+    smooth: int = 0,
+    watertight: bool = False,
     accept_rejected: bool = False,
 ) -> None:
     """Write a file for other programs: shapes in mm as .ply .stl .obj .xyz, in metres as .glb; the calibration; poses.
@@ -32,9 +37,25 @@ def export(
         out: The file, whose suffix says how it is written, or a folder; by default the session's exports.
         format: ply, stl, obj, glb, xyz, yml, xml, json, …, where out is a folder or left out.
         model: Which calibration to make a cloud with; by default the one that the scan is kept from, or the best.
+        method: Of a mesh: triangles between the pixels of one scan, one surface fitted to all points, or the mean
+            surface in small cells; by default grid for a scan, poisson for a merge.
+        fill_holes: Of a mesh: fill holes up to so many mm across; by default those of a few points.
+        triangles: Of a mesh: no more than so many.
+        smooth: Of a mesh: rounds of smoothing; how far they moved the surface is said.
+        watertight: Of a mesh: closed, or refused.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
+    from slviewer.surface.meshing import MeshingPlan  # only now: nothing heavy is imported before it is needed
+
     found = workflow.export(
-        session, what, name, out=out, file_format=format, model=model, accept_rejected=accept_rejected, **ui()
+        session,
+        what,
+        name,
+        out=out,
+        file_format=format,
+        model=model,
+        plan=MeshingPlan(method, fill_holes, triangles, smooth, watertight),
+        accept_rejected=accept_rejected,
+        **ui(),
     )
     print(found.text())

@@ -8,6 +8,7 @@ from slviewer.errors import InputError
 from slviewer.session.atomic import megabytes
 from slviewer.session.mesh_files import IN_WORDS, MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
 from slviewer.session.store import Session
+from slviewer.surface.meshing import MeshingPlan
 from slviewer.workflow.exporting_documents import (
     write_calibration_file,
     write_coefficients,
@@ -70,13 +71,17 @@ def units(file_format: str) -> str:
     return IN_WORDS.get(file_format) or DOCUMENTS.get(file_format, "")
 
 
-def foreseen_bytes(what: What, file_format: str, points: int, model: str = "", coloured: bool = True) -> int | None:
-    """About how large a file of a scan or a merge of so many points becomes; None where that is not known before."""
-    if what not in ("cloud", "mesh", "merge"):
-        return None
-    faces = 2 * points if what == "mesh" else 0  # between neighbouring pixels, all but those at borders
-    scalars = 3 if model == "splined" else 1
-    return estimated_bytes(file_format, points, faces, colours=coloured, scalars=scalars)
+def foreseen_bytes(
+    what: What, file_format: str, points: int, model: str = "", triangles: int | None = None
+) -> int | None:
+    """About how large a file of a scan or a merge of so many points becomes, thinned to ``triangles`` where that is
+    wanted; None where it is not known before."""
+    if what in ("cloud", "merge"):
+        return estimated_bytes(file_format, points, scalars=3 if model == "splined" else 1)
+    faces = 2 * points if what == "mesh" else None  # between neighbouring pixels, all but those at borders
+    if triangles is not None:
+        faces = triangles if faces is None else min(triangles, faces)
+    return None if faces is None else estimated_bytes(file_format, faces // 2, faces, scalars=1)
 
 
 def check_export(what: What, file_format: str) -> None:
@@ -103,6 +108,7 @@ def export(
     out: Path | str | None = None,
     file_format: str = "",
     model: str | None = None,
+    plan: MeshingPlan | None = None,
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
@@ -112,7 +118,7 @@ def export(
     ``name``: the scan of a cloud or a mesh (not needed where there is one alone), the number of a merge (the last one
     by default), the model of the coefficients. ``out``: the file, whose suffix says how it is written, or a folder; by
     default the session's exports, as ``file_format`` or the first of ``FORMATS``. ``model``: the calibration that
-    clouds are made with, by default the one they are kept from, else the preferred one.
+    clouds are made with, by default the one they are kept from, else the preferred one. ``plan``: how to mesh.
     """
     with opened(session) as store:
         chosen = file_format.lower().removeprefix(".")
@@ -121,8 +127,10 @@ def export(
         target = _target(store, what, name, out, chosen)
         if what not in ("report", "table"):
             check_accepted(store, accept_rejected)
-        if what in ("cloud", "mesh", "merge", "merged-mesh"):
-            words = _write_shape(store, what, name, target, model, progress, warn)
+        if what in ("mesh", "merged-mesh"):
+            words = _write_shape(store, what, name, target, model, plan or MeshingPlan(), progress, warn)
+        elif what in ("cloud", "merge"):
+            words = _write_shape(store, what, name, target, model, None, progress, warn)
         elif what == "report":
             report(store, target, progress=progress, warn=warn)
             words = "report"
@@ -134,16 +142,23 @@ def export(
 
 
 def _write_shape(
-    store: Session, what: What, name: str, target: Path, model: str | None, progress: Progress, warn: Warn
+    store: Session,
+    what: What,
+    name: str,
+    target: Path,
+    model: str | None,
+    plan: MeshingPlan | None,
+    progress: Progress,
+    warn: Warn,
 ) -> str:
-    making = part(progress, 0, 0.7)
+    making = part(progress, 0, 0.8)
     if what in ("cloud", "mesh"):
-        made = scan_shape(store, name, model, what == "mesh", making, warn)
+        made = scan_shape(store, name, model, plan, making, warn)
     else:
-        made = merge_shape(store, name, what == "merged-mesh", making, warn)
-    progress(0.75, f"writing {target.name}")
+        made = merge_shape(store, name, plan, making, warn)
+    progress(0.85, f"writing {target.name}")
     write_shape(target, made.shape, scalars=made.scalars, notes=made.notes)
-    return f"{made.text()}, in {units(target.suffix.lower().removeprefix('.'))}"
+    return "; ".join([f"{made.text()}, in {units(target.suffix.lower().removeprefix('.'))}", *made.done])
 
 
 def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:

@@ -8,6 +8,7 @@ import viser
 
 from slviewer.errors import SlviewerError
 from slviewer.gui.inputs import Choice, change, titled
+from slviewer.gui.meshing import MeshInputs
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
 from slviewer.gui.views import bring_button
@@ -60,9 +61,11 @@ class Panel:
         with gui.add_folder("Cloud or mesh"):
             self._of = Choice(gui, "Of")
             self._as = gui.add_dropdown("As", (POINTS, MESH))
+            self._mesh = MeshInputs(self._stage, self._say)
             self._shape_format = Choice(gui, "File type")
             self._shape_hint = Words(gui)
             self._shape_link = Words(gui)
+            self._shape_done = Words(gui)
             self._write = gui.add_button("Write file", icon=viser.Icon.FILE_EXPORT)
             self._write.on_click(safely(self._ask_shape))
             bring_button(self._stage, lambda: self._points)
@@ -131,17 +134,22 @@ class Panel:
             return
         self._look(session)
         what, name = self._shape()
+        mesh = what in ("mesh", "merged-mesh")
+        self._mesh.draw(mesh and bool(name), what == "merged-mesh")
         self._shape_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[what]])
         if name:
             chosen = self._shape_format.value
             made = _made(session, file_name(what, name, chosen))
-            self._shape_hint.say(shape_words(session, what, name, chosen, foreseen=made is None), "dim")
+            foreseen = foreseen_bytes(what, chosen, *_points(session, name), self._mesh.triangles if mesh else None)
+            self._shape_hint.say(shape_words(session, what, name, chosen, None if made else foreseen), "dim")
             self._shape_link.set(self._offered(made))
+            self._shape_done.say(self._done(made) if made and mesh else "", "dim")
             kept = made is not None and what == "merge" and chosen == "ply"  # the merge's own file
             change(self._write, visible=not kept, label="Write again" if made else "Write file", color=_tone(made))
         else:
             self._shape_hint.say("Nothing is reconstructed yet: scan an object first.", "warning")
             self._shape_link.set("")
+            self._shape_done.say("")
         numbers: What = self._numbers.value or "calibration"  # type: ignore[assignment]
         self._number_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[numbers]])
         chosen = self._number_format.value
@@ -189,7 +197,8 @@ class Panel:
     def _ask_shape(self) -> None:
         what, name = self._shape()
         if name:
-            self._stage.operator.export(what, name, self._shape_format.value)
+            plan = self._mesh.plan() if what in ("mesh", "merged-mesh") else None
+            self._stage.operator.export(what, name, self._shape_format.value, plan)
 
     def _ask_numbers(self) -> None:
         self._stage.operator.export(self._numbers.value, "", self._number_format.value)
@@ -210,6 +219,12 @@ class Panel:
         ]
         return Html(f'<div style="max-height:{LIST_PX}px;overflow-y:auto">{table(("File", "size", ""), rows)}</div>')
 
+    def _done(self, export: ExportView) -> str:
+        """What was done to make this file, as it was told when it was; empty where that is long ago."""
+        notices = reversed(self._snapshot.notices if self._snapshot else ())
+        said = next((each.text for each in notices if each.text.startswith(f"{export.name} is ready")), "")
+        return said.partition(": ")[2]
+
     def _offered(self, export: ExportView | None) -> str:
         """A link to what was written already; empty where it was not."""
         return "" if export is None else block(self._link(export, f"Download {export.name}, {size(export.bytes)}"))
@@ -222,20 +237,24 @@ class Panel:
             return cell("")
 
 
-def shape_words(session: SessionView, what: What, name: str, file_format: str, foreseen: bool = True) -> str:
-    """What a file of a scan or a merge will be: how it is made, its units, and if `foreseen` about how large."""
-    scan = next((each for each in session.scans if each.name == name), None)
-    points, model = (session.merge.points, "") if scan is None and session.merge else (0, "")
-    if scan is not None:
-        points, model = scan.points, scan.model
+def shape_words(session: SessionView, what: What, name: str, file_format: str, foreseen: int | None) -> str:
+    """What a file of a scan or a merge will be: how it is made, its units, and about how large, where that is known."""
+    points, _ = _points(session, name)
     made = {
-        "cloud": f"Every measured point, {points:,}".replace(",", " "),
-        "mesh": "Triangles between neighbouring pixels; depth jumps stay open",
-        "merge": f"The {points:,} points of all scans".replace(",", " "),
+        "cloud": f"Every measured point, {points:,}",
+        "mesh": "Triangles between the measured points; depth jumps stay open",
+        "merge": f"The {points:,} merged points",
         "merged-mesh": "One surface through all scans, cut off where nothing was measured",
     }[what]
-    about = foreseen_bytes(what, file_format, points, model) if foreseen else None
-    return f"{made}. In {units(file_format)}.{'' if about is None else f' About {size(about)}.'}"
+    return f"{made}. In {units(file_format)}.{'' if foreseen is None else f' About {size(foreseen)}.'}"
+
+
+def _points(session: SessionView, name: str) -> tuple[int, str]:
+    """How many points a scan or the merge has, and a scan's model."""
+    scan = next((each for each in session.scans if each.name == name), None)
+    if scan is not None:
+        return scan.points, scan.model
+    return session.merge.points if session.merge else 0, ""
 
 
 def _made(session: SessionView, name: str) -> ExportView | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from slviewer.session import atomic
 from slviewer.session.names import safe_name
 from slviewer.session.store import Session
+from slviewer.surface.meshing import MeshingPlan
 from slviewer.workflow.exporting import What, export, file_name
 from slviewer.workflow.feedback import Warn
 from slviewer.workflow.models import insisted
@@ -26,13 +27,15 @@ def delivered(session: Session, name: str, report: Reporter) -> Iterator[Path]:
     atomic.discard(folder)
 
 
-def export_file(session: Session, what: What, name: str, file_format: str, report: Reporter, warn: Warn) -> str:
-    """Write one file, as `workflow.export` does; returns its name."""
+def export_file(
+    session: Session, what: What, name: str, file_format: str, plan: MeshingPlan | None, report: Reporter, warn: Warn
+) -> str:
+    """Write one file, as `workflow.export` does; returns what it is, in words that begin with its name."""
     with delivered(session, file_name(what, name, file_format), report) as path:
-        insist = insisted(session)
-        export(session, what, name, out=path, accept_rejected=insist, progress=report.within(0, 0.98), warn=warn)
+        insist, progress = insisted(session), report.within(0, 0.98)
+        found = export(session, what, name, out=path, plan=plan, accept_rejected=insist, progress=progress, warn=warn)
     report(1.0, "exported")
-    return path.name
+    return f"{path.name} is ready to download: {found.words}"
 
 
 def listed(session: Session) -> tuple[ExportView, ...]:

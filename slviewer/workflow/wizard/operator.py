@@ -19,6 +19,7 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
+from slviewer.surface.meshing import MeshingPlan
 from slviewer.target.board import Board
 from slviewer.workflow.calibrating import CalibrationResult
 from slviewer.workflow.exporting import FORMATS, What, check_export
@@ -398,9 +399,10 @@ class Operator(LiveRequests):
         (store.exports / f"merged_{view.merge.name}.ply").unlink(missing_ok=True)
 
     @request("Exporting")
-    def export(self, what: What, name: str = "", file_format: str = "") -> None:
+    def export(self, what: What, name: str = "", file_format: str = "", plan: MeshingPlan | None = None) -> None:
         """Write a file into the session's exports; `exporting.FORMATS` lists what there is and the formats, the first
         by default. `name` is the scan of a cloud or a mesh, and the model of coefficients; a merge is the current one.
+        `plan` says how to mesh.
         """
         store, view = self._engine.store, self._engine.teller.now().session
         chosen = file_format or FORMATS.get(what, ("",))[0]
@@ -415,8 +417,8 @@ class Operator(LiveRequests):
             name = view.merge.name
         self._submit(
             "Exporting",
-            lambda r: export_file(store, what, name, chosen, r, self._warn),
-            lambda file_name: f"{file_name} is ready to download",
+            lambda r: export_file(store, what, name, chosen, plan, r, self._warn),
+            str,
         )
 
     def report(self) -> bool:

@@ -14,7 +14,6 @@ from slviewer.calibration.guidance import choosing
 from slviewer.errors import Cancelled
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
-from slviewer.workflow import exporting_shapes
 from slviewer.workflow.wizard import looking, work
 from slviewer.workflow.wizard.autopilot import TARGET, Autopilot
 from slviewer.workflow.wizard.jobs import Reporter
@@ -144,8 +143,7 @@ def test_work_given_up_inside_a_long_call_saves_nothing(
         assert store.state_of("poses/pose_05") == "absent"
 
 
-def test_files_for_other_programs(operator: Operator, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exporting_shapes, "_CELLS", 100)  # a coarse surface does
+def test_files_for_other_programs(operator: Operator) -> None:
     assert operator.export("mesh", "scan_01", "stl") and operator.export("mesh", "scan_01", "glb")
     assert operator.export("cloud", "scan_02") and operator.export("calibration") and operator.export("table")
     assert operator.export("merged-mesh") and operator.diagnostic_bundle()
