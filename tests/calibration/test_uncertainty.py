@@ -17,6 +17,8 @@ from slviewer.calibration.splined.volume import (
 )
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
+from slviewer.inspection.relations import distance
+from slviewer.inspection.uncertainty import Spread, splined_shared
 from slviewer.reconstruction.reconstruct import reconstruct
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
@@ -166,3 +168,20 @@ def test_a_proof_pools_its_rigs_and_says_whether_it_holds() -> None:
     record = both.to_json()
     assert [row["rig"] for row in record["rigs"]] == ["cautious", "bold", "pooled"] and record["holds"]
     assert "1.00 lies between" in both.text() and "does NOT lie" in UncertaintyProof((bold,), 0.5, 25).text()
+
+
+def test_what_is_fitted_is_as_sure_as_the_calibrations_covariance_says(model) -> None:
+    bundle = model.bundle
+    volume = working_volume(model.rig, bundle.depth_range_mm, columns=5, rows=4, depths=3)
+    supported = volume.supported(model.rig, *lit(model))
+    pixels, z, points = (each[supported][:2] for each in (volume.pixels, volume.z, volume.points))
+    shared = splined_shared(bundle, "x")
+    ends = [Spread(np.zeros((3, 3)), shared(point[None], np.eye(3)[:, None]), "one") for point in points]
+    found = distance(points[0], points[1], *ends)
+    # a distance does not know of rigid motions: it is the same with them left in
+    along = (points[1] - points[0]) / np.linalg.norm(points[1] - points[0])
+    whitened = bundle.whitened(bundle.point_jacobian("x", pixels, z)).astype(np.float64)
+    assert found.sigma == pytest.approx(np.linalg.norm(whitened @ np.concatenate([-along, along])), rel=0.02)
+    assert 0 < found.sigma < 0.2 and all(np.sqrt(np.trace(end.covariance)) < 0.2 for end in ends)
+    larger = splined_shared(bundle, "x", 1.5)(1.5 * points[:1], np.eye(3)[:, None])
+    assert np.allclose(larger, 1.5 * ends[0].shared, rtol=1e-3, atol=1e-6)
