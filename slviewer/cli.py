@@ -14,6 +14,7 @@ from slviewer import __version__, terminal
 from slviewer.commands.batching import batch
 from slviewer.commands.comparing import compare
 from slviewer.commands.devices import capture, devices, preflight
+from slviewer.commands.dimensions import measure, measurements
 from slviewer.commands.exporting import export
 from slviewer.commands.importing import bring_in
 from slviewer.commands.measuring import calibrate, merge, reconstruct, validate, verify
@@ -39,6 +40,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "merge": merge,
     "mesh": mesh,
     "compare": compare,
+    "measure": measure,
+    "measurements": measurements,
     "export": export,
     "batch": batch,
     "check": check,

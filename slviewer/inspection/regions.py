@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from slviewer.errors import InputError
 
@@ -40,12 +41,12 @@ class Region:
         return cls("set", chosen=mask)
 
     @classmethod
-    def ball(cls, centre: np.ndarray, radius: float) -> "Region":
+    def ball(cls, centre: ArrayLike, radius: float) -> "Region":
         """What lies within ``radius`` mm of ``centre`` (3,)."""
         return cls("ball", centre=_vector(centre), size=_positive([radius]))
 
     @classmethod
-    def box(cls, low: np.ndarray, high: np.ndarray) -> "Region":
+    def box(cls, low: ArrayLike, high: ArrayLike) -> "Region":
         """What lies between two corners (3,) mm."""
         a, b = _vector(low), _vector(high)
         return cls("box", centre=(a + b) / 2, size=_positive(np.abs(b - a) / 2))

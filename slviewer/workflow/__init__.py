@@ -32,6 +32,8 @@ _HOMES = {
     "add_section": "measuring",
     "measurements": "measuring",
     "export_measurements": "measuring",
+    "measure": "dimensions",
+    "tell_measurements": "dimensions",
     "export": "exporting",
     "batch": "batching",
     "check": "drifting",

@@ -107,7 +107,8 @@ def compare(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Compared:
-    """Compare a capture with a nominal model (STL, PLY or OBJ) after best-fit alignment, and keep what is found.
+    """Compare a capture, or a kept merge (``merge/<number>``), with a nominal model (STL, PLY or OBJ) after best-fit
+    alignment, and keep what is found.
 
     ``tolerance``: plus and minus, mm. ``units`` of the model's numbers; where none are given and the sizes do not fit,
     InputError asks for them. ``reach``: mm, beyond which points belong to something else. ``out``: the coloured PLY, by
@@ -117,7 +118,7 @@ def compare(
     with opened(session, write=True) as store:
         reading = part(progress, 0.0, 0.4)
         on = surface(store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn)
-        default = store.exports / f"{scan}_{_stem(ideal.name)}_deviation.ply"
+        default = store.exports / f"{_plain(scan)}_{_plain(Path(ideal.name).stem)}_deviation.ply"
         return compare_surface(
             store,
             on,
@@ -271,6 +272,6 @@ def _kept(
     )
 
 
-def _stem(name: str) -> str:
-    """A file's name without its ending, of letters, digits, dashes."""
-    return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in Path(name).stem)[:60]
+def _plain(name: str) -> str:
+    """A name that a file can have on every system."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in name)[:60]

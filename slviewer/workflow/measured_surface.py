@@ -12,14 +12,15 @@ from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
-from slviewer.workflow.decoding import capture_texture, decode_capture
+from slviewer.workflow.exporting_shapes import scan_cloud
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, check_accepted, load_model, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
-from slviewer.workflow.scaling import corrected_cloud, scale_factor
-from slviewer.workflow.trust import told
+from slviewer.workflow.scaling import scale_factor
 
+MERGED = "merge/"
 Place = tuple[int, int] | int
 """A point of a surface: pixel (u, v) of a scan, or the index of a merged surface's point."""
 
@@ -60,6 +61,11 @@ class Surface:
     def within(self, region: Region) -> np.ndarray:
         """(n, 3) float64: the points of a region."""
         return np.asarray(self.points[region.within(self.points)], np.float64)
+
+    def noise(self, region: Region) -> float:
+        """mm: the region's expected noise in the median; infinite where it is not known."""
+        sigma = self.sigma_mm[region.within(self.points)]
+        return float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else float("inf")
 
     def picked(self, place: Place) -> tuple[Feature, Spread]:
         """A point, with its uncertainty. Raises InputError where nothing was measured there."""
@@ -104,21 +110,14 @@ def surface(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Surface:
-    """Reconstruct a capture to measure on it."""
+    """Reconstruct a capture to measure on it, or read a merge that the session keeps, named ``merge/<number>``."""
     with opened(session) as store:
+        if scan.startswith(MERGED):
+            return merged_surface(store, scan, warn)
         check_accepted(store, accept_rejected)
-        fitted = load_model(store, model or preferred(store))
         warn_if_stale(store, warn)
-        shot = store.load_capture(scan)
-        progress(0.1, "reading frames")
-        frames = shot.stack()
-        for sentence in told(store, scan, frames):
-            warn(f"{scan}: {sentence}")
-        progress(0.3, "decoding")
-        phases = decode_capture(shot, frames)
-        progress(0.6, "reconstructing")
-        cloud = corrected_cloud(store, fitted, phases, texture=capture_texture(shot, frames))
-        found = surface_of(store, scan, cloud, fitted)
+        cloud = scan_cloud(store, scan, model or preferred(store), progress, warn)
+        found = surface_of(store, scan, cloud, load_model(store, cloud.model))
         progress(1.0, "reconstructed")
     return found
 
@@ -143,4 +142,29 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surfac
         calibration=inputs[calibration] if sure else "",
         texture=cloud.texture,
         scale=scale,
+    )
+
+
+def merged_surface(store: Session, merge: str, warn: Warn = unwarned) -> Surface:
+    """A merge that the session keeps as ``merge/<number>``, in the frame of its reference's camera."""
+    meta = store.load_result(merge, only=())[0]
+    if store.state_of(merge) == "stale":
+        warn(f"{merge} came from scans or a calibration that have changed since: merge again")
+    points = read_ply(store.exports / str(meta["ply"]))
+    sigma = points.scalars.get("sigma")
+    sigma = np.full(len(points.points), np.nan, np.float32) if sigma is None else np.where(sigma > 0, sigma, np.nan)
+    normals = points.normals
+    if normals is not None:
+        normals = np.where(normals.any(axis=1, keepdims=True), normals, np.float32(np.nan))
+    model = str(meta.get("model", ""))
+    return Surface(
+        points.points,
+        sigma,
+        merge,
+        model,
+        store.input_hashes(merge),
+        normals=normals,
+        faces=points.faces,
+        texture=points.colours,
+        scale=scale_factor(store, model),
     )

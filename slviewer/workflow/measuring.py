@@ -38,6 +38,8 @@ from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.scaling import scale_factor
 
 Shape = Literal["plane", "sphere", "cylinder"]
+ROUGH = 5.0
+"""Times the points' noise: a fit that leaves more is told of."""
 COLUMNS = ("id", "name", "kind", "scan", "quantity", "value", "unit", "U (k = 2)", "calibration in U", "state", "time")
 
 
@@ -63,6 +65,12 @@ def add_distance(session: SessionLike, on: Surface, a: Place, b: Place, name: st
 def add_fit(session: SessionLike, on: Surface, shape: Shape, region: Region, name: str = "") -> Measurement:
     """A plane, sphere or cylinder fitted to a region. Raises InputError where the region does not hold it."""
     found = fit_feature(shape, on.within(region), on.shared, on.calibration)
+    noise = on.noise(region)
+    if found.rms > ROUGH * noise:
+        told = (
+            f"points lie {found.rms:.3g} mm (RMS) off the {shape}, and their noise is {noise:.2g} mm: see what it shows"
+        )
+        found = replace(found, warnings=(*found.warnings, told))
     arrays = {} if found.spread.shared is None else {"shared": found.spread.shared.astype(np.float32)}
     data = {"region": region.to_dict(), "where": region.text(), "fit": found.to_dict()}
     with opened(session, write=True) as store:

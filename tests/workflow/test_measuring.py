@@ -14,7 +14,7 @@ from slviewer.errors import InputError, SessionError
 from slviewer.evaluation.region import find_spheres
 from slviewer.fringe.presets import p18
 from slviewer.inspection.regions import Region
-from slviewer.session.ply import read_ply
+from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
@@ -208,3 +208,45 @@ def test_a_damaged_measurement_is_told_not_guessed(folder, balls) -> None:
     next((folder / "results" / "measurements" / one.id).rglob("lines.npy")).write_bytes(b"x")
     with pytest.raises(SessionError, match="missing or damaged"):
         measuring.section_lines(folder, one.id)
+
+
+def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, run: Run, tmp_path) -> None:
+    (u, v), (x, y) = tops(balls)
+    for centre, name in zip(CENTRES, ("left", "right"), strict=True):
+        top = centre - [0, 0, RADIUS]
+        status, said, wrong = run("measure", folder, "balls", "sphere", "--ball", *top, 14, "--name", name)
+        assert status == 0 and f"{name} (sphere on balls): radius 2" in said, wrong
+    status, said, _ = run("measure", folder, "balls", "distance", "--at", u, v, x, y)
+    assert status == 0 and said.startswith("m3 ") and "distance 8" in said
+    status, said, _ = run(
+        "measurements", folder, "--relate", "m1", "m2", "--name", "m3", "tops", "--csv", tmp_path / "m.csv"
+    )
+    assert status == 0 and "left – right" in said and "tops (distance" in said and "4 measurements ->" in said
+    assert (tmp_path / "m.csv").read_text("utf-8-sig").startswith("id,name,kind")
+    assert "m4" not in run("measurements", folder, "--delete", "m4")[1]
+    assert "m4" in run("measurements", folder, "--bring-back")[1]
+    for wrong_use in (("plane",), ("plane", "--ball", 1, 2), ("distance", "--at", 3, 4), ("point",)):
+        status, _, wrong = run("measure", folder, "balls", *wrong_use)
+        assert status == 2 and "needs" in wrong
+
+
+def test_a_merge_is_measured_on_too(folder, balls) -> None:
+    chosen = balls.measured
+    with Session.open(folder, write=True) as store:
+        points = balls.points[chosen]
+        sigma = np.full(len(points), 0.05, np.float32)
+        write_ply(store.exports / "merged_1.ply", points, normals=balls.normals[chosen], scalars={"sigma": sigma})
+        meta = {"ply": "merged_1.ply", "model": "stereo", "inputs": store.input_hashes("balls")}
+        store.save_result("merge/1", meta, {})
+    on = surface(folder, "merge/1")
+    region = find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)[0]
+    one = measuring.add_fit(folder, on, "sphere", Region.of_mask(region[chosen]))
+    assert abs(measuring.quantities_of(one)[0].value - RADIUS) < 0.05 and one.source == "merge/1"
+    assert measuring.quantities_of(measuring.add_distance(folder, on, 0, 5))[0].sigma > 0
+    with pytest.raises(InputError, match="mesh it first"):
+        measuring.add_section(folder, on, 0, 5000)
+    with pytest.raises(InputError, match="give an index"):
+        measuring.add_point(folder, on, (3, 4))
+    other = measuring.add_fit(folder, balls, "sphere", Region.of_mask(region))
+    with pytest.raises(InputError, match="not lie in one frame"):
+        measuring.add_relation(folder, one.id, other.id)
