@@ -67,6 +67,8 @@ def at_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
     """
     noise = 6 * np.nan_to_num(sigma_z, nan=0.0, posinf=0.0, neginf=0.0)
     jumps = np.zeros(points.shape[:2], bool)
+    if not np.isfinite(points[..., 2]).any():
+        return jumps
     for here, there in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         step = np.abs(points[there] - points[here])
         across = np.hypot(step[..., 0], step[..., 1])

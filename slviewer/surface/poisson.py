@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.registration.open3d_loader import open3d
+from slviewer.surface.edit import fill_holes
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.surface.tools import carried, compact
 from slviewer.surface.topology import areas, extent_across, face_groups
@@ -47,9 +48,9 @@ def poisson(points: PointSet, cell_mm: float) -> Mesh:
     depth = int(np.clip(np.ceil(np.log2(1.1 * extent / cell_mm)), 4, DEEPEST))
     # one thread: its own pool spins, and where other programs hold the cores it takes a hundred times as long
     surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
-    # the box cuts the surface where it leaves it: those cells may hold degenerate triangles
-    surface.remove_degenerate_triangles()
-    return carried(points, np.asarray(surface.vertices) + middle, np.asarray(surface.triangles))
+    mesh = carried(points, np.asarray(surface.vertices) + middle, np.asarray(surface.triangles))
+    closed, _ = fill_holes(mesh, np.inf)  # where the box around the points cut it
+    return closed
 
 
 def trimmed(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> tuple[Mesh, Trimmed]:

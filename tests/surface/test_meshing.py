@@ -1,0 +1,149 @@
+"""Meshing: closed or refused, holes by their size, and every change told in mm."""
+
+import numpy as np
+import pytest
+from ball_scans import RADIUS, around, ball, off, rms
+
+from slviewer.errors import InputError, SlviewerError
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.surface.edit import fill_holes, smooth, thin, without_small_parts
+from slviewer.surface.fuse import fuse
+from slviewer.surface.grid import grid_mesh
+from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
+from slviewer.surface.shapes import Mesh, PointSet
+from slviewer.surface.tools import compact
+from slviewer.surface.topology import topology
+
+VOLUME = 4 / 3 * np.pi * RADIUS**3
+
+
+@pytest.fixture(scope="module")
+def points() -> PointSet:
+    return fuse(*around()).surface
+
+
+@pytest.fixture(scope="module")
+def closed(points: PointSet) -> Meshed:
+    return mesh_of(points, MeshingPlan(watertight=True))
+
+
+@pytest.fixture(scope="module")
+def open_points() -> PointSet:
+    return fuse(*around(without=("bottom",))).surface
+
+
+def test_scans_all_around_close(points: PointSet, closed: Meshed) -> None:
+    assert closed.topology.watertight and closed.topology.faults() == ""
+    assert closed.topology.volume_mm3 == pytest.approx(VOLUME, rel=2e-3)
+    assert rms(off(closed.mesh.vertices)) < rms(off(points.points)) < 0.04
+    assert closed.mesh.colours is not None and closed.mesh.sigma_mm is not None and closed.mesh.normals is not None
+    outwards = (closed.mesh.normals * closed.mesh.vertices).sum(axis=1) / RADIUS
+    assert np.percentile(outwards, 1) > 0.98
+    assert "watertight, 268" in closed.text() and closed.to_json()["watertight"] is True
+
+
+def test_what_no_scan_saw_stays_open_or_is_closed_as_asked(open_points: PointSet) -> None:
+    plain = mesh_of(open_points)
+    assert len(plain.topology.openings_mm) == 1 and not plain.topology.watertight
+    across = plain.topology.openings_mm[0]
+    assert 20 < across < 75
+    with pytest.raises(SlviewerError, match="does not close: 1 opening, the largest"):
+        mesh_of(open_points, MeshingPlan(fill_holes_mm=0.8 * across, watertight=True))
+    wide = mesh_of(open_points, MeshingPlan(fill_holes_mm=1.2 * across))
+    assert wide.topology.watertight and wide.trimmed is not None
+    assert wide.trimmed.filled == 1 and 0.01 < wide.trimmed.imagined < 0.15
+    assert wide.topology.volume_mm3 == pytest.approx(VOLUME, rel=0.03)
+    assert "% of the surface was not measured" in wide.text()
+
+
+def test_one_side_alone_is_not_closed() -> None:
+    with pytest.raises(SlviewerError, match=r"does not close|would be imagined"):
+        mesh_of(ball(300.0, 0.03, 0), MeshingPlan(watertight=True))
+
+
+def test_a_volume(points: PointSet) -> None:
+    found = mesh_of(points, MeshingPlan("volume", fill_holes_mm=6.0))
+    assert found.topology.watertight and found.topology.volume_mm3 == pytest.approx(VOLUME, rel=3e-3)
+    assert rms(off(found.mesh.vertices)) < 0.04
+
+
+def test_a_scans_grid_ends_where_depth_jumps() -> None:
+    v, u = np.mgrid[:60, :80].astype(float)
+    z = np.where(u < 40, 300.0, 330.0)
+    points = np.stack([(u - 40) / 400 * z, (v - 30) / 400 * z, z], axis=2)
+    mesh = grid_mesh(Cloud(points, "x", "stereo", np.full(z.shape, 0.02), np.full(z.shape, 90, np.uint8)))
+    depths = mesh.vertices[mesh.faces][..., 2]
+    assert np.ptp(depths, axis=1).max() == 0 and set(np.unique(depths)) == {300.0, 330.0}
+    assert mesh.normals is not None and np.allclose(mesh.normals, [0, 0, -1], atol=1e-3)
+    assert mesh.sigma_mm is not None and np.allclose(mesh.sigma_mm, 0.02, rtol=0.05)
+    assert len(topology(mesh).openings_mm) == 2  # the rims of two sheets
+
+
+def sheet(holes: list[tuple[slice, slice]]) -> Mesh:
+    v, u = np.mgrid[:40, :50].astype(float)
+    points = np.stack([u, v, np.full(u.shape, 600.0)], axis=2)
+    index = np.arange(2000).reshape(40, 50)
+    kept = np.ones((39, 49), bool)
+    for hole in holes:
+        kept[hole] = False
+    a, b, c, d = (index[s][kept] for s in (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]))
+    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
+    return compact(Mesh(points.reshape(-1, 3), faces), np.ones(len(faces), bool))
+
+
+def test_holes_are_filled_up_to_their_size() -> None:
+    mesh = sheet([np.s_[5:8, 5:8], np.s_[20:30, 20:30], np.s_[8:10, 8:10]])  # the first and last share a corner
+    assert topology(mesh).openings_mm == pytest.approx((62.6, 14.1, 4.2, 2.8), rel=0.05)
+    filled, report = fill_holes(mesh, 5.0)
+    assert (report.holes, report.left) == (2, 2) and report.largest_mm == pytest.approx(4.2, rel=0.05)
+    found = topology(filled)
+    assert len(found.openings_mm) == 2 and not found.crowded and not found.turned
+    assert filled.normals is not None and np.allclose(filled.normals[:, 2], filled.normals[0, 2])
+    assert fill_holes(mesh, 1.0)[1] == type(report)(0, 0.0, 4)
+
+
+def test_small_parts_go(closed: Meshed) -> None:
+    chip = Mesh([[90, 0, 0], [91, 0, 0], [90, 1, 0]], [[0, 1, 2]])
+    n = len(closed.mesh.vertices)
+    both = Mesh(
+        np.concatenate([closed.mesh.vertices, chip.vertices]), np.concatenate([closed.mesh.faces, chip.faces + n])
+    )
+    cleaned, report = without_small_parts(both)
+    assert len(cleaned.faces) == len(closed.mesh.faces) and report.parts == 1
+    assert report.largest_mm2 == pytest.approx(0.5)
+
+
+def test_thinning_and_smoothing_tell_how_far_they_moved_the_surface(closed: Meshed) -> None:
+    thinned, report = thin(closed.mesh, 3000)
+    assert 2900 <= len(thinned.faces) <= 3000 and topology(thinned).watertight
+    assert 0.001 < report.rms_mm < 0.2 and report.rms_mm < report.max_mm < 1.0
+    assert thinned.colours is not None and thinned.sigma_mm is not None
+    rough = Mesh(
+        closed.mesh.vertices + np.random.default_rng(0).normal(0, 0.1, closed.mesh.vertices.shape), closed.mesh.faces
+    )
+    calm, moved = smooth(rough, 10)
+    assert rms(off(calm.vertices)) < 0.8 * rms(off(rough.vertices))
+    assert 0.01 < moved.rms_mm < 0.1 < moved.max_mm < 1.0
+    assert topology(calm).volume_mm3 == pytest.approx(VOLUME, rel=5e-3)
+
+
+def test_what_is_wrong_with_a_mesh_is_said(closed: Meshed) -> None:
+    faces = closed.mesh.faces
+    inside_out = topology(Mesh(closed.mesh.vertices, faces[:, ::-1]))
+    assert inside_out.faults() == "its inside is outside"
+    turned = faces.copy()
+    turned[10] = turned[10, ::-1]
+    assert topology(Mesh(closed.mesh.vertices, turned)).faults() == "3 edges whose triangles wind against each other"
+    crowded = np.concatenate([faces, [[faces[0, 0], faces[0, 1], faces[len(faces) // 2, 0]]]])
+    assert "1 edges where more than two triangles meet" in topology(Mesh(closed.mesh.vertices, crowded)).faults()
+    assert "1 opening" in topology(Mesh(closed.mesh.vertices, faces[1:])).faults()
+
+
+def test_refusals(points: PointSet) -> None:
+    with pytest.raises(InputError, match="have no pixels"):
+        mesh_of(points, MeshingPlan("grid"))
+    with pytest.raises(InputError, match="no normals"):
+        mesh_of(PointSet(points.points))
+    for plan in ({"triangles": 2}, {"smooth": -1}, {"fill_holes_mm": float("nan")}):
+        with pytest.raises(InputError):
+            MeshingPlan(**plan)
