@@ -26,9 +26,11 @@ class MeshInputs:
         self._holes = gui.add_dropdown("Holes", (SMALL, OPEN, SIZED, CLOSED))
         self._size = gui.add_number("Up to, mm", 2.0, min=0.1, max=500.0, step=0.1, visible=False)
         self._thin = gui.add_number(
-            "Triangles", 0, min=0, max=50_000_000, step=1000, hint="No more than so many; 0: as many as there are"
+            "Triangles", 0, min=0, max=50_000_000, step=1000, hint="At most so many; 0: as many as there are"
         )
-        self._smooth = gui.add_dropdown("Smoothing", tuple(SMOOTHING), hint="How far it moved the surface is said")
+        self._smooth = gui.add_dropdown(
+            "Smoothing", tuple(SMOOTHING), hint="Evens out noise; how far it moved the surface is told"
+        )
         self._method.on_change(stage.safely(changed))
         for handle in (self._holes, self._size, self._thin, self._smooth):
             handle.on_update(stage.safely(changed))

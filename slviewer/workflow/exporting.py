@@ -58,7 +58,7 @@ class Exported:
 
     def text(self) -> str:
         """For people."""
-        return f"{self.words} -> {self.path}, {size(self.bytes)}"
+        return f"{self.words}\n-> {self.path}, {size(self.bytes)}: {units(self.path.suffix.lower().removeprefix('.'))}"
 
 
 def size(count: int) -> str:
@@ -158,20 +158,20 @@ def _write_shape(
         made = merge_shape(store, name, plan, making, warn)
     progress(0.85, f"writing {target.name}")
     write_shape(target, made.shape, scalars=made.scalars, notes=made.notes)
-    return "; ".join([f"{made.text()}, in {units(target.suffix.lower().removeprefix('.'))}", *made.done])
+    return made.text()
 
 
 def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:
     if what == "calibration":
         write_calibration_file(store, target)
-        return "calibration of camera and projector, in mm and px"
+        return "calibration of camera and projector"
     if what == "coefficients":
         return f"coefficients of each pixel by the {write_coefficients(store, name, target)} model"
     if what == "poses":
         write_poses(store, model or preferred(store), target)
-        return "poses of the devices, the target and the scans, in mm"
+        return "poses of the devices, the target and the scans"
     write_table(store, target)
-    return "verifications, in mm"
+    return "verifications"
 
 
 def _named(store: Session, what: What, name: str) -> str:

@@ -34,7 +34,7 @@ class Described:
     def text(self) -> str:
         """For people."""
         if isinstance(self.shape, Mesh):
-            return f"{self.whose}: {len(self.shape.faces)} triangles between {len(self.shape.vertices)} points"
+            return f"{self.whose}: {'; '.join(self.done)}"
         return f"{self.whose}: {len(self.shape)} points"
 
 

@@ -39,6 +39,7 @@ NUMBERS: dict[What, tuple[str, str]] = {
     "coefficients": ("each pixel's coefficients", "The rational function of every camera pixel"),
 }
 """What there is beside shapes: as a choice, and what it holds."""
+_QUIET = "color:var(--mantine-color-anchor);font-weight:600;text-decoration:none"
 _SHAPED = {"ply", "stl", "obj", "glb", "xyz"}
 
 
@@ -141,7 +142,8 @@ class Panel:
             chosen = self._shape_format.value
             made = _made(session, file_name(what, name, chosen))
             foreseen = foreseen_bytes(what, chosen, *_points(session, name), self._mesh.triangles if mesh else None)
-            self._shape_hint.say(shape_words(session, what, name, chosen, None if made else foreseen), "dim")
+            seen: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
+            self._shape_hint.say(shape_words(session, seen, name, chosen, None if made else foreseen), "dim")
             self._shape_link.set(self._offered(made))
             self._shape_done.say(self._done(made) if made and mesh else "", "dim")
             kept = made is not None and what == "merge" and chosen == "ply"  # the merge's own file
@@ -232,7 +234,11 @@ class Panel:
     def _link(self, export: ExportView, words: str, quiet: bool = False) -> Html:
         try:
             address = self._stage.offer(export.path)
-            return Html(f'<a href="{cell(address)}" download>{words}</a>') if quiet else link(address, words)
+            return (
+                Html(f'<a href="{cell(address)}" download style="{_QUIET}">{words}</a>')
+                if quiet
+                else link(address, words)
+            )
         except SlviewerError:  # taken away since the snapshot was made: the next one will not list it
             return cell("")
 
@@ -242,9 +248,9 @@ def shape_words(session: SessionView, what: What, name: str, file_format: str, f
     points, _ = _points(session, name)
     made = {
         "cloud": f"Every measured point, {points:,}",
-        "mesh": "Triangles between the measured points; depth jumps stay open",
         "merge": f"The {points:,} merged points",
-        "merged-mesh": "One surface through all scans, cut off where nothing was measured",
+        "mesh": "Triangles between neighbouring pixels; depth jumps stay open",
+        "merged-mesh": "One surface through the points, cut off where nothing was measured",
     }[what]
     return f"{made}. In {units(file_format)}.{'' if foreseen is None else f' About {size(foreseen)}.'}"
 
