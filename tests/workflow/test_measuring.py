@@ -65,19 +65,25 @@ def folder(made, tmp_path) -> Path:
     return tmp_path / "session"
 
 
-def tops(on: Surface) -> list[tuple[int, int]]:
+@pytest.fixture(scope="module")
+def regions(balls) -> list[np.ndarray]:
+    """The pixels of each ball, from left to right."""
+    return find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)
+
+
+@pytest.fixture(scope="module")
+def tops(balls, regions) -> list[tuple[int, int]]:
     """The pixel of each ball that is nearest to the camera."""
-    found = []
-    for region in find_spheres(on.points, 2, on.sigma_mm, RADIUS):
+    on, found = balls, []
+    for region in regions:
         z = np.where(region & on.measured, on.points[..., 2], np.inf)
         v, u = np.unravel_index(np.argmin(z), z.shape)
         found.append((int(u), int(v)))
     return found
 
 
-def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_path) -> None:
-    a, b = tops(balls)
-    regions = find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)
+def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_path, regions, tops) -> None:
+    a, b = tops
     first, second = (
         measuring.add_fit(folder, balls, "sphere", Region.of_mask(r), n) for r, n in zip(regions, "LR", strict=True)
     )
@@ -108,15 +114,9 @@ def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_p
     assert rows[0]["name"] == "L" and rows[0]["unit"] == "mm" and rows[0]["calibration in U"] == "no"
     assert float(rows[0]["U (k = 2)"]) == pytest.approx(2 * radius.sigma, rel=1e-4)
 
-    report(folder, tmp_path / "r.html")
-    page = (tmp_path / "r.html").read_text()
-    assert (
-        "Measurements" in page and "L – R" in page and "without the calibration" in page and "Section section 5" in page
-    )
 
-
-def test_measurements_are_renamed_deleted_and_brought_back(folder, balls) -> None:
-    a, b = tops(balls)
+def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) -> None:
+    a, b = tops
     one = measuring.add_distance(folder, balls, a, b)
     assert one.name == "distance 1"
     assert measuring.rename(folder, one.id, "=width").name == "=width"
@@ -134,8 +134,7 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls) -> Non
         measuring.rename(folder, "m9", "x")
 
 
-def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls) -> None:
-    regions = find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)
+def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls, regions) -> None:
     fits = [measuring.add_fit(folder, balls, "sphere", Region.of_mask(region)) for region in regions]
     measuring.add_relation(folder, fits[0].id, fits[1].id)
     measuring.remove(folder, fits[1].id)
@@ -151,27 +150,25 @@ def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(f
         measuring.add_relation(folder, fits[0].id, fits[1].id)
 
 
-def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls) -> None:
+def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls, regions, tops) -> None:
     with pytest.raises(InputError, match="nothing was measured at"):
-        measuring.add_distance(folder, balls, (0, 0), tops(balls)[0])
+        measuring.add_distance(folder, balls, (0, 0), tops[0])
     with pytest.raises(InputError, match="lies outside balls"):
         measuring.add_point(folder, balls, (-1, 5))
     with pytest.raises(InputError, match="is no place on balls"):
         measuring.add_point(folder, balls, 7)
     with pytest.raises(InputError, match="bends"):
-        measuring.add_fit(
-            folder, balls, "plane", Region.of_mask(find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)[0])
-        )
+        measuring.add_fit(folder, balls, "plane", Region.of_mask(regions[0]))
     with pytest.raises(InputError, match="0 measured points"):
         measuring.add_fit(folder, balls, "sphere", Region.ball([0, 0, 0], 5.0))
-    one = measuring.add_distance(folder, balls, *tops(balls))
+    one = measuring.add_distance(folder, balls, *tops)
     with pytest.raises(InputError, match="choose a point, plane, sphere"):
-        point = measuring.add_point(folder, balls, tops(balls)[0])
+        point = measuring.add_point(folder, balls, tops[0])
         measuring.add_relation(folder, one.id, point.id)
     assert len(measuring.measurements(folder)) == 2
 
 
-def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: Run, tmp_path) -> None:
+def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: Run, tmp_path, balls, tops) -> None:
     ammonite = asset("objects/ammonite.ply")
     arguments = ("compare", folder, "object", ammonite, "--tolerance", 1.5, "--json", tmp_path / "c.json")
     status, said, wrong = run(*arguments, "--out", tmp_path / "d.ply")
@@ -185,10 +182,13 @@ def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: 
     assert len(written.points) == found["statistics_mm"]["points"]
     assert np.sqrt(np.mean(written.scalars["deviation"] ** 2)) == pytest.approx(found["statistics_mm"]["rms"], rel=1e-3)
 
+    measuring.add_section(folder, balls, *tops, "across")
+    measuring.add_distance(folder, balls, *tops)
     status, said, _ = run("inspect", folder)
     assert "object against ammonite.ply (deviation on object): mean" in said
     report(folder, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text()
+    assert "Measurements" in page and "without the calibration" in page and "Section across" in page
     assert "Deviation from nominal" in page and "coloured by its deviation from ammonite.ply" in page
 
     small = read_ply(ammonite)
@@ -200,18 +200,18 @@ def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: 
     (tmp_path / "broken.stl").write_bytes(b"\0" * 300)
     status, _, wrong = run("compare", folder, "object", tmp_path / "broken.stl")
     assert status == 1 and "broken.stl" in wrong
-    assert len(measuring.measurements(folder)) == 1
+    assert len(measuring.measurements(folder)) == 3
 
 
-def test_a_damaged_measurement_is_told_not_guessed(folder, balls) -> None:
-    one = measuring.add_section(folder, balls, *tops(balls))
+def test_a_damaged_measurement_is_told_not_guessed(folder, balls, tops) -> None:
+    one = measuring.add_section(folder, balls, *tops)
     next((folder / "results" / "measurements" / one.id).rglob("lines.npy")).write_bytes(b"x")
     with pytest.raises(SessionError, match="missing or damaged"):
         measuring.section_lines(folder, one.id)
 
 
-def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, run: Run, tmp_path) -> None:
-    (u, v), (x, y) = tops(balls)
+def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, run: Run, tmp_path, tops) -> None:
+    (u, v), (x, y) = tops
     for centre, name in zip(CENTRES, ("left", "right"), strict=True):
         top = centre - [0, 0, RADIUS]
         status, said, wrong = run("measure", folder, "balls", "sphere", "--ball", *top, 14, "--name", name)
@@ -230,7 +230,7 @@ def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, r
         assert status == 2 and "needs" in wrong
 
 
-def test_a_merge_is_measured_on_too(folder, balls) -> None:
+def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
     chosen = balls.measured
     with Session.open(folder, write=True) as store:
         points = balls.points[chosen]
@@ -239,7 +239,7 @@ def test_a_merge_is_measured_on_too(folder, balls) -> None:
         meta = {"ply": "merged_1.ply", "model": "stereo", "inputs": store.input_hashes("balls")}
         store.save_result("merge/1", meta, {})
     on = surface(folder, "merge/1")
-    region = find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)[0]
+    region = regions[0]
     one = measuring.add_fit(folder, on, "sphere", Region.of_mask(region[chosen]))
     assert abs(measuring.quantities_of(one)[0].value - RADIUS) < 0.05 and one.source == "merge/1"
     assert measuring.quantities_of(measuring.add_distance(folder, on, 0, 5))[0].sigma > 0
