@@ -157,7 +157,8 @@ def merge(
     surface = fused.surface
     scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
     scalars["seen_by"] = fused.seen_by
-    write_ply(Path(out), surface.points, colours=surface.colours, normals=surface.normals, scalars=scalars)
+    notes = (f"scans {', '.join(names)}, frame: the camera's at {reference}", f"calibration {fitted.name}")
+    write_ply(Path(out), surface.points, surface.colours, surface.normals, scalars, notes=notes)
     progress(1.0, "merged")
     return Merge(alignment, fused, clouds, Path(out), scale)
 
