@@ -11,7 +11,7 @@ from slviewer.errors import SlviewerError
 @deferred
 def prove(
     quick: bool = False,
-    only: tuple[Literal["accuracy", "causes", "guidance", "uncertainty"], ...] = (),
+    only: tuple[Literal["accuracy", "causes", "guidance", "registration", "uncertainty"], ...] = (),
     seed: int = 0,
     json: Path | None = None,
 ) -> None:
@@ -22,7 +22,7 @@ def prove(
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
         only: What to prove: accuracy on planes and spheres, causes of bad calibrations, guidance of an operator to
-            good poses, uncertainty against true errors; by default all.
+            good poses, registration of scans, uncertainty against true errors; by default all.
         seed: Another seed proves it on other rigs of the same kinds.
         json: Write all figures to this file too.
     """

@@ -22,7 +22,8 @@ from slviewer.registration.start import SEARCHED, Candidate, Start, apart, ranke
 
 Progress = Callable[[float], None]
 
-LEVELS_MM = ((2.0, 8.0), (1.0, 2.0), (0.5, 1.0))  # voxel and gate for objects of 75 to 300 mm, coarse to fine
+LEVELS_MM = ((2.0, 8.0), (1.0, 2.0))
+"""Voxel and gate for objects of 75 to 300 mm, coarse to fine; the last stage, ``refine``, goes on from there."""
 LAST_GATE_MM = 1.0
 LEAST_OVERLAP = 0.15
 LEAST_AGREEMENT = 0.8
@@ -30,7 +31,7 @@ MOST_ATTEMPTS = 3
 MOST_SLACK = 1 / 30  # of the object's size
 RIVAL_SCORE, RIVAL_OVERLAP, RIVAL_RMS = 0.7, 0.6, 1.25
 """A rival comes to so much of the best pose's score and overlap, and to at most so many times its RMS."""
-_STATISTICS_POINTS = 100_000
+_STATISTICS_POINTS = 50_000
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ def _icp(scan: Any, reference: Any, T: np.ndarray, gate: float) -> np.ndarray:
 def _figures(
     scan: Prepared, reference: Prepared, T: np.ndarray, gate: float, uncertainty: Uncertainty | None, start: Start
 ) -> tuple[Registration, Freedom]:
-    """The figures of a pose, from up to 100,000 scan points against every reference point."""
+    """The figures of a pose, from up to 50,000 scan points against every reference point."""
     spacing = reference.spacing
     gate = max(gate, 2.0 * spacing)
     points = scan.points[:: -(-len(scan.points) // _STATISTICS_POINTS)] @ T[:3, :3].T + T[:3, 3]

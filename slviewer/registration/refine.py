@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from slviewer.registration.prepared import Prepared
 
 _STEPS = 12
-_SETTLED_MM, _NEAR_MM = 3e-4, 3e-3
-_FIRST_POINTS = 10_000
+_SETTLED_MM, _NEAR_MM = 2e-3, 5e-3
+_FIRST_POINTS, _MOST_POINTS = 8_000, 40_000
 _TUKEY = 4.685  # times the residuals' standard deviation
 _ALIKE = 0.8  # cosine between the normals of a pair
 _PATCHES = (16.0, 9.0, 5.0)
@@ -66,7 +66,7 @@ def refined(scan: Prepared, reference: Prepared, T: np.ndarray, widest: float, n
     pairs to go by, the pose comes back as it was, and its uncertainty is None.
     """
     gate, lateral = widest, 2.0 * max(scan.fine_spacing, reference.fine_spacing)
-    stride = max(1, len(scan.fine_points) // _FIRST_POINTS)
+    stride, least = (max(1, len(scan.fine_points) // points) for points in (_FIRST_POINTS, _MOST_POINTS))
     for _ in range(_STEPS):
         pairs = _pairs(scan, reference, T, gate, lateral, stride)
         if pairs is None:
@@ -79,12 +79,12 @@ def refined(scan: Prepared, reference: Prepared, T: np.ndarray, widest: float, n
         T = _moved(step, centre) @ T
         closed = min(gate, max(3.0 * sigma, narrowest))
         moved = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.linalg.norm(np.ptp(arm, axis=0))
-        if closed > 0.99 * gate and moved < (_SETTLED_MM if stride == 1 else _NEAR_MM):
-            if stride == 1:
+        if closed > 0.99 * gate and moved < (_SETTLED_MM if stride == least else _NEAR_MM):
+            if stride == least:
                 break
-            stride = 1  # the last steps are of all points
+            stride = least  # the last steps are of many more points
         gate = closed
-    pairs = _pairs(scan, reference, T, gate, lateral)
+    pairs = _pairs(scan, reference, T, gate, lateral, stride)
     return Refined(T, gate, None if pairs is None else _uncertainty(*pairs))
 
 

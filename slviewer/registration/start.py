@@ -104,7 +104,7 @@ def _feature_poses(scanned: Prepared, referred: Prepared, voxel: float) -> list[
 
     triplets = np.random.default_rng(_SEED).integers(0, len(p), (_TRIPLETS, 3))
     span = float(np.linalg.norm(np.ptp(p, axis=0)))
-    triplets = triplets[_same_triangle(p[triplets], q[triplets], 0.1 * span, voxel)][:4000]
+    triplets = triplets[_same_triangle(p[triplets], q[triplets], 0.1 * span, voxel)][:2000]
     if len(triplets) == 0:
         return []
     R, t = rigid(p[triplets], q[triplets])

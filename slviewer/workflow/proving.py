@@ -8,14 +8,16 @@ from slviewer.workflow.feedback import Progress, part, unheard
 from slviewer.workflow.proving_accuracy import prove_accuracy
 from slviewer.workflow.proving_causes import prove_causes
 from slviewer.workflow.proving_guidance import prove_guidance
+from slviewer.workflow.proving_registration import prove_registration
 from slviewer.workflow.proving_uncertainty import prove_uncertainty
 
-Claim = Literal["accuracy", "causes", "guidance", "uncertainty"]
+Claim = Literal["accuracy", "causes", "guidance", "registration", "uncertainty"]
 CLAIMS: tuple[Claim, ...] = get_args(Claim)
 TITLES: Mapping[Claim, str] = {
     "accuracy": "accuracy at the noise floor",
     "causes": "faults called by their names",
     "guidance": "guided poses",
+    "registration": "scans in one frame",
     "uncertainty": "predicted uncertainty",
 }
 QUICK_SCALE = 0.25
@@ -68,6 +70,7 @@ def prove(only: Sequence[Claim] = (), *, quick: bool = False, seed: int = 0, pro
         "accuracy": lambda told: prove_accuracy(scale, seed=seed, progress=told),
         "causes": lambda told: prove_causes(scale, seed=seed, progress=told),
         "guidance": lambda told: prove_guidance(scale, seed=seed, progress=told),
+        "registration": lambda told: prove_registration(scale, seed=seed, progress=told),
         "uncertainty": lambda told: prove_uncertainty(scale, seed=seed, progress=told),
     }
     chosen = [claim for claim in CLAIMS if not only or claim in only]

@@ -45,13 +45,14 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
     out = tmp_path / "figures.json"
     assert main(["prove", "--json", str(out)]) == 1
     said = capsys.readouterr()
-    assert asked == {claim: (1.0, 0) for claim in ("accuracy", "causes", "guidance", "uncertainty")}
-    assert said.out.count("a table") == 4 and said.out.count("pass  ") == 3
+    assert asked == {claim: (1.0, 0) for claim in ("accuracy", "causes", "guidance", "registration", "uncertainty")}
+    assert said.out.count("a table") == 5 and said.out.count("pass  ") == 4
     assert "FAIL  faults called by their names" in said.out and "not proven: causes:" in said.err
     assert {claim: proof["holds"] for claim, proof in json.loads(out.read_text()).items()} == {
         "accuracy": True,
         "causes": False,
         "guidance": True,
+        "registration": True,
         "uncertainty": True,
     }
 
