@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from trimesh.creation import box
 
 from slviewer.errors import InputError, SessionError
 from slviewer.evaluation.region import find_spheres
@@ -191,10 +192,7 @@ def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: 
     assert "Measurements" in page and "without the calibration" in page and "Section across" in page
     assert "Deviation from nominal" in page and "coloured by its deviation from ammonite.ply" in page
 
-    small = read_ply(ammonite)
-    from trimesh import Trimesh
-
-    Trimesh(small.points / 25.4, small.faces, process=False).export(tmp_path / "inch.stl")
+    box((5.6, 5.0, 1.6)).export(tmp_path / "inch.stl")
     status, _, wrong = run("compare", folder, "object", tmp_path / "inch.stl")
     assert status == 1 and "--units inch" in wrong and "Traceback" not in wrong
     (tmp_path / "broken.stl").write_bytes(b"\0" * 300)
