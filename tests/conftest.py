@@ -7,17 +7,36 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     for library in ("OMP", "OPENBLAS", "NUMBA"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from chromium import launched
+from filelock import FileLock
 from playwright.sync_api import Browser, sync_playwright
+
+TESTS = Path(__file__).parent
+FIRST = ("workflow/test_commands.py", "server/", "devices/", "gui/", "workflow/")
+"""One worker compiles the kernels in the first of these, while the other runs what needs few of them."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The long journeys first, so that both workers end at about the same time."""
-    items.sort(key=lambda item: not {"gui", "workflow"} & set(item.path.parts))
+    """What takes long first, so that both workers end at about the same time; each compiles what the other does not."""
+
+    def turn(item: pytest.Item) -> int:
+        path = item.path.relative_to(TESTS).as_posix()
+        return next((i for i, start in enumerate(FIRST) if path.startswith(start)), len(FIRST))
+
+    items.sort(key=turn)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def disk_without_waits() -> Iterator[None]:
+    """Nobody pulls the plug in a test: what the system was given is not waited for until the disk has it as well."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -36,4 +55,23 @@ def real_data() -> Path:
     folder = Path(given) if given else Path(__file__).parents[2] / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"no real captures: {folder} is missing; name their folder in SLVIEWER_REAL_DATA")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a ``session`` as the commands simulate and calibrate it, and ``calibration.json``, what they found.
+
+    8 poses, planes, spheres and objects at quarter resolution, made once for all workers: only to be read or copied.
+    """
+    from slviewer.cli import main
+
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "recorded"
+    session, found = folder / "session", folder / "calibration.json"
+    with FileLock(f"{folder}.lock"):
+        if not folder.exists():
+            assert main(["simulate", str(session), "--scale", "0.25", "--poses", "8"]) == 0
+            assert main(["calibrate", str(session), "--target", "circles:21x16:9", "--json", str(found)]) == 0
+    assert json.loads(found.read_text())["poses_used"], "the worker that made it failed"
     return folder

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,9 +21,8 @@ from slviewer.gui.pictures import Painter, spread
 from slviewer.gui.steps.scan import ordered, painting, point_words, uncertainty
 from slviewer.gui.steps.verify import distances_table, likely, results_table
 from slviewer.session.ply import read_ply
-from slviewer.workflow.calibrating import calibrate
+from slviewer.session.store import Session
 from slviewer.workflow.diagnosing import save_verdict
-from slviewer.workflow.simulating import simulate
 from slviewer.workflow.wizard.looking import ScanCloud
 from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.snapshot import CentreDistance, ComparisonView, ModelFigures, ScanView, VerificationRow
@@ -33,17 +33,14 @@ REJECTED = Verdict.of(
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recorded") / "session"
-    simulate(folder, scale=0.25, poses=8)
-    calibrate(folder, "circles:21x16:9", models=("stereo", "pixelwise"))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def measured(recorded: Path, browser: Browser) -> Iterator[tuple[Page, Operator, list[str]]]:
-    """A page on the recorded session, without a rig."""
-    with Operator(recorded) as engine:
+def measured(
+    recorded: Path, tmp_path_factory: pytest.TempPathFactory, browser: Browser
+) -> Iterator[tuple[Page, Operator, list[str]]]:
+    """A page on a copy of the recorded session, without a rig, and without the model that takes longest to compare."""
+    folder = shutil.copytree(recorded / "session", tmp_path_factory.mktemp("measured") / "session")
+    with Session.open(folder, write=True) as store:
+        store.trash_result("calibration/splined")
+    with Operator(folder) as engine:
         wizard = App(engine, port=0)
         page = browser.new_page(viewport=SIZE)
         page.set_default_timeout(20_000)
