@@ -7,12 +7,23 @@ import pytest
 from playwright.sync_api import Browser, expect
 from wizard_page import SIZE, Opened, button
 
+from slviewer.calibration.guidance import choosing
 from slviewer.gui.app import App
+from slviewer.workflow.wizard import acquisition
 from slviewer.workflow.wizard.operator import Operator
 
 RIG = {"driver": "simulated", "scale": 0.25}
 
 expect.set_options(timeout=40_000)  # a browser that draws in software beside the wizard's own work has its pauses
+
+
+@pytest.fixture(scope="session", autouse=True)
+def calm() -> Iterator[None]:
+    """Fewer previews, and fewer places tried before one is suggested: a browser draws beside them, in software."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(acquisition, "PREVIEWS_PER_S", 4.0)
+        patch.setattr(choosing, "TRIALS", 20)
+        yield
 
 
 @pytest.fixture
