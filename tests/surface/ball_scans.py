@@ -26,7 +26,7 @@ def looking_from(side: tuple[float, float, float], away: float) -> np.ndarray:
     return T
 
 
-def ball(away: float, sigma: float, seed: int, size: tuple[int, int] = (84, 63), grey: float = 200.0) -> Cloud:
+def ball(away: float, sigma: float, seed: int, size: tuple[int, int] = (76, 57), grey: float = 200.0) -> Cloud:
     """What a camera with a slight barrel distortion sees of the ball; noise along z, texture by the angle of sight."""
     w, h = size
     v, u = np.mgrid[:h, :w].astype(float)

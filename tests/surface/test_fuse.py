@@ -81,8 +81,8 @@ def test_strays_flying_pixels_and_what_others_see_through_go() -> None:
     points = scans["middle"].points.copy()
     v, u = np.mgrid[:5, :5]
     points[1:6, 1:6] = np.stack([u / 2, v / 2, np.full(u.shape, 200.0)], axis=2)
-    points[31, 42] *= 1.05  # behind the surface, by 14 mm
-    points[26:37, 21:32] *= 0.97  # a patch that stands 9 mm before it
+    points[28, 38] *= 1.05  # behind the surface, by 14 mm
+    points[24:35, 18:29] *= 0.97  # a patch that stands 9 mm before it
     found = fuse({**scans, "middle": replace(scans["middle"], points=points)}, poses)
     left_out = found.left_out["middle"]
     assert left_out["groups"] == 9 and left_out["edges"] > 60 and left_out["unconfirmed"] > 40
