@@ -150,7 +150,7 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     expect(page.get_by_text(re.compile("in the place of"))).to_be_visible(timeout=60_000)
     choose(page, "Show in 3D", "before, coloured by scan")
 
-    button(page, "8. Export").click()
+    page.get_by_role("button", name=re.compile(r"^\d+\. Export")).click()
     with page.expect_download() as download:
         page.get_by_role("link", name="Download").first.click()
     download.value.save_as(tmp_path / "merged.ply")
@@ -162,12 +162,19 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     choose(page, "As", "mesh")
     choose(page, "File type", "GLB")
     expect(page.get_by_text(re.compile(r"In metres, as glTF demands.*About \d"))).to_be_visible()
+    choose(page, "Smoothing", "light")
+    field(page, "Triangles").fill("6000")
+    field(page, "Triangles").press("Tab")
+    expect(page.get_by_text(re.compile(r"In metres.*About 0\.2 MB"))).to_be_visible()
     button(page, "Write file").click()
     with page.expect_download() as download:
         page.get_by_role("link", name="Download object_r2_mesh.glb").click(timeout=40_000)
     download.value.save_as(tmp_path / "part.glb")
     part = trimesh.load(tmp_path / "part.glb", force="mesh")
-    assert len(part.faces) > 10_000 and 0.08 < part.extents.max() < 0.2  # the ammonite, 140 mm wide
+    assert 4000 < len(part.faces) <= 6000 and 0.08 < part.extents.max() < 0.2  # the ammonite, 140 mm wide
+    expect(
+        page.get_by_text(re.compile("^object_r2: 6000 triangles by grid.*smoothing moved the surface by"))
+    ).to_be_visible()
     button(page, "Write calibration").click()
     expect(page.get_by_text("calibration.yml").first).to_be_visible()
     choose(page, "What", "poses")
