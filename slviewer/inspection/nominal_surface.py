@@ -23,9 +23,9 @@ class NominalSurface:
         if not len(mesh.faces):
             raise InputError("The nominal model has no triangles: give a mesh.")
         vertices = mesh.vertices.astype(np.float64)
-        self._middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # casting in float32 is finest about 0
+        self.middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # casting in float32 is finest about 0
         self.diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-        self._corners = (vertices - self._middle)[mesh.faces]
+        self._corners = (vertices - self.middle)[mesh.faces]
         flat = np.cross(self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0])
         lengths = np.linalg.norm(flat, axis=1)
         self.areas = lengths / 2
@@ -37,13 +37,13 @@ class NominalSurface:
         core = open3d().core
         self._scene: Any = open3d().t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            core.Tensor((vertices - self._middle).astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32))
+            core.Tensor((vertices - self.middle).astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32))
         )
 
     def signed(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open mesh; and the
         surface's normals (n, 3) where each is nearest."""
-        centred = points - self._middle
+        centred = points - self.middle
         found = self._scene.compute_closest_points(open3d().core.Tensor(centred.astype(np.float32)))
         face = found["primitive_ids"].numpy().astype(np.int64)
         s, t = found["primitive_uvs"].numpy().astype(np.float64).T
@@ -76,7 +76,7 @@ class NominalSurface:
         ``view`` (3,); ``least``: cosine between the two."""
         seen: np.ndarray = facing @ view > least
         lift = 1e-4 * self.diagonal
-        begin = (places[seen] - self._middle + lift * facing[seen]).astype(np.float32)
+        begin = (places[seen] - self.middle + lift * facing[seen]).astype(np.float32)
         rays = np.concatenate([begin, np.broadcast_to(view, begin.shape)], axis=1).astype(np.float32)
         seen[seen] = ~self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy()
         return seen
@@ -94,7 +94,7 @@ class NominalSurface:
         corners = self._corners[face]
         places = corners[:, 0] + a[:, None] * (corners[:, 1] - corners[:, 0])
         places += b[:, None] * (corners[:, 2] - corners[:, 0])
-        return places + self._middle, self._flat[face]
+        return places + self.middle, self._flat[face]
 
 
 def _smooth(corners: np.ndarray, flat: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:

@@ -1,17 +1,21 @@
 """Where on a nominal model a scan lies, to begin with."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from slviewer.errors import SlviewerError
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.registration.pairwise import Registration, register
+from slviewer.registration.pairwise import MOST_ATTEMPTS, Registration, register_prepared, searched
+from slviewer.registration.prepared import Prepared, prepared
+from slviewer.registration.refusal import Refused
 
-SAMPLES = 40_000
-"""Points of the nominal that a scan is aligned with."""
+SAMPLES = 60_000
+"""Points of the nominal that a scan is aligned with, all around it."""
 MOST_POINTS = 40_000
+LEAST_SEEN = 2_000
 GOOD_RMS = 0.002
 """Of the nominal's diagonal: no better place is looked for than one that leaves less, or thrice the noise, of most of
 the scan."""
@@ -19,6 +23,8 @@ GOOD_OVERLAP = 0.6
 VIEWS = [np.array(v) / np.linalg.norm(v) for v in sorted(product((-1, 0, 1), repeat=3), key=np.count_nonzero)[1:]]
 """From where a model is looked at: its sides, then its edges, then its corners."""
 FACING = 0.1
+AWAY = 3.0
+"""Diagonals: from so far."""
 
 
 def found_start(
@@ -30,34 +36,57 @@ def found_start(
 ) -> Registration:
     """The scan (n, 3) registered to the nominal.
 
-    A scan shows one side of a part, and what it does not see of the nominal leads a search for features astray: where
-    the whole nominal is refused, each of its sides is tried alone. Raises the first refusal where no side is accepted.
+    A scan shows one side of a part: each of the nominal's sides is tried as if a camera saw it, until one fits well;
+    else the best that is accepted. Raises the first refusal where none is.
     """
     places, facing = surface.sampled(SAMPLES)
     step = -(-len(points) // MOST_POINTS)
-    points, normals = points[::step], None if normals is None else normals[::step]
+    scan = prepared("scan", points[::step], None if normals is None else normals[::step], sigma_mm)
     good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
     refusal: SlviewerError | None = None
     best: Registration | None = None
-    for turn, view in enumerate([None, *VIEWS]):
-        say(turn / (len(VIEWS) + 1))
-        seen = slice(None) if view is None else surface.seen_from(places, facing, view, FACING)
+    for turn, view in enumerate(VIEWS):
+        say(turn / len(VIEWS))
+        seen = surface.seen_from(places, facing, view, FACING)
+        if np.count_nonzero(seen) < LEAST_SEEN:
+            continue
+        camera = surface.middle + AWAY * surface.diagonal * view
         try:
-            found = register(
-                points,
-                places[seen],
-                scan_normals=normals,
-                reference_normals=facing[seen],
-                sigma_mm=sigma_mm,
-            )
+            found = _registered(scan, prepared("nominal model", places[seen] - camera, facing[seen]))
         except SlviewerError as error:
             refusal = refusal or error
             continue
+        T = found.T_reference_scan.copy()
+        T[:3, 3] += camera
+        found = replace(found, T_reference_scan=T)
         if best is None or found.rms_mm / found.overlap < best.rms_mm / best.overlap:
             best = found
         if best.rms_mm <= good and best.overlap >= GOOD_OVERLAP:
             break
+    if best is None and isinstance(refusal, Refused):
+        raise refusal.about("The scan was not found on the nominal model.")
     if best is None:
-        assert refusal is not None
-        raise refusal
+        raise refusal or SlviewerError("The nominal model shows no side that a scan could lie on: check the file.")
     return best
+
+
+def _registered(scan: Prepared, reference: Prepared) -> Registration:
+    """As ``register_prepared``; of a part that looks alike from several sides the pose that leaves least: which of them
+    it is makes no difference to how far the scan lies off."""
+    size = min(scan.size, reference.size)
+    starts = searched(scan, reference, size)
+    try:
+        return register_prepared(scan, reference, size=size, starts=starts)
+    except Refused as error:
+        if error.reason != "ambiguous":
+            raise
+        refusal = error
+    alike = []
+    for start in starts[:MOST_ATTEMPTS]:
+        try:
+            alike.append(register_prepared(scan, reference, size=size, initial=start.T))
+        except Refused:
+            continue
+    if not alike:
+        raise refusal
+    return min(alike, key=lambda found: found.rms_mm / found.overlap)

@@ -72,7 +72,8 @@ def add_fit(session: SessionLike, on: Surface, shape: Shape, region: Region, nam
         )
         found = replace(found, warnings=(*found.warnings, told))
     arrays = {} if found.spread.shared is None else {"shared": found.spread.shared.astype(np.float32)}
-    data = {"region": region.to_dict(), "where": region.text(), "fit": found.to_dict()}
+    where = f"{region.text()}: {found.used:,} used, {found.left_out:,} left out"
+    data = {"region": region.to_dict(), "where": where, "fit": found.to_dict()}
     with opened(session, write=True) as store:
         return _saved(store, on, shape, found.quantities(), data, arrays, name)
 

@@ -123,6 +123,16 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     assert judged(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
 
 
+def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
+    box = trimesh.creation.box((60, 40, 20))
+    points, normals = box_scan(0.01)
+    z = np.array([-0.5, 0.5, -0.7071])  # the camera sees all three sides
+    x = np.cross([0.0, 1.0, 0.0], z)
+    R = np.stack([x / np.linalg.norm(x), np.cross(z, x) / np.linalg.norm(x), z])
+    found = deviation(points @ R.T + [10, -5, 480], Mesh(box.vertices, box.faces), normals=normals @ R.T)
+    assert 0.0095 < found.statistics()["rms"] < 0.0125 and found.statistics()["left_out"] < 100
+
+
 def _pose(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
