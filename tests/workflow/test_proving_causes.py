@@ -31,7 +31,7 @@ ALL = SINGLE + SHARE
 
 @pytest.fixture(scope="module")
 def proof() -> Proof:
-    return prove_causes(0.2, faults=ALL, clean=1, poses=7, steps=6)
+    return prove_causes(0.15, faults=ALL, clean=1, poses=7, steps=6)
 
 
 @pytest.mark.parametrize("fault", ALL)
