@@ -20,8 +20,11 @@ GOOD_RMS = 0.002
 """Of the nominal's diagonal: no better place is looked for than one that leaves less, or thrice the noise, of most of
 the scan."""
 GOOD_OVERLAP = 0.6
-VIEWS = [np.array(v) / np.linalg.norm(v) for v in sorted(product((-1, 0, 1), repeat=3), key=np.count_nonzero)[1:]]
-"""From where a model is looked at: its sides, then its edges, then its corners."""
+VIEWS = [
+    np.array(view) / np.linalg.norm(view)
+    for view in sorted(product((-1, 0, 1), repeat=3), key=lambda v: (np.count_nonzero(v), -abs(v[2])))[1:]
+]
+"""From where a model is looked at: its sides, from below and above first, then its edges, then its corners."""
 FACING = 0.1
 AWAY = 3.0
 """Diagonals: from so far."""

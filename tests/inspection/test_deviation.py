@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from slviewer.errors import InputError, SlviewerError
+from slviewer.inspection import placing
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.nominal_surface import NominalSurface
@@ -123,7 +124,8 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     assert judged(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
 
 
-def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
+def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch) -> None:
+    monkeypatch.setattr(placing, "VIEWS", placing.VIEWS[-2:])  # corners; a box has no front
     box = trimesh.creation.box((60, 40, 20))
     points, normals = box_scan(0.01)
     z = np.array([-0.5, 0.5, -0.7071])  # the camera sees all three sides
@@ -158,7 +160,8 @@ def test_an_open_nominal_has_two_sides_and_nothing_beyond_its_rim() -> None:
     assert away[:2] == pytest.approx([0.3, -0.2], abs=1e-5) and away[2] == np.inf and np.isfinite(away[3])
 
 
-def test_another_part_is_refused(ammonite) -> None:
+def test_another_part_is_refused(ammonite, monkeypatch) -> None:
+    monkeypatch.setattr(placing, "VIEWS", placing.VIEWS[:2])
     _, _, points, normals = ammonite
     seen = np.isfinite(points[..., 0])
     other = trimesh.creation.box((120, 100, 70))
