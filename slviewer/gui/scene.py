@@ -219,6 +219,36 @@ class Scene:
         ball = self._api.add_icosphere(path, radius=1.5, color=colour, position=np.asarray(point, float))
         self._set(layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")])
 
+    def ball(self, layer: str, name: str, centre: np.ndarray, radius_mm: float, colour: Colour) -> None:
+        """A ball around centre (3,) mm that one sees through."""
+        handle = self._api.add_icosphere(
+            self._path(layer, name),
+            radius=radius_mm,
+            color=colour,
+            opacity=0.3,
+            position=np.asarray(centre, float),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._set(layer, name, [handle])
+
+    def drawing(
+        self, layer: str, name: str, segments: np.ndarray, colour: Colour, place: np.ndarray, text: str
+    ) -> None:
+        """Segments (n, 2, 3) mm (n may be 0), and words at place (3,) mm."""
+        path = self._path(layer, name)
+        nodes: list[Any] = [self._api.add_frame(path, show_axes=False)]
+        if len(segments):
+            nodes.append(
+                self._api.add_line_segments(
+                    f"{path}/lines", np.asarray(segments, np.float32), colour, thickness=3.0, thickness_units="screen"
+                )
+            )
+        nodes.append(
+            self._api.add_label(f"{path}/words", text, position=np.asarray(place, float), anchor="bottom-left")
+        )
+        self._set(layer, name, nodes)
+
     def mesh(self, layer: str, name: str, vertices: np.ndarray, faces: np.ndarray, colour: Colour) -> None:
         """A surface: vertices (n, 3) mm, faces (m, 3)."""
         handle = self._api.add_mesh_simple(

@@ -244,7 +244,9 @@ def flown_step(snapshot: Snapshot) -> str:
     if job.startswith("Merg"):
         return "merge"
     latest = next((scan.name for scan in reversed(session.scans) if scan.purpose == "scan"), "")
-    return "export" if session.merge is not None and latest in session.merge.scans else "scan"
+    if session.merge is None or latest not in session.merge.scans:
+        return "scan"
+    return "export" if any(measured.source == latest for measured in session.measurements) else "measure"
 
 
 def notify(client: viser.ClientHandle, level: str, text: str) -> None:

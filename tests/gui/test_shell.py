@@ -10,7 +10,7 @@ from slviewer.errors import UsageError
 from slviewer.gui.app import App, rig_choice
 from slviewer.workflow.wizard.operator import Operator
 
-STEPS = ("Rig", "Target", "Poses", "Calibrate", "Verify", "Scan", "Merge", "Export")
+STEPS = ("Rig", "Target", "Poses", "Calibrate", "Verify", "Scan", "Merge", "Measure", "Export")
 
 
 def test_from_the_link_to_a_pose_that_a_reload_keeps(opened: Opened, operator: Operator) -> None:

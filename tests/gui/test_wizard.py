@@ -186,7 +186,7 @@ def merge(page: Page, operator: Operator) -> None:
 
 def take_home(page: Page, operator: Operator, folder: Path) -> None:
     """The merged cloud, as another program reads it."""
-    button(page, "8. Export").click()
+    button(page, "9. Export").click()
     with page.expect_download() as download:
         page.get_by_role("link", name="Download").first.click()
     assert download.value.suggested_filename.endswith(".ply")
@@ -226,7 +226,7 @@ def test_whoever_watches_sees_the_pose_and_changes_nothing(
     button(guest, "Delete").click()
     field(guest, "Folder").fill(str(operator.snapshot().session.folder / "other"))
     button(guest, "Open or make session").click()
-    button(guest, "8. Export").click()
+    button(guest, "9. Export").click()
 
     capture_pose(page, "pose_02")  # after all that, what the operator asks for is all that happens
     expect(pose_row(guest, "pose_02", "good")).to_be_visible()

@@ -44,7 +44,7 @@ _SHAPED = {"ply", "stl", "obj", "glb", "xyz"}
 
 
 class Panel:
-    """The eighth step."""
+    """The ninth step."""
 
     key = "export"
 

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slviewer.errors import Cancelled, SlviewerError
+from slviewer.inspection.regions import Region
 from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
 from slviewer.simulation.scenes import Scene, Spheres
+from slviewer.workflow.measured_surface import Place, Surface
 from slviewer.workflow.wizard.snapshot import ScanView, Snapshot
 
 if TYPE_CHECKING:
@@ -73,6 +75,7 @@ class Autopilot:
             self._calibrate()
             self._verify()
             self._scan()
+            self._measure()
             self._act("Writing the report", self._operator.report)
         finally:
             self._says("")
@@ -118,6 +121,17 @@ class Autopilot:
         names = [scan.name for scan in _scans(operator.snapshot()) if scan.name not in before]
         self._act("Merging the three scans", lambda: operator.merge(names, names[-1]))
 
+    def _measure(self) -> None:
+        """The sphere's radius, and how wide the object is."""
+        operator = self._operator
+        scans = operator.snapshot().session.scans  # type: ignore[union-attr]
+        sphere = next(scan.name for scan in reversed(scans) if scan.purpose == "sphere")
+        region = _cap(operator.surface(sphere))
+        self._act("Measuring the sphere", partial(operator.measure_shape, sphere, "sphere", region))
+        latest = _scans(operator.snapshot())[-1].name
+        a, b = _across(operator.surface(latest))
+        self._act("Measuring how wide the object is", partial(operator.measure_distance, latest, a, b))
+
     def _place(self, thing: "Thing", scene: Scene) -> None:
         T = np.eye(4)
         if isinstance(scene, Spheres):
@@ -155,6 +169,21 @@ class Autopilot:
 def _good_poses(snapshot: Snapshot) -> int:
     poses = snapshot.session.poses if snapshot.session else ()
     return sum(pose.state in ("good", "used", "left out") for pose in poses)
+
+
+def _cap(on: Surface) -> Region:
+    """What lies around the point that is nearest to the camera, half as far as anything measured."""
+    z = np.where(on.measured, on.points[..., 2], np.inf)
+    top = on.points[np.unravel_index(int(np.argmin(z)), z.shape)]
+    away = np.linalg.norm(on.points[on.measured] - top, axis=-1)
+    return Region.ball(top, 0.5 * float(np.percentile(away, 95)))
+
+
+def _across(on: Surface) -> tuple[Place, Place]:
+    """The two ends of the image row in which most was measured."""
+    v = int(np.argmax(on.measured.sum(axis=1)))
+    columns = np.flatnonzero(on.measured[v])
+    return (int(columns[0]), v), (int(columns[-1]), v)
 
 
 def _scans(snapshot: Snapshot) -> list[ScanView]:

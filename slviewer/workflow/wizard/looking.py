@@ -48,13 +48,20 @@ class ScanCloud:
 
     def nearest(self, origin: np.ndarray, direction: np.ndarray) -> tuple[int, int] | None:
         """(u, v) of the measured pixel closest to a ray (camera frame, mm), within 1 % of its depth; None if none."""
-        ways = self.points - origin
-        along = ways @ (direction / np.linalg.norm(direction))
-        off = np.sqrt(np.maximum((ways**2).sum(-1) - along**2, 0))
-        score = np.where((along > 0) & (off < 0.01 * along), off + 0.02 * along, np.inf)  # the front before the back
-        score = np.where(np.isfinite(score), score, np.inf)
-        v, u = np.unravel_index(int(np.argmin(score)), score.shape)
-        return (int(u), int(v)) if np.isfinite(score[v, u]) else None
+        index = nearest(self.points, origin, direction)
+        return None if index is None else (index[1], index[0])
+
+
+def nearest(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tuple[int, ...] | None:
+    """Index of the point of (..., 3), NaN where none is, that is closest to a ray, within 1 % of its depth, the front
+    before the back; None where there is none."""
+    ways = points - origin
+    along = ways @ (direction / np.linalg.norm(direction))
+    off = np.sqrt(np.maximum((ways**2).sum(-1) - along**2, 0))
+    score = np.where((along > 0) & (off < 0.01 * along), off + 0.02 * along, np.inf)
+    score = np.where(np.isfinite(score), score, np.inf)
+    index = np.unravel_index(int(np.argmin(score)), score.shape)
+    return tuple(int(i) for i in index) if np.isfinite(score[index]) else None
 
 
 def scan_cloud(session: Session, name: str) -> ScanCloud:

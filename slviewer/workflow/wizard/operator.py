@@ -34,9 +34,11 @@ from slviewer.workflow.wizard.engine import Engine
 from slviewer.workflow.wizard.exporting import export_file
 from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.live_requests import LiveRequests
+from slviewer.workflow.wizard.measure_requests import MeasureRequests
 from slviewer.workflow.wizard.requesting import request
 from slviewer.workflow.wizard.rigs import Choice, SetUp, set_up
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
+from slviewer.workflow.wizard.surfaces import Surfaces
 from slviewer.workflow.wizard.taking import sequence_for_poses, take_pose, take_scan
 
 _CHECKED: dict[Verdict, tuple[Level, str]] = {
@@ -49,13 +51,14 @@ _CHECKED: dict[Verdict, tuple[Level, str]] = {
 T = TypeVar("T")
 
 
-class Operator(LiveRequests):
+class Operator(LiveRequests, MeasureRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:
         """Opens `session`, made where it is missing, and `rig`, by default the one that the session remembers."""
         self._engine = Engine(set_up, self.capture_pose)
         self._autopilot: Autopilot | None = None
+        self._surfaces = Surfaces()
         if session is not None:
             self.open_session(session, rig)
         elif rig is not None:

@@ -16,11 +16,13 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.session.capture import Capture
+from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.capturing import PATTERNS
 from slviewer.workflow.diagnosing import last_verdict
+from slviewer.workflow.measuring import measurements
 from slviewer.workflow.models import (
     available,
     insisted,
@@ -50,6 +52,7 @@ from slviewer.workflow.wizard.snapshot import (
     VerificationRow,
 )
 from slviewer.workflow.wizard.suggestion import Features, Plan, plan, plan_at_hand, takes_time
+from slviewer.workflow.wizard.surfaces import nominals
 from slviewer.workflow.wizard.work import lacking_for_splined
 
 
@@ -154,6 +157,9 @@ class Reader:
             scans=tuple(self._scan(c, labels, hashes, factors) for c in captures.values() if c.role == "scan"),
             merge=self._merge(merges[-1], hashes, factors) if merges else None,
             merges=len(merges),
+            measurements=tuple(measurements(session)),
+            deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}-") for name in session.deleted_results()),
+            nominals=nominals(session.folder),
             exports=listed(session),
             exposures_ms=self.exposures_ms(),
             linear=self.levels() is not None,

@@ -11,6 +11,7 @@ import numpy as np
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.geometry.lens import Lens
+from slviewer.session.measurements import Measurement
 from slviewer.workflow.preflight.checks import Preflight
 
 Level = Literal["info", "good", "warning", "error"]
@@ -316,6 +317,9 @@ class SessionView:
     scans: tuple[ScanView, ...] = ()
     merge: MergeView | None = None
     merges: int = 0  # how many undo can take back
+    measurements: tuple[Measurement, ...] = ()
+    deleted_measurements: int = 0  # how many can be brought back
+    nominals: tuple[str, ...] = ()  # names of the nominal models that were uploaded
     exports: tuple[ExportView, ...] = ()
     deleted_poses: tuple[str, ...] = ()  # what can be brought back, the last deleted first
     deleted_scans: tuple[str, ...] = ()

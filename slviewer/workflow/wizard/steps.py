@@ -1,4 +1,4 @@
-"""The eight steps, in order: what to do now, what each waits for, what is wrong. Adding a step is adding an entry.
+"""The nine steps, in order: what to do now, what each waits for, what is wrong. Adding a step is adding an entry.
 
 Everything here follows from the session's files and the rig.
 """
@@ -287,6 +287,35 @@ def _merge_wrong(facts: Facts) -> Iterator[str]:
                 yield f"{name} overlaps by {100 * overlap:.0f} % only (RMS {rms:.2f} mm): scan with more overlap."
 
 
+def _measure_blocked(facts: Facts) -> str:
+    if why := _needs_calibration(facts):
+        return why
+    session = facts.session
+    surfaces = session is not None and (session.merge or any(scan.cloud == "fresh" for scan in session.scans))
+    if not surfaces and not (session and session.measurements):
+        return "Measuring takes a scan: capture one, or reconstruct one that was recorded."
+    return ""
+
+
+def _measure_done(facts: Facts) -> bool:
+    return facts.session is not None and any(not measured.stale for measured in facts.session.measurements)
+
+
+def _measure_now(facts: Facts) -> str:
+    if _measure_done(facts):
+        assert facts.session is not None
+        kept = sum(not measured.stale for measured in facts.session.measurements)
+        return f"{kept} measurement{'s are' if kept != 1 else ' is'} kept for the report: add others, or export next."
+    return "Choose a surface and a tool, and click on what you want to know; or export next."
+
+
+def _measure_wrong(facts: Facts) -> Iterator[str]:
+    stale = [measured.name for measured in facts.session.measurements if measured.stale] if facts.session else []
+    if stale:
+        named = ", ".join(stale[:3]) + (f" and {len(stale) - 3} more" if len(stale) > 3 else "")
+        yield f"{named}: what {'it was' if len(stale) == 1 else 'they were'} measured on has changed; measure again."
+
+
 def _export_now(facts: Facts) -> str:
     exports = facts.session.exports if facts.session else ()
     if exports:
@@ -313,6 +342,7 @@ STEPS = (
     Step("verify", "Verify", _needs_calibration, _verify_done, _verify_now, _verify_wrong),
     Step("scan", "Scan", _needs_calibration, lambda f: f.scans > 0, _scan_now, _scan_wrong),
     Step("merge", "Merge", _merge_blocked, _merge_done, _merge_now, _merge_wrong),
+    Step("measure", "Measure", _measure_blocked, _measure_done, _measure_now, _measure_wrong),
     Step(
         "export",
         "Export",

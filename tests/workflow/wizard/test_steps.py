@@ -31,7 +31,7 @@ def states(facts: Facts) -> dict[str, str]:
 
 
 def test_the_way_through_the_wizard() -> None:
-    blocked = dict.fromkeys(("calibrate", "verify", "scan", "merge", "export"), "blocked")
+    blocked = dict.fromkeys(("calibrate", "verify", "scan", "merge", "measure", "export"), "blocked")
     assert states(Facts(None, RigView(), None)) == {"rig": "ready", "target": "blocked", "poses": "blocked", **blocked}
     assert states(Facts(EMPTY, OPEN, None)) == {"rig": "done", "target": "ready", "poses": "blocked", **blocked}
     aimed = replace(EMPTY, target="circles:9x7:20")
@@ -43,7 +43,7 @@ def test_the_way_through_the_wizard() -> None:
     assert (reached["poses"], reached["calibrate"], reached["verify"]) == ("done", "ready", "blocked")
     done = states(Facts(replace(enough, calibration=calibration()), OPEN, None))
     assert done["calibrate"] == "done" and done["verify"] == done["scan"] == done["export"] == "ready"
-    assert done["merge"] == "blocked"
+    assert done["merge"] == done["measure"] == "blocked"
     stale = Facts(replace(enough, calibration=calibration("pose_1 was excluded since: calibrate again")), OPEN, None)
     assert states(stale)["calibrate"] == "ready"
     assert "pose_1 was excluded" in next(v for v in views(stale) if v.key == "calibrate").wrong[0]

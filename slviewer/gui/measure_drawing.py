@@ -1,0 +1,122 @@
+"""Measurements in the 3D view: what stands at their places, and in which words."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from slviewer.inspection.features import Feature
+from slviewer.inspection.quantities import Quantity
+from slviewer.inspection.section import CutPlane
+from slviewer.session.measurements import Measurement
+from slviewer.workflow.measuring import quantities_of
+
+_UNITS = {"deg": "°", "%": " %", "": ""}
+_ROUND = 48
+_OFF = 0.01
+"""What lies on the surface is drawn off it by this share of its size: the surface would hide it."""
+_LEG, _SHORTEST_LEG_MM = 0.15, 5.0
+"""Of a dimension's length."""
+_EXTENT_MM = 15.0
+"""Of a plane or a cylinder whose region says no size."""
+
+
+def value_words(quantity: Quantity) -> str:
+    """Value ± U (k = 2) with the unit; a star where the calibration's part of U is not known."""
+    digits = 1 if quantity.unit == "%" else 3
+    unit = _UNITS.get(quantity.unit, f" {quantity.unit}")
+    if quantity.U is None:
+        return f"{quantity.value:.{digits}f}{unit}"
+    star = "" if quantity.whole else "*"
+    return f"{quantity.value:.{digits}f} ± {quantity.U:.{digits}f}{unit}{star}"
+
+
+def label(measured: Measurement) -> str:
+    """What stands beside it in 3D: its name, and the number that it is about."""
+    if measured.kind in ("point", "section", "deviation"):
+        return measured.name
+    first = quantities_of(measured)[0]
+    named = "" if first.name == "distance" else f"{first.name} "
+    return f"{measured.name}: {named}{value_words(first)}" + (" (stale)" if measured.stale else "")
+
+
+def drawn(
+    measured: Measurement, others: Mapping[str, Measurement], lines: Sequence[np.ndarray] = ()
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """((n, 2, 3) segments, (3,) place of its words) mm; None where there is nothing to be seen of it.
+
+    ``others``: all measurements by id; ``lines`` (k, 2) mm: of a section.
+    """
+    if measured.kind == "distance":
+        return _dimension(*(np.array(end) for end in measured.data["ends"]))
+    if measured.kind == "section":
+        plane = CutPlane.from_dict(measured.data["plane"])
+        off = _OFF * float(np.ptp(np.concatenate(lines)[:, 0])) if lines else 0.0
+        cut = [lifted(plane, line + [0.0, off]) for line in lines]
+        place = cut[0][np.argmax(cut[0] @ plane.up)] if cut else plane.origin
+        return np.concatenate([_chain(each) for each in cut]) if cut else np.empty((0, 2, 3)), place
+    if measured.kind == "relation":
+        ends = [feature_of(others[each]) for each in measured.of if each in others]
+        if len(ends) != 2 or ends[0] is None or ends[1] is None:
+            return None
+        return _dimension(ends[0].place, ends[1].place, 1.2 * max(end.radius or 0.0 for end in ends))
+    feature = feature_of(measured)
+    return None if feature is None else (_outline(feature, _extent(measured)), feature.place)
+
+
+def feature_of(measured: Measurement) -> Feature | None:
+    """The point, plane, sphere or cylinder that a measurement is."""
+    found = measured.data.get("feature") or measured.data.get("fit", {}).get("feature")
+    return None if found is None else Feature.from_dict(found)
+
+
+def lifted(plane: CutPlane, points: np.ndarray) -> np.ndarray:
+    """(n, 3) mm: points (n, 2) of a section's drawing, in space."""
+    return np.asarray(plane.origin + points[..., :1] * plane.along + points[..., 1:] * plane.up)
+
+
+def _outline(feature: Feature, extent: float) -> np.ndarray:
+    """(n, 2, 3) mm: a sphere's three great circles, a plane's disc with its normal, a cylinder's ends and axis."""
+    if feature.kind == "point":
+        return _cross(feature.place, 1.5)
+    if feature.kind == "sphere":
+        assert feature.radius is not None
+        circles = [_circle(feature.place, axis, (1 + _OFF) * feature.radius) for axis in np.eye(3)]
+        return np.concatenate([*circles, _cross(feature.place, 0.1 * feature.radius)])
+    assert feature.direction is not None
+    along = extent * feature.direction
+    if feature.kind == "plane":
+        normal = np.array([[feature.place, feature.place + 0.4 * along]])
+        return np.concatenate([_circle(feature.place + _OFF * along, feature.direction, extent), normal])
+    assert feature.radius is not None
+    ends = [feature.place - along, feature.place + along]
+    rings = [_circle(end, feature.direction, (1 + _OFF) * feature.radius) for end in ends]
+    return np.concatenate([*rings, np.array([ends])])
+
+
+def _dimension(a: np.ndarray, b: np.ndarray, clear_mm: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """As on a technical drawing: a line beside the part, here towards the camera, with a leg down to either end."""
+    middle = (a + b) / 2
+    leg = max(_LEG * float(np.linalg.norm(b - a)), _SHORTEST_LEG_MM, clear_mm)
+    up = -leg * middle / max(float(np.linalg.norm(middle)), 1e-9)
+    return np.array([[a, a + up], [a + up, b + up], [b + up, b]]), middle + up
+
+
+def _circle(centre: np.ndarray, axis: np.ndarray, radius: float) -> np.ndarray:
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first /= np.linalg.norm(first)
+    second = np.cross(axis, first)
+    t = np.linspace(0, 2 * np.pi, _ROUND + 1)[:, None]
+    return _chain(centre + radius * (np.cos(t) * first + np.sin(t) * second))
+
+
+def _cross(centre: np.ndarray, half: float) -> np.ndarray:
+    return np.stack([centre - half * np.eye(3), centre + half * np.eye(3)], axis=1)
+
+
+def _chain(points: np.ndarray) -> np.ndarray:
+    return np.stack([points[:-1], points[1:]], axis=1)
+
+
+def _extent(measured: Measurement) -> float:
+    size = measured.data.get("region", {}).get("size")
+    return float(np.max(size)) if size else _EXTENT_MM
