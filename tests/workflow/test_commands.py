@@ -82,6 +82,30 @@ def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: P
     assert len(trimesh.load(ply).vertices) > 10_000
 
 
+def test_mesh_of_one_scan_and_of_scans_merged_on_the_way(
+    calibrated: dict, session: Path, run: Run, tmp_path: Path
+) -> None:
+    stl, out = tmp_path / "object.stl", tmp_path / "mesh.json"
+    thinned = ("--method", "volume", "--triangles", 20_000, "--smooth", 2)
+    status, text, _ = run("mesh", session, "object_r3", "object_r2", *thinned, "--out", stl, "--json", out)
+    assert status == 0 and "smoothing moved the surface by" in text and "not watertight: " in text
+    found = json.loads(out.read_text())
+    assert (
+        found["method"] == "volume" and 0.1 < found["cell_mm"] < 1.0 and set(found["merge"]["pairs"]) == {"object_r2"}
+    )
+    assert 0 < found["smoothed"]["rms_mm"] < found["smoothed"]["max_mm"] < 2.0
+    assert 19_000 < found["triangles"] <= 20_000 and len(trimesh.load(stl).faces) == found["triangles"]
+    assert trimesh.load(tmp_path / "object_points.ply").vertices.shape[0] > 10_000
+    status, text, _ = run("mesh", session, "object_r3")
+    assert status == 0 and "triangles by grid" in text
+    assert len(trimesh.load(session / "exports" / "object_r3_mesh.ply").faces) > 10_000
+    status, _, error = run("mesh", session, "object_r3", "--watertight")
+    assert status == 1 and "would be imagined, not measured" in error
+    status, _, error = run("mesh", session, "merge/")
+    assert status == 1 and "there is no merge yet" in error
+    assert run("mesh", session, "merge/1", "object_r1")[0] == 2
+
+
 def test_report_and_inspect(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     assert run("report", session, "--out", page)[0] == 0
