@@ -17,7 +17,7 @@ RIG = {"driver": "simulated", "scale": 0.25}
 expect.set_options(timeout=40_000)  # a browser that draws in software beside the wizard's own work has its pauses
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)  # not longer: others measure what is suggested
 def calm() -> Iterator[None]:
     """Fewer previews, and fewer places tried before one is suggested: a browser draws beside them, in software."""
     with pytest.MonkeyPatch.context() as patch:
