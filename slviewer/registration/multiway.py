@@ -48,7 +48,8 @@ class Starts:
 
 @dataclass(frozen=True)
 class Loop:
-    """Round ``names`` the poses should come back to where they began; ``before`` the adjustment and ``after``."""
+    """Round ``names``, and from the last to the first, the pairs should lead back to where they began; ``before`` the
+    adjustment and ``after``."""
 
     names: tuple[str, ...]
     before: Gap

@@ -99,9 +99,10 @@ def alignment_text(alignment: Alignment) -> str:
     lines.append(f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)")
     if alignment.loops:
         worst = alignment.loops[0]
+        way = " - ".join([*worst.names, worst.names[0]])
         lines.append(
             f"loop error, the worst of {len(alignment.loops)}: {worst.before.shift_mm:.3f} mm and "
-            f"{worst.before.turn_deg:.4f} degrees round {len(worst.names) - 1} pairs ({' - '.join(worst.names)}); "
+            f"{worst.before.turn_deg:.4f} degrees round {len(worst.names)} pairs ({way}); "
             f"{max(loop.after.shift_mm for loop in alignment.loops):.3f} mm at most once closed"
         )
     lines += [f"left out: {why}" for why in alignment.dropped.values()]

@@ -7,6 +7,7 @@ and poses true.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from time import perf_counter
 from typing import Any
 
@@ -61,6 +62,19 @@ class Measured:
     poses: Mapping[str, np.ndarray]
     seconds: float
 
+    def round_all(self) -> tuple[float, float]:
+        """Loop error of the pairs that follow one another, from the first scan to the last and back to the first, mm at
+        the object's middle and degrees; NaN where one of them did not register."""
+        names, pairs = list(self.clouds), self.alignment.pairs
+        steps = [(after, before) for before, after in pairwise(names)]
+        if not {*steps, (names[-1], names[0])} <= set(pairs):
+            return float("nan"), float("nan")
+        T = np.linalg.multi_dot([np.eye(4), *(pairs[step].T_reference_scan for step in steps)])
+        D = T @ np.linalg.inv(pairs[names[-1], names[0]].T_reference_scan)
+        middle = self.poses[names[0]][:3, 3]
+        shift = np.linalg.norm(D[:3, :3] @ middle + D[:3, 3] - middle)
+        return float(shift), float(np.degrees(np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec())))
+
     def true(self, scan: str, onto: str) -> np.ndarray:
         """(4, 4): how a scan really lies on another."""
         return np.asarray(self.poses[onto] @ np.linalg.inv(self.poses[scan]))
@@ -96,12 +110,10 @@ class RegistrationProof:
                 found.append(Check(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
                 found.append(Check(name, "error of its turn in degrees", turn, 0.0, TURN_DEG))
         loops = self.turn.alignment.loops
-        whole = max(loops, key=lambda loop: len(loop.names), default=None)
         found.append(Check("three depths", "seconds to register", self.depths.seconds, 0.0, SECONDS))
         left = max((loop.after.shift_mm for loop in loops), default=float("nan"))
-        found.append(Check("turn", "loop error in mm once closed", left, 0.0, LOOP_MM))
-        before = whole.before.shift_mm if whole else float("nan")
-        found.append(Check("turn", "loop error in mm before, round the turn", before, 0.0, 4 * LOOP_MM))
+        found.append(Check("turn", "largest loop error in mm once adjusted", left, 0.0, LOOP_MM))
+        found.append(Check("turn", "loop error in mm round all scans", self.turn.round_all()[0], 0.0, LOOP_MM))
         good = len(self.depths.alignment.pairs) + len(self.turn.alignment.pairs)
         found.append(Check("good pairs", "number accepted", float(good), GOOD_PAIRS, float("inf")))
         for what, ratio in zip(("shift", "turn"), self.honesty, strict=True):

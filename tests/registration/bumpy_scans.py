@@ -9,7 +9,7 @@ from slviewer.registration.pairwise import Registration
 
 CENTRE = np.array([0.0, 0.0, 600.0])
 NOISE = 0.03
-POINTS = 20_000
+POINTS = 12_000
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 

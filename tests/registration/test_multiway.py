@@ -112,7 +112,7 @@ def turned_scans(count: int, step: float) -> dict[str, Scan]:
     scans = {}
     for k in range(count):
         rng = np.random.default_rng(k)
-        directions = rng.normal(size=(24_000, 3))
+        directions = rng.normal(size=(16_000, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         T = TABLE.turned(step * k)
         normals = directions @ T[:3, :3].T  # nearly: enough to say what the camera sees
@@ -125,18 +125,18 @@ def turned_scans(count: int, step: float) -> dict[str, Scan]:
 
 @pytest.fixture(scope="module")
 def turn() -> Alignment:
-    return register_all(turned_scans(9, 40.0), "turn_03", Starts(step_deg=40.0))
+    return register_all(turned_scans(6, 60.0), "turn_03", Starts(step_deg=60.0))
 
 
 def test_a_turn_closes(turn: Alignment) -> None:
     for k, T in enumerate(turn.T_reference_scan.values()):
-        shift, deg = off(T, TABLE.turned(40.0 * (2 - k)))
+        shift, deg = off(T, TABLE.turned(60.0 * (2 - k)))
         assert shift < 0.03 and deg < 0.06
     longest = max(turn.loops, key=lambda loop: len(loop.names))
-    assert len(longest.names) > 5
+    assert len(longest.names) > 3
     assert turn.loops[0].before.shift_mm < 0.1
     assert max(loop.after.shift_mm for loop in turn.loops) < 0.05
-    assert len(turn.pairs) >= 9 and not turn.dropped
+    assert len(turn.pairs) >= 6 and not turn.dropped
     assert {pair.start for pair in turn.pairs.values()} <= {"turntable", "features", "initial"}
 
 
