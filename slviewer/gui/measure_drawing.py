@@ -47,16 +47,18 @@ def drawn(
     ``others``: all measurements by id; ``lines`` (k, 2) mm: of a section.
     """
     if measured.kind == "distance":
-        return _dimension(*(np.array(end) for end in measured.data["ends"]))
+        a, b = (np.array(end) for end in measured.data["ends"])
+        return _dimension(a, b)
     if measured.kind == "section":
         plane = CutPlane.from_dict(measured.data["plane"])
         off = _OFF * float(np.ptp(np.concatenate(lines)[:, 0])) if lines else 0.0
-        cut = [lifted(plane, line + [0.0, off]) for line in lines]
+        cut = [lifted(plane, line + np.array([0.0, off])) for line in lines]
         place = cut[0][np.argmax(cut[0] @ plane.up)] if cut else plane.origin
         return np.concatenate([_chain(each) for each in cut]) if cut else np.empty((0, 2, 3)), place
     if measured.kind == "relation":
-        ends = [feature_of(others[each]) for each in measured.of if each in others]
-        if len(ends) != 2 or ends[0] is None or ends[1] is None:
+        found = (feature_of(others[each]) for each in measured.of if each in others)
+        ends = [feature for feature in found if feature is not None]
+        if len(ends) != 2:
             return None
         return _dimension(ends[0].place, ends[1].place, 1.2 * max(end.radius or 0.0 for end in ends))
     feature = feature_of(measured)
