@@ -19,6 +19,8 @@ from slviewer.errors import InputError, SessionError
 from slviewer.session.atomic import read_json, write_bytes
 
 _THREADS = 4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
+_SEPARATOR = "."
+"""Between the parts of a chunk's name: with Zarr's default, "/", every frame has two folders to be synced too."""
 _DTYPES = {np.dtype(np.uint8): "uint8", np.dtype(np.uint16): "uint16"}
 
 
@@ -32,9 +34,7 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
 
     def write(index: int) -> bytes:
         frame = _little_endian(np.ascontiguousarray(frames[index]))
-        chunk = _chunk(path, index)
-        chunk.parent.mkdir(parents=True)
-        write_bytes(chunk, frame.data)
+        write_bytes(_chunk(path, _SEPARATOR, index), frame.data)
         return hashlib.blake2b(frame.data, digest_size=20).digest()
 
     with ThreadPoolExecutor(_THREADS) as pool:
@@ -47,14 +47,14 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
 
     Raises SessionError where a frame is missing or cut short, InputError for an index outside the stack.
     """
-    shape, dtype = describe_stack(path)
+    shape, dtype, separator = _described(path)
     wanted = list(range(shape[0])) if indices is None else [int(index) for index in indices]
     if any(not 0 <= index < shape[0] for index in wanted):
         raise InputError(f"frames {wanted} were asked for, {path.parent.name} has frames 0 to {shape[0] - 1}")
     stack = np.empty((len(wanted), *shape[1:]), dtype)
 
     def read(slot: int) -> None:
-        chunk = _chunk(path, wanted[slot])
+        chunk = _chunk(path, separator, wanted[slot])
         try:
             with open(chunk, "rb", buffering=0) as file:
                 whole = os.fstat(file.fileno()).st_size == stack[slot].nbytes
@@ -73,6 +73,10 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
 
 def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
     """Shape (n, h, w) and type of a stack; SessionError where its layout is not the one written here."""
+    return _described(path)[:2]
+
+
+def _described(path: Path) -> tuple[tuple[int, int, int], np.dtype, str]:
     description = read_json(path / "zarr.json")
     try:
         n, height, width = (int(extent) for extent in description["shape"])
@@ -82,9 +86,9 @@ def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
         codecs = [codec["name"] for codec in description["codecs"]]
     except (KeyError, TypeError, ValueError) as error:
         raise SessionError(f"{path} does not describe a stack of frames ({error}): import the capture again") from error
-    if dtype not in _DTYPES or chunk != [1, height, width] or separator != "/" or codecs != ["bytes"]:
+    if dtype not in _DTYPES or chunk != [1, height, width] or separator not in "./" or codecs != ["bytes"]:
         raise SessionError(f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it again")
-    return (n, height, width), dtype
+    return (n, height, width), dtype, separator
 
 
 def check_frames(frames: np.ndarray) -> None:
@@ -108,14 +112,15 @@ def _create_array(path: Path, shape: tuple[int, ...], dtype: str) -> None:
         fill_value=0,
         zarr_format=3,
         dimension_names=["frame", "v", "u"],
+        chunk_key_encoding={"name": "default", "separator": _SEPARATOR},
     )
     description = path / "zarr.json"
     with open(description, "rb") as file:
         os.fsync(file.fileno())
 
 
-def _chunk(path: Path, index: int) -> Path:
-    return path / "c" / str(index) / "0" / "0"
+def _chunk(path: Path, separator: str, index: int) -> Path:
+    return path / separator.join(("c", str(index), "0", "0"))
 
 
 def _read_into(file: RawIOBase, frame: np.ndarray) -> bool:

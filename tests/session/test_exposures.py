@@ -68,6 +68,6 @@ def test_a_replaced_or_damaged_capture_is_never_mixed(session, sequence, stacks)
         first.stack()
     assert second.frames.shape == stacks.shape[1:]
     third = save(session, sequence, np.ascontiguousarray(stacks[..., ::-1]), force=True)
-    (third.folder / "frames.zarr" / "c" / "5" / "0" / "0").unlink()
+    (third.folder / "frames.zarr" / "c.5.0.0").unlink()
     with pytest.raises(SessionError, match="missing"):
         third.stack()

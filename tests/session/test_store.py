@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -41,6 +42,18 @@ def test_other_programs_read_the_frames_as_zarr(session, sequence, frames):
     array = zarr.open_array(folder / "frames.zarr", mode="r")
     assert array.metadata.zarr_format == 3 and array.chunks == (1, 30, 40)
     np.testing.assert_array_equal(array[...], frames)
+
+
+def test_a_stack_with_folders_for_each_frame_is_read_too(session, sequence, frames):
+    saved = session.save_capture("a", "scan", sequence, frames, source="")
+    stack = saved.folder / "frames.zarr"
+    shutil.rmtree(stack)
+    older = zarr.create_array(
+        stack, shape=frames.shape, dtype=frames.dtype, chunks=(1, *frames.shape[1:]), compressors=None
+    )
+    older[...] = frames
+    assert (stack / "c" / "0" / "0" / "0").is_file()
+    np.testing.assert_array_equal(session.load_capture("a").frames, frames)
 
 
 def test_names_are_counted_and_safe(session, sequence, frames):
@@ -125,7 +138,7 @@ def test_captures_are_saved_all_or_none(session, sequence, frames, noise):
 )
 def test_damage_is_an_error_and_never_a_black_frame(session, sequence, frames, damage):
     folder = session.save_capture("a", "scan", sequence, frames, source="").folder
-    chunk, array, meta = folder / "frames.zarr/c/2/0/0", folder / "frames.zarr/zarr.json", folder / "capture.json"
+    chunk, array, meta = folder / "frames.zarr/c.2.0.0", folder / "frames.zarr/zarr.json", folder / "capture.json"
     if damage == "missing chunk":
         chunk.unlink()
     elif damage == "short chunk":
