@@ -86,7 +86,7 @@ def _described(path: Path) -> tuple[tuple[int, int, int], np.dtype, str]:
         codecs = [codec["name"] for codec in description["codecs"]]
     except (KeyError, TypeError, ValueError) as error:
         raise SessionError(f"{path} does not describe a stack of frames ({error}): import the capture again") from error
-    if dtype not in _DTYPES or chunk != [1, height, width] or separator not in "./" or codecs != ["bytes"]:
+    if dtype not in _DTYPES or chunk != [1, height, width] or separator not in (".", "/") or codecs != ["bytes"]:
         raise SessionError(f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it again")
     return (n, height, width), dtype, separator
 
