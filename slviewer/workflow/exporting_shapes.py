@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -97,11 +98,8 @@ def merge_name(store: Session, name: str) -> str:
 def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: Progress, warn: Warn) -> Described:
     """The points of a merge, or where there is a ``plan`` one mesh through them."""
     name = merge_name(store, name)
-    if not is_fresh(store, f"merge/{name}"):
-        warn(f"merge {name} came from scans or a calibration that have changed since: merge again")
-    meta = store.load_result(f"merge/{name}", only=())[0]
     progress(0.1, "reading the merged points")
-    merged = read_ply(store.exports / str(meta["ply"]))
+    meta, merged = _kept_merge(store, name, warn)
     notes = (
         f"merge {name} of {', '.join(meta['scans'])}, frame: the camera's at {meta['reference']}",
         *_of_model(store, str(meta.get("model", ""))),
@@ -113,8 +111,20 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
     return _meshed(f"merge {name}", mesh_of(_with_normals(merged), plan, part(progress, 0.1, 1)), notes)
 
 
+def merged_points(store: Session, name: str, warn: Warn) -> PointSet:
+    """The points of a merge whose outside is known, to make a mesh of; of the last one where none is named."""
+    return _with_normals(_kept_merge(store, merge_name(store, name), warn)[1])
+
+
+def _kept_merge(store: Session, name: str, warn: Warn) -> tuple[dict[str, Any], Ply]:
+    if not is_fresh(store, f"merge/{name}"):
+        warn(f"merge {name} came from scans or a calibration that have changed since: merge again")
+    meta = store.load_result(f"merge/{name}", only=())[0]
+    return meta, read_ply(store.exports / str(meta["ply"]))
+
+
 def _with_normals(merged: Ply) -> PointSet:
-    """The points whose outside is known."""
+    """In such a file a normal of 0, 0, 0 and a sigma of -1 are not known."""
     if merged.normals is None:
         raise InputError("the merged cloud has no normals: merge the scans again")
     known = merged.normals.any(axis=1)

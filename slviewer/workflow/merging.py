@@ -24,12 +24,15 @@ from slviewer.workflow.scaling import corrected_cloud, told_scale
 from slviewer.workflow.trust import told
 
 StartKind = Literal["features", "turntable", "identity"]
+Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
+"""Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class Merge:
     """How scans lie on one of them, the one surface that they were fused to, and the file it went to. ``scale`` says,
-    in words, what correction of scale is in it."""
+    in words, what correction of scale is in it. In the file ``seen_by`` counts the scans that a point is the mean of,
+    and ``source`` numbers the one that its place comes from, 0 for the first of ``fused.names``."""
 
     alignment: Alignment
     fused: Fused
@@ -121,7 +124,7 @@ def merge(
     angle: float | None = None,
     axis: Axis | None = None,
     poses: Mapping[str, np.ndarray] | None = None,
-    picked: Mapping[Pair, tuple[np.ndarray, np.ndarray]] | None = None,
+    picked: Picked | None = None,
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
@@ -157,7 +160,7 @@ def merge(
     Path(out).parent.mkdir(parents=True, exist_ok=True)
     surface = fused.surface
     scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
-    scalars["seen_by"] = fused.seen_by
+    scalars |= {"seen_by": fused.seen_by, "source": fused.source}
     notes = (f"scans {', '.join(names)}, frame: the camera's at {reference}", f"calibration {fitted.name}")
     write_ply(Path(out), surface.points, surface.colours, surface.normals, scalars, notes=notes)
     progress(1.0, "merged")
@@ -170,7 +173,7 @@ def _starts(
     angle: float | None,
     axis: Axis | None,
     poses: Mapping[str, np.ndarray] | None,
-    picked: Mapping[Pair, tuple[np.ndarray, np.ndarray]] | None,
+    picked: Picked | None,
     warn: Warn,
 ) -> Starts:
     if (start == "turntable") != (angle is not None):
@@ -183,6 +186,9 @@ def _starts(
             raise UsageError(f"points were picked on {scan} and {onto}, which are not both among the scans to merge")
         picks[scan, onto], apart = picked_start(there, here)
         warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
+    for base in {onto for _, onto in picks} if poses is None and angle is None else ():
+        if all((name, base) in picks for name in names if name != base):  # pairs that nobody picked start there too
+            poses = {base: np.eye(4)} | {name: picks[name, base].T for name in names if name != base}
     return Starts(poses=poses, step_deg=angle, axis=axis, picked=picks)
 
 
@@ -197,5 +203,6 @@ def _figures(found: Registration) -> dict[str, Any]:
         "start": found.start,
         "sigma_shift_mm": found.uncertainty.shift_mm,
         "sigma_turn_deg": found.uncertainty.turn_deg,
+        "middle": found.uncertainty.centre.tolist(),
         "T_reference_scan": found.T_reference_scan.tolist(),
     }

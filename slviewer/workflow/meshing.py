@@ -8,11 +8,9 @@ from typing import Any
 from slviewer.errors import UsageError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape
-from slviewer.session.ply import read_ply
-from slviewer.session.store import Session
 from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
 from slviewer.surface.shapes import PointSet
-from slviewer.workflow.exporting_shapes import is_fresh, merge_name, scan_cloud
+from slviewer.workflow.exporting_shapes import merged_points, scan_cloud
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.merging import Merge, StartKind, merge
 from slviewer.workflow.models import check_accepted
@@ -80,7 +78,7 @@ def mesh(
             )  # fmt: skip
             shape = merged.fused.surface
         elif sources[0].startswith(MERGE):
-            shape = _kept_merge(store, sources[0].removeprefix(MERGE), warn)
+            shape = merged_points(store, sources[0].removeprefix(MERGE), warn)
         else:
             shape = scan_cloud(store, sources[0], model, before, warn)
     meshed = mesh_of(shape, plan, part(progress, 0.5, 0.95))
@@ -88,12 +86,3 @@ def mesh(
     write_shape(path, meshed.mesh, notes=(f"of {', '.join(sources)}", *meshed.text().splitlines()))
     progress(1.0, "meshed")
     return Mesh(meshed, sources, path, merged)
-
-
-def _kept_merge(store: Session, name: str, warn: Warn) -> PointSet:
-    number = merge_name(store, name)
-    result = f"{MERGE}{number}"
-    if not is_fresh(store, result):
-        warn(f"merge {number} came from scans or a calibration that have changed since: merge again")
-    found = read_ply(store.exports / str(store.load_result(result, only=())[0]["ply"]))
-    return PointSet(found.points, found.normals, found.colours, found.scalars.get("sigma"))

@@ -62,6 +62,7 @@ class Engine:
         self.autopilot = ""
         self.bench: Bench | None = None
         self.preflight: Preflight | None = None  # of the rig in use
+        self.not_merged = ""  # why, where the latest merge that was asked for came to nothing
         self._choice: Choice | None = None
         self._rig_fault = ""  # why the chosen rig could not even be set up
         self._reader: Reader | None = None
@@ -123,7 +124,7 @@ class Engine:
             self.acquisition.unstream()
             self.jobs.cancel_all()
             self._reader, self._session_view, self._queued = Reader(store, self._planner), None, set()
-            self._enough = False
+            self._enough, self.not_merged = False, ""
             if before is not None:
                 before.close()
             try:
@@ -331,6 +332,7 @@ class Engine:
             autopilot=self.autopilot,
             preflight=self.preflight,
             live=self.live.figures() if self.live is not None and self.live.running else None,
+            not_merged=self.not_merged,
         )
 
     def _read(self, reader: Reader, rig: RigView, bench: Bench | None) -> None:

@@ -35,6 +35,7 @@ from slviewer.workflow.wizard.exporting import export_file
 from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.live_requests import LiveRequests
 from slviewer.workflow.wizard.measure_requests import MeasureRequests
+from slviewer.workflow.wizard.merge_requests import MergeRequests
 from slviewer.workflow.wizard.requesting import request
 from slviewer.workflow.wizard.rigs import Choice, SetUp, set_up
 from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
@@ -51,7 +52,7 @@ _CHECKED: dict[Verdict, tuple[Level, str]] = {
 T = TypeVar("T")
 
 
-class Operator(LiveRequests, MeasureRequests):
+class Operator(LiveRequests, MergeRequests, MeasureRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:
@@ -384,23 +385,6 @@ class Operator(LiveRequests, MeasureRequests):
             lambda points: f"{name}: {points} points",
         )
 
-    @request("Merging")
-    def merge(self, names: Sequence[str], reference: str) -> None:
-        """Register scans to a reference, and merge them; `undo_merge` takes it back."""
-        store = self._engine.store
-        chosen = [store.load_capture(name).name for name in names]
-        merge = partial(work.merge_scans, store, chosen, reference, warn=self._warn)
-        self._submit("Merging", merge, partial(work.told_merge, reference))
-
-    @request("Undoing the merge")
-    def undo_merge(self) -> None:
-        """Move the current merge to the trash; the one before it is current again."""
-        view, store = self._engine.teller.now().session, self._engine.store
-        if view is None or view.merge is None:
-            raise InputError("there is no merge to take back")
-        store.trash_result(f"merge/{view.merge.name}")
-        (store.exports / f"merged_{view.merge.name}.ply").unlink(missing_ok=True)
-
     @request("Exporting")
     def export(self, what: What, name: str = "", file_format: str = "", plan: MeshingPlan | None = None) -> None:
         """Write a file into the session's exports; `exporting.FORMATS` lists what there is and the formats, the first
@@ -479,11 +463,17 @@ class Operator(LiveRequests, MeasureRequests):
     def _warn(self, text: str) -> None:
         self._engine.notices.tell("warning", text)
 
-    def _submit(self, name: str, make: Callable[[Reporter], T], sentence: Callable[[T], str]) -> None:
-        """A job of the operator's; `sentence(result)` says how it ended."""
+    def _submit(
+        self,
+        name: str,
+        make: Callable[[Reporter], T],
+        sentence: Callable[[T], str],
+        failed: Callable[[BaseException], None] | None = None,
+    ) -> None:
+        """A job of the operator's; `sentence(result)` says how it ended, `failed(error)` is called in place of that."""
 
         def done(result: T) -> None:
             self._engine.notices.tell("good", sentence(result))
             self._engine.teller.changed(session=True)
 
-        self._engine.jobs.submit(name, make, done)
+        self._engine.jobs.submit(name, make, done, failed=failed)

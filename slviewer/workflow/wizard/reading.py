@@ -35,6 +35,7 @@ from slviewer.workflow.models import (
 )
 from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.wizard.exporting import listed
+from slviewer.workflow.wizard.merge_reading import merge_view
 from slviewer.workflow.wizard.planning import Asked, Planner
 from slviewer.workflow.wizard.snapshot import (
     CalibrationView,
@@ -413,17 +414,10 @@ class Reader:
         )
 
     def _merge(self, result: str, hashes: Mapping[str, str], factors: Mapping[str, float]) -> MergeView:
-        meta = self._meta(result)
-        return MergeView(
-            name=result.removeprefix("merge/"),
-            reference=meta["reference"],
-            scans=tuple(meta["scans"]),
-            points=meta["points"],
-            pairs={
-                name: (pair["rms_mm"], pair["overlap"], np.array(pair["T_reference_scan"]))
-                for name, pair in meta["pairs"].items()
-            },
-            stale=not self._fresh(result, hashes, factors),
+        name = result.removeprefix("merge/")
+        return self._keep(  # type: ignore[no-any-return]
+            ("merge", self._meta(result)["hash"], stale := not self._fresh(result, hashes, factors)),
+            lambda: merge_view(name, self._meta(result), stale),
         )
 
     # files

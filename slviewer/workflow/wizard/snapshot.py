@@ -228,9 +228,41 @@ class ScanView:
     scale: str = ""  # what correction of scale is in the cloud
 
 
+@dataclass(frozen=True)
+class MergedPair:
+    """How one scan lies on another: the overlap, 0 ... 1; one standard deviation of the pose, and how far the overlap's
+    middle was moved, None where a merge of before did not keep them.
+    """
+
+    scan: str
+    onto: str
+    rms_mm: float
+    overlap: float
+    sigma_mm: float | None
+    sigma_deg: float | None
+    moved_mm: float | None
+    turned_deg: float
+
+
+@dataclass(frozen=True)
+class MergedLoop:
+    """How far the pairs round these scans fail to lead back: as registered, and as adjusted together."""
+
+    scans: tuple[str, ...]
+    error_mm: float
+    error_deg: float
+    left_mm: float
+    left_deg: float
+
+
 @dataclass(frozen=True, eq=False)
 class MergeView:
-    """The current merge: `pairs` maps each scan but the reference to (RMS mm, overlap 0 ... 1, T_reference_scan)."""
+    """The current merge: `pairs` maps each scan but the reference to (RMS mm, overlap 0 ... 1, T_reference_scan).
+
+    `registered`: the pairs that it was made from; `loops` that these close, the worst first; `dropped`: pairs that the
+    others contradict, and `refused` ones that did not register, in sentences. `stray`: how many pixels of all scans lie
+    on no surface, by what they are; `shared`: the share of the points that more than one scan measured.
+    """
 
     name: str
     reference: str
@@ -238,6 +270,12 @@ class MergeView:
     points: int
     pairs: Mapping[str, tuple[float, float, np.ndarray]]
     stale: bool
+    registered: tuple[MergedPair, ...] = ()
+    loops: tuple[MergedLoop, ...] = ()
+    dropped: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
+    stray: Mapping[str, int] = field(default_factory=dict)
+    shared: float | None = None
 
 
 @dataclass(frozen=True)
@@ -360,6 +398,7 @@ class Snapshot:
     autopilot: str  # what it does now; empty where it rests
     preflight: Preflight | None = None  # what the last check of the rig in use said
     live: LiveView | None = None  # None while nothing is scanned live
+    not_merged: str = ""  # why the latest merge that was asked for was refused, or failed
 
     def step(self, key: str) -> StepView:
         """The step called `key`."""

@@ -20,7 +20,7 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.calibrating import CalibrationResult, calibrate
 from slviewer.workflow.feedback import Warn
-from slviewer.workflow.merging import Merge, merge
+from slviewer.workflow.merging import Merge, Picked, StartKind, merge
 from slviewer.workflow.models import POSES_FOR_PIXELWISE, available, best, insisted
 from slviewer.workflow.poses import Judged, judge_all
 from slviewer.workflow.reconstructing import reconstruct
@@ -166,15 +166,27 @@ def told_measures(rms: dict[str, dict[str, float]]) -> str:
     return "; ".join(f"{name}: RMS {said}" for name, said in figures.items())
 
 
-def merge_scans(session: Session, names: list[str], reference: str, report: Reporter, warn: Warn) -> Merge:
+def merge_scans(
+    session: Session,
+    names: list[str],
+    reference: str,
+    report: Reporter,
+    warn: Warn,
+    *,
+    start: StartKind = "features",
+    angle: float | None = None,
+    picked: Picked | None = None,
+) -> Merge:
     """Register scans to a reference, and keep how they lie; the merged PLY goes into the exports."""
     done = [int(name.removeprefix("merge/")) for name in session.result_names() if name.startswith("merge/")]
     number = max(done, default=0) + 1
     insist = insisted(session)
     model = best(session, insist)
     with delivered(session, f"merged_{number}.ply", report) as ply:
-        progress = report.within(0, 0.97)
-        found = merge(session, names, reference, ply, model=model, accept_rejected=insist, progress=progress, warn=warn)
+        found = merge(
+            session, names, reference, ply, model=model, start=start, angle=angle, picked=picked,
+            accept_rejected=insist, progress=report.within(0, 0.97), warn=warn,
+        )  # fmt: skip
         calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
         meta = {
             **found.to_json(),

@@ -1,0 +1,67 @@
+"""What an operator can ask of merges: to make one, and to take it back."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeVar
+
+from slviewer.errors import InputError
+from slviewer.workflow.merging import Picked, StartKind
+from slviewer.workflow.wizard import work
+from slviewer.workflow.wizard.jobs import Reporter
+from slviewer.workflow.wizard.notices import words_for
+from slviewer.workflow.wizard.requesting import Asked, request
+
+MERGING = "Merging"
+T = TypeVar("T")
+
+
+class MergeRequests(Asked):
+    """Merging scans by the worker; what could not be merged is told until the next try."""
+
+    @request(MERGING)
+    def merge(
+        self,
+        names: Sequence[str],
+        reference: str,
+        *,
+        start: StartKind = "features",
+        angle: float | None = None,
+        picked: Picked | None = None,
+    ) -> None:
+        """Register scans, named in the order in which they were taken, to a reference, and merge them; `undo_merge`
+        takes it back. Where registration starts, as `merging.merge` takes it.
+        """
+        engine = self._engine
+        store, engine.not_merged = engine.store, ""
+        chosen = [store.load_capture(name).name for name in names]
+        merge = partial(
+            work.merge_scans, store, chosen, reference, start=start, angle=angle, picked=picked, warn=self._warn
+        )
+
+        def failed(error: BaseException) -> None:
+            engine.not_merged = words_for(MERGING, error)
+            engine.notices.tell("error", engine.not_merged)
+
+        self._submit(MERGING, merge, partial(work.told_merge, reference), failed)
+
+    @request("Undoing the merge")
+    def undo_merge(self) -> None:
+        """Move the current merge to the trash; the one before it is current again."""
+        view, store = self._engine.teller.now().session, self._engine.store
+        if view is None or view.merge is None:
+            raise InputError("there is no merge to take back")
+        store.trash_result(f"merge/{view.merge.name}")
+        (store.exports / f"merged_{view.merge.name}.ply").unlink(missing_ok=True)
+
+    @abstractmethod
+    def _submit(
+        self,
+        name: str,
+        make: Callable[[Reporter], T],
+        sentence: Callable[[T], str],
+        failed: Callable[[BaseException], None] | None = None,
+    ) -> None: ...
+
+    @abstractmethod
+    def _warn(self, text: str) -> None: ...
