@@ -24,10 +24,10 @@ def value_words(quantity: Quantity) -> str:
     """Value ± U (k = 2) with the unit; a star where the calibration's part of U is not known."""
     digits = 1 if quantity.unit == "%" else 3
     unit = _UNITS.get(quantity.unit, f" {quantity.unit}")
+    value = f"{round(quantity.value, digits) + 0.0:.{digits}f}".replace("-", "−")  # no minus before nothing
     if quantity.U is None:
-        return f"{quantity.value:.{digits}f}{unit}"
-    star = "" if quantity.whole else "*"
-    return f"{quantity.value:.{digits}f} ± {quantity.U:.{digits}f}{unit}{star}"
+        return f"{value}{unit}"
+    return f"{value} ± {quantity.U:.{digits}f}{unit}{'' if quantity.whole else '*'}"
 
 
 def label(measured: Measurement) -> str:
@@ -60,7 +60,9 @@ def drawn(
         ends = [feature for feature in found if feature is not None]
         if len(ends) != 2:
             return None
-        return _dimension(ends[0].place, ends[1].place, 1.2 * max(end.radius or 0.0 for end in ends))
+        # from outside of both; a point lies on the surface already
+        clear = 0.0 if any(end.kind == "point" for end in ends) else 1.2 * max(end.radius or 0.0 for end in ends)
+        return _dimension(ends[0].place, ends[1].place, clear)
     feature = feature_of(measured)
     return None if feature is None else (_outline(feature, _extent(measured)), feature.place)
 
@@ -79,7 +81,7 @@ def lifted(plane: CutPlane, points: np.ndarray) -> np.ndarray:
 def _outline(feature: Feature, extent: float) -> np.ndarray:
     """(n, 2, 3) mm: a sphere's three great circles, a plane's disc with its normal, a cylinder's ends and axis."""
     if feature.kind == "point":
-        return _cross(feature.place, 1.5)
+        return _cross(feature.place, 2.5)
     if feature.kind == "sphere":
         assert feature.radius is not None
         circles = [_circle(feature.place, axis, (1 + _OFF) * feature.radius) for axis in np.eye(3)]

@@ -93,6 +93,11 @@ class Results:
         self.refresh()
         return new
 
+    def move_to(self, on: str) -> None:
+        """Another surface is drawn: show what was measured on it."""
+        self._on = on
+        self.refresh()
+
     def refresh(self) -> None:
         """Show the chosen one."""
         chosen, measured = self.chosen, self._measured

@@ -21,7 +21,7 @@ _COLOURS = ("#b3261e", "#1f9673", "#7b5cc4")
 _LINE = "#2270b8"
 _STEPS = 400
 _MOST_DRAWN = 2000
-_HIGH = 300
+_LEAST_HIGH, _MOST_HIGH = 210, 330
 _FLAT = 0.1
 """Height over length below which heights are drawn larger: to scale nothing would be seen of them."""
 
@@ -49,7 +49,7 @@ class SectionBox:
         low, high, step = _range(np.concatenate(lines)[:, 0])
         for slider, share in zip(self._sliders, _AT, strict=True):
             slider.min, slider.max, slider.step = low, high, step
-            slider.value = low + round(share * (high - low) / step) * step
+            slider.value = round(low + round(share * (high - low) / step) * step, 6)
             change(slider, visible=True)
 
     def hide(self) -> None:
@@ -101,7 +101,7 @@ def section_figure(name: str, lines: list[np.ndarray], cursors: np.ndarray) -> F
     """The section's lines (k, 2) mm, with the cursors (3, 2) on them."""
     every = np.concatenate(lines)
     width, height = np.maximum(np.ptp(every, axis=0), 1e-6)
-    drawing = new_figure(PLOT_PX, _HIGH)
+    drawing = new_figure(PLOT_PX, int(np.clip(1.6 * PLOT_PX * height / width + 90, _LEAST_HIGH, _MOST_HIGH)))
     axes = drawing.subplots()
     tidy(axes, "", "along, mm", "height, mm")
     for line in lines:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.gui.inputs import Choice, titled
+from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.measure_words import deviation_bar
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened, spread
@@ -20,6 +20,7 @@ from slviewer.workflow.wizard.snapshot import SessionView
 from slviewer.workflow.wizard.surfaces import place_at
 
 COLOURS = ("texture", "depth", "uncertainty")
+DEVIATION = "deviation"
 SHOWN = 150_000
 
 
@@ -67,8 +68,15 @@ class SurfaceBox:
         self.ask()
 
     def deviate(self, measured: Measurement | None) -> None:
-        """Colour by this deviation while its surface is chosen; None: as the operator chose."""
+        """Offer to colour by this deviation, and do so; None: offer it no longer."""
         self._deviation = measured
+        if measured is not None:
+            change(self._colour, options=(*COLOURS, DEVIATION))
+            change(self._colour, value=DEVIATION)
+        elif DEVIATION in self._colour.options:
+            kept = COLOURS[0] if self._colour.value == DEVIATION else self._colour.value
+            self._colour.options = COLOURS
+            change(self._colour, value=kept)
         self.ask()
 
     def show(self, visible: bool) -> None:
@@ -99,7 +107,7 @@ class SurfaceBox:
             self._stage.scene.remove(self._layer, "surface")
             self._legend.set("")
             return
-        if shown is not None and shown.source != name:
+        if shown is not None and (shown.source != name or colour != DEVIATION):
             shown = None
         key = (name, self._versions.get(name), colour if shown is None else shown.id)
         operator = self._stage.operator

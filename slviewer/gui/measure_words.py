@@ -43,10 +43,8 @@ def measurement_words(measured: Measurement, labels: Mapping[str, str]) -> Html:
     about = f"{measured.kind} on {on}, by {measured.model}"
     if where := measured.data.get("where"):
         about += f"; {where}"
-    if fit := measured.data.get("fit"):
-        about += f"; {fit['used']:,} points used, {fit['left_out']:,} left out"
     said = Html(table((measured.name, ""), rows) + block(toned(f"{about}.", "dim")) + _notes([measured]))
-    for warning in (fit or {}).get("warnings", ()):
+    for warning in measured.data.get("fit", {}).get("warnings", ()):
         said = Html(said + boxed(f"{warning[:1].upper()}{warning[1:]}.", "warning"))
     if measured.stale:
         said = Html(boxed("Stale: what it was measured on has changed since; measure it again.", "warning") + said)
@@ -110,7 +108,7 @@ def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: fl
         for side in (-tolerance, tolerance):
             axes.axvline(side, color=_LIMIT, linewidth=1.2, linestyle="--")
         axes.plot([], [], color=_LIMIT, linewidth=1.2, linestyle="--", label=f"tolerance ± {tolerance:g} mm")
-        legend(axes, loc="upper right")
+        legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
         far = max(float(edges[-1]), 1.15 * tolerance)
         axes.set_xlim(-far, far)
     return finish(drawing, "How many of the points lie how far off the nominal.", name)

@@ -40,6 +40,7 @@ class Panel:
         self._lock = threading.RLock()
         self._tool = Tool()
         self._sized = ""
+        self._related: list[tuple[str, str]] = []
         self._visible = False
         self._surface = SurfaceBox(stage, self._painter, LAYER, self._loaded)
         self._results = Results(stage, self._painter, LAYER, self._chose)
@@ -86,11 +87,11 @@ class Panel:
                 "Upload nominal model", icon=viser.Icon.UPLOAD, color="gray", mime_type=".stl,.ply,.obj"
             )
             upload.on_upload(safely(lambda: self._stage.operator.take_nominal(upload.value.name, upload.value.content)))
-            self._nominal = Choice(gui, "Nominal model")
+            self._nominal = Choice(gui, "Model")
             hint = "Not said: mm, and it is asked where the sizes do not fit"
             self._units = gui.add_dropdown("Its units", (NOT_SAID, *MM), hint=hint)
-            hint = "0: none; nothing is judged"
-            self._tolerance = gui.add_number("Tolerance ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint)
+            hint = "The tolerance; 0: none, and nothing is judged"
+            self._tolerance = gui.add_number("Limit ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint)
             self._compare = gui.add_button("Compare", icon=viser.Icon.ARROWS_DIFF)
             self._compare.on_click(safely(self._ask_compare))
 
@@ -206,6 +207,7 @@ class Panel:
             on = self._surface.on
             assert on is not None
             self._take(self._tool.name)
+            self._results.move_to(on.source)
             if self._sized != on.source:
                 self._sized = on.source
                 low, high = np.nanpercentile(on.points.reshape(-1, 3), [2, 98], axis=0)
@@ -224,9 +226,14 @@ class Panel:
     def _offer_inputs(self, session: SessionView | None) -> None:
         measured = session.measurements if session else ()
         related = [(each.id, each.name) for each in measured if each.kind in KINDS and not each.stale]
-        ends = [identity for identity, _ in related[-2:]]
-        self._one.offer(related, ends[0] if ends else "")
-        self._other.offer(related, ends[-1] if ends else "")
+        for choice in (self._one, self._other):
+            choice.offer(related)
+        if (
+            related != self._related and len(related) > 1 and self._tool.name != COMPARE[0]
+        ):  # the latest two, most likely
+            self._one.choose(related[-2][0])
+            self._other.choose(related[-1][0])
+        self._related = related
         change(self._between, disabled=len(related) < 2)
         self._nominal.offer([(name, name) for name in (session.nominals if session else ())])
 
