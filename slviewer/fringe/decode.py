@@ -62,7 +62,7 @@ def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.n
     rules = code_rules(found, fringe_mean(found, stack) if is_plain(found) else MIDDLE)
     kernels.decode_coded(
         stack,
-        *waves(found.shifts[0], found.sign),
+        steps_of(found.shifts[0], found.sign),
         np.array(found.gray, np.int64),
         np.array(found.inverse, np.int64),
         -1 if found.complementary is None else found.complementary,
@@ -78,28 +78,9 @@ def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.n
 
 
 def _levels(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
-    shape = stack.shape[1:]
-    levels = found_levels(found)
-    wrapped = np.empty((len(found.shifts), *shape), np.float32)
-    phase, modulation, background = (np.empty(shape, np.float32) for _ in range(3))
-    weakest, clipped, reason = np.full(shape, np.inf, np.float32), np.zeros(shape, bool), np.empty(shape, np.uint8)
-    for shift, psi in zip(found.shifts, wrapped, strict=True):  # the finest is last, and its maps stay
-        turned = waves(shift, found.sign)
-        kernels_levels.decode_shift(stack, *turned, scale, psi, modulation, background, weakest, clipped)
-    kernels_levels.unwrap_levels(
-        wrapped,
-        np.array([level.weights for level in levels], np.float64),
-        np.array([level.period_px for level in levels], np.float64),
-        lowest_coordinate(levels[0].period_px, found.extent),
-        limits.LEVEL_MISFIT,
-        background,
-        weakest,
-        clipped,
-        scale,
-        phase,
-        reason,
-    )
-    return phase, wrapped[-1].copy(), modulation, background, reason
+    maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
+    kernels_levels.decode_levels(stack, shifts_of(found), ladder_of(found), scale, *maps)
+    return maps
 
 
 def _gray_alone(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
@@ -170,6 +151,53 @@ def spike_rules(found: Layout) -> kernels_spikes.SpikeRules:
         limits.LONELY,
         limits.LONELY_NEIGHBOURS,
         *border_rad(found),
+    )
+
+
+def steps_of(shift: Shift, sign: int) -> kernels.Steps:
+    """The frames of a period and the cosines and sines that they are weighed with, as the kernels read them."""
+    n = len(shift.indices)
+    half = n // 2
+    if n % 2:  # less the first frame, steps k and n - k
+        lines = [(k, 0, 0, n - k) for k in range(1, half + 1)]
+    else:
+        lines = [(0, 0, half, 0)] + [(k, half - k, half + k, n - k) for k in range(1, (half + 1) // 2)]
+        lines += [(half // 2, 0, half + half // 2, 0)] if half % 2 == 0 else []
+    angle = 2 * np.pi * np.array([line[0] for line in lines]) / n
+    cosines, sines = np.cos(angle), sign * np.sin(angle)
+    if n % 2 == 0:
+        cosines[-1:] *= half % 2  # a quarter of a turn, exactly
+    if len(lines) % 2:
+        lines, cosines, sines = [*lines, (0, 0, 0, 0)], np.append(cosines, 0), np.append(sines, 0)
+    counted = n - 1 + sum(line.count(0) for line in lines)
+    frames = np.array(shift.indices, np.int64)[np.array(lines)]
+    return kernels.Steps(frames, cosines.astype(np.float32), sines.astype(np.float32), shift.indices[0], n, counted)
+
+
+def shifts_of(found: Layout) -> kernels.Shifts:
+    """All periods of a layout, as the kernels read them."""
+    shifts = [steps_of(shift, found.sign) for shift in found.shifts]
+    return kernels.Shifts(
+        np.concatenate([shift.frames for shift in shifts]),
+        np.concatenate([shift.cosines for shift in shifts]),
+        np.concatenate([shift.sines for shift in shifts]),
+        np.cumsum([0, *(len(shift.frames) for shift in shifts)]),
+        np.array([shift.first for shift in shifts], np.int64),
+        np.array([shift.steps for shift in shifts], np.int64),
+        np.array([shift.counted for shift in shifts], np.int64),
+    )
+
+
+def ladder_of(found: Layout) -> kernels_levels.Ladder:
+    """How a layout's periods become one absolute phase; empty where a Gray code tells it."""
+    if found.gray:
+        return kernels_levels.Ladder(np.zeros((0, 0)), np.zeros(0), 0.0, 0.0)
+    levels = found_levels(found)
+    return kernels_levels.Ladder(
+        np.array([level.weights for level in levels], np.float64),
+        np.array([level.period_px for level in levels], np.float64),
+        lowest_coordinate(levels[0].period_px, found.extent),
+        limits.LEVEL_MISFIT,
     )
 
 

@@ -1,25 +1,24 @@
 """Multi-frequency decoding, compiled; `reference` is what this must agree with."""
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
-from slviewer.fringe.kernels import is_clipped, is_dark, shift_row, verdict
+from slviewer.fringe.kernels import CONTRACT, is_clipped, is_dark, period, shift_row, verdict
 from slviewer.geometry.jit import kernel
 
 TWO_PI = 2 * np.pi
 
 
-@kernel(parallel=True)
-def decode_shift(stack, shift, cosines, sines, scale, wrapped, modulation, background, weakest, clipped):
-    """One period: fills three maps, lowers ``weakest`` (h, w) and sets ``clipped`` (h, w) where this period is."""
-    _, height, width = stack.shape
-    for row in numba.prange(height):
-        peak = np.empty(width, np.float32)
-        B, A = modulation[row], background[row]
-        shift_row(stack, shift, cosines, sines, row, wrapped[row], B, A, peak)
-        for x in range(width):
-            weakest[row, x] = min(weakest[row, x], B[x])
-            clipped[row, x] |= is_clipped(B[x], A[x], peak[x], scale)
+class Ladder(NamedTuple):
+    """How several periods become one absolute phase; ``weights`` (levels, m) of the m wrapped
+    phases and ``periods`` (levels,) px describe the levels, longest first; ``low`` px is where the first is cut."""
+
+    weights: np.ndarray
+    periods: np.ndarray
+    low: float
+    misfit: float
 
 
 @numba.njit(inline="always")
@@ -60,21 +59,42 @@ def levels_row(psi, weights, periods, low, misfit, B, A, clipped, scale, coordin
         phase[x] = np.float32(np.nan) if dark | clipped[x] | unclear else absolute
 
 
-@kernel(parallel=True)
-def unwrap_levels(wrapped, weights, periods, low, misfit, background, weakest, clipped, scale, phase, reason):
-    """Absolute phase of the finest period from (m, h, w) ``wrapped`` phases, longest period first.
+@numba.njit(inline="always")
+def levels_room(width):
+    """Room for a row: weakest modulation, whether clipped, and four of float64."""
+    weakest, clipped = np.empty(width, np.float32), np.empty(width, np.bool_)
+    a, b = np.empty(width, np.float64), np.empty(width, np.float64)
+    return weakest, clipped, a, b, np.empty(width, np.float64), np.empty(width, np.float64)
 
-    ``weights`` (levels, m) and ``periods`` (levels,) px describe the levels; ``low`` px is where the first is cut.
-    """
-    count, height, width = wrapped.shape
+
+@numba.njit(inline="always")
+def ladder_row(stack, shifts, ladder, scale, row, psi, B, A, peak, room, phase, reason):
+    """One row's absolute phase, reason, modulation B and background A of the finest period, and all wrapped phases."""
+    weakest, clipped, coordinate, order, own, worst = room
+    width = stack.shape[2]
+    for x in range(width):
+        weakest[x], clipped[x] = np.float32(np.inf), False
+    for i in range(len(shifts.steps)):  # the finest is last, and its values stay
+        shift_row(stack, period(shifts, i), row, psi[i], B, A, peak)
+        for x in range(width):
+            weakest[x] = min(weakest[x], B[x])
+            clipped[x] |= is_clipped(B[x], A[x], peak[x], scale)
+    levels_row(
+        psi, ladder.weights, ladder.periods, ladder.low, ladder.misfit, weakest, A, clipped, scale,
+        coordinate, order, own, worst, phase, reason,
+    )  # fmt: skip
+
+
+@kernel(parallel=True, fastmath=CONTRACT)
+def decode_levels(stack, shifts, ladder, scale, phase, wrapped, modulation, background, reason):
+    """Several periods, each by its own phase steps; fills the five (h, w) maps, of the finest period."""
+    _, height, width = stack.shape
+    count = len(shifts.steps)
     for row in numba.prange(height):
-        psi = np.empty((count, width), np.float32)  # neighbours in memory, for the vector instructions
-        for i in range(count):
-            for x in range(width):
-                psi[i, x] = wrapped[i, row, x]
-        coordinate, order = np.empty(width, np.float64), np.empty(width, np.float64)
-        own, worst = np.empty(width, np.float64), np.empty(width, np.float64)
-        levels_row(
-            psi, weights, periods, low, misfit, weakest[row], background[row], clipped[row], scale,
-            coordinate, order, own, worst, phase[row], reason[row],
+        psi, peak = np.empty((count, width), np.float32), np.empty(width, stack.dtype)
+        ladder_row(
+            stack, shifts, ladder, scale, row, psi, modulation[row], background[row], peak, levels_room(width),
+            phase[row], reason[row],
         )  # fmt: skip
+        for x in range(width):
+            wrapped[row, x] = psi[count - 1, x]

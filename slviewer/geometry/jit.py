@@ -12,12 +12,18 @@ _LOCK = threading.Lock()
 _SETTINGS: Any = numba.config
 
 
-def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def kernel(
+    *, parallel: bool = False, fastmath: bool | frozenset[str] = False
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator: ``numba.njit`` that releases the GIL and caches its machine code where a folder can be written.
 
     Where none can, a kernel is compiled in memory at its first call.
     """
-    options: dict[str, Any] = {"parallel": parallel, "fastmath": fastmath, "nogil": True}
+    options: dict[str, Any] = {
+        "parallel": parallel,
+        "fastmath": fastmath if isinstance(fastmath, bool) else set(fastmath),
+        "nogil": True,
+    }
 
     def compile_lazily(function: Callable[..., Any]) -> Callable[..., Any]:
         folder = folder_for(function.__module__)

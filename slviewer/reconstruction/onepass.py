@@ -7,11 +7,11 @@ import numpy as np
 from slviewer.calibration.pixelwise import REACH, PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
-from slviewer.fringe import limits
-from slviewer.fringe.decode import code_rules, grey_scale, spike_rules, waves
+from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of, spike_rules, waves
+from slviewer.fringe.kernels import Shifts
+from slviewer.fringe.kernels_levels import Ladder
 from slviewer.fringe.layout import Layout, check_stack, clip_level, layout, white_level
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.reference import found_levels, lowest_coordinate
 from slviewer.fringe.reference_spikes import is_plain
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
@@ -68,7 +68,8 @@ class OnePass:
     axis: Axis
     _layout: Layout = field(init=False, repr=False)
     _order: kernels.Order = field(init=False, repr=False)
-    _ladder: kernels.Ladder = field(init=False, repr=False)
+    _shifts: Shifts = field(init=False, repr=False)
+    _ladder: Ladder = field(init=False, repr=False)
     _depths: kernels.Depths = field(init=False, repr=False)
     _lists: tuple[np.ndarray, ...] = field(init=False, repr=False)
 
@@ -87,7 +88,8 @@ class OnePass:
                 f"A {self.model.name} calibration measures no cloud in one pass: use the pixelwise or the splined one."
             )
         self._order = _order(self.sequence, self._layout)
-        self._ladder = _ladder(self._layout)
+        self._shifts = shifts_of(self._layout)
+        self._ladder = ladder_of(self._layout)
         height, width = self.shape
         self._lists = np.empty((height, width), np.uint16), np.empty((height, width), np.uint8), np.empty(height, int)
 
@@ -128,6 +130,7 @@ class OnePass:
         kernels.sweep(
             frames,
             self._order,
+            self._shifts,
             self._ladder,
             code_rules(self._layout, light.mean),
             grey_scale(self._layout, light.noise, light.white),
@@ -183,18 +186,6 @@ def _order(sequence: PatternSequence, found: Layout) -> kernels.Order:
         -1 if found.complementary is None else found.complementary,
         next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), -1),
         np.array([i for i in sequence.select(found.axis) if i not in read], np.int64),
-    )
-
-
-def _ladder(found: Layout) -> kernels.Ladder:
-    if found.gray:
-        return kernels.Ladder(np.zeros((0, 0)), np.zeros(0), 0.0, 0.0)
-    levels = found_levels(found)
-    return kernels.Ladder(
-        np.array([level.weights for level in levels], np.float64),
-        np.array([level.period_px for level in levels], np.float64),
-        lowest_coordinate(levels[0].period_px, found.extent),
-        limits.LEVEL_MISFIT,
     )
 
 

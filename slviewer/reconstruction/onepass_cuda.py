@@ -9,13 +9,14 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
-from slviewer.fringe.decode import decode, texture
+from slviewer.fringe.decode import decode, ladder_of, texture
+from slviewer.fringe.kernels_levels import Ladder
 from slviewer.fringe.layout import Layout, clip_level, layout
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry import cuda_device
 from slviewer.geometry.rig import StereoRig
-from slviewer.reconstruction.onepass import Light, OnePass, Scan, _ladder, _order
-from slviewer.reconstruction.onepass_kernels import Depths, Ladder, Order
+from slviewer.reconstruction.onepass import Light, OnePass, Scan, _order
+from slviewer.reconstruction.onepass_kernels import Depths, Order
 
 if TYPE_CHECKING:  # it imports CUDA
     from slviewer.reconstruction.onepass_cuda_card import Card
@@ -69,7 +70,7 @@ class CudaPass(OnePass):
                 raise InputError("Gray code without phase steps is not measured in one pass: decode and reconstruct it")
             if self.axis not in self.model.axes:
                 raise InputError(f"The stereo calibration has no axis {self.axis}: choose another axis.")
-            self._order, self._ladder = _order(self.sequence, self._layout), _ladder(self._layout)
+            self._order, self._ladder = _order(self.sequence, self._layout), ladder_of(self._layout)
         else:
             super().__post_init__()
 

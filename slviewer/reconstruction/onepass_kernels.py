@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from slviewer.fringe.kernels import coded_row, is_clipped, shift_row
-from slviewer.fringe.kernels_levels import levels_row
+from slviewer.fringe.kernels import CONTRACT, coded_row, five, period, shift_row
+from slviewer.fringe.kernels_levels import ladder_row, levels_room
 from slviewer.geometry.jit import kernel
 
 ROWS = 4
@@ -30,15 +30,6 @@ class Order(NamedTuple):
     complementary: int
     texture: int
     others: np.ndarray
-
-
-class Ladder(NamedTuple):
-    """How several periods become one absolute phase; see `kernels_levels.unwrap_levels`."""
-
-    weights: np.ndarray
-    periods: np.ndarray
-    low: float
-    misfit: float
 
 
 class Depths(NamedTuple):
@@ -71,7 +62,7 @@ class Maps(NamedTuple):
 
 
 @kernel(parallel=True)
-def sweep(stack, order, ladder, rules, scale, depths, maps, peaks):
+def sweep(stack, order, shifts, ladder, rules, scale, depths, maps, peaks):
     """Fill ``maps`` from the frames (n, h, w); ``peaks`` (blocks of rows,) int32 with the largest grey levels, where it
     is not empty.
 
@@ -79,15 +70,14 @@ def sweep(stack, order, ladder, rules, scale, depths, maps, peaks):
     the time, and knows that nothing overlaps.
     """
     _, height, width = stack.shape
-    count = len(order.starts) - 1
-    per_step = np.float32(2.0 / (order.starts[count] - order.starts[count - 1]))
+    per_step = np.float32(2.0 / shifts.steps[-1])
     for block in numba.prange((height + ROWS - 1) // ROWS):
         first, last = block * ROWS, min((block + 1) * ROWS, height)
         A = np.empty((ROWS, width), np.float32)
         if len(order.gray):
-            _coded(stack, order, rules, scale, first, last, A, maps)
+            _coded(stack, order, shifts, rules, scale, first, last, A, maps)
         else:
-            _levels(stack, order, ladder, scale, first, last, A, maps)
+            _levels(stack, shifts, ladder, scale, first, last, A, maps)
         if depths.grid.size:
             _splined(first, last, A, depths, scale, per_step, maps)
         else:
@@ -97,71 +87,43 @@ def sweep(stack, order, ladder, rules, scale, depths, maps, peaks):
             peaks[block] = _brightest(stack, order, first, last)
 
 
-@kernel()
-def _coded(stack, order, rules, scale, first, last, background, maps):
+@kernel(fastmath=CONTRACT)
+def _coded(stack, order, shifts, rules, scale, first, last, background, maps):
     width = stack.shape[2]
-    psi, B, A = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-    peak, least, top = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-    bottom, contrast = np.empty(width, np.float32), np.empty(width, np.float32)
-    code, doubtful = np.empty(width, np.int32), np.empty(width, np.bool_)
-    phase, reason = np.empty(width, np.float32), np.empty(width, np.uint8)
+    psi, peak, code, room = (
+        np.empty(width, np.float32),
+        np.empty(width, stack.dtype),
+        np.empty(width, np.int32),
+        five(width),
+    )
     for row in range(first, last):
-        shift_row(stack, order.frames, order.cosines, order.sines, row, psi, B, A, peak)
+        A, B = background[row - first], maps.modulation[row]
+        shift_row(stack, period(shifts, 0), row, psi, B, A, peak)
         coded_row(
             stack, order.gray, order.inverse, order.complementary, row, scale, rules, psi, B, A, peak,
-            code, least, top, bottom, contrast, doubtful, phase, reason,
+            code, room, maps.phase[row], maps.reason[row],
         )  # fmt: skip
-        _keep(row, row - first, phase, reason, B, A, background, maps)
 
 
-@kernel()
-def _levels(stack, order, ladder, scale, first, last, background, maps):
-    count, width = len(order.starts) - 1, stack.shape[2]
-    psi, B, A = np.empty((count, width), np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-    peak, weakest, clipped = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.bool_)
-    turns, own = np.empty(width, np.float64), np.empty(width, np.float64)
-    position, worst = np.empty(width, np.float64), np.empty(width, np.float64)
-    phase, reason = np.empty(width, np.float32), np.empty(width, np.uint8)
+@kernel(fastmath=CONTRACT)
+def _levels(stack, shifts, ladder, scale, first, last, background, maps):
+    psi, peak = np.empty((len(shifts.steps), stack.shape[2]), np.float32), np.empty(stack.shape[2], stack.dtype)
+    room = levels_room(stack.shape[2])
     for row in range(first, last):
-        for x in range(width):
-            weakest[x], clipped[x] = np.float32(np.inf), False
-        for i in range(count):
-            a, b = order.starts[i], order.starts[i + 1]
-            shift_row(stack, order.frames[a:b], order.cosines[a:b], order.sines[a:b], row, psi[i], B, A, peak)
-            for x in range(width):
-                weakest[x] = min(weakest[x], B[x])
-                clipped[x] |= is_clipped(B[x], A[x], peak[x], scale)
-        levels_row(
-            psi, ladder.weights, ladder.periods, ladder.low, ladder.misfit, weakest, A, clipped, scale,
-            position, turns, own, worst, phase, reason,
+        ladder_row(
+            stack, shifts, ladder, scale, row, psi, maps.modulation[row], background[row - first], peak, room,
+            maps.phase[row], maps.reason[row],
         )  # fmt: skip
-        _keep(row, row - first, phase, reason, B, A, background, maps)
 
 
-@numba.njit(inline="always")
-def _keep(row, here, phase, reason, B, A, background, maps):
-    for x in range(len(phase)):
-        maps.phase[row, x] = phase[x]
-    for x in range(len(phase)):
-        maps.reason[row, x] = reason[x]
-    for x in range(len(phase)):
-        maps.modulation[row, x] = B[x]
-    for x in range(len(phase)):
-        background[here, x] = A[x]
-
-
-@numba.njit(inline="always")
-def _noise(A, B, scale, per_step):
-    """Standard deviation of the phase, rad, at a background and modulation."""
-    variance = np.float32(scale.noise_a) + np.float32(scale.noise_b) * A
-    return np.divide(np.sqrt(variance * per_step), max(B, np.float32(1e-6)))
-
-
-@kernel()
+@kernel(fastmath=CONTRACT)
 def _pixelwise(first, last, background, depths, scale, per_step, maps):
     """Points and their depth noise, by each pixel's own rational function."""
     one, zero, none = np.float32(1), np.float32(0), np.float32(np.nan)
     gain, centre, c = np.float32(depths.gain), np.float32(depths.centre), depths.c
+    # the phase's standard deviation is the square root of the noise's variance times 2/n, over the modulation
+    squared, least_B = per_step * gain * gain, np.float32(1e-6)
+    noise_a, noise_b = np.float32(scale.noise_a) * squared, np.float32(scale.noise_b) * squared
     width = maps.phase.shape[1]
     z, slope = np.empty(width, np.float32), np.empty(width, np.float32)
     for row in range(first, last):
@@ -171,17 +133,19 @@ def _pixelwise(first, last, background, depths, scale, per_step, maps):
         points, sigma = maps.points[row], maps.sigma_z[row]
         for x in range(width):
             s = gain * phase[x] - centre
-            per = np.divide(one, one + c2[x] * s)
+            below, contrast = one + c2[x] * s, max(B[x], least_B)
+            both = np.divide(one, below * contrast)  # one division for two
+            per = contrast * both
             depth = (c0[x] + c1[x] * s) * per
             z[x] = depth if (s >= least[x]) & (s <= largest[x]) & (depth > zero) else none
-            slope[x] = abs(c1[x] - c0[x] * c2[x]) * per * per * gain
+            slope[x] = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
         for x in range(width):
-            sigma[x] = slope[x] * _noise(A[x], B[x], scale, per_step)
+            sigma[x] = slope[x] * np.sqrt(noise_a + noise_b * A[x])
         for x in range(width):
             points[x, 0], points[x, 1], points[x, 2] = ray_x[x] * z[x], ray_y[x] * z[x], z[x]
 
 
-@kernel()
+@kernel(fastmath=CONTRACT)
 def _splined(first, last, background, depths, scale, per_step, maps):
     """The same by the compiled splined model: the rational function, then what the grid adds to it.
 
@@ -190,6 +154,9 @@ def _splined(first, last, background, depths, scale, per_step, maps):
     """
     one, zero, none = np.float32(1), np.float32(0), np.float32(np.nan)
     gain, centre, c, grid, step = np.float32(depths.gain), np.float32(depths.centre), depths.c, depths.grid, depths.step
+    # the phase's standard deviation is the square root of the noise's variance times 2/n, over the modulation
+    squared, least_B = per_step * gain * gain, np.float32(1e-6)
+    noise_a, noise_b = np.float32(scale.noise_a) * squared, np.float32(scale.noise_b) * squared
     near, per_mm = np.float32(depths.near), np.float32(depths.per_mm)
     width, layers, next_one = maps.phase.shape[1], np.uint32(grid.shape[2]), np.uint32(1)
     deepest, per_px = np.float32(grid.shape[2] - 1.0001), np.float32(1.0 / step)
@@ -206,16 +173,18 @@ def _splined(first, last, background, depths, scale, per_step, maps):
             table[i] = above[i] + down * (below[i] - above[i])  # the grid at this row
         for x in range(width):
             s = gain * phase[x] - centre
-            per = np.divide(one, one + c2[x] * s)
+            below, contrast = one + c2[x] * s, max(B[x], least_B)
+            both = np.divide(one, below * contrast)  # one division for two
+            per = contrast * both
             rational = (c0[x] + c1[x] * s) * per
             depth = (rational - near) * per_mm
             measured = (depth >= zero) & (depth <= deepest)
             depth = depth if measured else zero
             k = np.int32(depth)
             z[x], cell[x], rest[x] = rational if measured else none, k, depth - np.float32(k)
-            slope[x] = abs(c1[x] - c0[x] * c2[x]) * per * per * gain
+            slope[x] = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
         for x in range(width):
-            sigma[x] = slope[x] * _noise(A[x], B[x], scale, per_step)
+            sigma[x] = slope[x] * np.sqrt(noise_a + noise_b * A[x])
         for i in range(grid.shape[1] - 1):
             start = i * step
             for q in range(min(step, width - start)):
