@@ -5,9 +5,13 @@ pair that could join what is apart is tried. Once every scan has a place, pairs 
 too: they close loops. A pair that the others contradict is dropped; the rest is adjusted together.
 """
 
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from threading import Lock
+from typing import TypeVar
 
 import numpy as np
 
@@ -23,6 +27,8 @@ from slviewer.registration.scan import Scan
 from slviewer.registration.start import Candidate, Start
 from slviewer.registration.turntable import Axis, axis_of
 
+Given = TypeVar("Given")
+Made = TypeVar("Made")
 Pair = tuple[str, str]
 """A scan, and the one that it lies on."""
 
@@ -109,14 +115,13 @@ class _Work:
     """One call of ``register_all``: what was tried so far."""
 
     def __init__(self, scans: Mapping[str, Scan | Cloud], reference: str, starts: Starts, say: Progress) -> None:
-        self.names, self.reference, self.starts, self.say = list(scans), reference, starts, say
+        self.names, self.reference, self.starts, self._progress = list(scans), reference, starts, say
+        self._share, self._saying = 0.0, Lock()
         self.root = self.names.index(reference)
         self.found: dict[Pair, Registration] = {}
         self.refused: dict[Pair, Refused] = {}
-        self.scans: list[Prepared] = []
-        for k, (name, scan) in enumerate(scans.items()):
-            say(0.2 * k / len(scans))
-            self.scans.append(_ready(name, scan if isinstance(scan, Scan) else Scan.from_cloud(scan)))
+        self.say(0.0)
+        self.scans = _side_by_side(self._ready, list(scans.items()))
         self.size = min(scan.size for scan in self.scans)
         self.expected = len(self._first_pairs()) + (_MORE_PAIRS * len(scans) if len(scans) > ALL_PAIRS else 0)
 
@@ -124,8 +129,7 @@ class _Work:
         for pair, start in (self.starts.picked or {}).items():
             self._try(*pair, start)
         known = self._known_poses()
-        for scan, onto in self._first_pairs():
-            self._try(scan, onto, self._start(known, scan, onto))
+        self._try_each([(pair, self._start(known, *pair)) for pair in self._first_pairs()])
         self._join()
         poses = self._tree()[0]
         if len(self.names) > ALL_PAIRS:
@@ -198,7 +202,7 @@ class _Work:
     def _close_loops(self, poses: np.ndarray) -> None:
         """Register pairs that must overlap where the scans lie now."""
         count = dict.fromkeys(self.names, 0)
-        shares = []
+        shares, wanted = [], []
         for i, a in enumerate(self.names):
             for j, b in enumerate(self.names[:i]):
                 if not {(a, b), (b, a)} & {*self.found, *self.refused}:
@@ -208,9 +212,25 @@ class _Work:
             if share < _OVERLAPPING or max(count[a], count[b]) >= _MORE_PAIRS:
                 continue
             count[a], count[b] = count[a] + 1, count[b] + 1
-            self._try(a, b, Candidate(T, "initial"))
+            wanted.append(((a, b), Candidate(T, "initial")))
+        self._try_each(wanted)
 
     # registering
+
+    def _ready(self, given: tuple[str, Scan | Cloud]) -> Prepared:
+        name, scan = given
+        scan = scan if isinstance(scan, Scan) else Scan.from_cloud(scan)
+        chosen = slice(None) if scan.trusted is None else scan.trusted
+        normals = None if scan.normals is None else scan.normals[chosen]
+        made = prepared(name, scan.points[chosen], normals, scan.sigma_mm)
+        self.say(self._share + 0.2 / len(self.names))
+        return made
+
+    def _try_each(self, wanted: Sequence[tuple[Pair, Candidate | None]]) -> None:
+        """Register pairs, none of which waits for another, and keep what came in their order."""
+        waiting = [(pair, start) for pair, start in wanted if not {pair, pair[::-1]} & set(self.found)]
+        for (pair, _), result in zip(waiting, _side_by_side(lambda one: self._registered(*one), waiting), strict=True):
+            self._keep(pair, result)
 
     def _try(self, scan: str, onto: str, start: Candidate | None, begun: list[Candidate] | None = None) -> bool:
         if (scan, onto) in self.found or (onto, scan) in self.found:
@@ -220,20 +240,35 @@ class _Work:
     def _register(
         self, scan: str, onto: str, start: Candidate | None, begun: list[Candidate] | None = None
     ) -> Registration | None:
+        return self._keep((scan, onto), self._registered((scan, onto), start, begun))
+
+    def _registered(
+        self, pair: Pair, start: Candidate | None, begun: list[Candidate] | None = None
+    ) -> Registration | Refused:
         tried = len(self.found) + len(self.refused)
         share = 0.2 + 0.7 * min(1.0, tried / (self.expected + 1))
         one = 0.7 / (self.expected + 1)
-        a, b = (self.scans[self.names.index(name)] for name in (scan, onto))
+        a, b = (self.scans[self.names.index(name)] for name in pair)
         try:
-            found = register_prepared(
+            return register_prepared(
                 a, b, size=self.size, initial=start, starts=begun, progress=lambda part: self.say(share + one * part)
             )
         except Refused as error:
-            self.refused[scan, onto] = error
+            return error
+
+    def _keep(self, pair: Pair, result: Registration | Refused) -> Registration | None:
+        if isinstance(result, Refused):
+            self.refused[pair] = result
             return None
-        self.found[scan, onto] = found
-        self.refused.pop((scan, onto), None)
-        return found
+        self.found[pair] = result
+        self.refused.pop(pair, None)
+        return result
+
+    def say(self, share: float) -> None:
+        """The share of the work that is done, which never goes back; whoever hears it may raise to cancel."""
+        with self._saying:
+            self._share = max(self._share, share)
+            self._progress(self._share)
 
     # putting together
 
@@ -291,10 +326,10 @@ class _Work:
         return bool(np.linalg.norm(left[3:]) < found.gate_mm)
 
 
-def _ready(name: str, scan: Scan) -> Prepared:
-    chosen = slice(None) if scan.trusted is None else scan.trusted
-    normals = None if scan.normals is None else scan.normals[chosen]
-    return prepared(name, scan.points[chosen], normals, scan.sigma_mm)
+def _side_by_side(do: Callable[[Given], Made], each: Sequence[Given]) -> list[Made]:
+    """What ``do`` makes of each, in their order; on all cores, for most of it runs outside the interpreter."""
+    with ThreadPoolExecutor(max(1, min(len(each), os.cpu_count() or 1))) as pool:
+        return list(pool.map(do, each))
 
 
 def _overlap(scan: Prepared, reference: Prepared, T: np.ndarray) -> float:
