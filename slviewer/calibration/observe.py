@@ -178,11 +178,12 @@ def observe(
             )
     projector, slopes = _projector_pixels(detection, phases, bright, pitch)
     surfaces: dict[Axis, Surface | Polynomial2D] = {}
+    u0, v0, u1, v1 = box
     supported = inside.copy()
     for axis, phase in phases.items():
-        surfaces[axis] = _smooth(phase, _weight(phase, bright[axis]), box, typical_pitch, smoothing)
+        weight = _weight(phase, bright[axis])
+        surfaces[axis] = smooth(phase.phase[v0:v1, u0:u1], weight[v0:v1, u0:u1], box, width, typical_pitch, smoothing)
         supported &= _near(bright[axis], reach=typical_pitch)
-    u0, v0, u1, v1 = box
     return Observation(
         name=name,
         points=board.points[detection.ids],
@@ -233,20 +234,27 @@ def _weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
     return np.asarray(weight / max(float(weight.max()), 1e-30))
 
 
-def _smooth(
-    phase: PhaseMap, weight: np.ndarray, box: tuple[int, int, int, int], pitch: float, smoothing: Smoothing
+def smooth(
+    phase: np.ndarray,
+    weight: np.ndarray,
+    box: tuple[int, int, int, int],
+    width: int,
+    pitch: float,
+    smoothing: Smoothing,
 ) -> Surface | Polynomial2D:
+    """The smoothed phase (step 2) of a board within ``box`` = (u0, v0, u1, v1): phase rad and weight are (v1 - v0,
+    u1 - u0); the image's ``width`` and the board's ``pitch`` are in px."""
     u0, v0, u1, v1 = box
-    v, u = np.nonzero(weight[v0:v1, u0:u1])
+    v, u = np.nonzero(weight)
     if len(v) > SAMPLES:
         chosen = np.random.default_rng(0).choice(len(v), SAMPLES, replace=False)
         v, u = v[chosen], u[chosen]
+    values, weights = phase[v, u].astype(float), weight[v, u]
     v, u = v + v0, u + u0
-    values, weights = phase.phase[v, u].astype(float), weight[v, u]
     extent = (u0 - 0.5, v0 - 0.5, u1 - 0.5, v1 - 0.5)
     if smoothing.kind == "polynomial":
         return fit_polynomial(u, v, values, weights, extent, smoothing.degree, robust=True)
-    cell = max(phase.phase.shape[1] / CELLS_PER_WIDTH, 1.2 * pitch)
+    cell = max(width / CELLS_PER_WIDTH, 1.2 * pitch)
     cells = (max(1, round((u1 - u0) / cell)), max(1, round((v1 - v0) / cell)))
     return fit_surface(u, v, values, weights, extent, cells, robust=True)
 

@@ -18,20 +18,24 @@ def row(
     floor: float | None = None,
     definition: float | None = None,
     note: str = "",
+    target: str = "",
 ) -> dict[str, Any]:
-    """One row of the table; ``floor`` and ``definition`` in seconds, for the ratios."""
+    """One row of the table; ``floor`` and ``definition`` in seconds, for the ratios. ``target``: what is aimed at, on
+    two cores at 1600x1200."""
     return {
         "stage": stage,
         "ms": 1e3 * seconds,
         "MB": megabytes,
+        "floor ms": None if floor is None else 1e3 * floor,
         "ratio to floor": None if floor is None else seconds / floor,
         "ratio NumPy / kernel": None if definition is None else definition / seconds,
+        "target": target,
         "note": note,
     }
 
 
 def beside(work: Callable[[], object], floor: Callable[[], object], times: int = 9) -> tuple[float, float]:
-    """Median seconds of some work and of its floor, one after the other in turns, so that both see the same machine."""
+    """Least seconds of some work and of its floor, taken in turns: other programs' share in them is least then."""
     work(), floor()  # compiled, and in the caches
     taken: tuple[list[float], list[float]] = ([], [])
     for _ in range(times):
@@ -39,7 +43,7 @@ def beside(work: Callable[[], object], floor: Callable[[], object], times: int =
             start = time.perf_counter()
             one()
             seconds.append(time.perf_counter() - start)
-    return statistics.median(taken[0]), statistics.median(taken[1])
+    return min(taken[0]), min(taken[1])
 
 
 def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
@@ -52,6 +56,17 @@ def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
         work()
         taken.append(time.perf_counter() - start)
     return statistics.median(taken)
+
+
+def fastest(work: Callable[[], object], times: int) -> float:
+    """Least seconds, after a first time that is not counted."""
+    work()
+    taken = []
+    for _ in range(times):
+        start = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - start)
+    return min(taken)
 
 
 def megabytes(*arrays: np.ndarray) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import SlviewerError
-from slviewer.workflow.benchmarking_floors import median, row
+from slviewer.workflow.benchmarking_floors import fastest, median, row
 
 INSTALL = "pip install 'slviewer[bench]'"
 
@@ -24,7 +24,7 @@ def missing(package: str) -> str:
 
 def fringes_row(frames: int, size: tuple[int, int], ours: float) -> dict[str, Any]:
     """Decoding by `fringes` of as many frames of (width, height), three periods of the same number of steps; ``ours``
-    seconds took the same by our kernel."""
+    seconds took our kernel. It makes its arrays itself: brightness and modulation of each period, and coordinates."""
     from fringes import Fringes
 
     width, height = size
@@ -35,9 +35,9 @@ def fringes_row(frames: int, size: tuple[int, int], ours: float) -> dict[str, An
     coder.v = [1, 8, 57]
     coder.N = frames // 3
     levels = np.random.default_rng(0).integers(0, 256, (int(coder.T), height, width)).astype(np.uint8)
-    seconds = median(lambda: coder.decode(levels), 1)
-    note = f"{seconds / ours:.0f} times as long as slviewer's decoding"
-    return row(f"decode {len(levels)} frames, fringes {version('fringes')}", seconds, note=note)
+    seconds = fastest(lambda: coder.decode(levels), 3)
+    note = f"{seconds / ours:.0f} times the kernel; brightness, modulation, coordinate, in arrays of its own"
+    return row(f"decode {len(levels)} frames, fringes {version('fringes')}", seconds, note=note, target=">= 100 times")
 
 
 def icp_rows(points: np.ndarray) -> list[dict[str, Any]]:
