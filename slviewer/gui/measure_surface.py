@@ -115,7 +115,7 @@ class SurfaceBox:
         def make() -> tuple[Surface, np.ndarray, np.ndarray, Html]:
             on = operator.surface(name)
             if shown is None:
-                return (on, *painting(on, colour))
+                return (on, *painting(on, COLOURS[0] if colour == DEVIATION else colour))
             arrays = measurement_arrays(opened(operator), shown.id)
             return (on, *_deviating(arrays, shown))
 

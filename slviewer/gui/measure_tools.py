@@ -15,7 +15,7 @@ _CLICKS = {
 }
 _REST = {
     "Two results": "Choose two points or fits, and press Measure between them.",
-    "Nominal model": "Upload the model (STL, PLY, OBJ) or choose one, give the limit if there is a tolerance, press Compare.",
+    "Nominal model": "Upload the model (STL, PLY, OBJ) or choose one, give the limit, if any, and press Compare.",
 }
 
 

@@ -1,5 +1,6 @@
 """From a calibration to a file: the panels that measure, in a browser, over a recorded session."""
 
+import csv
 import json
 import re
 import shutil
@@ -17,12 +18,16 @@ from wizard_page import SIZE, Opened, button, field
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.gui.app import App
 from slviewer.gui.calibration_words import comparison_table, named_poses, verdict_words
+from slviewer.gui.inputs import titled
 from slviewer.gui.pictures import Painter, spread
 from slviewer.gui.steps.scan import ordered, painting, point_words, uncertainty
 from slviewer.gui.steps.verify import distances_table, likely, results_table
+from slviewer.session.measurements import Measurement
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
+from slviewer.simulation.assets import asset
 from slviewer.workflow.diagnosing import save_verdict
+from slviewer.workflow.measuring import quantities_of
 from slviewer.workflow.wizard.looking import ScanCloud
 from slviewer.workflow.wizard.operator import Operator
 from slviewer.workflow.wizard.snapshot import CentreDistance, ComparisonView, ModelFigures, ScanView, VerificationRow
@@ -189,6 +194,99 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     button(page, "Undo this merge").click()
     expect(button(page, "Undo this merge")).to_be_hidden()
     assert errors == []
+
+
+def test_a_part_is_measured_and_compared_with_its_nominal(
+    measured: tuple[Page, Operator, list[str]],
+) -> None:
+    page, operator, errors = measured
+    for name in ("object_r2", "sphere_3"):
+        if operator.settle().scan(name).cloud != "fresh":  # type: ignore[union-attr]
+            assert operator.reconstruct(name)
+    operator.settle(60)
+    button(page, "8. Measure").click()
+    choose(page, "Measure on", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
+    tool(page, "Distance", "Click the first point.")
+    click_until(page, (480, 440), "Click the second point.")
+    page.keyboard.press("Escape")
+    expect(page.get_by_text("Choose a tool.")).to_be_visible()
+    tool(page, "Distance", "Click the first point.")
+    click_until(page, (480, 440), "Click the second point.")
+    page.mouse.click(590, 420)
+    width = came(operator, 1)
+    assert width.kind == "distance" and 5 < quantities_of(width)[0].value < 140
+    expect(page.get_by_text(re.compile(rf"{quantities_of(width)[0].value:.3f} ± 0\.\d+ mm")).first).to_be_visible()
+
+    tool(page, "Section", "Click where the cut begins.")
+    page.mouse.click(480, 440)
+    page.get_by_text("Click where it ends").wait_for()
+    page.mouse.click(590, 420)
+    came(operator, 2)
+    expect(page.get_by_text("height difference A – B")).to_be_visible()
+    expect(page.get_by_text("radius through A, C, B")).to_be_visible()
+
+    choose(page, "Measure on", "sphere_3")
+    tool(page, "Sphere", "Click the middle of the sphere.")
+    click_until(page, (540, 400), "points in the ball")
+    button(page, "Fit sphere").click()
+    radius = quantities_of(came(operator, 3))[0]
+    assert radius.U is not None and abs(radius.value - 98.0) < max(2 * radius.U, 0.1)  # the simulated sphere's, mm
+    field(page, "New name").fill("Ball <i>")
+    page.get_by_role("button", name="Rename", exact=True).click()
+    expect(page.get_by_text("Ball <i>").first).to_be_visible()
+
+    tool(page, "Nominal model", "Upload the model")
+    choose(page, "Measure on", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
+    with page.expect_file_chooser() as chooser:
+        button(page, "Upload nominal model").click()
+    chooser.value.set_files(asset("objects/ammonite.ply"))
+    field(page, "Limit ±, mm").fill("1.5")
+    expect(button(page, "Compare")).to_be_enabled()
+    button(page, "Compare").click()
+    found = came(operator, 4).data
+    assert found["verdict"]["decision"] == "pass" and 0.01 < found["statistics_mm"]["rms"] < 0.5
+    expect(page.get_by_text("Tolerance ± 1.5 mm: pass").first).to_be_visible()
+    expect(page.get_by_text("How many of the points lie how far off the nominal.")).to_be_visible()
+
+    button(page, "Delete measurement").click()
+    button(page, "Bring deleted back").click()
+    came(operator, 4)
+    button(page, "Write table as CSV").click()
+    with page.expect_download() as download:
+        page.get_by_text("Download measurements.csv").click(timeout=40_000)
+    rows = list(csv.DictReader(Path(download.value.path()).read_text("utf-8-sig").splitlines()))
+    assert {row["kind"] for row in rows} == {"distance", "section", "sphere", "deviation"}
+    assert all(row["state"] == "fresh" and row["unit"] for row in rows)
+    assert errors == []
+
+
+def titles(operator: Operator, title: str) -> bool:
+    """Whether a scan is called so."""
+    session = operator.snapshot().session
+    return session is not None and any(titled(scan.name, scan.label) == title for scan in session.scans)
+
+
+def tool(page: Page, name: str, says: str) -> None:
+    """Take a measuring tool in hand."""
+    page.get_by_role("button", name=name, exact=True).click()
+    expect(page.get_by_text(says)).to_be_visible()
+
+
+def click_until(page: Page, place: tuple[int, int], answer: str) -> None:
+    """Click on the surface, which comes before the eyes by itself, until it answers."""
+    for _ in range(20):
+        page.mouse.click(*place)
+        page.wait_for_timeout(700)
+        if page.get_by_text(answer).is_visible():
+            return
+    raise AssertionError(f"no click brought {answer!r}")
+
+
+def came(operator: Operator, count: int) -> Measurement:
+    """The last of so many measurements, once it is there."""
+    found = operator.wait_for(lambda s: s.session is not None and len(s.session.measurements) == count, 90.0)
+    assert found is not None and found.session is not None, operator.snapshot().notices[-1].text
+    return found.session.measurements[-1]
 
 
 def test_a_rejected_calibration_says_why_and_is_used_only_where_one_insists(
