@@ -108,6 +108,8 @@ def deviation(
     """
     say = progress or (lambda share: None)
     points = np.asarray(points, np.float64)
+    if not len(points) or not np.isfinite(points).all():
+        raise InputError("The scan has no points, or some that are not finite: give its measured points alone.")
     surface = NominalSurface(nominal)
     if reach_mm is None:
         reach_mm = max(REACH * surface.diagonal, NOISE_REACH * (sigma_mm or 0.0))

@@ -7,9 +7,10 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.registration.open3d_loader import open3d
 from slviewer.surface.shapes import Mesh
+from slviewer.surface.topology import half_edges
 
 RIM = 0.5
-"""Cosine: what a place's nearest triangle faces less than this lies beyond the surface's rim, not above it."""
+"""Cosine: what the rim of an open surface faces less than this lies beyond it, not above it."""
 CORNER = 1e-4
 """Barycentric: nearer to a side than this, the nearest place lies on it."""
 NEGLIGIBLE = 1e-4
@@ -34,6 +35,7 @@ class NominalSurface:
         self._flat = flat / np.maximum(lengths, 1e-300)[:, None]
         self._smooth = _smooth(self._corners, self._flat, mesh.faces, len(vertices))
         self._faces = mesh.faces
+        self._at_rim = _at_rim(mesh.faces, len(vertices))
         core = open3d().core
         self._scene: Any = open3d().t.geometry.RaycastingScene()
         self._scene.add_triangles(
@@ -55,14 +57,15 @@ class NominalSurface:
         away = np.sum(normals * offsets, axis=1)
         if at_side.any():
             some = self._smooth[self._faces[face[at_side]]]
-            weights = np.stack([1 - s - t, s, t], axis=1)[at_side, :, None]
-            smooth = (some * weights).sum(axis=1)
+            weights = np.stack([1 - s - t, s, t], axis=1)[at_side]
+            smooth = (some * weights[..., None]).sum(axis=1)
             smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-300)
             lengths = np.linalg.norm(offsets[at_side], axis=1)
             above = np.sum(smooth * offsets[at_side], axis=1)
             signs = np.where(above < 0, -1.0, 1.0)
             away[at_side] = np.where(lengths > NEGLIGIBLE, signs * lengths, away[at_side])
-            beyond = (np.abs(above) < RIM * lengths) & (lengths > NEGLIGIBLE)
+            at_rim = (self._at_rim[self._faces[face[at_side]]] | (weights < CORNER)).all(axis=1)
+            beyond = at_rim & (np.abs(above) < RIM * lengths) & (lengths > NEGLIGIBLE)
             away[np.flatnonzero(at_side)[beyond]] = np.inf
             normals = normals.copy()
             clear = lengths > 10 * NEGLIGIBLE
@@ -95,6 +98,15 @@ class NominalSurface:
         places = corners[:, 0] + a[:, None] * (corners[:, 1] - corners[:, 0])
         places += b[:, None] * (corners[:, 2] - corners[:, 0])
         return places + self.middle, self._flat[face]
+
+
+def _at_rim(faces: np.ndarray, count: int) -> np.ndarray:
+    """(count,) bool: the vertices at sides that one triangle alone has."""
+    sides = np.sort(half_edges(faces), axis=1)
+    edges, triangles = np.unique(sides, axis=0, return_counts=True)
+    found = np.zeros(count, bool)
+    found[edges[triangles == 1]] = True
+    return found
 
 
 def _smooth(corners: np.ndarray, flat: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:

@@ -160,6 +160,23 @@ def test_an_open_nominal_has_two_sides_and_nothing_beyond_its_rim() -> None:
     assert away[:2] == pytest.approx([0.3, -0.2], abs=1e-5) and away[2] == np.inf and np.isfinite(away[3])
 
 
+def test_round_sharp_corners_of_a_closed_nominal_nothing_is_beyond() -> None:
+    corners = np.array([[0, 0, 0], [60, 0, 0], [0, 40, 0], [60, 40, 0], [0, 0, 8], [0, 40, 8.0]])
+    wedge = trimesh.convex.convex_hull(corners)
+    edge = np.column_stack([np.full(50, 60.0), np.linspace(1, 39, 50), np.zeros(50)])
+    for direction in ([1, 0, 0], [0.3, 0, -0.95], [0.4, 0, 0.92]):
+        places = edge + 0.5 * np.array(direction) / np.linalg.norm(direction)
+        away, normals = NominalSurface(Mesh(wedge.vertices, wedge.faces)).signed(places)
+        assert away == pytest.approx(0.5, abs=1e-4)
+        assert np.allclose(normals, (places - edge) / 0.5, atol=1e-3)
+
+
+def test_a_scan_without_points_is_refused(ammonite) -> None:
+    for points in (np.zeros((0, 3)), np.full((600, 3), np.nan)):
+        with pytest.raises(InputError, match="no points, or some that are not finite"):
+            deviation(points, ammonite[1], initial=np.eye(4))
+
+
 def test_another_part_is_refused(ammonite, monkeypatch) -> None:
     monkeypatch.setattr(placing, "VIEWS", placing.VIEWS[:2])
     _, _, points, normals = ammonite
