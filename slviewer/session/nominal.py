@@ -147,7 +147,7 @@ def _wound(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[n
     twice = len(keys) - len(np.unique(keys))  # neighbours that turn alike run along their side in opposite directions
     if twice:
         if mesh.orient_triangles():
-            faces = np.asarray(mesh.triangles).astype(np.int32)
+            faces = _as_most_were(vertices, faces, np.asarray(mesh.triangles).astype(np.int32))
             notes.append("its triangles did not all turn one way: they were turned")
         else:
             notes.append(
@@ -162,3 +162,20 @@ def _wound(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[n
     else:
         notes.append("it is open: outside is where its triangles face")
     return faces, closed
+
+
+def _as_most_were(vertices: np.ndarray, before: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """Triangles (m, 3) that were turned alike, each part of the surface the way in which most of its area faced before:
+    they are turned after the first one, which may be the one that was wrong."""
+    from trimesh import graph
+
+    first, second = (_area_vectors(vertices, faces) for faces in (before, turned))
+    against = -np.sum(first * second, axis=1) / np.maximum(np.linalg.norm(first, axis=1), 1e-300)
+    part = graph.connected_component_labels(graph.face_adjacency(before), node_count=len(before))
+    wrong = np.bincount(part, against)[part] > 0
+    return np.where(wrong[:, None], turned[:, ::-1], turned)
+
+
+def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    return np.cross(b - a, c - a)

@@ -51,6 +51,20 @@ def test_triangles_are_turned_outwards_and_empty_ones_left_out_and_it_is_said(tm
     assert "it is open" in read_nominal(tmp_path / "open.ply").notes[0]
 
 
+def test_an_open_model_keeps_the_side_that_most_of_it_faces(tmp_path: Path) -> None:
+    cap = BALL.copy()
+    cap.update_faces(cap.triangles_center[:, 2] > 25)
+    cap.faces[0] = cap.faces[0, ::-1]  # the first one, which the others must not follow
+    far = cap.copy()
+    far.apply_translation([200, 0, 0])
+    far.faces[:] = far.faces[:, ::-1]  # a part that faces inwards, and was meant to
+    trimesh.util.concatenate([cap, far]).export(tmp_path / "caps.ply")
+    found = read_nominal(tmp_path / "caps.ply")
+    a, b, c = (found.mesh.vertices[found.mesh.faces[:, k]] for k in range(3))
+    upwards = np.cross(b - a, c - a)[:, 2] > 0
+    assert (upwards == (a[:, 0] < 100)).all() and "were turned" in found.notes[0]
+
+
 def hostile(folder: Path) -> dict[str, tuple[bytes, str]]:
     BALL.export(folder / "s.stl")
     BALL.export(folder / "p.ply")
