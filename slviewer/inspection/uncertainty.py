@@ -87,10 +87,10 @@ def scatter(points: np.ndarray, jacobian: np.ndarray, residuals: np.ndarray) -> 
     return np.asarray(together * np.outer(ratio, ratio))
 
 
-def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0) -> Shared:
+def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: float = 0.0) -> Shared:
     """What a splined calibration leaves uncertain in points measured through one axis, rigid motion apart: that of the
     working volume's places is taken from all, so that distances and angles are as they were. ``scale``: by what factor
-    the points were enlarged after their reconstruction."""
+    the points were enlarged after their reconstruction, and ``scale_sigma`` the standard uncertainty of that factor."""
     rig = bundle.state.rig
     reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
     motion = BestMotion.of(reference.points)
@@ -104,7 +104,8 @@ def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0) -> Shared:
         volume = Volume(pixels, places[:, 2], *looked(rig, pixels, places[:, 2]))
         weighed = (answers * (scale * beyond(bundle, volume))[None, :, None]).reshape(len(answers), -1)
         free = weighed @ jacobian - (weighed @ motion.at(places)) @ moved
-        return np.asarray(bundle.whitened(np.asarray(free)), np.float64)
+        larger = np.einsum("pni,ni->p", answers, scale_sigma * (places - motion.centre))
+        return np.vstack([np.asarray(bundle.whitened(np.asarray(free)), np.float64), larger])
 
     return shared
 

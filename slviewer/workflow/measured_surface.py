@@ -14,11 +14,11 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
-from slviewer.workflow.exporting_shapes import scan_cloud
+from slviewer.workflow.exporting_shapes import is_fresh, scan_cloud
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, check_accepted, load_model, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
-from slviewer.workflow.scaling import scale_factor
+from slviewer.workflow.scaling import scale_factor, scale_sigma
 
 MERGED = "merge/"
 Place = tuple[int, int] | int
@@ -129,7 +129,9 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surfac
     if store.state_of(f"scale/{fitted.name}") == "fresh":
         names.append(f"scale/{fitted.name}")
     inputs, scale = store.input_hashes(*names), scale_factor(store, fitted.name)
-    sure = isinstance(fitted, SplinedModel)
+    shared = None
+    if isinstance(fitted, SplinedModel):
+        shared = splined_shared(fitted.bundle, cloud.axis, scale, scale_sigma(store, fitted.name))
     return Surface(
         cloud.points,
         cloud.sigma_z,
@@ -138,8 +140,8 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surfac
         inputs,
         left_mm=cloud.sigma_calibration,
         normals=grid_normals(cloud.points),
-        shared=splined_shared(fitted.bundle, cloud.axis, scale) if isinstance(fitted, SplinedModel) else None,
-        calibration=inputs[calibration] if sure else "",
+        shared=shared,
+        calibration="" if shared is None else inputs[calibration],
         texture=cloud.texture,
         scale=scale,
     )
@@ -148,7 +150,7 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surfac
 def merged_surface(store: Session, merge: str, warn: Warn = unwarned) -> Surface:
     """A merge that the session keeps as ``merge/<number>``, in the frame of its reference's camera."""
     meta = store.load_result(merge, only=())[0]
-    if store.state_of(merge) == "stale":
+    if not is_fresh(store, merge):
         warn(f"{merge} came from scans or a calibration that have changed since: merge again")
     points = read_ply(store.exports / str(meta["ply"]))
     sigma = points.scalars.get("sigma")
@@ -166,5 +168,5 @@ def merged_surface(store: Session, merge: str, warn: Warn = unwarned) -> Surface
         normals=normals,
         faces=points.faces,
         texture=points.colours,
-        scale=scale_factor(store, model),
+        scale=float(meta.get("scales", {}).get(model, 1.0)),
     )

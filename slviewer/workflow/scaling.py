@@ -28,6 +28,13 @@ def scale_factor(store: Session, model: str) -> float:
     return 1.0 if applied is None else float(applied["factor"])
 
 
+def scale_sigma(store: Session, model: str) -> float:
+    """The standard uncertainty of ``scale_factor``, as the test found it that it comes from; 0 without a correction,
+    whose scale is the target's."""
+    applied = correction(store, model)
+    return 0.0 if applied is None else 1e-6 * float(applied["U_ppm"]) / 2
+
+
 def told_scale(store: Session, model: str) -> str:
     """What was applied to a calibration, in words; empty where nothing was."""
     applied = correction(store, model)

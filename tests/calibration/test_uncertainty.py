@@ -185,3 +185,8 @@ def test_what_is_fitted_is_as_sure_as_the_calibrations_covariance_says(model) ->
     assert 0 < found.sigma < 0.2 and all(np.sqrt(np.trace(end.covariance)) < 0.2 for end in ends)
     larger = splined_shared(bundle, "x", 1.5)(1.5 * points[:1], np.eye(3)[:, None])
     assert np.allclose(larger, 1.5 * ends[0].shared, rtol=1e-3, atol=1e-6)
+    # nor is any distance surer than the scale that it was corrected by
+    scaled = splined_shared(bundle, "x", 1.0, 2e-3)
+    ends = [Spread(np.zeros((3, 3)), scaled(point[None], np.eye(3)[:, None]), "one") for point in points]
+    of_scale = 2e-3 * np.linalg.norm(points[1] - points[0])
+    assert distance(points[0], points[1], *ends).sigma == pytest.approx(np.hypot(found.sigma, of_scale), rel=1e-3)
