@@ -73,17 +73,22 @@ def load_measurement(store: Session, identity: str) -> Measurement:
     """One measurement. Raises InputError where there is none of that id."""
     result = _result(store, identity)
     meta = store.load_result(result, only=())[0]
-    kind, named = meta["kind"], (store.decision(NAMES) or {}).get(identity)
+    return as_saved(identity, meta, store.decision(NAMES) or {}, store.state_of(result) == "stale")
+
+
+def as_saved(identity: str, meta: Mapping[str, Any], names: Mapping[str, str], stale: bool) -> Measurement:
+    """The measurement of that id from its result's ``meta`` and the ``names`` that were given since."""
+    kind = meta["kind"]
     return Measurement(
         identity,
-        str(named or meta["name"] or f"{kind} {identity.removeprefix('m')}"),
+        str(names.get(identity) or meta["name"] or f"{kind} {identity.removeprefix('m')}"),
         kind,
         meta["source"],
         meta["model"],
         meta["time"],
         meta["data"],
         tuple(meta["of"]),
-        store.state_of(result) == "stale",
+        stale,
     )
 
 

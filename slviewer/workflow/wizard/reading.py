@@ -22,7 +22,6 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.capturing import PATTERNS
 from slviewer.workflow.diagnosing import last_verdict
-from slviewer.workflow.measuring import measurements
 from slviewer.workflow.models import (
     available,
     insisted,
@@ -35,6 +34,7 @@ from slviewer.workflow.models import (
 )
 from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.wizard.exporting import listed
+from slviewer.workflow.wizard.measure_reading import read_measurements
 from slviewer.workflow.wizard.merge_reading import merge_view
 from slviewer.workflow.wizard.planning import Asked, Planner
 from slviewer.workflow.wizard.snapshot import (
@@ -158,7 +158,7 @@ class Reader:
             scans=tuple(self._scan(c, labels, hashes, factors) for c in captures.values() if c.role == "scan"),
             merge=self._merge(merges[-1], hashes, factors) if merges else None,
             merges=len(merges),
-            measurements=tuple(measurements(session)),
+            measurements=read_measurements(session, hashes, factors),
             deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}-") for name in session.deleted_results()),
             nominals=nominals(session.folder),
             exports=listed(session),

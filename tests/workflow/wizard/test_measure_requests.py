@@ -19,7 +19,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import rig_record
-from slviewer.workflow.measuring import quantities_of
+from slviewer.workflow.measuring import measurements, quantities_of
 from slviewer.workflow.models import save_imported_stereo
 from slviewer.workflow.simulating import one_axis
 from slviewer.workflow.wizard.measure_requests import plain_name
@@ -52,8 +52,10 @@ def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
 
 
 def now(operator: Operator) -> SessionView:
+    """The session, once all is done; what it says of measurements is what the workflow says."""
     session = operator.settle(60).session
-    assert session is not None
+    assert session is not None and operator.session is not None
+    assert list(session.measurements) == measurements(operator.session)
     return session
 
 
