@@ -1,6 +1,6 @@
 """Many scans as a graph: scans are nodes, registered pairs are edges, and loops say how well these fit together."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -9,6 +9,8 @@ from scipy.optimize import least_squares
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
+
+from slviewer.registration.refine import Uncertainty
 
 _FLOOR_MM, _FLOOR_DEG = 0.003, 0.002
 """What calibrations and gates leave of an edge, however many points it has."""
@@ -99,8 +101,34 @@ def expected_mm(edge: Edge, edges: Sequence[Edge], by: Sequence[int]) -> float:
     return float(np.sqrt(sum(steps) + edge.variance))
 
 
+_LEVER_MM = 100.0
+"""Unknown turns are counted in mm at so many mm, so that all unknowns are alike."""
+
+
 def optimised(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray:
     """The poses (n, 4, 4) in the root's frame that all edges together make most likely, from poses near by."""
+    moved, cost, _ = _problem(poses, edges, root)
+    return moved(least_squares(cost, np.zeros(6 * (len(poses) - 1)), x_scale="jac").x)
+
+
+def uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> list[Uncertainty]:
+    """How sure each pose (n, 4, 4) in the root's frame is by all edges together, at the middle of what they share: the
+    farther from the root, the less. The root's own is 0."""
+    _, cost, middle = _problem(poses, edges, root)
+    steps = np.eye(6 * (len(poses) - 1)) * 1e-3
+    J = np.stack([(cost(step) - cost(-step)) / 2e-3 for step in steps], axis=1)
+    unit = np.repeat([1 / _LEVER_MM, 1.0], 3)
+    covariance = np.linalg.inv(J.T @ J)
+    blocks = [covariance[k : k + 6, k : k + 6] * np.outer(unit, unit) for k in range(0, len(steps), 6)]
+    blocks.insert(root, np.zeros((6, 6)))
+    return [Uncertainty(block, middle) for block in blocks]
+
+
+def _problem(
+    poses: np.ndarray, edges: Sequence[Edge], root: int
+) -> tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    """Of the unknowns x (6 (n - 1),), a turn and a shift about a middle (3,) for every pose but the root's: the poses
+    moved so, the edges' residuals then, in standard deviations; and the middle."""
     free = [node for node in range(len(poses)) if node != root]
     roots = []
     for edge in edges:
@@ -111,7 +139,7 @@ def optimised(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray
     def moved(x: np.ndarray) -> np.ndarray:
         turn, shift = x.reshape(-1, 2, 3).transpose(1, 0, 2)
         M = np.tile(np.eye(4), (len(free), 1, 1))
-        M[:, :3, :3] = Rotation.from_rotvec(turn / 100.0).as_matrix()  # as mm at 100 mm, so that all unknowns are alike
+        M[:, :3, :3] = Rotation.from_rotvec(turn / _LEVER_MM).as_matrix()
         M[:, :3, 3] = shift + middle - M[:, :3, :3] @ middle
         out = poses.copy()
         out[free] = M @ poses[free]
@@ -122,7 +150,7 @@ def optimised(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray
     def cost(x: np.ndarray) -> np.ndarray:
         return np.asarray(np.einsum("kij,kj->ki", whiten, residuals(edges, moved(x))).ravel())
 
-    return moved(least_squares(cost, np.zeros(6 * len(free)), x_scale="jac").x)
+    return moved, cost, middle
 
 
 def residuals(edges: Sequence[Edge], poses: np.ndarray) -> np.ndarray:

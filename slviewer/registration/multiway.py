@@ -22,6 +22,7 @@ from slviewer.registration.agreeing import agreeing
 from slviewer.registration.graph import Edge, Gap
 from slviewer.registration.pairwise import Progress, Registration, register_prepared, searched
 from slviewer.registration.prepared import Prepared, prepared
+from slviewer.registration.refine import Uncertainty
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import Scan
 from slviewer.registration.start import Candidate, Start
@@ -66,27 +67,30 @@ class Loop:
 class Alignment:
     """Where every scan lies.
 
-    ``T_reference_scan`` (4, 4) by name, into the frame of ``reference``. ``pairs``: the registrations that it was made
-    from; ``loops`` that they close, the worst first. ``dropped``: pairs that registered and that the others
-    contradict, and ``refused`` ones that did not register, each with why.
+    ``T_reference_scan`` (4, 4) by name, into the frame of ``reference``, and how sure each is (``uncertainties``), by
+    all that lies between the two. ``pairs``: the registrations that it was made from; ``loops`` that they close, the
+    worst first. ``dropped``: pairs that registered and that the others contradict, and ``refused`` ones that did not
+    register, each with why.
     """
 
     reference: str
     T_reference_scan: Mapping[str, np.ndarray]
+    uncertainties: Mapping[str, Uncertainty]
     pairs: Mapping[Pair, Registration]
     loops: tuple[Loop, ...]
     dropped: Mapping[Pair, str]
     refused: Mapping[Pair, str]
 
     def on_reference(self) -> dict[str, Registration]:
-        """For every scan but the reference: its pose in the reference's frame, after the adjustment, with the figures
-        of the surest pair that it is part of, that with the reference itself where there is one."""
+        """For every scan but the reference: its pose in the reference's frame, after the adjustment, with the
+        uncertainty of that; the other figures are those of the surest pair that it is part of, that with the reference
+        itself where there is one."""
         found = {}
         for name, T in self.T_reference_scan.items():
             if name != self.reference:
                 own = [pair for pair in self.pairs if name in pair]
                 best = min(own, key=lambda p: (self.reference not in p, self.pairs[p].uncertainty.shift_mm))
-                found[name] = replace(self.pairs[best], T_reference_scan=T)
+                found[name] = replace(self.pairs[best], T_reference_scan=T, uncertainty=self.uncertainties[name])
         return found
 
 
@@ -206,6 +210,7 @@ class _Work:
         for i, a in enumerate(self.names):
             for j, b in enumerate(self.names[:i]):
                 if not {(a, b), (b, a)} & {*self.found, *self.refused}:
+                    self.say(self._share)  # it may raise to cancel
                     T = np.linalg.inv(poses[j]) @ poses[i]
                     shares.append((_overlap(self.scans[i], self.scans[j], T), (a, b), T))
         for share, (a, b), T in sorted(shares, key=lambda one: -one[0]):
@@ -262,6 +267,7 @@ class _Work:
             return None
         self.found[pair] = result
         self.refused.pop(pair, None)
+        self.refused.pop(pair[::-1], None)
         return result
 
     def say(self, share: float) -> None:
@@ -307,6 +313,7 @@ class _Work:
         return Alignment(
             self.reference,
             dict(zip(self.names, poses, strict=True)),
+            dict(zip(self.names, graph.uncertainties(poses, edges, self.root), strict=True)),
             {pair: self.found[pair] for pair in pairs},
             tuple(sorted(loops, key=lambda loop: -loop.before.shift_mm)),
             told,

@@ -74,7 +74,7 @@ def register(
     Points are ``(n, 3)`` mm without NaN, each in the frame of the camera that took it; normals ``(n, 3)`` point to that
     camera, and are estimated where missing. ``sigma_mm`` is the expected error of one point, when it is known: gates
     are never narrower than noise. ``initial`` replaces the search for a start: the last pose (4, 4), or a ``Candidate``
-    such as ``picked.picked_start`` and ``turntable.Axis.start`` give. ``progress`` receives the share of the work done,
+    such as ``picked.picked_start`` gives. ``progress`` receives the share of the work done,
     0 to 1, and may raise to cancel.
 
     Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not hold the pose, or where

@@ -100,6 +100,8 @@ def prepared(
     _check(name, points, normals)
     points = np.ascontiguousarray(points, dtype=np.float64)
     size = _size(points)
+    if not size > 0:
+        raise InputError(f"Nearly all points of the {name} are one: give those that were measured, each once.")
     voxel = FINEST_MM * scale_of(size)
     fine = _cloud(points, normals, voxel)
     if len(fine.points) < LEAST_POINTS // 5:

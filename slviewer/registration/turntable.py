@@ -33,8 +33,13 @@ def axis_of(steps: Sequence[np.ndarray], step_deg: float) -> Axis:
     """The axis, from how scans lie on the ones before them (``T`` (4, 4) each), one step of ``step_deg`` apart.
 
     It points so that the table turns by ``step_deg`` from each scan to the next. Raises ``InputError`` where a step
-    that was found is not of that angle.
+    that was found is not of that angle, and for an angle that tells no direction.
     """
+    if not _OFF_DEG < abs(step_deg) < 180.0 - _OFF_DEG:
+        raise InputError(
+            f"A turntable's step of {step_deg:g} degrees gives no axis: step by {_OFF_DEG:g} to {180 - _OFF_DEG:g} "
+            "degrees, either way, or start from features."
+        )
     # what was scanned one step later lies turned back on the scan before
     turns = np.array([-np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec()) for T in steps])
     angles = np.linalg.norm(turns, axis=1)

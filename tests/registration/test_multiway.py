@@ -137,6 +137,9 @@ def test_a_turn_closes(turn: Alignment) -> None:
     assert turn.loops[0].before.shift_mm < 0.1
     assert max(loop.after.shift_mm for loop in turn.loops) < 0.05
     assert len(turn.pairs) >= 6 and not turn.dropped
+    # the third scan and its neighbours are one pair apart, the sixth is three: it is the least sure, and told so
+    sure = {name: pair.uncertainty.shift_mm for name, pair in turn.on_reference().items()}
+    assert 0.005 < sure["turn_02"] < sure["turn_06"] < 0.05 and max(sure, key=lambda name: sure[name]) == "turn_06"
     assert {pair.start for pair in turn.pairs.values()} <= {"turntable", "features", "initial"}
 
 
@@ -147,9 +150,12 @@ def test_the_axis_is_found_from_two_steps_and_a_wrong_angle_is_told() -> None:
     np.testing.assert_allclose(axis_of(steps, -40.0).turned(-25.0), TABLE.turned(25.0), atol=1e-9)
     with pytest.raises(InputError, match=r"40\.0 degrees apart and the turntable is said to step by 30"):
         axis_of(steps, 30.0)
+    for angle in (0.0, 180.0):
+        with pytest.raises(InputError, match="gives no axis"):
+            axis_of([TABLE.turned(-angle)] * 2, angle)
 
 
-# contradictions, on poses alone
+# contradictions, and what poses are worth, on poses alone
 
 
 def ring(count: int) -> tuple[list[np.ndarray], list[Edge]]:
@@ -162,6 +168,20 @@ def ring(count: int) -> tuple[list[np.ndarray], list[Edge]]:
             T = np.linalg.inv(poses[k]) @ poses[other] @ motion(0.002, 0.004, seed=9 * k + hop)
             edges.append(Edge(other, k, T, covariance, CENTRE))
     return poses, edges
+
+
+def test_poses_are_as_sure_as_the_pairs_that_lead_there() -> None:
+    sigma, floor = 0.02, graph._FLOOR_MM
+    covariance = np.diag([1e-16] * 3 + [sigma**2] * 3)
+    poses = np.stack([motion(0.0, 0.0)] * 4)
+    chain = [Edge(k + 1, k, np.eye(4), covariance, CENTRE) for k in range(3)]
+    one = np.sqrt(3 * (sigma**2 + floor**2))
+    open_end = [each.shift_mm for each in graph.uncertainties(poses, chain, 1)]
+    assert open_end == pytest.approx([one, 0.0, one, np.sqrt(2) * one], rel=1e-3, abs=1e-9)
+    closed = graph.uncertainties(poses, [*chain, Edge(0, 3, np.eye(4), covariance, CENTRE)], 0)
+    assert [each.shift_mm for each in closed] == pytest.approx(
+        [0.0, np.sqrt(3 / 4) * one, one, np.sqrt(3 / 4) * one], rel=1e-3, abs=1e-9
+    )
 
 
 def never(edge: Edge, T: np.ndarray) -> bool:

@@ -63,6 +63,11 @@ def test_unrelated_shapes_are_refused(other: int, relief: float) -> None:
         register(view(bumpy(other, relief), (-45, 75), 1, points=10_000), view(bumpy(2, relief), (-75, 45), 2))
 
 
+def test_points_that_are_all_one_are_refused() -> None:
+    with pytest.raises(InputError, match="Nearly all points of the scan are one"):
+        register(np.tile(CENTRE, (1000, 1)), view(bumpy(2), (-75, 45), 2, points=1000))
+
+
 def test_no_common_surface_is_refused() -> None:
     with pytest.raises(SlviewerError):
         register(view(bumpy(2), (10, 75), 1, motion(10, 30)), view(bumpy(2), (-75, -10), 2))
