@@ -30,7 +30,7 @@ class Agreement:
 
 
 def agreements(views: Mapping[str, View], say: Callable[[float], None]) -> dict[tuple[str, str], Agreement]:
-    """Every ordered pair of scans that meet in enough places. A pair that meets only one way is in both orders."""
+    """Every ordered pair of scans of which the first meets the second in enough places."""
     found: dict[tuple[str, str], Agreement] = {}
     ways = list(permutations(views, 2))
     for i, (a, b) in enumerate(ways):

@@ -160,6 +160,8 @@ def spacing(points: PointSet) -> float:
     """Median distance in mm of a point to its nearest neighbour."""
     if len(points) < 2:
         raise InputError(f"{len(points)} points make no surface.")
+    if not np.isfinite(points.points).all():
+        raise InputError("Some points are NaN: select the valid ones first.")
     distance, _ = cKDTree(points.points).query(points.points[:: max(1, len(points) // 20_000)], k=2)
     found = float(np.median(distance[:, 1]))
     if not found > 0:

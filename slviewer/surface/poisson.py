@@ -73,8 +73,8 @@ def trimmed(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> 
         patch = order[starts[k] : starts[k + 1]]
         corners = np.unique(mesh.faces[patch])
         rim = corners[measured[corners]]
-        across = extent_across(mesh.vertices[rim]) if len(rim) else np.inf  # no rim: it floats by itself
-        if across <= fill_mm:
+        across = extent_across(mesh.vertices[rim]) if len(rim) else np.inf
+        if len(rim) and across <= fill_mm:  # what has no rim floats by itself
             kept[patch] = True
             filled, largest = filled + 1, max(largest, across)
     area = areas(mesh)

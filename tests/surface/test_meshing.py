@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from ball_scans import RADIUS, around, ball, off, rms
 
 from slviewer.errors import InputError, SlviewerError
@@ -9,7 +10,8 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.edit import fill_holes, smooth, thin, without_small_parts
 from slviewer.surface.fuse import fuse
 from slviewer.surface.grid import grid_mesh
-from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
+from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of, spacing
+from slviewer.surface.poisson import trimmed
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.surface.tools import compact
 from slviewer.surface.topology import topology
@@ -54,6 +56,17 @@ def test_what_no_scan_saw_stays_open_or_is_closed_as_asked(open_points: PointSet
     assert wide.trimmed.filled == 1 and 0.01 < wide.trimmed.imagined < 0.15
     assert wide.topology.volume_mm3 == pytest.approx(VOLUME, rel=0.03)
     assert "% of the surface was not measured" in wide.text()
+
+
+def test_what_floats_where_nothing_was_measured_goes_whatever_holes_are_filled(points: PointSet) -> None:
+    ball = trimesh.creation.icosphere(4, RADIUS)
+    n = len(ball.vertices)
+    two = Mesh(
+        np.concatenate([ball.vertices, ball.vertices + np.array([200, 0, 0])]),
+        np.concatenate([ball.faces, ball.faces + n]),
+    )
+    kept, report = trimmed(two, points, spacing(points), np.inf)
+    assert len(kept.faces) == len(ball.faces) and (report.filled, report.imagined, report.cut) == (0, 0.0, 1)
 
 
 def test_one_side_alone_is_not_closed() -> None:
@@ -144,6 +157,8 @@ def test_refusals(points: PointSet) -> None:
         mesh_of(points, MeshingPlan("grid"))
     with pytest.raises(InputError, match="no normals"):
         mesh_of(PointSet(points.points))
+    with pytest.raises(InputError, match="Some points are NaN"):
+        mesh_of(PointSet(np.full((300, 3), np.nan), np.zeros((300, 3))))
     for plan in ({"triangles": 2}, {"smooth": -1}, {"fill_holes_mm": float("nan")}):
         with pytest.raises(InputError):
             MeshingPlan(**plan)
