@@ -82,7 +82,7 @@ def write_calibration_file(store: Session, path: Path) -> None:
         "T_camera_projector": np.linalg.inv(T),
         "baseline_mm": factor * stereo.baseline_mm,
         **({"scale_factor": factor} if factor != 1 else {}),
-        **({"depth_range_mm": np.array(stereo.depth_range_mm)} if stereo.depth_range_mm else {}),
+        **({"depth_range_mm": factor * np.array(stereo.depth_range_mm)} if stereo.depth_range_mm else {}),
         **({"target_poses": len(stereo.poses)} if stereo.poses else {}),
         **{f"reprojection_rms_px_{name}": float(value) for name, value in stereo.reprojection_rms_px.items()},
     }
