@@ -1,4 +1,4 @@
-"""Merge: choose scans and the one whose place the others take, and see them before and after."""
+"""Merge: choose scans, the one whose place the others take, and where to begin; see them before and after."""
 
 import threading
 from typing import Any
@@ -7,19 +7,24 @@ import numpy as np
 import viser
 
 from slviewer.gui.inputs import Choice, change, titled
+from slviewer.gui.merge_picking import PickBox
+from slviewer.gui.merge_views import AFTER, BEFORE, MERGED, Drawn, merged_drawn, scans_drawn
+from slviewer.gui.merge_words import merge_words, refusal_words, turn_words
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
 from slviewer.gui.steps.verify import likely
 from slviewer.gui.views import bring_button
-from slviewer.gui.widgets import Html, Words, block, cell, meter, table, toned
-from slviewer.workflow.wizard import looking
+from slviewer.gui.widgets import Words
 from slviewer.workflow.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
 
 LAYER = "merge"
-VIEWS = ("after, coloured by scan", "before, coloured by scan", "merged points in their own colours")
-SCAN_COLOURS = ((91, 143, 208), (224, 161, 60), (99, 178, 138), (200, 113, 143), (143, 131, 201), (120, 120, 120))
-_LOW = 0.3
-"""Overlap below which an alignment is doubted."""
+SHAPES, TURNTABLE, LYING, PICKED = "by their shapes", "on a turntable", "as they lie", "by points that I pick"
+STARTS = (SHAPES, TURNTABLE, LYING, PICKED)
+SIDE_BY_SIDE = "scan and reference side by side, to pick on"
+_SAYS = {
+    SHAPES: "",
+    LYING: "Neither the object nor the camera was moved between the scans, or hardly; what is left is refined.",
+}
 
 
 class Panel:
@@ -33,24 +38,36 @@ class Panel:
         self._lock = threading.RLock()
         self._snapshot: Snapshot | None = None
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
-        self._points: np.ndarray | None = None
+        self._picks = PickBox(stage, self._painter, self._refresh)
+        self._merged: int | None = None
+        self._drawn: Drawn | None = None
         self._visible = False
+        self._shows: bool | None = None
 
     def build(self) -> None:
         gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
         with gui.add_folder("Scans to merge") as self._scans_folder:
             self._none = Words(gui)
-        self._reference = Choice(gui, "Reference", "The others are brought to its place")
-        self._merge = gui.add_button("Merge", icon=viser.Icon.LAYERS_INTERSECT)
-        self._merge.on_click(safely(self._ask_merge))
+        with gui.add_folder("Alignment", visible=False) as self._start_folder:
+            self._reference = Choice(gui, "Reference", "The others are brought to its place")
+            self._reference.on_change(safely(self._refresh))
+            self._start = gui.add_dropdown("Begin", STARTS, hint="Alignment is refined from there in any case")
+            self._start.on_update(safely(self._choose_start))
+            hint = "By which the table turns from each scan to the next"
+            self._angle: Any = gui.add_number("Angle, °", 30.0, min=1.0, max=180.0, step=0.5, hint=hint)
+            self._angle.on_update(safely(self._refresh))
+            self._start_says = Words(gui)
+            self._picks.build()
+            self._merge = gui.add_button("Merge", icon=viser.Icon.LAYERS_INTERSECT)
+            self._merge.on_click(safely(self._ask_merge))
+            self._refusal = Words(gui)
+        self._result = Words(gui)
         self._undo = gui.add_button("Undo this merge", icon=viser.Icon.ARROW_BACK_UP, color="orange", visible=False)
         self._undo.on_click(safely(lambda: operator.undo_merge()))
-        self._result = Words(gui)
-        self._view = gui.add_dropdown("Show in 3D", VIEWS)
-        self._view.on_update(safely(self._refresh))
-        self._reference.on_change(safely(self._refresh))
+        self._view = Choice(gui, "Show in 3D")
+        self._view.on_change(safely(self._refresh))
         self._legend = Words(gui)
-        bring_button(self._stage, lambda: self._points)
+        bring_button(self._stage, lambda: self._seen)
 
     def draw(self, snapshot: Snapshot) -> None:
         with self._lock:
@@ -61,14 +78,22 @@ class Panel:
             merge = session.merge if session else None
             preferred = merge.reference if merge else scans[-1].name if scans else ""
             self._reference.offer([(scan.name, titled(scan.name, scan.label)) for scan in scans], preferred)
+            change(self._start_folder, visible=len(scans) > 1)
             change(self._undo, visible=merge is not None)
-            self._result.set(merge_words(merge, {scan.name: scan.label for scan in scans}) if merge else "")
+            labels = {scan.name: scan.label for scan in scans}
+            self._result.set(merge_words(merge, labels) if merge else "")
+            self._refusal.set(refusal_words(snapshot.not_merged, labels) if snapshot.not_merged else "")
+            self._offer_views(merge)
+            number = int(merge.name) if merge is not None else 0
+            if self._merged is not None and number > self._merged:
+                self._view.choose(AFTER)  # just made: this is what the operator wants to see
+            self._merged = number
             self._refresh()
 
     def shown(self, visible: bool) -> None:
-        self._visible = visible
-        self._stage.scene.show(LAYER, visible)
-        self._look()
+        with self._lock:
+            self._visible = visible
+            self._show_layers()
 
     # drawing
 
@@ -90,8 +115,35 @@ class Panel:
                 self._boxes[scan.name] = box
             change(self._boxes[scan.name], label=label)
 
+    def _offer_views(self, merge: MergeView | None) -> None:
+        views = [BEFORE] if merge is None else [AFTER, BEFORE, *MERGED]
+        if self._start.value == PICKED:
+            views.append(SIDE_BY_SIDE)
+        self._view.offer([(view, view) for view in views])
+        self._view.show(len(views) > 1)
+
+    def _choose_start(self) -> None:
+        with self._lock:
+            self._offer_views(self._snapshot.session.merge if self._snapshot and self._snapshot.session else None)
+            if self._start.value == PICKED:
+                self._view.choose(SIDE_BY_SIDE)
+            self._refresh()
+
     def _chosen(self) -> list[str]:
-        return [name for name, box in self._boxes.items() if box.value]
+        """The scans to merge with the reference, in the order in which they were taken."""
+        scans = mergeable(self._snapshot.session) if self._snapshot and self._snapshot.session else []
+        boxes, reference = self._boxes, self._reference.value
+        return [s.name for s in scans if s.name == reference or (s.name in boxes and boxes[s.name].value)]
+
+    @property
+    def _seen(self) -> np.ndarray | None:
+        if self._picking:
+            return self._picks.seen
+        return None if self._drawn is None else self._drawn.points
+
+    @property
+    def _picking(self) -> bool:
+        return self._start.value == PICKED and self._view.value == SIDE_BY_SIDE
 
     def _refresh(self) -> None:
         """Offer what can be merged now, and ask for the clouds."""
@@ -100,103 +152,83 @@ class Panel:
             session = snapshot.session if snapshot else None
             if snapshot is None or session is None:
                 return
-            names = list(dict.fromkeys([*self._chosen(), *filter(None, [self._reference.value])]))
-            busy = snapshot.job is not None and not snapshot.job.background
-            change(self._merge, label=f"Merge {len(names)} scans", disabled=busy or len(names) < 2)
-            merge, view = session.merge, self._view.value
-            if merge is None:
-                view = VIEWS[1]
-            change(self._view, visible=merge is not None)
-            shown = list(merge.scans) if merge is not None else names
+            names, start = self._chosen(), self._start.value
             made = {scan.name: (scan.points, scan.model) for scan in session.scans if scan.cloud != "absent"}
-            places = (
-                {name: pair[2] for name, pair in merge.pairs.items()} if merge is not None and view == VIEWS[0] else {}
-            )
-            key = (
-                view,
-                merge.name if merge else "",
-                tuple((name, made[name]) for name in shown if name in made),
-                tuple((name, T.tobytes()) for name, T in places.items()),
-            )
             labels = {scan.name: scan.label for scan in session.scans}
-            self._painter.ask(
-                "clouds",
-                key,
-                lambda: self._load(view, merge, [n for n in shown if n in made], places, labels),
-                self._draw_clouds,
-            )
+            change(self._angle, visible=start == TURNTABLE)
+            self._start_says.set(turn_words(names, float(self._angle.value), labels) if start == TURNTABLE else "")
+            if start in _SAYS:
+                self._start_says.say(_SAYS[start], "dim")
+            versions = {name: made[name] for name in names}
+            self._picks.offer(versions, self._reference.value, labels, start == PICKED)
+            busy = snapshot.job is not None and not snapshot.job.background
+            ready = len(names) > 1 and (start != PICKED or self._picks.ready)
+            change(self._merge, label=f"Merge {len(names)} scans", disabled=busy or not ready)
+            self._show_layers()
+            if not self._picking:
+                self._ask_clouds(session, names, made, labels)
 
-    def _load(
-        self,
-        view: str,
-        merge: MergeView | None,
-        names: list[str],
-        places: dict[str, np.ndarray],
-        labels: dict[str, str],
-    ) -> list[tuple[str, np.ndarray, Any]]:
-        """(name, points (n, 3), colours) to draw; on the painter's thread."""
-        session = opened(self._stage.operator)
-        if view == VIEWS[2] and merge is not None:
-            whole = looking.merged_cloud(session, merge.name)
-            colours = whole.colours
-            if colours is not None and colours.ndim == 1:
-                colours = np.repeat(colours[:, None], 3, axis=1)
-            return [("merged", whole.points, (150, 150, 150) if colours is None else colours)]
-        things = []
-        for i, name in enumerate(names):
-            cloud = looking.scan_cloud(session, name)
-            rows, columns = cloud.thinned(60_000)
-            points = cloud.points[rows, columns].reshape(-1, 3)
-            T = places.get(name, np.eye(4))
-            moved = (points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-            things.append((labels.get(name, name), moved, SCAN_COLOURS[i % len(SCAN_COLOURS)]))
-        return things
+    def _ask_clouds(
+        self, session: SessionView, names: list[str], made: dict[str, tuple[int, str]], labels: dict[str, str]
+    ) -> None:
+        merge, view, operator = session.merge, self._view.value, self._stage.operator
+        shown = [name for name in (merge.scans if merge is not None else names) if name in made]
+        places = {name: pair[2] for name, pair in merge.pairs.items()} if merge is not None and view == AFTER else {}
+        key = (
+            view,
+            merge.name if merge else "",
+            tuple((name, made[name], labels[name]) for name in shown),
+            tuple((name, T.tobytes()) for name, T in places.items()),
+        )
 
-    def _draw_clouds(self, things: list[tuple[str, np.ndarray, Any]]) -> None:
+        def make() -> Drawn:
+            store = opened(operator)
+            if merge is not None and view in MERGED:
+                return merged_drawn(store, merge.name, view, [labels.get(name, name) for name in merge.scans])
+            return scans_drawn(store, shown, places, labels)
+
+        self._painter.ask("clouds", key, make, self._draw_clouds)
+
+    def _draw_clouds(self, drawn: Drawn) -> None:
         scene = self._stage.scene
-        for name in set(scene.names(LAYER)) - {name for name, _, _ in things}:
+        for name in set(scene.names(LAYER)) - set(drawn.clouds):
             scene.remove(LAYER, name)
-        self._points = np.concatenate([points for _, points, _ in things]) if things else None
-        words = []
-        for name, points, colours in things:
-            scene.cloud(LAYER, name, points, colours)
-            if isinstance(colours, tuple):
-                patch = f'<span style="color:rgb{colours};font-size:1.3em">■</span>'
-                words.append(f"<span>{patch} {cell(name)}</span>")
-        scene.show(LAYER, self._visible)
-        legend = f'<div style="display:flex;flex-wrap:wrap;gap:0 1em;align-items:center">{"".join(words)}</div>'
-        self._legend.set(block(Html(legend)) if words else "")
-        self._look()
+        for name, (points, painted) in drawn.clouds.items():
+            scene.cloud(LAYER, name, points, painted)
+        with self._lock:
+            self._drawn = drawn
+            self._show_layers()
 
-    def _look(self) -> None:
-        if self._visible:
-            self._stage.eyes.at(f"{LAYER} {self._view.value}", self._points)
+    def _show_layers(self) -> None:
+        """The clouds, or the two that are picked on; and what the browsers look at."""
+        picking = self._picking
+        if self._shows != (shows := self._visible and not picking):
+            self._shows = shows
+            self._stage.scene.show(LAYER, shows)
+        self._picks.show(self._visible and picking)
+        self._legend.set("" if picking or self._drawn is None else self._drawn.legend)
+        if self._visible and not picking and self._drawn is not None:
+            self._stage.eyes.at(f"{LAYER} {self._drawn.about}", self._drawn.points)
 
     # requests
 
     def _ask_merge(self) -> None:
-        reference = self._reference.value
-        names = [name for name in self._chosen() if name != reference]
-        self._stage.operator.merge([*names, reference], reference)
+        merge, start, reference, names = (
+            self._stage.operator.merge,
+            self._start.value,
+            self._reference.value,
+            self._chosen(),
+        )
+        if start == TURNTABLE:
+            merge(names, reference, start="turntable", angle=float(self._angle.value))
+        elif start == LYING:
+            merge(names, reference, start="identity")
+        elif start == PICKED:
+            merge(names, reference, picked=self._picks.picked())
+        else:
+            merge(names, reference)
 
 
 def mergeable(session: SessionView) -> list[ScanView]:
     """Scans of objects that are reconstructed; planes and spheres that were captured to verify are none."""
     return [scan for scan in session.scans if scan.cloud != "absent" and likely(scan) == "scan"]
-
-
-def merge_words(merge: MergeView, labels: dict[str, str]) -> Html:
-    """How each scan lies on the reference."""
-    reference = labels.get(merge.reference, merge.reference)
-    rows = []
-    for name, (rms, overlap, T) in merge.pairs.items():
-        moved = f"{np.linalg.norm(T[:3, 3]):.1f} mm"
-        turned = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
-        share = Html(f"{100 * overlap:.0f} %{meter(overlap, 'good' if overlap >= _LOW else 'warning')}")
-        rows.append(
-            (labels.get(name, name), toned(f"{rms:.3f} mm", "plain", bold=True), share, f"{moved}, {turned:.1f}°")
-        )
-    said = table((f"On {reference}", "RMS", "overlap", "moved by"), rows)
-    stale = toned("Scans or calibration have changed since: merge again.", "warning") if merge.stale else ""
-    points = block(Html(f"Merged: <b>{merge.points:,} points</b> in the place of {cell(reference)}. {stale}"))
-    return Html(said + points)

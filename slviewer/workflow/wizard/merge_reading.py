@@ -54,4 +54,5 @@ def _pair(found: Mapping[str, Any]) -> MergedPair:
         found.get("sigma_turn_deg"),
         moved,
         float(turned),
+        found.get("point_to_point_rms_mm"),
     )

@@ -6,6 +6,7 @@ from functools import partial
 from typing import TypeVar
 
 from slviewer.errors import InputError
+from slviewer.registration.refusal import Refused
 from slviewer.workflow.merging import Picked, StartKind
 from slviewer.workflow.wizard import work
 from slviewer.workflow.wizard.jobs import Reporter
@@ -13,6 +14,13 @@ from slviewer.workflow.wizard.notices import words_for
 from slviewer.workflow.wizard.requesting import Asked, request
 
 MERGING = "Merging"
+_ELSEWHERE = {
+    "features": "Or begin by points that you pick.",
+    "turntable": "Or begin by their shapes, or by points that you pick.",
+    "identity": "Or begin by their shapes, or by points that you pick.",
+    "picked": "Or pick other points.",
+}
+"""What else to try where scans do not come together from a start."""
 T = TypeVar("T")
 
 
@@ -40,7 +48,10 @@ class MergeRequests(Asked):
         )
 
         def failed(error: BaseException) -> None:
-            engine.not_merged = words_for(MERGING, error)
+            words = words_for(MERGING, error)
+            if isinstance(error, Refused) and error.reason in ("overlap", "disagree"):
+                words = f"{words} {_ELSEWHERE['picked' if picked else start]}"
+            engine.not_merged = words
             engine.notices.tell("error", engine.not_merged)
 
         self._submit(MERGING, merge, partial(work.told_merge, reference), failed)

@@ -230,8 +230,8 @@ class ScanView:
 
 @dataclass(frozen=True)
 class MergedPair:
-    """How one scan lies on another: the overlap, 0 ... 1; one standard deviation of the pose, and how far the overlap's
-    middle was moved, None where a merge of before did not keep them.
+    """How one scan lies on another: RMS along the normal, and from point to point; the overlap, 0 ... 1; one standard
+    deviation of the pose, and how far the overlap's middle was moved. None where a merge of before did not keep it.
     """
 
     scan: str
@@ -242,6 +242,7 @@ class MergedPair:
     sigma_deg: float | None
     moved_mm: float | None
     turned_deg: float
+    point_mm: float | None = None
 
 
 @dataclass(frozen=True)

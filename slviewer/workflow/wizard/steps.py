@@ -273,7 +273,7 @@ def _merge_done(facts: Facts) -> bool:
 
 def _merge_now(facts: Facts) -> str:
     if _merge_done(facts):
-        return "Look at how the scans lie on each other; undo if they do not, or export next."
+        return "Look at how the scans lie on each other; undo if they do not, or measure next."
     return "Choose the scans, and the one whose place the others take."
 
 
