@@ -35,7 +35,7 @@ def label(measured: Measurement) -> str:
     if measured.kind in ("point", "section", "deviation"):
         return measured.name
     first = quantities_of(measured)[0]
-    named = "" if first.name == "distance" else f"{first.name} "
+    named = "" if measured.kind in ("distance", "relation") else f"{first.name} "
     return f"{measured.name}: {named}{value_words(first)}" + (" (stale)" if measured.stale else "")
 
 

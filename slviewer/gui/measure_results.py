@@ -1,5 +1,6 @@
 """What was measured: drawn in 3D, listed, looked at one by one, renamed, deleted, brought back, written as a table."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -29,6 +30,7 @@ class Results:
 
     def __init__(self, stage: Stage, painter: Painter, layer: str, chose: Callable[[Measurement | None], None]) -> None:
         self._stage, self._painter, self._layer, self._chose = stage, painter, layer, chose
+        self._lock = threading.RLock()
         self._session: SessionView | None = None
         self._on = ""
         self._known: set[str] = set()
@@ -70,8 +72,13 @@ class Results:
 
     def draw(self, session: SessionView | None, on: str) -> list[Measurement]:
         """Show the session's measurements, in 3D those on the surface ``on``; returns those that have just come."""
+        with self._lock:
+            return self._draw(session, on)
+
+    def _draw(self, session: SessionView | None, on: str) -> list[Measurement]:
         if session is None or self._session is None or session.folder != self._session.folder:
             self._known = {each.id for each in session.measurements} if session else set()
+            self._forget()
         self._session, self._on = session, on
         measured = self._measured
         names = [each.name for each in measured]
@@ -100,6 +107,10 @@ class Results:
 
     def refresh(self) -> None:
         """Show the chosen one."""
+        with self._lock:
+            self._refresh()
+
+    def _refresh(self) -> None:
         chosen, measured = self.chosen, self._measured
         if (chosen.id if chosen else "") != self._told:
             self._told = chosen.id if chosen else ""
@@ -124,6 +135,14 @@ class Results:
         merge = self._session.merge
         merged = {} if merge is None else {f"merge/{merge.name}": f"the merge of {len(merge.scans)} scans"}
         return {scan.name: scan.label for scan in self._session.scans} | merged
+
+    def _forget(self) -> None:
+        """Another session: its measurements are called m1, m2, … too."""
+        for identity in self._drawn:
+            self._stage.scene.remove(self._layer, identity)
+        self._drawn, self._lines, self._told = {}, {}, ""
+        for place in ("drawings", "histogram", "section"):
+            self._painter.forget(place)
 
     def _rename(self) -> None:
         if self._choice.value:
@@ -190,17 +209,18 @@ class Results:
             return {i: self._lines[i] if i in self._lines else section_lines(store, i) for i in cut}
 
         def show(lines: dict[str, tuple[CutPlane, Lines]]) -> None:
-            came = lines.keys() - self._lines.keys()
-            self._lines = lines
-            for identity in self._drawn.keys() - looks.keys():
-                self._stage.scene.remove(self._layer, identity)
-                del self._drawn[identity]
-            for each in shown:
-                if self._drawn.get(each.id) != looks[each.id]:
-                    self._drawn[each.id] = looks[each.id]
-                    self._draw_one(each, others, each is chosen)
-            if came and chosen is not None and chosen.id in came:
-                self.refresh()
+            with self._lock:
+                came = lines.keys() - self._lines.keys()
+                self._lines = lines
+                for identity in self._drawn.keys() - looks.keys():
+                    self._stage.scene.remove(self._layer, identity)
+                    del self._drawn[identity]
+                for each in shown:
+                    if self._drawn.get(each.id) != looks[each.id]:
+                        self._drawn[each.id] = looks[each.id]
+                        self._draw_one(each, others, each is chosen)
+                if came and chosen is not None and chosen.id in came:
+                    self._refresh()
 
         self._painter.ask("drawings", (self._on, tuple(looks.items()), tuple(cut)), make, show)
 

@@ -58,12 +58,13 @@ class SurfaceBox:
         """Offer what can be measured on now, and draw what is chosen."""
         scans = [scan for scan in ordered(session.scans) if scan.cloud == "fresh"] if session else []
         offered = [(scan.name, titled(scan.name, scan.label)) for scan in scans]
-        self._versions = {scan.name: (scan.model, scan.points, scan.noise_mm, scan.scale) for scan in scans}
+        where = session.folder if session else None
+        self._versions = {s.name: (where, s.model, s.points, s.noise_mm, s.scale) for s in scans}
         merge = session.merge if session else None
         if merge is not None and not merge.stale:
             name = f"{MERGED}{merge.name}"
             offered.append((name, f"Merge of {len(merge.scans)} scans"))
-            self._versions[name] = (merge.points,)
+            self._versions[name] = (where, merge.points)
         self._choice.offer(offered)
         self.ask()
 

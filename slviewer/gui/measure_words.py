@@ -63,9 +63,9 @@ def verdict_words(data: Mapping[str, Any]) -> Html:
             + table(
                 ("Points", "share"),
                 [
-                    (f"inside by more than U = {U:.3f} mm", f"{verdict['inside']:.1f} %"),
-                    ("too close to tell", f"{verdict['close']:.1f} %"),
-                    ("outside by more than U", f"{verdict['outside']:.1f} %"),
+                    (f"inside by more than U = {U:.3f} mm", f"{verdict['inside']:.2f} %"),
+                    ("too close to tell", f"{verdict['close']:.2f} %"),
+                    ("outside by more than U", f"{verdict['outside']:.2f} %"),
                 ],
             )
         )

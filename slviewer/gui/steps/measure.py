@@ -13,7 +13,7 @@ from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter
 from slviewer.gui.scene import GHOST
-from slviewer.gui.widgets import Html, Words, block, boxed, cell, toned
+from slviewer.gui.widgets import Html, Tone, Words, block, boxed, cell, toned
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
 from slviewer.report.canvas import rounded_up
@@ -132,7 +132,15 @@ class Panel:
         """Hear of clicks into the scene while the tool waits for them; another step's clicks are its own."""
         if self._visible:
             change(self._escape, disabled=not self._tool.name)
-            self._stage.scene.on_pick(self._click if self._tool.clicks else None)
+            self._stage.scene.on_pick(self._click if self._tool.clicks and not self._lacking else None)
+
+    @property
+    def _lacking(self) -> str:
+        """What the surface lacks for the tool; empty where it can be used."""
+        on = self._surface.on
+        if self._tool.name != "Section" or on is None or on.organised or on.faces is not None:
+            return ""
+        return "This merge has no triangles to cut: measure on one of its scans."
 
     def _click(self, origin: np.ndarray, direction: np.ndarray) -> None:
         self._stage.safely(lambda: self._surface.clicked(origin, direction, self._picked))(None)
@@ -157,8 +165,9 @@ class Panel:
         """What the tool asks for now, and what was picked with it."""
         tool = self._tool
         title = f"<b>{cell(tool.name)}</b>: " if tool.name else ""
-        said = Html(title + cell(tool.sentence))
-        self._now.set(boxed(said, "info") if tool.name else block(toned(said, "dim")))
+        said = Html(title + cell(self._lacking or tool.sentence))
+        tone: Tone = "warning" if self._lacking else "info"
+        self._now.set(boxed(said, tone) if tool.name else block(toned(said, "dim")))
         change(self._away, visible=bool(tool.name))
         ready = tool.fits and bool(tool.picked)
         change(self._radius, visible=tool.fits)

@@ -3,7 +3,8 @@
 import os
 import re
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -103,7 +104,7 @@ class MeasureRequests(Asked):
             report(0.0, f"reading {nominal}")
             ideal, surface = read_nominal(path, units), self._surfaces.of(store, on)
             name = f"{on.replace('/', '_')}_{path.stem}_deviation.ply"
-            with delivered(store, name, report) as ply:
+            with delivered(store, name, report) as ply, _asked_here():
                 found = compare_surface(
                     store.guarded(report.saving),
                     surface,
@@ -166,6 +167,15 @@ class MeasureRequests(Asked):
 
     @abstractmethod
     def _warn(self, text: str) -> None: ...
+
+
+@contextmanager
+def _asked_here() -> Iterator[None]:
+    """Where other units are asked for, in words that hold without a command line too."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace("give --units ", "choose its units, ").replace("--units ", "")) from error
 
 
 def told(measured: Measurement) -> str:

@@ -14,6 +14,7 @@ from slviewer.calibration.guidance import choosing
 from slviewer.errors import Cancelled
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
+from slviewer.workflow.measuring import quantities_of
 from slviewer.workflow.wizard import looking, work
 from slviewer.workflow.wizard.autopilot import TARGET, Autopilot
 from slviewer.workflow.wizard.jobs import Reporter
@@ -45,7 +46,7 @@ def session_of(snapshot: Snapshot) -> SessionView:
 def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
     snapshot = operator.snapshot()
     session = session_of(snapshot)
-    assert [step.state for step in snapshot.steps] == ["done"] * 8
+    assert [step.state for step in snapshot.steps] == ["done"] * 9
     assert not [notice.text for notice in snapshot.notices if notice.level == "error"]
     assert "Capturing pose 8 of 8" in acts and acts[-1] == "Writing the report"
     assert {pose.state for pose in session.poses} == {"used"}
@@ -70,6 +71,10 @@ def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) ->
     merged = read_ply(next(e.path for e in session.exports if e.name == "merged_1.ply"))
     assert len(merged.points) == merge.points > 30_000
     assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
+    sphere, width = session.measurements
+    radius = quantities_of(sphere)[0]
+    assert radius.U is not None and abs(radius.value - 98) < 2 * radius.U < 0.2  # the simulated sphere's
+    assert 130 < quantities_of(width)[0].value < 150  # the ammonite's
 
 
 def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:

@@ -129,7 +129,8 @@ def test_a_nominal_model_is_looked_at_kept_and_compared_with(operator: Operator,
     session = now(operator)
     assert session.nominals == ("My_ammonite.ply", "inch.stl") == nominals(session.folder)
     assert sorted(each.name for each in (session.folder / "nominal").iterdir()) == list(session.nominals)
-    assert operator.compare_nominal("object", "inch.stl") and "inch if it is so" in last(operator)
+    assert operator.compare_nominal("object", "inch.stl")
+    assert "choose its units, inch if it is so, else mm" in last(operator)
 
     assert operator.compare_nominal("object", "My_ammonite.ply", tolerance_mm=1.5)
     assert "tolerance ± 1.5 mm: pass" in last(operator)

@@ -1,0 +1,127 @@
+"""The parts of the step Measure that need no browser: tools, drawings in space, words, cursors."""
+
+import re
+
+import numpy as np
+import pytest
+
+from slviewer.gui.measure_drawing import drawn, label, lifted, value_words
+from slviewer.gui.measure_section import cursor_words, placed, section_figure
+from slviewer.gui.measure_surface import painting
+from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
+from slviewer.gui.measure_words import deviation_figure, measurement_words, measurements_table, verdict_words
+from slviewer.inspection.features import Feature
+from slviewer.inspection.quantities import Quantity
+from slviewer.inspection.section import CutPlane
+from slviewer.session.measurements import Measurement
+from slviewer.workflow.measured_surface import Surface
+from slviewer.workflow.wizard.surfaces import place_at
+
+CENTRE = np.array([10.0, 20.0, 500.0])
+TOP = CENTRE - np.array([0.0, 0.0, 30.0])
+
+
+def made(kind: str, quantities: list[Quantity], of: tuple[str, ...] = (), stale: bool = False, **data) -> Measurement:
+    name = f"<b>{kind}</b>"
+    data["quantities"] = [quantity.to_dict() for quantity in quantities]
+    return Measurement(f"m_{kind}", name, kind, "scan_01", "stereo", "", data, of, stale)
+
+
+SPHERE = made(
+    "sphere",
+    [Quantity("radius", 25.0, "mm", 0.01, whole=False)],
+    fit={"feature": Feature("sphere", CENTRE, None, 25.0).to_dict(), "warnings": ["it is rough"]},
+)
+POINT = made("point", [Quantity("x", -0.00001, "mm")], feature=Feature("point", TOP).to_dict())
+
+
+def text(html: str) -> str:
+    return re.sub(r"&#(\d+);", lambda m: chr(int(m[1])), html).replace("\u2060", "")
+
+
+def test_every_tool_says_what_to_do_and_ends_with_what_it_needs() -> None:
+    tool = Tool()
+    assert tool.sentence == "Choose a tool." and not tool.clicks
+    for name in (*PICK, *FIT, *COMPARE):
+        tool.take(name)
+        assert tool.sentence[0].isupper() and tool.sentence.endswith(".")
+        assert tool.clicks == (name not in COMPARE)
+    tool.take("Distance")
+    assert tool.pick((1, 2)) is None and "second" in tool.sentence
+    assert tool.pick((3, 4)) == ((1, 2), (3, 4)) and "first" in tool.sentence  # ready for the next distance
+    tool.take("Point")
+    assert tool.pick(7) == (7,)
+    tool.take("Sphere")
+    assert tool.pick((1, 2)) is None and tool.pick((5, 6)) is None and tool.picked == [(5, 6)]
+    assert "press Fit sphere" in tool.sentence
+    tool.take("")
+    assert tool.picked == []
+
+
+def test_what_is_drawn_lies_where_it_was_measured() -> None:
+    segments, place = drawn(SPHERE, {})  # type: ignore[misc]
+    away = np.linalg.norm(segments[:-3].reshape(-1, 3) - CENTRE, axis=1)
+    assert np.allclose(away, 1.01 * 25) and np.array_equal(place, CENTRE)
+    width = made("distance", [Quantity("distance", 80.0, "mm", 0.1)], ends=[[-40, 0, 500], [40, 0, 500]])
+    segments, place = drawn(width, {})  # type: ignore[misc]
+    assert np.allclose(segments[0, 0], [-40, 0, 500]) and np.allclose(segments[2, 1], [40, 0, 500])
+    assert np.allclose(place, [0, 0, 488]) and label(width) == "<b>distance</b>: 80.000 ± 0.200 mm"
+    related = made("relation", [Quantity("distance from the centre", 30.0, "mm", 0.1)], of=("m_point", "m_sphere"))
+    assert drawn(related, {"m_point": POINT}) is None  # the sphere was deleted
+    segments, _ = drawn(related, {"m_point": POINT, "m_sphere": SPHERE})  # type: ignore[misc]
+    assert np.allclose(segments[0, 0], TOP) and np.allclose(segments[2, 1], CENTRE)
+    tube = Feature("cylinder", CENTRE, np.array([0.0, 1.0, 0.0]), 8.0)
+    cylinder = made("cylinder", [], fit={"feature": tube.to_dict()}, region={"kind": "ball", "size": [12.0]})
+    segments, _ = drawn(cylinder, {})  # type: ignore[misc]
+    assert np.allclose(np.abs(segments[:-1, :, 1] - CENTRE[1]), 12) and np.ptp(segments[..., 0]) == pytest.approx(16.16)
+    plane = made("plane", [], fit={"feature": Feature("plane", CENTRE, np.array([0.0, 0.0, -1.0])).to_dict()})
+    segments, _ = drawn(plane, {})  # type: ignore[misc]
+    assert np.allclose(segments[:-1, :, 2], CENTRE[2] - 0.15)
+
+
+def test_a_section_is_read_off_at_its_cursors() -> None:
+    plane = CutPlane.through(np.array([0.0, 0, 500]), np.array([100.0, 0, 500]), np.array([0.0, 0, -1]))
+    t = np.linspace(0, np.pi, 721)
+    arc = np.stack([50 - 50 * np.cos(t), 50 * np.sin(t)], axis=1)
+    cursors = placed([arc], (10.0, 90.0, 50.0))
+    assert cursors[:, 1] == pytest.approx([30, 30, 50], abs=1e-3)
+    assert np.allclose(lifted(plane, cursors), [[10, 0, 470], [90, 0, 470], [50, 0, 450]], atol=1e-3)
+    words = text(cursor_words(cursors))
+    assert "80.000 mm" in words and "50.000 mm" in words and "0.000 mm" in words
+    assert "straight line" in text(cursor_words(np.array([[0.0, 0], [2, 0], [1, 0]])))
+    assert "drawn alike" in section_figure("s", [arc], cursors).caption
+    flat = arc * [1, 0.01]
+    assert "larger than lengths" in section_figure("s", [flat], placed([flat], (10.0, 90.0, 50.0))).caption
+    cut = made("section", [], plane=plane.to_dict())
+    segments, place = drawn(cut, {}, [arc])  # type: ignore[misc]
+    assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(449)  # the highest point, a little off
+
+
+def test_words_of_measurements() -> None:
+    assert value_words(Quantity("x", -0.00001, "mm")) == "0.000 mm"
+    assert value_words(Quantity("height", -1.5, "mm", 0.1)) == "−1.500 ± 0.200 mm"
+    assert value_words(Quantity("angle", 90.0, "deg", 0.01, whole=False)) == "90.000 ± 0.020°*"
+    full = text(measurement_words(SPHERE, {"scan_01": "Lion <i>"}))
+    assert "25.000 ± 0.020 mm*" in full and "It is rough." in full and "on Lion <i>" in full
+    assert "<b>sphere" not in measurement_words(SPHERE, {}) and "does not know" in full
+    stale = made("point", [Quantity("x", 1.0, "mm")], stale=True)
+    listed = text(measurements_table([SPHERE, stale], "", {}))
+    assert listed.index("point on scan_01, stale") < listed.index("sphere on scan_01")
+    statistics = {"points": 900, "left_out": 100}
+    verdict = {"tolerance_mm": 0.1, "decision": "undecided", "U_mm": 0.02, "inside": 90.0, "close": 9.0, "outside": 1.0}
+    told = text(verdict_words({"verdict": verdict, "statistics_mm": statistics, "reach_mm": 2.0}))
+    assert "Tolerance ± 0.1 mm: too close to tell" in told and "10.0 % lie farther than 2 mm" in told
+    edges = np.linspace(-0.2, 0.2, 9)
+    assert deviation_figure("d", edges, np.arange(8), 0.1, 0.1).png.startswith(b"\x89PNG")
+
+
+def test_a_merge_is_painted_and_clicked_as_a_scan_is() -> None:
+    points = np.stack([np.arange(5.0), np.zeros(5), np.full(5, 300.0)], axis=1).astype(np.float32)
+    merge = Surface(points, np.full(5, 0.1, np.float32), "merge/1", "stereo", {}, texture=np.full((5, 3), 9, np.uint8))
+    assert place_at(merge, np.zeros(3), points[3]) == 3
+    drawn_points, painted, _ = painting(merge, "texture")
+    assert drawn_points is not points and drawn_points.shape == painted.shape == (5, 3) and painted.max() == 9
+    assert "along the normal" in text(painting(merge, "uncertainty")[2])
+    scan = Surface(points[None], np.full((1, 5), 0.1, np.float32), "scan_01", "stereo", {})
+    assert place_at(scan, np.zeros(3), points[3]) == (3, 0)
+    assert "depth" in painting(scan, "texture")[2]  # where there is no texture
