@@ -51,8 +51,17 @@ def volume(points: PointSet, cell_mm: float) -> Mesh:
     found = grid.extract_triangle_mesh(weight_threshold=0.5)
     if not len(found.vertex.positions):
         raise InputError("No surface was found between the points: the cells are too fine for them.")
-    vertices = found.vertex.positions.numpy().astype(np.float64) * cell_mm + origin
-    return carried(points, vertices, found.triangle.indices.numpy())
+    vertices, faces = _in_order(found.vertex.positions.numpy(), found.triangle.indices.numpy())
+    return carried(points, vertices.astype(np.float64) * cell_mm + origin, faces)
+
+
+def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same triangles, whatever order the threads found them in: by place, each from its first vertex on."""
+    order = np.lexsort(vertices.T)
+    faces = np.argsort(order)[faces]
+    first = faces.argmin(axis=1)[:, None]
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    return vertices[order], faces[np.lexsort(faces.T[::-1])]
 
 
 @kernel()

@@ -15,6 +15,7 @@ from slviewer.surface.poisson import trimmed
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.surface.tools import compact
 from slviewer.surface.topology import topology
+from slviewer.surface.volume import volume
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
 
@@ -78,6 +79,8 @@ def test_a_volume(points: PointSet) -> None:
     found = mesh_of(points, MeshingPlan("volume", fill_holes_mm=6.0))
     assert found.topology.watertight and found.topology.volume_mm3 == pytest.approx(VOLUME, rel=3e-3)
     assert rms(off(found.mesh.vertices)) < 0.04
+    one, other = (volume(points, found.cell_mm) for _ in range(2))  # whatever thread is first
+    assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
 
 
 def test_a_scans_grid_ends_where_depth_jumps() -> None:
