@@ -195,7 +195,7 @@ def take_home(page: Page, operator: Operator, folder: Path) -> None:
     merged = session_of(operator).merge
     assert merged is not None and isinstance(cloud, trimesh.PointCloud)
     assert len(cloud.vertices) == merged.points and np.isfinite(cloud.vertices).all()
-    assert cloud.extents == pytest.approx([142, 127, 33], abs=3)  # the ammonite's size, mm
+    assert cloud.extents == pytest.approx([141, 126, 31], abs=3)  # the ammonite's size, mm, less its steep rim
 
 
 def session_of(operator: Operator) -> SessionView:
