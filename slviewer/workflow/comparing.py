@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.errors import UsageError
 from slviewer.evaluation.render import Row, render
 from slviewer.inspection.colours import colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
@@ -114,6 +115,8 @@ def compare(
     InputError asks for them. ``reach``: mm, beyond which points belong to something else. ``out``: the coloured PLY, by
     default in the session's exports.
     """
+    if out is not None and Path(out).suffix.lower() != ".ply":
+        raise UsageError(f"coloured points are written as .ply, not as {Path(out).name}: end its name so")
     ideal = read_nominal(nominal, units)  # a wrong file is told before minutes of work
     with opened(session, write=True) as store:
         reading = part(progress, 0.0, 0.4)

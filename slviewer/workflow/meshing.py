@@ -10,6 +10,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape
 from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
 from slviewer.surface.shapes import PointSet
+from slviewer.workflow.exporting import check_export
 from slviewer.workflow.exporting_shapes import merged_points, scan_cloud
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.merging import Merge, StartKind, merge
@@ -63,6 +64,8 @@ def mesh(
         raise UsageError("nothing was named: name one scan, several to merge, or a merge")
     if len(sources) > 1 and any(name.startswith(MERGE) for name in sources):
         raise UsageError("a merge is meshed by itself: name one merge, or scans")
+    if out is not None:
+        check_export("mesh", Path(out).suffix.lower().removeprefix("."))
     merged = None
     with opened(session) as store:
         check_accepted(store, accept_rejected)

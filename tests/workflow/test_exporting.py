@@ -13,7 +13,7 @@ import trimesh
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import Cancelled, InputError
+from slviewer.errors import Cancelled, InputError, UsageError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import PRESETS
 from slviewer.geometry.lens import Lens
@@ -21,7 +21,9 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.session.importers import opencv_calibration
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
+from slviewer.workflow.comparing import compare
 from slviewer.workflow.exporting import FORMATS, export
+from slviewer.workflow.meshing import mesh
 from slviewer.workflow.models import save_fitted, save_stereo
 
 Run = Callable[..., tuple[int, str, str]]
@@ -208,6 +210,13 @@ def test_a_mesh_is_made_as_planned_and_says_what_that_did(kept: Path, run: Run, 
     status, _, error = run("export", kept, "mesh", "scan_01", "--out", tmp_path / "w.stl", "--watertight")
     assert status == 1 and ("imagined, not measured" in error or "does not close" in error)
     assert not (tmp_path / "w.stl").exists()
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"mesh cannot be written as \.step"):
+        mesh(tmp_path / "nowhere", ["a", "b"], tmp_path / "m.step")
+    with pytest.raises(UsageError, match="written as .ply, not as d.stl"):
+        compare(tmp_path / "nowhere", "a", tmp_path / "nominal.stl", out=tmp_path / "d.stl")
 
 
 def test_a_cancelled_export_leaves_nothing(kept: Path, tmp_path: Path) -> None:
