@@ -215,7 +215,7 @@ def test_a_mesh_is_made_as_planned_and_says_what_that_did(kept: Path, run: Run, 
 def test_a_file_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"mesh cannot be written as \.step"):
         mesh(tmp_path / "nowhere", ["a", "b"], tmp_path / "m.step")
-    with pytest.raises(UsageError, match="written as .ply, not as d.stl"):
+    with pytest.raises(UsageError, match=r"written as \.ply, not as d\.stl"):
         compare(tmp_path / "nowhere", "a", tmp_path / "nominal.stl", out=tmp_path / "d.stl")
 
 
