@@ -15,6 +15,7 @@ from slviewer.gui.inputs import Choice, change
 from slviewer.gui.merge_views import SCAN_COLOURS, patch
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
+from slviewer.gui.views import ASIDE
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, table, toned
 from slviewer.registration.multiway import Pair
 from slviewer.registration.picked import LEAST_PICKS, picked_start
@@ -26,7 +27,10 @@ _SIDES: tuple[Side, Side] = ("scan", "onto")
 _MARKS = dict(zip(_SIDES, SCAN_COLOURS, strict=False))
 _WHERE = {"scan": "on the left", "onto": "on the right"}
 _APART = 0.15
-"""Of their widths: the gap between the two clouds."""
+"""Of the wider one's width: the gap between the two clouds."""
+_ROOM = 1.15
+_BALL = 0.022
+"""Of the width: the radius of a mark."""
 
 
 @dataclass
@@ -57,20 +61,23 @@ class _Picks:
 
 @dataclass(frozen=True, eq=False)
 class _SideBySide:
-    """The two clouds (h, w, 3) mm in their cameras' frames, and how far the scan's is moved to be drawn."""
+    """The two clouds (h, w, 3) mm in their cameras' frames, how far the scan's is moved to be drawn, and the width."""
 
     pair: Pair
     clouds: Mapping[Side, np.ndarray]
     colours: Mapping[Side, np.ndarray]
     shift: np.ndarray
+    wide_mm: float
 
     def moved(self, side: Side) -> np.ndarray:
         return self.shift if side == "scan" else np.zeros(3)
 
     @cached_property
-    def points(self) -> np.ndarray:
-        """(n, 3) mm, of both as they are drawn."""
-        return np.concatenate([(self.clouds[side] + self.moved(side)).reshape(-1, 3) for side in _SIDES])
+    def seen(self) -> np.ndarray:
+        """(n, 3) mm: what to look at to see both as they are drawn, whole in a narrow window too."""
+        points = np.concatenate([(self.clouds[side][::4, ::4] + self.moved(side)).reshape(-1, 3) for side in _SIDES])
+        middle = np.nanmean(points, axis=0)
+        return np.asarray(middle + _ROOM * (points - middle), np.float32)
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> tuple[Side, np.ndarray] | None:
         """What a ray meets first: on which cloud, and the point (3,) of it."""
@@ -156,8 +163,8 @@ class PickBox:
 
     @property
     def seen(self) -> np.ndarray | None:
-        """The points that are drawn."""
-        return None if self._shown is None else self._shown.points
+        """The points (n, 3) mm to look at."""
+        return None if self._shown is None else self._shown.seen
 
     @property
     def _pair(self) -> Pair | None:
@@ -190,6 +197,7 @@ class PickBox:
         """The numbered places, on both clouds."""
         shown, scene = self._shown, self._stage.scene
         wanted: dict[str, tuple[np.ndarray, str, Side]] = {}
+        ball = 0.0 if shown is None else _BALL * shown.wide_mm
         if shown is not None and shown.pair == self._pair:
             picks = self._picks[shown.pair]
             for k, pair in enumerate([*picks.pairs, picks.begun], 1):
@@ -199,7 +207,7 @@ class PickBox:
             scene.remove(LAYER, name)
         for name, (point, text, side) in wanted.items():
             if self._marked.get(name) != tuple(point):
-                scene.mark(LAYER, name, point, text, _MARKS[side])
+                scene.mark(LAYER, name, point, text, _MARKS[side], ball)
         self._marked = {name: tuple(point) for name, (point, _, _) in wanted.items()}
 
     def _say(self, on: bool) -> None:
@@ -233,7 +241,7 @@ class PickBox:
 
     def _others(self) -> Html:
         """How many pairs the other scans have."""
-        if len(self._names) < 2:
+        if len(self._names) < 2 or not any(picks.pairs for picks in self._current()):
             return Html("")
         words = []
         for name in self._names:
@@ -282,14 +290,13 @@ def _pairs_words(picks: _Picks) -> Html:
 
 
 def _side_by_side(session: Any, pair: Pair) -> _SideBySide:
-    """The scan moved beside the reference, to its left, as far away from the camera."""
+    """The scan moved beside the reference, to its left and as far away as one looks at it first."""
     found: dict[Side, ScanCloud] = {side: scan_cloud(session, name) for side, name in zip(_SIDES, pair, strict=True)}
-    ends = {side: np.nanpercentile(cloud.points.reshape(-1, 3), [1, 50, 99], axis=0) for side, cloud in found.items()}
-    here, there = ends["scan"], ends["onto"]
-    shift = there[1] - here[1]
-    shift[0] = there[0, 0] - here[2, 0] - _APART * max(np.ptp(here[:, 0]), np.ptp(there[:, 0]))
+    flat = {side: cloud.points[np.isfinite(cloud.points[..., 2])].astype(np.float64) for side, cloud in found.items()}
+    wide = max(float(np.ptp(np.percentile(points @ ASIDE, [1, 99]))) for points in flat.values())
+    shift = np.median(flat["onto"], axis=0) - np.median(flat["scan"], axis=0) - (1 + _APART) * wide * ASIDE
     painted: dict[Side, np.ndarray] = {}
     for side, cloud in found.items():
         texture = cloud.texture
         painted[side] = texture if texture.ndim == 3 else np.repeat(texture[..., None], 3, axis=2)
-    return _SideBySide(pair, {side: cloud.points for side, cloud in found.items()}, painted, shift)
+    return _SideBySide(pair, {side: cloud.points for side, cloud in found.items()}, painted, shift, wide)

@@ -213,10 +213,18 @@ class Scene:
         )
         self._set(layer, name, [handle])
 
-    def mark(self, layer: str, name: str, point: np.ndarray, text: str, colour: Colour = (220, 40, 40)) -> None:
+    def mark(
+        self,
+        layer: str,
+        name: str,
+        point: np.ndarray,
+        text: str,
+        colour: Colour = (220, 40, 40),
+        radius_mm: float = 1.5,
+    ) -> None:
         """A point (3,) mm with words beside it."""
         path = self._path(layer, name)
-        ball = self._api.add_icosphere(path, radius=1.5, color=colour, position=np.asarray(point, float))
+        ball = self._api.add_icosphere(path, radius=radius_mm, color=colour, position=np.asarray(point, float))
         self._set(layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")])
 
     def ball(self, layer: str, name: str, centre: np.ndarray, radius_mm: float, colour: Colour) -> None:

@@ -10,6 +10,8 @@ from slviewer.gui.panel import Stage
 
 _FROM = np.array([-0.45, -0.35, -0.82])
 """From a little to the left and above of where the camera looks from: depth is seen, and nothing is upside down."""
+ASIDE = np.cross([0.0, 1.0, 0.0], -_FROM) / np.linalg.norm(_FROM[[0, 2]])
+"""(3,): to the right as one looks from there, at the same distance."""
 OVERVIEW = ((-430.0, -560.0, -820.0), (55.0, 40.0, 330.0))
 """Position and point looked at, mm: the rig and what stands at its working distance, in a narrow window too."""
 FIELD_OF_VIEW = 0.75  # rad
