@@ -24,13 +24,16 @@ def simulate(
 
     Args:
         session: Session folder to make.
-        preset: letter, or turn.
-        scale: Resolution of the camera, as a share of the preset's.
+        preset: letter: planes, spheres and an object at three depths; turn: an object at three depths, and another on a
+            turntable.
+        scale: Resolution of the camera, as a share of 1600x1200 px; 0.25 is quick.
         poses: How many target poses.
         seed: Another seed is another rig of the same kind.
     """
+    from slviewer.workflow.simulating import TARGET  # only now: nothing heavy is imported before it is needed
+
     names = workflow.simulate(session, preset=preset, scale=scale, poses=poses, seed=seed, **ui())
-    print(f"{len(names)} captures simulated into {session}")
+    print(f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}")
 
 
 @deferred

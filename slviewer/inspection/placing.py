@@ -67,7 +67,10 @@ def found_start(
         if best.rms_mm <= good and best.overlap >= GOOD_OVERLAP:
             break
     if best is None and isinstance(refusal, Refused):
-        raise refusal.about("The scan was not found on the nominal model.")
+        raise refusal.about(
+            "The scan was not found on the nominal model: see that it shows this part, at this size, and that little "
+            "else is in view. What the best try lacked:"
+        )
     if best is None:
         raise refusal or SlviewerError("The nominal model shows no side that a scan could lie on: check the file.")
     return best

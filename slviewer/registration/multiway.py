@@ -198,10 +198,8 @@ class _Work:
     def _hanging(self, lost: list[str]) -> Refused:
         told = next(error for pair, error in self.refused.items() if set(pair) & set(lost))
         if len(lost) == 1:
-            return told.about(f"{lost[0]} could not be merged: it hangs on nothing.")
-        return told.about(
-            f"{', '.join(lost)} could not be merged: they hang on nothing that leads to {self.reference}."
-        )
+            return told.about(f"{lost[0]} could not be merged: nothing joins it to {self.reference}.")
+        return told.about(f"{', '.join(lost)} could not be merged: nothing joins them to {self.reference}.")
 
     def _close_loops(self, poses: np.ndarray) -> None:
         """Register pairs that must overlap where the scans lie now."""

@@ -210,7 +210,7 @@ def _check_space(folder: Path, needs_bytes: int) -> None:
 
 def _full(folder: Path, needs_bytes: int) -> SessionError:
     free = shutil.disk_usage(folder).free
-    needs = f"needs {megabytes(needs_bytes)}, " if needs_bytes else ""
+    needs = f"needs {megabytes(needs_bytes)} and {megabytes(_SPARE_BYTES)} to spare, " if needs_bytes else ""
     return SessionError(
         f"the disk is full: the save {needs}{megabytes(free)} are free on {folder}: "
         "free some space or choose another folder"

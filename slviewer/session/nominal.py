@@ -89,11 +89,17 @@ def check_size(nominal: Nominal, points: np.ndarray) -> None:
     if 1 / LIKELY < ratio < LIKELY:
         return
     fitting = [name for name, mm in MM.items() if 1 / NEAR < ratio / mm < NEAR and name != "mm"]
-    many = f"{ratio:.3g} times larger" if ratio > 1 else f"{1 / ratio:.3g} times smaller"
-    seen = f"{nominal.name} measures {model:.4g} across if its numbers are mm, and the scan {scan:.4g} mm, {many}"
+    many = f"about {_plain(ratio)} times larger" if ratio > 1 else f"about {_plain(1 / ratio)} times smaller"
+    sizes = f"{_plain(model)} mm across if its numbers are mm, and the scan {_plain(scan)} mm"
+    seen = f"{nominal.name} measures {sizes}, {many}"
     if fitting:
         raise InputError(f"{seen}: give --units {' or --units '.join(fitting)} if it is so, else --units mm")
     raise InputError(f"{seen}: see that it is the same part; give --units mm if its numbers are mm all the same")
+
+
+def _plain(size: float) -> str:
+    """A size in three digits or more, never with an exponent."""
+    return f"{size:,.0f}" if size >= 100 else f"{size:#.3g}"
 
 
 def _loaded(name: str, data: bytes, form: Format) -> tuple[np.ndarray, np.ndarray]:

@@ -171,10 +171,13 @@ def spacing(points: PointSet) -> float:
 
 def _refuse_if_open(found: Topology, cut: Trimmed | None, method: Method) -> None:
     if not found.watertight:
-        remedy = "fill larger holes, or scan there" if method == "poisson" else "fill larger holes, or use poisson"
+        remedy = (
+            "fill larger holes, or scan there" if method == "poisson" else "fill holes of that size, or use poisson"
+        )
         raise SlviewerError(f"The surface does not close: {found.faults()}; {remedy}.")
     if cut is not None and cut.imagined > MOST_IMAGINED:
         raise SlviewerError(
-            f"{100 * cut.imagined:.0f} % of the closed surface would be imagined, not measured: scan the object from "
-            "more sides, or do without watertight."
+            f"{100 * cut.imagined:.0f} % of the closed surface would be imagined, not measured (the largest gap is "
+            f"{cut.largest_mm:.0f} mm across): scan the object from more sides, do without watertight, or close a gap "
+            "such as the foot it stood on by the method volume, filling holes of that size."
         )

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NoReturn
 
 from slviewer.errors import UsageError
 from slviewer.inspection.regions import Region
@@ -49,20 +49,29 @@ def measure(
     fitted = what in ("plane", "sphere", "cylinder")
     if fitted and (len(ball), len(box)) not in ((4, 0), (0, 6)):
         raise UsageError(f"a {what} needs its region: give --ball x y z radius, or --box x y z x y z, in mm")
+    ends = 1 if what == "point" else 2
+    if not fitted and len(at) not in (ends, 2 * ends):
+        _refuse_places(what, ends, "pixel u v")
     with opened(session, write=True) as store:
         on = surface(store, scan, model=model, accept_rejected=accept_rejected, progress=progress, warn=warn)
         if fitted:
             region = Region.ball(ball[:3], ball[3]) if ball else Region.box(box[:3], box[3:])
             return add_fit(store, on, what, region, name)  # type: ignore[arg-type]
-        ends = 1 if what == "point" else 2
         numbers = 2 if on.organised else 1
         if len(at) != ends * numbers:
-            which = "pixel u v" if on.organised else "index"
-            raise UsageError(f"a {what} needs --at with the {which} of {'its point' if ends == 1 else 'both its ends'}")
+            _refuse_places(what, ends, "pixel u v" if on.organised else "index")
         places: list[Place] = [(at[i], at[i + 1]) if on.organised else at[i] for i in range(0, len(at), numbers)]
         if what == "point":
             return add_point(store, on, places[0], name)
         return (add_distance if what == "distance" else add_section)(store, on, places[0], places[1], name)
+
+
+def _refuse_places(what: What, ends: int, which: str) -> NoReturn:
+    example = " ".join(("180 150", "220 150")[:ends]) if which == "pixel u v" else " ".join(("1200", "3400")[:ends])
+    raise UsageError(
+        f"a {what} needs --at with the {which} of {'its point' if ends == 1 else 'both its ends'}, "
+        f"such as --at {example}"
+    )
 
 
 def tell_measurements(

@@ -34,7 +34,7 @@ def inspect(session: SessionLike) -> str:
             lines.append(f"{len(measured)} measurement{'s' * (len(measured) != 1)}:")
             lines += [f"  {in_words(each)}" for each in measured]
         if not available(store):
-            lines.append("no calibration yet: run `slviewer calibrate`")
+            lines.append("no calibration yet: run `slviewer calibrate` with the --target in use")
     return "\n".join(lines)
 
 

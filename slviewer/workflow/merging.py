@@ -140,6 +140,11 @@ def merge(
     names = given if reference in given else [*given, reference]
     if len(names) < 2:
         raise UsageError(f"only {reference} was named: name the scans to merge with it")
+    if Path(out).suffix.lower() != ".ply":
+        raise UsageError(
+            f"merged points are written as .ply, not as {Path(out).name}: a mesh goes into other files too"
+        )
+    Path(out).parent.mkdir(parents=True, exist_ok=True)
     starts = _starts(names, start, angle, axis, poses, picked, warn)
     with opened(session) as store:
         check_accepted(store, accept_rejected)
@@ -157,7 +162,6 @@ def merge(
         warn(why)
     fused = fuse(clouds, alignment.T_reference_scan, lambda done: fusing(done, "fusing"))
     progress(0.9, "writing")
-    Path(out).parent.mkdir(parents=True, exist_ok=True)
     surface = fused.surface
     scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
     scalars |= {"seen_by": fused.seen_by, "source": fused.source}

@@ -136,6 +136,7 @@ def test_size_and_triangles_are_limited_before_anything_is_loaded(tmp_path: Path
         (10.0, "--units cm if"),
         (0.1, "times smaller: see that it is the same part"),
         (100.0, "times larger: see that"),
+        (0.001, r"138,564 mm across .* about 1,0\d\d times smaller"),
     ],
 )
 def test_other_units_are_asked_for_with_what_was_seen(tmp_path: Path, factor: float, said: str) -> None:

@@ -21,3 +21,5 @@ def test_starts_that_do_not_fit_together_are_refused_at_once(tmp_path) -> None:
         merge(tmp_path / "nowhere", ["a"], "b", out, picked={("a", "b"): (line, line)})
     with pytest.raises(UsageError, match="only b was named"):
         merge(tmp_path / "nowhere", ["b"], "b", out)
+    with pytest.raises(UsageError, match=r"written as .ply, not as merged.stl"):
+        merge(tmp_path / "nowhere", ["a"], "b", out.with_suffix(".stl"))
