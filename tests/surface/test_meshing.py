@@ -134,6 +134,8 @@ def test_thinning_and_smoothing_tell_how_far_they_moved_the_surface(closed: Mesh
     assert 2900 <= len(thinned.faces) <= 3000 and topology(thinned).watertight
     assert 0.001 < report.rms_mm < 0.2 and report.rms_mm < report.max_mm < 1.0
     assert thinned.colours is not None and thinned.sigma_mm is not None
+    small = Mesh(0.01 * closed.mesh.vertices, closed.mesh.faces)
+    assert thin(small, 3000)[1].rms_mm == pytest.approx(0.01 * report.rms_mm, rel=0.1)
     rough = Mesh(
         closed.mesh.vertices + np.random.default_rng(0).normal(0, 0.1, closed.mesh.vertices.shape), closed.mesh.faces
     )
