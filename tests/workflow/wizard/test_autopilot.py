@@ -176,7 +176,7 @@ def test_files_for_other_programs(operator: Operator) -> None:
 
 def read_head(path: Path) -> str:
     with path.open("rb") as file:
-        return file.read(300).decode("ascii", "replace")
+        return file.read(1000).decode("ascii", "replace")
 
 
 def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(operator: Operator) -> None:
