@@ -103,6 +103,7 @@ class PickBox:
         self._reference = ""
         self._shown: _SideBySide | None = None
         self._marked: dict[str, tuple[float, ...]] = {}
+        self._offered = False
         self._on: bool | None = None
 
     def build(self) -> None:
@@ -130,7 +131,7 @@ class PickBox:
                 self._picks.setdefault((name, reference), _Picks((versions[name], versions[reference])))
             self._scan.offer([(name, labels.get(name, name)) for name in self._names])
             self._scan.show(on and len(self._names) > 1)
-            self._say(on)
+            self._offered = on
 
     @property
     def ready(self) -> bool:
@@ -153,6 +154,7 @@ class PickBox:
                     scene.on_pick(self._click if on else None)
                 self._on = on
                 scene.show(LAYER, on)
+            self._say(self._offered)
             pair = self._pair
             if not on or pair is None:
                 return
@@ -219,7 +221,10 @@ class PickBox:
             change(self._undo, visible=False)
             return
         picks = self._picks[pair]
-        self._now.set(boxed(self._sentence(pair, picks), "info"))
+        if self._on:
+            self._now.set(boxed(self._sentence(pair, picks), "info"))
+        else:
+            self._now.say("To pick more, show scan and reference side by side.", "dim")
         self._table.set(_pairs_words(picks) + self._others())
         change(self._undo, visible=bool(picks.pairs or picks.begun))
 

@@ -20,12 +20,13 @@ _STRAY = {
 
 def merge_words(merge: MergeView, labels: Mapping[str, str]) -> Html:
     """How the scans lie on each other, the loops that they close, and what was left out."""
-    said = [_pairs_table(merge.registered, labels)]
+    onto = sorted(merge.registered, key=lambda pair: merge.reference not in (pair.scan, pair.onto))
+    said = [_pairs_table(onto, labels)]
     if len(merge.scans) == 3:
         said.append(_beside_the_letter(merge, labels))
     if merge.loops:
         said.append(_loops_table(merge.loops, labels))
-    said += [boxed(f"Left out: {named(why, labels)}", "warning") for why in merge.dropped]
+    said += [boxed(named(why, labels), "warning") for why in merge.dropped]
     if merge.refused:
         pairs = "".join(f"<li>{cell(named(why, labels))}</li>" for why in merge.refused)
         title = "Pairs that were not registered; the scans hang together without them"

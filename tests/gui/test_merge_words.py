@@ -1,0 +1,76 @@
+"""What the step Merge says and paints, without a browser."""
+
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.gui.merge_views import BY_SCAN, BY_SIGMA, OWN, SCAN_COLOURS, merged_drawn
+from slviewer.gui.merge_words import merge_words, named, refusal_words, turn_words
+from slviewer.session.ply import write_ply
+from slviewer.session.store import Session
+from slviewer.workflow.wizard.snapshot import MergedLoop, MergedPair, MergeView
+
+LABELS = {"scan_01": "Lion <b>", "scan_02": "scan_02", "scan_03": "Lion, behind", "scan_10": "Tail"}
+PAIR = MergedPair("scan_02", "scan_01", 0.117, 0.2, 0.0231, 0.0363, 297.2, 4.46, 0.24)
+
+
+def test_pairs_loops_and_what_was_left_out_are_told_by_the_operators_names() -> None:
+    pairs = (MergedPair("scan_03", "scan_02", 0.082, 0.99, 0.0187, 0.0286, 145.1, 9.77, 0.2), PAIR)
+    merge = MergeView(
+        name="2",
+        reference="scan_01",
+        scans=("scan_01", "scan_02", "scan_03"),
+        points=197_971,
+        pairs={},
+        stale=True,
+        registered=pairs,
+        loops=(MergedLoop(("scan_02", "scan_03", "scan_01"), 0.016, 0.0284, 0.004, 0.0059),),
+        dropped=("scan_03 -> scan_01 contradicts the other pairs by 3.1 mm and 2.0 degrees, and is left out",),
+        refused=("scan_10 -> scan_01: Only 3 % of the scan lies on the reference",),
+        stray={"edges": 5527, "grazing": 0, "unconfirmed": 8},
+        shared=0.99,
+    )
+    shown = merge_words(merge, LABELS)
+    said = unescape(shown)
+    assert "Lion <b>" not in shown and said.index("on Lion <b>") < said.index(
+        "on scan_02"
+    )  # those with the reference first
+    for words in (
+        "± 0.0231 mm", "± 0.0363°", "297.20 mm", "0.016 mm<br>0.0284°", "0.004 mm<br>0.0059°", "orange",
+        "0.26 and 0.25 mm for its object", "it is 0.24 mm here", "Lion, behind -> Lion <b> contradicts",
+        "Tail -> Lion <b>: Only 3 %", "<b>197,971 points</b> in the place of", "99 % of them measured by more",
+        "5,527 beside depth jumps, 8 that other scans see through", "merge again",
+    ):  # fmt: skip
+        assert words in said, words
+    assert "grazing" not in said
+    before = MergedPair("scan_02", "scan_01", 0.117, 0.2, None, None, None, 4.46)
+    bare = unescape(merge_words(MergeView("1", "scan_01", ("scan_01", "scan_02"), 10, {}, False, (before,)), LABELS))
+    assert "–</td>" in bare and "4.46°" in bare and "Letter" not in bare and "Loop" not in bare
+
+
+def test_names_inside_sentences_and_angles() -> None:
+    assert named("scan_01, scan_100 and scan_10.", LABELS) == "Lion <b>, scan_100 and Tail."
+    assert "Not merged.</b> Lion <b> hangs on nothing" in unescape(refusal_words("scan_01 hangs on nothing", LABELS))
+    turned = unescape(turn_words(["scan_02", "scan_10", "scan_03"], 22.5, LABELS))
+    assert "scan_02 at 0°, Tail at 22.5°, Lion, behind at 45°. " in turned
+    assert "a at 0°, b at 30°, c at 60°, …, e at 120°. " in unescape(turn_words(list("abcde"), 30.0, {}))
+
+
+def test_merged_points_by_scan_and_by_uncertainty(tmp_path: Path) -> None:
+    points = np.arange(12, dtype=np.float32).reshape(4, 3)
+    scalars = {"sigma": np.array([0.01, 0.02, 0.03, np.nan], np.float32), "source": np.array([0, 1, 1, 2], np.uint8)}
+    with Session.create(tmp_path / "session") as store:
+        store.exports.mkdir(exist_ok=True)
+        write_ply(store.exports / "merged_1.ply", points, np.array([10, 20, 30, 40], np.uint8), None, scalars)
+        write_ply(store.exports / "merged_2.ply", points)
+        for number in ("1", "2"):
+            store.save_result(f"merge/{number}", {"ply": f"merged_{number}.ply"}, {})
+        by_scan = merged_drawn(store, "1", BY_SCAN, ["a", "b", "<c>"])
+        assert by_scan.clouds["merged"][1][3].tolist() == list(SCAN_COLOURS[2]) and "<c>" in unescape(by_scan.legend)
+        by_sigma = merged_drawn(store, "1", BY_SIGMA, [])
+        assert by_sigma.clouds["merged"][1][3].tolist() == [128, 128, 128]
+        assert "0.010 mm" in unescape(by_sigma.legend) and "grey where it is not known" in by_sigma.legend
+        assert merged_drawn(store, "1", OWN, []).clouds["merged"][1][1].tolist() == [20, 20, 20]
+        assert "merge again" in merged_drawn(store, "2", BY_SCAN, []).legend
+        assert by_sigma.points.shape == (4, 3) and by_sigma.about == by_scan.about
