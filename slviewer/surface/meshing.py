@@ -22,8 +22,8 @@ Progress = Callable[[float, str], None]
 
 SMALL_HOLE = 5.0
 """Spacings of the points: holes of that size are filled where no size is given."""
-MOST_IMAGINED = 0.25
-"""Share of a watertight surface that may be filled in where nothing was measured."""
+MOST_IMAGINED = 1 / 3
+"""Share of a watertight surface that may be filled in where nothing was measured: the foot of what stood on a table."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,8 @@ class Meshed:
         for done, holes in ((self.trimmed, "filled"), (self.filled, "holes")):
             if done is not None and (n := getattr(done, holes)):
                 lines.append(f"{n} hole{'s' * (n > 1)} filled, up to {done.largest_mm:.1f} mm across")
+        if self.trimmed is not None and (n := self.trimmed.flattened):
+            lines.append(f"{n} of them laid flat, for the surface bulged there")
         if self.trimmed is not None and self.trimmed.imagined:
             lines.append(f"{100 * self.trimmed.imagined:.1f} % of the surface was not measured: it closes those holes")
         for what, change in (("smoothing", self.smoothed), ("thinning", self.thinned)):
@@ -178,6 +180,5 @@ def _refuse_if_open(found: Topology, cut: Trimmed | None, method: Method) -> Non
     if cut is not None and cut.imagined > MOST_IMAGINED:
         raise SlviewerError(
             f"{100 * cut.imagined:.0f} % of the closed surface would be imagined, not measured (the largest gap is "
-            f"{cut.largest_mm:.0f} mm across): scan the object from more sides, do without watertight, or close a gap "
-            "such as the foot it stood on by the method volume, filling holes of that size."
+            f"{cut.largest_mm:.0f} mm across): scan the object from more sides, or do without watertight."
         )

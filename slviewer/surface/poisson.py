@@ -10,21 +10,24 @@ from slviewer.registration.open3d_loader import open3d
 from slviewer.surface.edit import fill_holes
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.surface.tools import carried, compact
-from slviewer.surface.topology import areas, extent_across, face_groups
+from slviewer.surface.topology import areas, extent_across, face_groups, rims
 
 LEAST_POINTS = 100
 DEEPEST = 11
 """Halvings of the box around the points: 2048 cells along its longest side, 80 um of 150 mm."""
 REACH = 3.0
 """Spacings of the points beyond which the surface is not measured, but imagined."""
+BULGE = 1.3
+"""Times the flat area within its rim that an imagined patch may have."""
 
 
 @dataclass(frozen=True)
 class Trimmed:
     """What became of the surface where nothing was measured: ``filled`` patches stayed (the largest ``largest_mm``
-    across, together the share ``imagined`` of the whole area), ``cut`` went."""
+    across, together the share ``imagined`` of the whole area), of which ``flattened`` had bulged; ``cut`` went."""
 
     filled: int
+    flattened: int
     largest_mm: float
     imagined: float
     cut: int
@@ -56,17 +59,19 @@ def poisson(points: PointSet, cell_mm: float) -> Mesh:
 def trimmed(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> tuple[Mesh, Trimmed]:
     """The mesh without the patches that lie far from all points and whose rims are more than ``fill_mm`` across.
 
-    Smaller ones stay: holes filled by the surface that fits around them best.
+    Smaller ones stay: holes filled by the surface that fits around them best. One that bulges, as where the object
+    stood on its foot, is laid flat: nothing that was measured says otherwise.
     """
     distance, _ = cKDTree(points.points).query(mesh.vertices, distance_upper_bound=REACH * spacing_mm)
     far = ~np.isfinite(distance)
     imagined = far[mesh.faces].any(axis=1)
     if not imagined.any():
-        return mesh, Trimmed(0, 0.0, 0.0, 0)
+        return mesh, Trimmed(0, 0, 0.0, 0.0, 0)
     groups = face_groups(mesh.faces, len(mesh.vertices), imagined)
     measured = np.zeros(len(mesh.vertices), bool)
     measured[mesh.faces[~imagined]] = True
-    kept, filled, largest = ~imagined, 0, 0.0
+    area = areas(mesh)
+    kept, filled, flattened, largest = ~imagined, 0, 0, 0.0
     order = np.argsort(groups, kind="stable")
     starts = np.searchsorted(groups[order], np.arange(groups.max() + 2))
     for k in range(groups.max() + 1):
@@ -75,8 +80,25 @@ def trimmed(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> 
         rim = corners[measured[corners]]
         across = extent_across(mesh.vertices[rim]) if len(rim) else np.inf
         if len(rim) and across <= fill_mm:  # what has no rim floats by itself
-            kept[patch] = True
-            filled, largest = filled + 1, max(largest, across)
-    area = areas(mesh)
-    share = float(area[kept & imagined].sum() / max(area[kept].sum(), 1e-12))
-    return compact(mesh, kept), Trimmed(filled, largest, share, int(groups.max() + 1 - filled))
+            bulges = area[patch].sum() > BULGE * _flat_area(mesh.vertices, mesh.faces[patch])
+            kept[patch] = not bulges
+            filled, flattened, largest = filled + 1, flattened + bulges, max(largest, across)
+    left, cut = compact(mesh, kept), int(groups.max() + 1 - filled)
+    invented = area[kept & imagined].sum()
+    if flattened:
+        open_area = areas(left).sum()
+        left, _ = fill_holes(left, fill_mm)
+        invented += areas(left).sum() - open_area
+    share = float(invented / max(areas(left).sum(), 1e-12))
+    return left, Trimmed(filled, int(flattened), largest, share, cut)
+
+
+def _flat_area(vertices: np.ndarray, patch: np.ndarray) -> float:
+    """Area in mm2 of the fan about the middle of a patch's rim; infinite where the patch joins several rims."""
+    loops = rims(patch)
+    longest = max(loops, key=len, default=np.empty(0, int))
+    if len(longest) < 0.8 * sum(map(len, loops)):
+        return float("inf")
+    around = vertices[longest].astype(np.float64)
+    arms = around - around.mean(axis=0)
+    return float(np.linalg.norm(np.cross(arms, np.roll(arms, -1, axis=0)), axis=1).sum() / 2)

@@ -1,8 +1,7 @@
 """Whether scans are registered as well as is claimed, on a simulated rig whose truth is known.
 
-Three depths and a full turn of an object, measured with the splined calibration of rendered target poses, and pairs
-that must be refused. What a mesh of the turn is worth can be judged from ``Measured``, which holds clouds, poses found
-and poses true.
+Three depths and a full turn of an object, measured with the splined calibration of rendered target poses, what their
+fused surfaces are worth, and pairs that must be refused.
 """
 
 from collections.abc import Mapping
@@ -35,11 +34,13 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene, sphere
 from slviewer.simulation.turning import STEP_DEG, stone
+from slviewer.surface.shapes import Mesh
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 from slviewer.workflow.decoding import decode_frames
 from slviewer.workflow.feedback import Progress, part, unheard
 from slviewer.workflow.proving_accuracy import Check
+from slviewer.workflow.proving_surface import SurfaceProof, prove_surface
 from slviewer.workflow.simulating import TARGET, one_axis, turn_plan
 
 POSES = 25
@@ -92,10 +93,12 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class RegistrationProof:
-    """What came of the three depths, of the turn, and of what had to be refused: the reason by pair, or "accepted"."""
+    """What came of the three depths, of the turn, of the surfaces made from them, and of what had to be refused: the
+    reason by pair, or "accepted"."""
 
     depths: Measured
     turn: Measured
+    surface: SurfaceProof
     refusals: Mapping[str, tuple[str, str]]
     scale: float
 
@@ -118,6 +121,7 @@ class RegistrationProof:
         found.append(Check("good pairs", "number accepted", float(good), GOOD_PAIRS, float("inf")))
         for what, ratio in zip(("shift", "turn"), self.honesty, strict=True):
             found.append(Check("all pairs", f"predicted over true error of the {what}", ratio, *HONEST))
+        found += self.surface.checks
         for name, (wanted, got) in self.refusals.items():
             found.append(Check(name, f"refused as {wanted} (it was: {got})", float(got in wanted.split("/")), 1.0, 1.0))
         return tuple(found)
@@ -150,6 +154,7 @@ class RegistrationProof:
         said = [
             f"errors of pairs at scale {self.scale:g}; the Letter's point-to-point RMS: {r1:.2f} and {r2:.2f} mm",
             render(rows),
+            self.surface.text(),
             *(check.text() for check in self.checks if check.holds),
             f"{len(self.checks) - len(missed)} of {len(self.checks)} figures hold",
         ]
@@ -160,6 +165,7 @@ class RegistrationProof:
         return {
             "scale": self.scale,
             "holds": self.holds,
+            "surface": self.surface.to_json(),
             "checks": [{**vars(check), "holds": check.holds} for check in self.checks],
             "refusals": {name: {"wanted": wanted, "got": got} for name, (wanted, got) in self.refusals.items()},
             "pairs": [
@@ -194,7 +200,16 @@ def prove_registration(
     )
     truth = {name: frame @ _matrix(scene.pose) for name, scene in scans.items()}
     first = _registered(depths, "object_r3", truth, None, part(progress, 0.75, 0.8))
-    around = _registered(turn, "turn_01", truth, Starts(step_deg=STEP_DEG), part(progress, 0.8, 0.95))
+    around = _registered(turn, "turn_01", truth, Starts(step_deg=STEP_DEG), part(progress, 0.8, 0.88))
+    progress(0.88, "fusing and meshing")
+    surface = prove_surface(
+        depths,
+        first.alignment.T_reference_scan,
+        (_mesh(scans["object_r3"]), truth),
+        turn,
+        around.alignment.T_reference_scan,
+        (_mesh(scans["turn_01"]), truth["turn_01"]),
+    )
     refusals = {}
     for k, (what, (wanted, one, other)) in enumerate(_doubtful().items()):
         progress(0.95 + 0.01 * k, what)
@@ -203,7 +218,7 @@ def prove_registration(
         }
         refusals[what] = wanted, _reason(pair)
     progress(1.0, "proven")
-    return RegistrationProof(first, around, refusals, scale)
+    return RegistrationProof(first, around, surface, refusals, scale)
 
 
 def _calibrated(rig: SimulatedRig, board: Board, targets: Mapping[str, Scene], progress: Progress) -> Model:
@@ -301,6 +316,10 @@ def _row(scan: str, onto: str, found: Registration, shift: float, turn: float) -
         "overlap %": 100 * found.overlap,
         "start": found.start,
     }
+
+
+def _mesh(scene: MeshScene) -> Mesh:
+    return Mesh(scene.vertices, scene.triangles)
 
 
 def _matrix(pose: Pose) -> np.ndarray:

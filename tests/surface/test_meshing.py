@@ -70,6 +70,21 @@ def test_what_floats_where_nothing_was_measured_goes_whatever_holes_are_filled(p
     assert len(kept.faces) == len(ball.faces) and (report.filled, report.imagined, report.cut) == (0, 0.0, 1)
 
 
+def test_a_foot_is_closed_flat() -> None:
+    """What stood on a table was not measured from below, and its sides lean outwards there: no balloon grows on it."""
+    rng = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(5, RADIUS)
+    directions = ball.vertices[ball.vertices[:, 2] > -0.5 * RADIUS] / RADIUS
+    points = PointSet(RADIUS * directions + rng.normal(0, 0.01, directions.shape), directions)
+    found = mesh_of(points, MeshingPlan("poisson", watertight=True))
+    assert found.trimmed is not None and (found.trimmed.filled, found.trimmed.flattened) == (1, 1)
+    cap = np.pi * RADIUS**3 * (0.5**2 * (3 - 0.5)) / 3
+    beyond = 3.0 * spacing(points)  # so far the surface still counts as measured
+    assert VOLUME - cap < found.topology.volume_mm3 < VOLUME - cap + beyond * np.pi * (0.87 * RADIUS) ** 2
+    assert found.mesh.vertices[:, 2].min() > -0.5 * RADIUS - beyond
+    assert "1 of them laid flat" in found.text()
+
+
 def test_one_side_alone_is_not_closed() -> None:
     with pytest.raises(SlviewerError, match=r"does not close|would be imagined"):
         mesh_of(ball(300.0, 0.03, 0), MeshingPlan(watertight=True))
