@@ -26,7 +26,7 @@ def compare(
 
     Args:
         session: Session folder.
-        scan: Name of the capture, or merge/1 and the like for what the wizard has merged.
+        scan: Name of the capture, or merge/1 and the like for a merge that the session keeps.
         nominal: STL, PLY or OBJ file of the part as it should be.
         tolerance: Plus and minus, mm; the answer is pass, fail, or too close to tell.
         units: What the file's numbers are; asked for where its size does not fit the scan's.

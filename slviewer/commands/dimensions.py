@@ -25,10 +25,11 @@ def measure(
 
     Args:
         session: Session folder.
-        scan: Name of the capture, or merge/1 and the like for what the wizard has merged.
-        what: What to measure.
-        at: Pixel u v of the point, or of both ends of the distance or section; for a merge the points' indices.
-        ball: The region to fit to: centre x y z and radius, mm, in the camera's frame.
+        scan: Name of the capture, or merge/1 and the like for a merge that the session keeps.
+        what: point, distance and section take --at; plane, sphere and cylinder take --ball or --box.
+        at: Pixel u v (column, row of the camera's picture) of the point, or u v u v of both ends of the distance or
+            section; for a merge the points' numbers in its file, from 0.
+        ball: The region to fit to: centre x y z and radius, mm, in the camera's frame (x right, y down, z away).
         box: The region to fit to: two corners x y z x y z, mm, in the camera's frame.
         name: What to call it.
         model: Which calibration to use; by default the best one available.

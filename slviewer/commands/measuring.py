@@ -135,7 +135,7 @@ def merge(
     session: Positional[Path],
     captures: Positional[tuple[str, ...]],
     reference: str,
-    out: Path,
+    out: Path | None = None,
     model: ModelName | None = None,
     start: Literal["features", "turntable", "identity"] = "features",
     angle: float | None = None,
@@ -150,9 +150,10 @@ def merge(
         session: Session folder.
         captures: Names of the captures, in the order in which they were taken.
         reference: The capture whose frame the merged cloud takes.
-        out: PLY file.
-        start: Where registration starts from: the surfaces' features, a turntable's angle, or where the scans lie
-            already.
+        out: PLY file. Left out, the session keeps the merge as merge/1 and so on, for mesh, compare, measure and
+            export, and its file is in the session's exports.
+        start: Where registration starts from: features finds by itself how the scans lie; turntable uses --angle;
+            identity takes them to lie nearly right already.
         angle: Degrees that the turntable turns from each capture to the next, with --start turntable.
         model: Which calibration to use; by default the best one available.
         json: Write the registrations to this file too.

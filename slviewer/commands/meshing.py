@@ -35,10 +35,12 @@ def mesh(
             small cells. By default grid for one scan and poisson for merged ones.
         fill_holes: Fill holes of up to so many mm across; by default a few spacings of the points.
         triangles: Thin the mesh to so many triangles.
-        smooth: Rounds of smoothing; how far it moved the surface is told.
-        watertight: Close the surface, or say why it cannot be closed.
-        start: Where the registration of several scans starts from.
-        angle: From each scan to the next, in degrees, with --start turntable.
+        smooth: Rounds of smoothing, 0 for none; how far it moved the surface is told.
+        watertight: Close the surface, or say why it cannot be closed. A gap that no scan shows, such as the foot, is
+            closed by --method volume with --fill-holes wider than it.
+        start: Where the registration of several scans starts from: features finds by itself how they lie; turntable
+            uses --angle; identity takes them to lie nearly right already.
+        angle: Degrees that the turntable turns from each scan to the next, with --start turntable.
         model: Which calibration to use; by default the best one available.
         json: Write the figures to this file too.
         accept_rejected: Use the calibration although its verdict rejects it.

@@ -24,6 +24,8 @@ def open3d() -> Any:
     try:
         import open3d as module
     except (ImportError, OSError) as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # pybind11 makes an ImportError of whatever comes meanwhile
+            raise KeyboardInterrupt from error
         package = "open3d-cpu" if sys.platform == "linux" else "open3d"
         raise SlviewerError(
             f"Open3D, which aligns scans and casts rays, cannot be imported ({error}): "

@@ -15,12 +15,13 @@ from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import picked_start
 from slviewer.registration.turntable import Axis
 from slviewer.session.ply import write_ply
+from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_model, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
-from slviewer.workflow.scaling import corrected_cloud, told_scale
+from slviewer.workflow.scaling import corrected_cloud, scale_factor, told_scale
 from slviewer.workflow.trust import told
 
 StartKind = Literal["features", "turntable", "identity"]
@@ -30,15 +31,19 @@ Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Merge:
-    """How scans lie on one of them, the one surface that they were fused to, and the file it went to. ``scale`` says,
-    in words, what correction of scale is in it. In the file ``seen_by`` counts the scans that a point is the mean of,
-    and ``source`` numbers the one that its place comes from, 0 for the first of ``fused.names``."""
+    """How scans lie on one of them, the one surface that they were fused to, and the file it went to.
+
+    ``scale`` says, in words, what correction of scale is in it; ``kept`` names the session's result, where it is kept.
+    In the file ``seen_by`` counts the scans that a point is the mean of, and ``source`` numbers the one that its place
+    comes from, 0 for the first of ``fused.names``.
+    """
 
     alignment: Alignment
     fused: Fused
     clouds: Mapping[str, Cloud]
     out: Path
     scale: str = ""
+    kept: str = ""
 
     @property
     def reference(self) -> str:
@@ -66,7 +71,10 @@ class Merge:
         if self.scale:
             lines.append(self.scale)
         seen = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
-        return "\n".join([*lines, f"{len(self.fused.surface)} points, {seen} -> {self.out}"])
+        lines.append(f"{len(self.fused.surface)} points, {seen} -> {self.out}")
+        if self.kept:
+            lines.append(f"the session keeps it as {self.kept}: mesh, compare and measure take it by that name")
+        return "\n".join(lines)
 
 
 def alignment_json(alignment: Alignment) -> dict[str, Any]:
@@ -117,7 +125,7 @@ def merge(
     session: SessionLike,
     captures: Sequence[str],
     reference: str,
-    out: Path | str,
+    out: Path | str | None = None,
     *,
     model: str | None = None,
     start: StartKind = "features",
@@ -134,19 +142,20 @@ def merge(
     Scans are given in the order in which they were taken. ``start``: where registration starts from; "turntable" needs
     the ``angle`` in degrees from each scan to the next and finds the ``axis`` where it is not given; "identity" takes
     scans to lie in one frame already, or as ``poses`` (4, 4) by name say. ``picked``: of a pair (scan, onto), three or
-    more points (n, 3) mm on either, in their cameras' frames; these pairs start from there.
+    more points (n, 3) mm on either, in their cameras' frames; these pairs start from there. Without ``out`` the
+    session keeps the merge, as ``merge/<number>``, and its file in the exports.
     """
     given = list(dict.fromkeys(captures))
     names = given if reference in given else [*given, reference]
     if len(names) < 2:
         raise UsageError(f"only {reference} was named: name the scans to merge with it")
-    if Path(out).suffix.lower() != ".ply":
-        raise UsageError(
-            f"merged points are written as .ply, not as {Path(out).name}: a mesh goes into other files too"
-        )
-    Path(out).parent.mkdir(parents=True, exist_ok=True)
+    if out is not None:
+        out = Path(out)
+        if out.suffix.lower() != ".ply":
+            raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
+        out.parent.mkdir(parents=True, exist_ok=True)
     starts = _starts(names, start, angle, axis, poses, picked, warn)
-    with opened(session) as store:
+    with opened(session, write=out is None) as store:
         check_accepted(store, accept_rejected)
         fitted = load_model(store, model or preferred(store))
         warn_if_stale(store, warn)
@@ -156,19 +165,45 @@ def merge(
                 warn(f"{shot.name}: {sentence}")
             progress(0.4 * i / len(names), f"reconstructing {shot.name}")
             clouds[shot.name] = corrected_cloud(store, fitted, phases, texture=capture_texture(shot, frames))
-    registering, fusing = part(progress, 0.4, 0.75), part(progress, 0.75, 0.9)
-    alignment = register_all(clouds, reference, starts, lambda done: registering(done, "registering"))
-    for why in alignment.dropped.values():
-        warn(why)
-    fused = fuse(clouds, alignment.T_reference_scan, lambda done: fusing(done, "fusing"))
-    progress(0.9, "writing")
-    surface = fused.surface
-    scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
-    scalars |= {"seen_by": fused.seen_by, "source": fused.source}
-    notes = (f"scans {', '.join(names)}, frame: the camera's at {reference}", f"calibration {fitted.name}")
-    write_ply(Path(out), surface.points, surface.colours, surface.normals, scalars, notes=notes)
+        registering, fusing = part(progress, 0.4, 0.75), part(progress, 0.75, 0.9)
+        alignment = register_all(clouds, reference, starts, lambda done: registering(done, "registering"))
+        for why in alignment.dropped.values():
+            warn(why)
+        fused = fuse(clouds, alignment.T_reference_scan, lambda done: fusing(done, "fusing"))
+        progress(0.9, "writing")
+        surface = fused.surface
+        scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
+        scalars |= {"seen_by": fused.seen_by, "source": fused.source}
+        notes = (f"scans {', '.join(names)}, frame: the camera's at {reference}", f"calibration {fitted.name}")
+        number = 0 if out is not None else next_merge(store)
+        path = store.exports / f"merged_{number}.ply" if out is None else out
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_ply(path, surface.points, surface.colours, surface.normals, scalars, notes=notes)
+        found = Merge(alignment, fused, clouds, path, scale, f"merge/{number}" if number else "")
+        if found.kept:
+            store.save_result(found.kept, merge_record(store, found, fitted.name), {})
     progress(1.0, "merged")
-    return Merge(alignment, fused, clouds, Path(out), scale)
+    return found
+
+
+def next_merge(store: Session) -> int:
+    """The number of the session's next merge."""
+    numbers = (int(name.removeprefix("merge/")) for name in store.result_names() if name.startswith("merge/"))
+    return max(numbers, default=0) + 1
+
+
+def merge_record(store: Session, found: Merge, model: str) -> dict[str, Any]:
+    """What a session keeps of a merge made with that model: its figures, its file in the exports, and its inputs."""
+    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
+    return {
+        **found.to_json(),
+        "scans": list(found.fused.names),
+        "ply": found.out.name,
+        "model": model,
+        "scale": found.scale,
+        "scales": {model: scale_factor(store, model)},
+        "inputs": store.input_hashes(*found.fused.names, *calibrations),
+    }
 
 
 def _starts(

@@ -64,6 +64,8 @@ def mesh(
         raise UsageError("nothing was named: name one scan, several to merge, or a merge")
     if len(sources) > 1 and any(name.startswith(MERGE) for name in sources):
         raise UsageError("a merge is meshed by itself: name one merge, or scans")
+    if len(sources) > 1 and plan is not None and plan.method == "grid":
+        raise UsageError("the method grid joins the pixels of one scan: name one, or use poisson or volume")
     if out is not None:
         check_export("mesh", Path(out).suffix.lower().removeprefix("."))
     merged = None

@@ -69,17 +69,19 @@ def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, ru
 
 
 def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
-    ply, out = tmp_path / "merged.ply", tmp_path / "merge.json"
-    status, _, _ = run(
-        "merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--out", ply, "--json", out
-    )
-    assert status == 0
+    ply, out = session / "exports" / "merged_1.ply", tmp_path / "merge.json"
+    status, text, _ = run("merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--json", out)
+    assert status == 0 and "the session keeps it as merge/1" in text
     pairs = json.loads(out.read_text())["pairs"]
     assert set(pairs) == {"object_r1", "object_r2"}
     for pair in pairs.values():
         assert 0.01 < pair["rms_mm"] < 0.5 and 0.5 < pair["overlap"] <= 1
         assert np.shape(pair["T_reference_scan"]) == (4, 4)
     assert len(trimesh.load(ply).vertices) > 10_000
+    status, text, _ = run("measure", session, "merge/1", "distance", "--at", 0, 5000)
+    assert status == 0 and "distance on merge/1" in text
+    status, text, _ = run("export", session, "merge", "--out", tmp_path / "all.xyz")
+    assert status == 0 and len(np.loadtxt(tmp_path / "all.xyz")) == json.loads(out.read_text())["points"]
 
 
 def test_mesh_of_one_scan_and_of_scans_merged_on_the_way(
@@ -101,8 +103,9 @@ def test_mesh_of_one_scan_and_of_scans_merged_on_the_way(
     assert len(trimesh.load(session / "exports" / "object_r3_mesh.ply").faces) > 10_000
     status, _, error = run("mesh", session, "object_r3", "--watertight")
     assert status == 1 and "would be imagined, not measured" in error
-    status, _, error = run("mesh", session, "merge/")
-    assert status == 1 and "there is no merge yet" in error
+    status, _, error = run("mesh", session, "merge/9")
+    assert status == 1 and "there is no merge" in error
+    assert run("mesh", session, "object_r3", "object_r2", "--method", "grid")[0] == 2
     assert run("mesh", session, "merge/1", "object_r1")[0] == 2
 
 
