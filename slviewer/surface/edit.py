@@ -9,6 +9,7 @@ from slviewer.surface.shapes import Mesh
 from slviewer.surface.tools import carried, compact, legacy, moved
 from slviewer.surface.topology import areas, extent_across, face_groups, rims
 
+LEAST_SHARE = 0.01
 _THINNED_AT = 1000.0
 
 
@@ -39,13 +40,13 @@ class Moved:
     after: int
 
 
-def without_small_parts(mesh: Mesh, least_share: float = 0.01) -> tuple[Mesh, Dropped]:
-    """The mesh without the parts that have less than a share of the largest part's area."""
+def without_small_parts(mesh: Mesh, most_mm2: float) -> tuple[Mesh, Dropped]:
+    """The mesh without the parts of up to so many mm2 that have less than 1 % of the largest part's area."""
     if not len(mesh.faces):
         return mesh, Dropped(0, 0.0)
     groups = face_groups(mesh.faces, len(mesh.vertices))
     sizes = np.bincount(groups, weights=areas(mesh))
-    small = sizes < least_share * sizes.max()
+    small = (sizes < LEAST_SHARE * sizes.max()) & (sizes <= most_mm2)
     largest = float(sizes[small].max()) if small.any() else 0.0
     return compact(mesh, ~small[groups]), Dropped(int(small.sum()), largest)
 

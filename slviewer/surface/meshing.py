@@ -22,6 +22,8 @@ Progress = Callable[[float, str], None]
 
 SMALL_HOLE = 5.0
 """Spacings of the points: holes of that size are filled where no size is given."""
+SMALL_PART = 1000.0
+"""Points, about: larger parts stay, for before a wall an object is a small share of what was scanned."""
 MOST_IMAGINED = 1 / 3
 """Share of a watertight surface that may be filled in where nothing was measured: the foot of what stood on a table."""
 
@@ -139,7 +141,7 @@ def mesh_of(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: 
     if not len(mesh.faces):
         raise SlviewerError("No surface could be laid through the points: merge scans that overlap more.")
     say(0.6, "leaving out floating parts")
-    mesh, dropped = without_small_parts(mesh)
+    mesh, dropped = without_small_parts(mesh, SMALL_PART * cell**2)
     filled = smoothed = thinned = None
     if method != "poisson" and limit > 0:
         say(0.65, "filling holes")

@@ -139,7 +139,8 @@ def test_small_parts_go(closed: Meshed) -> None:
     both = Mesh(
         np.concatenate([closed.mesh.vertices, chip.vertices]), np.concatenate([closed.mesh.faces, chip.faces + n])
     )
-    cleaned, report = without_small_parts(both)
+    assert without_small_parts(both, 0.1)[1].parts == 0  # it is large, for all that the other is larger
+    cleaned, report = without_small_parts(both, 1.0)
     assert len(cleaned.faces) == len(closed.mesh.faces) and report.parts == 1
     assert report.largest_mm2 == pytest.approx(0.5)
 
