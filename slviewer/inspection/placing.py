@@ -69,7 +69,7 @@ def found_start(
     if best is None and isinstance(refusal, Refused):
         raise refusal.about(
             "The scan was not found on the nominal model: see that it shows this part, at this size, and that little "
-            "else is in view. What the best try lacked:"
+            "else is in view. One of the tries ended so:"
         )
     if best is None:
         raise refusal or SlviewerError("The nominal model shows no side that a scan could lie on: check the file.")

@@ -17,7 +17,7 @@ from slviewer.workflow.exporting_documents import (
 )
 from slviewer.workflow.exporting_shapes import merge_name, merge_shape, scan_shape
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import check_accepted, preferred
+from slviewer.workflow.models import check_accepted, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.reporting import report
 
@@ -127,6 +127,8 @@ def export(
         target = _target(store, what, name, out, chosen)
         if what not in ("report", "table"):
             check_accepted(store, accept_rejected)
+        if what not in ("report", "table", "merge", "merged-mesh"):  # a merge says by itself that it is stale
+            warn_if_stale(store, warn)
         if what in ("mesh", "merged-mesh"):
             words = _write_shape(store, what, name, target, model, plan or MeshingPlan(), progress, warn)
         elif what in ("cloud", "merge"):

@@ -14,7 +14,7 @@ from slviewer.workflow.exporting import check_export
 from slviewer.workflow.exporting_shapes import merged_points, scan_cloud
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.merging import Merge, StartKind, merge
-from slviewer.workflow.models import check_accepted
+from slviewer.workflow.models import check_accepted, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 
 MERGE = "merge/"
@@ -85,6 +85,7 @@ def mesh(
         elif sources[0].startswith(MERGE):
             shape = merged_points(store, sources[0].removeprefix(MERGE), warn)
         else:
+            warn_if_stale(store, warn)
             shape = scan_cloud(store, sources[0], model, before, warn)
     meshed = mesh_of(shape, plan, part(progress, 0.5, 0.95))
     progress(0.95, f"writing {path.name}")

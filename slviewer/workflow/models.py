@@ -198,9 +198,11 @@ def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:
 
 def warn_if_stale(store: Session, warn: Warn) -> None:
     """Say so when target poses have changed since the calibration was made."""
-    for name in available(store):
-        if store.state_of(f"calibration/{name}") == "stale":
-            warn(
-                f"the {name} calibration was made from target poses that have since been replaced or removed: "
-                "run `slviewer calibrate` again"
-            )
+    stale = [name for name in available(store) if store.state_of(f"calibration/{name}") == "stale"]
+    if stale:
+        *others, last = stale
+        which = f"{', '.join(others)} and {last} calibrations were" if others else f"{last} calibration was"
+        warn(
+            f"the {which} made from target poses that have since been replaced or removed: run `slviewer calibrate` "
+            "again"
+        )
