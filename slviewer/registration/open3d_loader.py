@@ -6,8 +6,12 @@ linker is content with it.
 """
 
 import ctypes
+import signal
 import sys
+import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -22,10 +26,9 @@ def open3d() -> Any:
     """
     _supply_libusb()
     try:
-        import open3d as module
+        with _uninterrupted():
+            import open3d as module
     except (ImportError, OSError) as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):  # pybind11 makes an ImportError of whatever comes meanwhile
-            raise KeyboardInterrupt from error
         package = "open3d-cpu" if sys.platform == "linux" else "open3d"
         raise SlviewerError(
             f"Open3D, which aligns scans and casts rays, cannot be imported ({error}): "
@@ -35,6 +38,28 @@ def open3d() -> Any:
     warnings.filterwarnings("ignore", message="The TBB threading layer requires")
     module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
     return module
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits for the end of the block: an Open3D that is imported in part is told of as missing, or ends the
+    process with a status and pages of its own."""
+    if threading.current_thread() is not threading.main_thread():  # signals come to the main thread alone
+        yield
+        return
+    came = False
+
+    def keep(*_: object) -> None:
+        nonlocal came
+        came = True
+
+    before = signal.signal(signal.SIGINT, keep)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+    if came:
+        signal.raise_signal(signal.SIGINT)
 
 
 def _supply_libusb() -> None:

@@ -27,3 +27,13 @@ def test_a_missing_open3d_names_the_remedy() -> None:
         "try:\n    open3d()\nexcept SlviewerError as error:\n    print(error)"
     )
     assert "pip install open3d" in done.stdout, done.stderr
+
+
+def test_a_break_while_open3d_is_imported_waits_for_its_end() -> None:
+    done = run(
+        "import os, signal, threading, time\n"
+        "from slviewer.registration.open3d_loader import open3d\n"
+        "threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+        "try:\n    open3d(); time.sleep(60)\nexcept KeyboardInterrupt:\n    raise SystemExit(130)"
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
