@@ -20,7 +20,7 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.workflow.calibrating import CalibrationResult, calibrate
 from slviewer.workflow.feedback import Warn
-from slviewer.workflow.merging import Merge, Picked, StartKind, merge
+from slviewer.workflow.merging import Merge, Picked, StartKind, merge, merge_record, next_merge
 from slviewer.workflow.models import POSES_FOR_PIXELWISE, available, best, insisted
 from slviewer.workflow.poses import Judged, judge_all
 from slviewer.workflow.reconstructing import reconstruct
@@ -178,8 +178,7 @@ def merge_scans(
     picked: Picked | None = None,
 ) -> Merge:
     """Register scans to a reference, and keep how they lie; the merged PLY goes into the exports."""
-    done = [int(name.removeprefix("merge/")) for name in session.result_names() if name.startswith("merge/")]
-    number = max(done, default=0) + 1
+    number = next_merge(session)
     insist = insisted(session)
     model = best(session, insist)
     with delivered(session, f"merged_{number}.ply", report) as ply:
@@ -187,18 +186,7 @@ def merge_scans(
             session, names, reference, ply, model=model, start=start, angle=angle, picked=picked,
             accept_rejected=insist, progress=report.within(0, 0.97), warn=warn,
         )  # fmt: skip
-        calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
-        meta = {
-            **found.to_json(),
-            "scans": list(found.fused.names),
-            "points": len(found.fused.surface),
-            "ply": f"merged_{number}.ply",
-            "model": model,
-            "scale": found.scale,
-            "scales": {model: scale_factor(session, model)},
-            "inputs": session.input_hashes(*found.fused.names, *calibrations),
-        }
-        session.guarded(report.saving).save_result(f"merge/{number}", meta, {})
+        session.guarded(report.saving).save_result(f"merge/{number}", merge_record(session, found, model), {})
     report(1.0, "merged")
     return found
 
