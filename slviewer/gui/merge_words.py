@@ -43,9 +43,10 @@ def merge_words(merge: MergeView, labels: Mapping[str, str]) -> Html:
     return Html("".join(said))
 
 
-def refusal_words(why: str, labels: Mapping[str, str]) -> Html:
-    """Why there is no new merge."""
-    return boxed(Html(f"<b>Not merged.</b> {cell(named(why, labels))}"), "error")
+def refusal_words(why: str, labels: Mapping[str, str], merge: MergeView | None = None) -> Html:
+    """Why there is no new merge; ``merge``: the one before, which is shown still."""
+    still = "" if merge is None else " What is shown below is the merge before."
+    return boxed(Html(f"<b>Not merged.</b> {cell(named(why, labels) + still)}"), "error")
 
 
 def turn_words(names: Sequence[str], step_deg: float, labels: Mapping[str, str]) -> Html:

@@ -82,7 +82,7 @@ class Panel:
             change(self._undo, visible=merge is not None)
             labels = {scan.name: scan.label for scan in scans}
             self._result.set(merge_words(merge, labels) if merge else "")
-            self._refusal.set(refusal_words(snapshot.not_merged, labels) if snapshot.not_merged else "")
+            self._refusal.set(refusal_words(snapshot.not_merged, labels, merge) if snapshot.not_merged else "")
             self._offer_views(merge)
             number = int(merge.name) if merge is not None else 0
             if self._merged is not None and number > self._merged:
