@@ -5,7 +5,7 @@
 `.stl`   binary, mm: triangles alone
 `.obj`   text, mm: colours of the vertices, normals
 `.glb`   binary glTF, whose unit is the metre: vertices are written in metres; colours, normals
-`.xyz`   text, mm: a line a point, columns named in the first lines
+`.xyz`   text, mm: x y z of a point a line, and its red green blue; no other line, which most readers would not bear
 =======  ===========================================================================================================
 
 Large ones are written piece by piece, and appear whole or not at all.
@@ -32,7 +32,7 @@ IN_WORDS = {
     "stl": "mm; the triangles alone",
     "obj": "mm; with colours and normals",
     "glb": "metres, as glTF demands, so that programs show the true size; with colours",
-    "xyz": "mm; text, one line a point, columns named at the top",
+    "xyz": "mm; text, x y z of a point a line, and its colour",
 }
 """Units and content of each format."""
 FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -52,7 +52,7 @@ def write_shape(
     """Writes points or a mesh as the suffix says, and returns the file's size in bytes.
 
     ``scalars``: values (n,) of each point by name, such as ``sigma_noise`` mm or ``deviation`` mm, for the formats that
-    hold them (PLY, XYZ); the shape's own ``sigma_mm`` is called ``sigma``. ``notes``: sentences for the comments.
+    hold them (PLY); the shape's own ``sigma_mm`` is called ``sigma``. ``notes``: sentences for the comments.
 
     Raises InputError for another suffix, for points where a format takes only triangles, for NaN points and for an
     empty shape; SessionError where the disk refuses (a file of that name is left as it was).
@@ -78,8 +78,7 @@ def write_shape(
     elif file_format == "glb":
         write_glb(path, shape, notes)
     elif faces is None or file_format == "xyz":
-        columns = _columns(points, shape.normals, shape.colours, values)
-        _write_xyz(path, columns, notes, estimated_bytes(file_format, len(points), scalars=len(values)))
+        _write_xyz(path, points, shape.colours)
     elif file_format == "stl":
         _write_stl(path, points, faces)
     else:
@@ -100,35 +99,21 @@ def estimated_bytes(
     if file_format == "obj":
         vertex = 3 * _NUMBER + 2 + normals * (3 * _SMALL + 4) + 21 * colours
         return 200 + points * vertex + faces * (3 + 3 * (1 + normals) * len(str(points)) + 6 * normals)
-    return 300 + points * (3 * _NUMBER + (3 * normals + scalars) * _SMALL + 3 * _GREY * colours)
-
-
-def _columns(
-    points: np.ndarray, normals: np.ndarray | None, colours: np.ndarray | None, scalars: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    columns = dict(zip("xyz", points.T, strict=True))
-    if normals is not None:
-        columns |= dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
-    if colours is not None:
-        columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
-    for name, values in scalars.items():
-        if np.shape(values) != points.shape[:1]:
-            raise InputError(f"{name} has shape {np.shape(values)}: one value for each of {len(points)} points")
-        columns[name] = np.asarray(values)
-    return columns
+    return points * (3 * _NUMBER + 3 * _GREY * colours)
 
 
 def _comments(notes: Sequence[str]) -> str:
     return "".join(f"# {plain(line)}\n" for line in (f"slviewer {__version__}: units mm", *notes))
 
 
-def _write_xyz(path: Path, columns: dict[str, np.ndarray], notes: Sequence[str], size: int) -> None:
-    with arriving_file(path, size) as file:
-        file.write(f"{_comments(notes)}# columns: {' '.join(columns)}\n".encode("ascii"))
-        for part in pieces(len(columns["x"])):
+def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> None:
+    with arriving_file(path, estimated_bytes("xyz", len(points), colours=colours is not None)) as file:
+        for part in pieces(len(points)):
             fields: list[Field] = []
-            for name, values in columns.items():
-                fields += [(without_nan(name, values[part]), 0 if values.dtype.kind in "iu" else DECIMALS), b" "]
+            for values in points[part].T:
+                fields += [(values, DECIMALS), b" "]
+            for values in () if colours is None else colours[part].T:
+                fields += [(values, 0), b" "]
             file.write(lines(fields[:-1]))
 
 
