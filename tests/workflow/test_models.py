@@ -1,5 +1,6 @@
 """Calibrations that a session holds, read back."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from slviewer.errors import SessionError
 from slviewer.session.store import Session
 from slviewer.workflow.models import load_model, warn_if_stale
+from slviewer.workflow.wizard.operator import Operator
 
 
 @pytest.mark.parametrize("name", ["pixelwise", "anchored", "splined"])
@@ -30,3 +32,17 @@ def test_what_is_stale_is_told_in_one_sentence(tmp_path: Path) -> None:
         warn_if_stale(store, said.append)
     (sentence,) = said
     assert sentence.startswith("the stereo and splined calibrations were made from target poses that have since")
+
+
+def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recorded: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    shutil.rmtree(folder / "results" / "calibration" / "splined")
+    with Session.open(folder, write=True) as store:
+        meta = store.load_result("calibration/pixelwise", only=())[0]
+        kept = {key: meta[key] for key in ("model", "inputs", "settings")}
+        store.save_result("calibration/pixelwise", kept, {"coefficients": np.zeros((2, 2))})
+    with Operator(folder) as operator:
+        shown = operator.wait_for(lambda s: s.session is not None and s.session.calibration is not None, 20.0)
+        assert shown is not None and shown.session is not None and shown.session.calibration is not None
+        assert shown.session.calibration.stale == "it was saved by another version of slviewer: calibrate again"
+        assert shown.session.calibration.reprojection_px

@@ -347,6 +347,6 @@ class Engine:
             self._unreadable += 1
             if self._unreadable < _PATIENCE:
                 self.teller.changed(session=True)
-            else:
+            elif self._unreadable == _PATIENCE:  # told once, until it can be read again
                 self.notices.fail("Reading the session", error)
         self._watch()

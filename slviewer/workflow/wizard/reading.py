@@ -13,7 +13,7 @@ from slviewer.calibration.next_pose import outline_px
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import InputError
+from slviewer.errors import InputError, SessionError
 from slviewer.fringe.presets import PRESETS
 from slviewer.session.capture import Capture
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
@@ -308,11 +308,14 @@ class Reader:
         splined = None
         if "splined" in models:
             splined = self._keep(("splined", self._meta("calibration/splined")["hash"]), lambda: _splined(session))
+        foreign = ""
+        if ("pixelwise" in models and not fit_rms) or ("splined" in models and splined is None):
+            foreign = "it was saved by another version of slviewer: calibrate again"
         rig = stereo.rig
         return stereo, CalibrationView(
             models=models,
             best=preferred(session),
-            stale=self._stale(meta["inputs"], captures),
+            stale=foreign or self._stale(meta["inputs"], captures),
             target=stereo.board,
             poses=tuple(stereo.poses),
             left_out=stereo.left_out,
@@ -445,13 +448,21 @@ class Reader:
 
 
 def _fit_rms(session: Session) -> dict[str, Mapping[str, float]]:
-    model = load_model(session, "pixelwise")
+    """By axis and coefficients; nothing of a calibration that another version has saved."""
+    try:
+        model = load_model(session, "pixelwise")
+    except SessionError:
+        return {}
     assert isinstance(model, PixelwiseModel)
     return {axis: model.median_rms_mm(axis) for axis in model.axes}
 
 
-def _splined(session: Session) -> SplinedView:
-    model = load_model(session, "splined")
+def _splined(session: Session) -> SplinedView | None:
+    """None of a calibration that another version has saved."""
+    try:
+        model = load_model(session, "splined")
+    except SessionError:
+        return None
     assert isinstance(model, SplinedModel)
     found, fits = model.bundle.summary(), model.bundle.fits
     low, high = found["board_height_mm"]
