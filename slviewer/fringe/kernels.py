@@ -10,13 +10,11 @@ import numba
 import numpy as np
 
 from slviewer.fringe.phase import Reason
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import fma, kernel
 
 VALID, DARK, SATURATED, INCONSISTENT = (
     np.uint8(r) for r in (Reason.VALID, Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT)
 )
-CONTRACT = frozenset({"contract"})
-"""A product and a sum may be rounded once, as one instruction does it."""
 PER_TURN = np.float32(1 / (2 * np.pi))
 TURN = np.float32(6.28125)
 TURN_REST = np.float32(2 * np.pi - 6.28125)
@@ -89,14 +87,14 @@ def arctan2(y, x):
     # np.divide: the operator would check for zero and raise, which no vector instruction can.
     a = np.divide(min(ax, ay), max(ax, ay) + np.float32(1e-30))
     s = a * a
-    r = np.float32(0.0028662257) * s + np.float32(-0.0161657367)
-    r = r * s + np.float32(0.0429096138)
-    r = r * s + np.float32(-0.0752896400)
-    r = r * s + np.float32(0.1065626393)
-    r = r * s + np.float32(-0.1420889944)
-    r = r * s + np.float32(0.1999355085)
-    r = r * s + np.float32(-0.3333314528)
-    r = r * s * a + a
+    r = fma(np.float32(0.0028662257), s, np.float32(-0.0161657367))
+    r = fma(r, s, np.float32(0.0429096138))
+    r = fma(r, s, np.float32(-0.0752896400))
+    r = fma(r, s, np.float32(0.1065626393))
+    r = fma(r, s, np.float32(-0.1420889944))
+    r = fma(r, s, np.float32(0.1999355085))
+    r = fma(r, s, np.float32(-0.3333314528))
+    r = fma(r * s, a, a)
     r = HALF_PI - r if ay > ax else r
     r = PI - r if x < 0 else r
     return -r if y < 0 else r
@@ -120,15 +118,15 @@ def shift_row(stack, shift, row, wrapped, modulation, background, peak):
             value_e, value_f, value_g, value_h = np.float32(e[x]), np.float32(f[x]), np.float32(g[x]), np.float32(h[x])
             ac, bd, eg, fh = value_a - value_c, value_b - value_d, value_e - value_g, value_f - value_h
             total[x] += ((value_a + value_b) + (value_c + value_d)) + ((value_e + value_f) + (value_g + value_h))
-            cosine[x] += cos_a * (ac - bd) + cos_e * (eg - fh)
-            sine[x] += sin_a * (ac + bd) + sin_e * (eg + fh)
+            cosine[x] = fma(cos_a, ac - bd, fma(cos_e, eg - fh, cosine[x]))
+            sine[x] = fma(sin_a, ac + bd, fma(sin_e, eg + fh, sine[x]))
             peak[x] = max(peak[x], max(max(max(a[x], b[x]), max(c[x], d[x])), max(max(e[x], f[x]), max(g[x], h[x]))))
     per_two, per_one, counted = np.float32(2 / shift.steps), np.float32(1 / shift.steps), np.float32(shift.counted)
     for x in range(width):
         wrapped[x] = arctan2(np.float32(0) - sine[x], cosine[x])
-        modulation[x] = np.sqrt(cosine[x] * cosine[x] + sine[x] * sine[x]) * per_two
+        modulation[x] = np.sqrt(fma(cosine[x], cosine[x], sine[x] * sine[x])) * per_two
         level = np.float32(first[x])
-        background[x] = level + (total[x] - counted * level) * per_one
+        background[x] = fma(total[x] - counted * level, per_one, level)
 
 
 @numba.njit(inline="always")
@@ -272,7 +270,7 @@ def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A,
             dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
             reason[x] = verdict(dark, clipped, unclear)
             periods = np.float32(order) - whole
-            absolute = (psi[x] + periods * TURN_REST) + periods * TURN
+            absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
             phase[x] = none if dark | clipped | unclear else absolute
     else:
         for x in range(width):
@@ -290,11 +288,11 @@ def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A,
             periods = np.float32(code[x]) - whole
             periods += np.float32(1) if ahead else np.float32(0)
             periods -= np.float32(1) if behind else np.float32(0)
-            absolute = (psi[x] + periods * TURN_REST) + periods * TURN
+            absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
             phase[x] = none if dark | clipped | unclear else absolute
 
 
-@kernel(parallel=True, fastmath=CONTRACT)
+@kernel(parallel=True)
 def decode_coded(
     stack, shift, gray, inverse, complementary, scale, rules, phase, wrapped, modulation, background, reason
 ):

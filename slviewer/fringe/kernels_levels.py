@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from slviewer.fringe.kernels import CONTRACT, is_clipped, is_dark, period, shift_row, verdict
+from slviewer.fringe.kernels import is_clipped, is_dark, period, shift_row, verdict
 from slviewer.geometry.jit import kernel
 
 TWO_PI = 2 * np.pi
@@ -85,7 +85,7 @@ def ladder_row(stack, shifts, ladder, scale, row, psi, B, A, peak, room, phase, 
     )  # fmt: skip
 
 
-@kernel(parallel=True, fastmath=CONTRACT)
+@kernel(parallel=True)
 def decode_levels(stack, shifts, ladder, scale, phase, wrapped, modulation, background, reason):
     """Several periods, each by its own phase steps; fills the five (h, w) maps, of the finest period."""
     _, height, width = stack.shape

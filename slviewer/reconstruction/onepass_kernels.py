@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from slviewer.fringe.kernels import CONTRACT, coded_row, five, period, shift_row
+from slviewer.fringe.kernels import coded_row, five, period, shift_row
 from slviewer.fringe.kernels_levels import ladder_row, levels_room
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import fma, kernel
 
 ROWS = 4
 """Image rows that one turn of a thread takes: room for intermediate results is asked for once."""
@@ -87,7 +87,7 @@ def sweep(stack, order, shifts, ladder, rules, scale, depths, maps, peaks):
             peaks[block] = _brightest(stack, order, first, last)
 
 
-@kernel(fastmath=CONTRACT)
+@kernel()
 def _coded(stack, order, shifts, rules, scale, first, last, background, maps):
     width = stack.shape[2]
     psi, peak, code, room = (
@@ -105,7 +105,7 @@ def _coded(stack, order, shifts, rules, scale, first, last, background, maps):
         )  # fmt: skip
 
 
-@kernel(fastmath=CONTRACT)
+@kernel()
 def _levels(stack, shifts, ladder, scale, first, last, background, maps):
     psi, peak = np.empty((len(shifts.steps), stack.shape[2]), np.float32), np.empty(stack.shape[2], stack.dtype)
     room = levels_room(stack.shape[2])
@@ -116,7 +116,7 @@ def _levels(stack, shifts, ladder, scale, first, last, background, maps):
         )  # fmt: skip
 
 
-@kernel(fastmath=CONTRACT)
+@kernel()
 def _pixelwise(first, last, background, depths, scale, per_step, maps):
     """Points and their depth noise, by each pixel's own rational function."""
     one, zero, none = np.float32(1), np.float32(0), np.float32(np.nan)
@@ -132,20 +132,20 @@ def _pixelwise(first, last, background, depths, scale, per_step, maps):
         least, largest = depths.bounds[0, row], depths.bounds[1, row]
         points, sigma = maps.points[row], maps.sigma_z[row]
         for x in range(width):
-            s = gain * phase[x] - centre
-            below, contrast = one + c2[x] * s, max(B[x], least_B)
+            s = fma(gain, phase[x], -centre)
+            below, contrast = fma(c2[x], s, one), max(B[x], least_B)
             both = np.divide(one, below * contrast)  # one division for two
             per = contrast * both
-            depth = (c0[x] + c1[x] * s) * per
+            depth = fma(c1[x], s, c0[x]) * per
             z[x] = depth if (s >= least[x]) & (s <= largest[x]) & (depth > zero) else none
             slope[x] = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
         for x in range(width):
-            sigma[x] = slope[x] * np.sqrt(noise_a + noise_b * A[x])
+            sigma[x] = slope[x] * np.sqrt(fma(noise_b, A[x], noise_a))
         for x in range(width):
             points[x, 0], points[x, 1], points[x, 2] = ray_x[x] * z[x], ray_y[x] * z[x], z[x]
 
 
-@kernel(fastmath=CONTRACT)
+@kernel()
 def _splined(first, last, background, depths, scale, per_step, maps):
     """The same by the compiled splined model: the rational function, then what the grid adds to it.
 
@@ -170,13 +170,13 @@ def _splined(first, last, background, depths, scale, per_step, maps):
         down = np.float32(row - j * step) * per_px
         above, below = grid[j].ravel(), grid[j + 1].ravel()
         for i in range(len(above)):
-            table[i] = above[i] + down * (below[i] - above[i])  # the grid at this row
+            table[i] = fma(down, below[i] - above[i], above[i])  # the grid at this row
         for x in range(width):
-            s = gain * phase[x] - centre
-            below, contrast = one + c2[x] * s, max(B[x], least_B)
+            s = fma(gain, phase[x], -centre)
+            below, contrast = fma(c2[x], s, one), max(B[x], least_B)
             both = np.divide(one, below * contrast)  # one division for two
             per = contrast * both
-            rational = (c0[x] + c1[x] * s) * per
+            rational = fma(c1[x], s, c0[x]) * per
             depth = (rational - near) * per_mm
             measured = (depth >= zero) & (depth <= deepest)
             depth = depth if measured else zero
@@ -184,16 +184,16 @@ def _splined(first, last, background, depths, scale, per_step, maps):
             z[x], cell[x], rest[x] = rational if measured else none, k, depth - np.float32(k)
             slope[x] = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
         for x in range(width):
-            sigma[x] = slope[x] * np.sqrt(noise_a + noise_b * A[x])
+            sigma[x] = slope[x] * np.sqrt(fma(noise_b, A[x], noise_a))
         for i in range(grid.shape[1] - 1):
             start = i * step
             for q in range(min(step, width - start)):
                 here = np.uint32(start + q)
                 at = np.uint32(i) * layers + np.uint32(cell[here])
                 right, deep = np.float32(q) * per_px, rest[here]
-                a = table[at] + deep * (table[at + next_one] - table[at])
-                b = table[at + layers] + deep * (table[at + layers + next_one] - table[at + layers])
-                z[here] += a + right * (b - a)
+                a = fma(deep, table[at + next_one] - table[at], table[at])
+                b = fma(deep, table[at + layers + next_one] - table[at + layers], table[at + layers])
+                z[here] += fma(right, b - a, a)
         for x in range(width):
             points[x, 0], points[x, 1], points[x, 2] = ray_x[x] * z[x], ray_y[x] * z[x], z[x]
 
