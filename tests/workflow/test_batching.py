@@ -121,7 +121,7 @@ def test_a_batch_makes_what_the_commands_make_and_names_what_failed(
     session: Path, tmp_path: Path, alone: dict[str, bytes], cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
     remote = Path(shutil.copytree(session, tmp_path / "remote"))
-    (session / "captures" / "plane_04" / "frames.zarr" / "c" / "3" / "0" / "0").unlink()
+    (session / "captures" / "plane_04" / "frames.zarr" / "c.3.0.0").unlink()
     where = [str(session), f"file://{remote}", str(tmp_path / "nowhere")]
     out = tmp_path / "summary.json"
     arguments = ["--scheduler", cluster.address, "--json", str(out)]
