@@ -65,14 +65,14 @@ def delivered(address: str, batch: str) -> Iterator[Path]:
                     fs.mv(arriving, f"{root}/exports/{path.name}")
             return
         exports = Path(address, "exports")
-        folder = exports / _hidden(batch) / secrets.token_hex(4)
+        # beside those of other workers, not in one folder for all: whoever removed that one once it was empty would do
+        # so right as another makes its own in it
+        folder = exports / f"{_hidden(batch)}-{secrets.token_hex(4)}"
         folder.mkdir(parents=True)
         yield folder
         for path in sorted(folder.iterdir()):
             os.replace(path, exports / path.name)
         folder.rmdir()
-        with contextlib.suppress(OSError):  # another worker's is in it
-            folder.parent.rmdir()
     except OSError as error:
         raise SessionError(f"{address} cannot be written ({error}): check its permissions and free space") from error
 
@@ -81,7 +81,8 @@ def swept(address: str, batch: str) -> None:
     """Remove what killed or cancelled workers of a batch left unfinished, as far as it can be reached from here."""
     with contextlib.suppress(OSError, InputError):
         if not is_remote(address):
-            shutil.rmtree(Path(address, "exports", _hidden(batch)), ignore_errors=True)
+            for folder in Path(address, "exports").glob(f"{_hidden(batch)}-*"):
+                shutil.rmtree(folder, ignore_errors=True)
             return
         fs, root = _file_system(address)
         for path in fs.ls(f"{root}/exports", detail=False):
