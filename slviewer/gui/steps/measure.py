@@ -125,8 +125,8 @@ class Panel:
     def _take(self, name: str) -> None:
         with self._lock:
             self._tool.take(name)
+            self._listen()  # before it is said: a click made as soon as one reads the sentence would be lost
             self._draw_tool()
-            self._listen()
 
     def _listen(self) -> None:
         """Hear of clicks into the scene while the tool waits for them; another step's clicks are its own."""
