@@ -37,10 +37,9 @@ class Stand:
             self._handles = gui.add_checkbox("3D handles", False, hint="To drag and turn it in the 3D view")
         self._drawn = [Follows(each) for each in (self._thing, self._distance, self._turn)]
         self._thing.on_update(stage.safely_with(self._choose))
-        bring = stage.operator.bring
         self._handles.on_update(stage.safely(self._draw_handles))
-        self._distance.on_update(stage.safely_with(_typed(lambda: bring(distance_mm=self._distance.value))))
-        self._turn.on_update(stage.safely_with(_typed(lambda: bring(turn_deg=self._turn.value))))
+        self._distance.on_update(self._typed(self._distance, "distance_mm"))
+        self._turn.on_update(self._typed(self._turn, "turn_deg"))
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show what stands there."""
@@ -84,7 +83,12 @@ class Stand:
         if event.client_id is not None and self._thing.value in self._things:
             self._stage.operator.place(self._thing.value)
 
+    def _typed(self, number: Any, what: str) -> Callable[[Any], None]:
+        """Bring it to where somebody typed; not where a number was drawn."""
 
-def _typed(do: Callable[[], Any]) -> Callable[[Any], None]:
-    """Do it where somebody changed an input; not where it was drawn."""
-    return lambda event: do() if event.client_id is not None else None
+        def changed(event: Any) -> None:
+            if event.client_id is not None:
+                value = number.value  # now: until this has its turn, a snapshot from before may be drawn over it
+                self._stage.safely(lambda: self._stage.operator.bring(**{what: value}))(event)
+
+        return changed
