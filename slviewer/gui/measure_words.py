@@ -10,7 +10,8 @@ from slviewer.gui.pictures import PLOT_PX
 from slviewer.gui.widgets import Html, Tone, block, boxed, cell, table, toned
 from slviewer.inspection.colours import deviation_colours
 from slviewer.inspection.tolerance import DECIDED
-from slviewer.report.canvas import finish, legend, new_figure, tidy
+from slviewer.report.canvas import finish, new_figure, tidy
+from slviewer.report.measurements import draw_deviations
 from slviewer.report.page import Figure
 from slviewer.session.measurements import Measurement
 from slviewer.workflow.measuring import quantities_of
@@ -21,7 +22,6 @@ _TONES: dict[str, Tone] = {"pass": "good", "fail": "error", "undecided": "warnin
 _WHOLE = "± is the expanded uncertainty, k = 2."
 _PART = "* without the calibration's part, which this calibration does not know."
 _HIGH = 230
-_LIMIT = "#b3261e"
 
 
 def measurements_table(measured: Sequence[Measurement], chosen: str, labels: Mapping[str, str]) -> Html:
@@ -95,20 +95,8 @@ def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: fl
     drawing = new_figure(PLOT_PX, _HIGH)
     axes = drawing.subplots()
     tidy(axes, "", "deviation, mm", "points, %")
-    middles = (edges[1:] + edges[:-1]) / 2
-    axes.bar(
-        middles,
-        100 * counts / max(counts.sum(), 1),
-        0.98 * np.diff(edges),
-        color=deviation_colours(middles, limit) / 255,
-        edgecolor="#9aa6b2",
-        linewidth=0.3,
-    )
+    draw_deviations(axes, edges, counts, limit, tolerance)
     if tolerance is not None:
-        for side in (-tolerance, tolerance):
-            axes.axvline(side, color=_LIMIT, linewidth=1.2, linestyle="--")
-        axes.plot([], [], color=_LIMIT, linewidth=1.2, linestyle="--", label=f"tolerance ± {tolerance:g} mm")
-        legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
         far = max(float(edges[-1]), 1.15 * tolerance)
         axes.set_xlim(-far, far)
     return finish(drawing, "How many of the points lie how far off the nominal.", name)

@@ -1,6 +1,7 @@
 """What was measured on scans, and how far they lie off their nominal models: tables, sections, coloured surfaces."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -159,6 +160,25 @@ def _decided(decision: str) -> Cell:
     return Cell(DECIDED[decision], MARKS[decision])  # type: ignore[index]
 
 
+def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None) -> None:
+    """Bars of counts (n,) between edges (n + 1,) mm as shares of all, in the colours of the surface, whose scale ends
+    at ``limit`` mm; lines at plus and minus ``tolerance`` mm."""
+    middles = (edges[1:] + edges[:-1]) / 2
+    axes.bar(
+        middles,
+        100 * counts / max(counts.sum(), 1),
+        0.98 * np.diff(edges),
+        color=deviation_colours(middles, limit) / 255,
+        edgecolor="#9aa6b2",
+        linewidth=0.3,
+    )
+    if tolerance is not None:
+        for side in (-tolerance, tolerance):
+            axes.axvline(side, color=TOLERANCE, linewidth=1.2, linestyle="--")
+        axes.plot([], [], color=TOLERANCE, linewidth=1.2, linestyle="--", label=f"tolerance ± {tolerance:g} mm")
+        legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
+
+
 def deviation_picture(view: DeviationView) -> Figure:
     """The scan coloured by its deviation, what of the nominal was not measured in grey, and the histogram."""
     from matplotlib.cm import ScalarMappable
@@ -184,21 +204,8 @@ def deviation_picture(view: DeviationView) -> Figure:
     colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
     numbers = view.found["statistics_mm"]
     tidy(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
-    edges, counts = view.edges, view.counts
-    middles = (edges[1:] + edges[:-1]) / 2
-    right.bar(
-        middles,
-        100 * counts / max(counts.sum(), 1),
-        0.98 * np.diff(edges),
-        color=deviation_colours(middles, limit) / 255,
-        edgecolor="#9aa6b2",
-        linewidth=0.3,
-    )
-    if tolerance is not None:
-        for side in (-tolerance, tolerance):
-            right.axvline(side, color=TOLERANCE, linewidth=1.2, linestyle="--")
-        right.plot([], [], color=TOLERANCE, linewidth=1.2, linestyle="--", label=f"tolerance ± {tolerance:g} mm")
-        legend(right, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
+    edges = view.edges
+    draw_deviations(right, edges, view.counts, limit, tolerance)
     far = max(edges[-1], 0.0 if tolerance is None else 1.15 * tolerance)
     right.set_xlim(-far, far)
     left.set_xlabel("grey: parts of the nominal that were not measured", fontsize=TEXT_PT, color=SOFT, loc="left")
