@@ -6,7 +6,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from slviewer import workflow
-from slviewer.commands.parsing import ModelName, deferred, ui
+from slviewer.commands.parsing import Method, ModelName, deferred, ui
 
 What = Literal["cloud", "mesh", "merge", "merged-mesh", "calibration", "coefficients", "poses", "report", "table"]
 
@@ -19,7 +19,7 @@ def export(
     out: Path | None = None,
     format: str = "",
     model: ModelName | None = None,
-    method: Literal["grid", "poisson", "volume"] | None = None,
+    method: Method | None = None,
     fill_holes: float | None = None,
     triangles: int | None = None,
     smooth: int = 0,

@@ -6,7 +6,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from slviewer import workflow
-from slviewer.commands.parsing import Axis, ModelName, deferred, ui, write_json
+from slviewer.commands.parsing import Axis, ModelName, Start, deferred, ui, write_json
 
 
 @deferred
@@ -137,7 +137,7 @@ def merge(
     reference: str,
     out: Path | None = None,
     model: ModelName | None = None,
-    start: Literal["features", "turntable", "identity"] = "features",
+    start: Start = "features",
     angle: float | None = None,
     json: Path | None = None,
     accept_rejected: bool = False,

@@ -1,12 +1,11 @@
 """From scans to a mesh."""
 
 from pathlib import Path
-from typing import Literal
 
 from tyro.conf import Positional
 
 from slviewer import workflow
-from slviewer.commands.parsing import ModelName, deferred, ui, write_json
+from slviewer.commands.parsing import Method, ModelName, Start, deferred, ui, write_json
 
 
 @deferred
@@ -14,12 +13,12 @@ def mesh(
     session: Positional[Path],
     names: Positional[tuple[str, ...]],
     out: Path | None = None,
-    method: Literal["grid", "poisson", "volume"] | None = None,
+    method: Method | None = None,
     fill_holes: float | None = None,
     triangles: int | None = None,
     smooth: int = 0,
     watertight: bool = False,
-    start: Literal["features", "turntable", "identity"] = "features",
+    start: Start = "features",
     angle: float | None = None,
     model: ModelName | None = None,
     json: Path | None = None,
@@ -36,8 +35,8 @@ def mesh(
         fill_holes: Fill holes of up to so many mm across; by default a few spacings of the points.
         triangles: Thin the mesh to so many triangles.
         smooth: Rounds of smoothing, 0 for none; how far it moved the surface is told.
-        watertight: Close the surface, or say why it cannot be closed. A gap that no scan shows, such as the foot, is
-            closed by --method volume with --fill-holes wider than it.
+        watertight: Close the surface, or say why it cannot be closed. A gap that no scan shows, such as the foot
+            that an object stands on, is closed flat, and told.
         start: Where the registration of several scans starts from: features finds by itself how they lie; turntable
             uses --angle; identity takes them to lie nearly right already.
         angle: Degrees that the turntable turns from each scan to the next, with --start turntable.

@@ -13,6 +13,8 @@ from slviewer import terminal
 Axis = Literal["x", "y"]
 ModelName = Literal["stereo", "pixelwise", "anchored", "splined"]
 Role = Literal["calibration", "scan"]
+Start = Literal["features", "turntable", "identity"]
+Method = Literal["grid", "poisson", "volume"]
 
 
 def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
