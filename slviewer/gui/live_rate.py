@@ -189,6 +189,7 @@ class _Viewer:
             additional_headers=[("Cookie", f"{access.cookie_name}={access.view_token}"), ("Origin", f"http://{host}")],
             subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
             max_size=2**26,
+            ping_interval=None,  # who stalls does not give up by itself
         )
 
 
