@@ -119,12 +119,7 @@ class OnePass:
 
     def sweep(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
         """The first pass: every pixel by itself; each frame is read once."""
-        self._check(frames)
-        frames = np.ascontiguousarray(frames)
-        light = light or self.light(frames)
-        scan = self._room(frames.dtype, light) if out is None else replace(out, light=light)
-        if scan.texture.dtype != frames.dtype or scan.points.shape[:2] != self.shape:
-            raise InputError("The arrays to write into belong to other frames: leave them out, and new ones are made.")
+        frames, scan = self._begun(frames, light, out)
         deep = frames.dtype == np.uint16
         peaks = np.zeros(-(-self.shape[0] // kernels.ROWS) if deep else 0, np.int32)
         kernels.sweep(
@@ -132,13 +127,15 @@ class OnePass:
             self._order,
             self._shifts,
             self._ladder,
-            code_rules(self._layout, light.mean),
-            grey_scale(self._layout, light.noise, light.white),
+            code_rules(self._layout, scan.light.mean),
+            grey_scale(self._layout, scan.light.noise, scan.light.white),
             self._depths,
             _maps(scan),
             peaks,
         )
-        if deep and clip_level(frames.dtype, int(peaks.max())) > light.white:  # a camera of more bits than it seemed
+        if (
+            deep and clip_level(frames.dtype, int(peaks.max())) > scan.light.white
+        ):  # a camera of more bits than it seemed
             return self.sweep(frames, self.light(frames), scan)
         return scan
 
@@ -159,6 +156,16 @@ class OnePass:
                 f"Frames of {frames.shape[2]}x{frames.shape[1]} px were given, and the camera was calibrated at "
                 f"{width}x{height}: use captures of the same camera, at the same resolution and without cropping."
             )
+
+    def _begun(self, frames: np.ndarray, light: Light | None, out: Scan | None) -> tuple[np.ndarray, Scan]:
+        """The frames, checked and in one piece, and the arrays to write into."""
+        self._check(frames)
+        frames = np.ascontiguousarray(frames)
+        light = light or self.light(frames)
+        scan = self._room(frames.dtype, light) if out is None else replace(out, light=light)
+        if scan.texture.dtype != frames.dtype or scan.points.shape[:2] != self.shape:
+            raise InputError("The arrays to write into belong to other frames: leave them out, and new ones are made.")
+        return frames, scan
 
     def _room(self, dtype: np.dtype, light: Light) -> Scan:
         phase, sigma_z, modulation = (np.empty(self.shape, np.float32) for _ in range(3))

@@ -102,12 +102,7 @@ class CudaPass(OnePass):
         return self._card
 
     def _scan(self, frames: np.ndarray, light: Light | None, out: Scan | None, mended: bool) -> Scan:
-        self._check(frames)
-        frames = np.ascontiguousarray(frames)
-        light = light or self.light(frames)
-        scan = self._room(frames.dtype, light) if out is None else replace(out, light=light)
-        if scan.texture.dtype != frames.dtype or scan.points.shape[:2] != self.shape:
-            raise InputError("The arrays to write into belong to other frames: leave them out, and new ones are made.")
+        frames, scan = self._begun(frames, light, out)
         if cuda_device.device() is not None:
             try:
                 return self._on_card(frames, scan, mended)
@@ -116,7 +111,7 @@ class CudaPass(OnePass):
         self._card = None
         if isinstance(self.model, StereoModel):
             return self._defined(frames, scan)
-        return super().run(frames, light, scan) if mended else super().sweep(frames, light, scan)
+        return super().run(frames, scan.light, scan) if mended else super().sweep(frames, scan.light, scan)
 
     def _on_card(self, frames: np.ndarray, scan: Scan, mended: bool) -> Scan:
         card = self.card(frames.dtype)

@@ -50,23 +50,22 @@ def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
     """Median seconds."""
     if warm:
         work()
-    taken = []
-    for _ in range(times):
-        start = time.perf_counter()
-        work()
-        taken.append(time.perf_counter() - start)
-    return statistics.median(taken)
+    return statistics.median(_seconds(work, times))
 
 
 def fastest(work: Callable[[], object], times: int) -> float:
     """Least seconds, after a first time that is not counted."""
     work()
+    return min(_seconds(work, times))
+
+
+def _seconds(work: Callable[[], object], times: int) -> list[float]:
     taken = []
     for _ in range(times):
         start = time.perf_counter()
         work()
         taken.append(time.perf_counter() - start)
-    return min(taken)
+    return taken
 
 
 def megabytes(*arrays: np.ndarray) -> float:
