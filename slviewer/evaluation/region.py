@@ -64,15 +64,15 @@ def find_sphere(
 
 def find_spheres(
     points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
-) -> list[np.ndarray]:
-    """The regions of ``count`` spheres in one cloud, from left to right in the image."""
+) -> list[tuple[Sphere, np.ndarray]]:
+    """``count`` spheres of one cloud and their regions, from left to right in the image."""
     free = measured_pixels(points, None)
-    regions = []
+    found = []
     for _ in range(count):
-        _, region = find_sphere(points, free, sigma_z, radius)
-        regions.append(region)
+        sphere, region = find_sphere(points, free, sigma_z, radius)
+        found.append((sphere, region))
         free &= ~cv2.dilate(region.astype(np.uint8), np.ones((4 * RIM_PX + 1,) * 2, np.uint8)).astype(bool)
-    return sorted(regions, key=lambda region: float(np.nonzero(region)[1].mean()))
+    return sorted(found, key=lambda each: float(np.nonzero(each[1])[1].mean()))
 
 
 def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None) -> Plane:

@@ -47,8 +47,8 @@ def evaluate_spheres(
     points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
 ) -> list[SphereResult]:
     """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise as above."""
-    regions = find_spheres(points, count, sigma_z, radius)
-    return [evaluate_sphere(points, region, sigma_z, radius) for region in regions]
+    found = find_spheres(points, count, sigma_z, radius)
+    return [evaluate_sphere(points, region, sigma_z, radius, start) for start, region in found]
 
 
 @dataclass(frozen=True)

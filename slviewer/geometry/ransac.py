@@ -59,7 +59,10 @@ def ransac_sphere(
         return (origin + offset)[sized], radii[sized]
 
     def distances(sample: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        result: np.ndarray = np.linalg.norm(sample[None] - centre[:, None], axis=2) - radii[:, None]
+        middle = sample.mean(axis=0)  # about which the squares are small, and lose nothing in the difference
+        x, c = sample - middle, centre - middle
+        squares = np.einsum("ij,ij->i", x, x) + np.einsum("ij,ij->i", c, c)[:, None] - 2.0 * c @ x.T
+        result: np.ndarray = np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
         return result
 
     def fit(chosen: np.ndarray) -> Sphere:
@@ -105,8 +108,10 @@ def _search(
         chosen = np.abs(distances(sample, *(p[index : index + 1] for p in parameters))[0]) <= tolerance
         try:
             for _ in range(5):
-                shape = fit(sample[chosen])
+                before, shape = chosen, fit(sample[chosen])
                 chosen = np.abs(shape.distance(sample)) <= tolerance
+                if np.array_equal(chosen, before):
+                    break
         except InputError:  # too few, or flat: this hypothesis was chance
             continue
         score = float(_score(shape.distance(sample), tolerance))

@@ -69,7 +69,7 @@ def folder(made, tmp_path) -> Path:
 @pytest.fixture(scope="module")
 def regions(balls) -> list[np.ndarray]:
     """The pixels of each ball, from left to right."""
-    return find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)
+    return [region for _, region in find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)]
 
 
 @pytest.fixture(scope="module")
