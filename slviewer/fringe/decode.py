@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slviewer.fringe import kernels, kernels_gray, kernels_levels, kernels_spikes, limits
+from slviewer.fringe import kernels, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
 from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap
@@ -60,7 +60,7 @@ def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.n
     phase, wrapped, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(4))
     reason = np.empty(stack.shape[1:], np.uint8)
     rules = code_rules(found, fringe_mean(found, stack) if is_plain(found) else MIDDLE)
-    kernels.decode_coded(
+    kernels_coded.decode_coded(
         stack,
         steps_of(found.shifts[0], found.sign),
         np.array(found.gray, np.int64),
@@ -125,9 +125,9 @@ def grey_scale(found: Layout, noise: tuple[float, float], white: float) -> kerne
     return kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(found), white)
 
 
-def code_rules(found: Layout, mean: float) -> kernels.CodeRules:
+def code_rules(found: Layout, mean: float) -> kernels_coded.CodeRules:
     """How the Gray bits of a layout are read; ``mean`` as `threshold.fringe_mean` has it."""
-    return kernels.CodeRules(
+    return kernels_coded.CodeRules(
         found.gray_origin_px / found.period_px,
         limits.EDGE,
         limits.WEAK_BIT,
@@ -167,8 +167,6 @@ def steps_of(shift: Shift, sign: int) -> kernels.Steps:
     cosines, sines = np.cos(angle), sign * np.sin(angle)
     if n % 2 == 0:
         cosines[-1:] *= half % 2  # a quarter of a turn, exactly
-    if len(lines) % 2:
-        lines, cosines, sines = [*lines, (0, 0, 0, 0)], np.append(cosines, 0), np.append(sines, 0)
     counted = n - 1 + sum(line.count(0) for line in lines)
     frames = np.array(shift.indices, np.int64)[np.array(lines)]
     return kernels.Steps(frames, cosines.astype(np.float32), sines.astype(np.float32), shift.indices[0], n, counted)

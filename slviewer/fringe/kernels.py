@@ -1,4 +1,4 @@
-"""The phase shift and its Gray code in one pass over the frames; `reference` is what they must agree with.
+"""The phase shift, compiled; `reference` is what it must agree with.
 
 A row of the image at a time, so that sums and codes stay in the cache while each frame is read once. Loops over a row
 have no branches and no library calls: the compiler turns them into vector instructions.
@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from slviewer.fringe.phase import Reason
-from slviewer.geometry.jit import fma, kernel
+from slviewer.geometry.jit import fma, less, plus, prefetch, signed
 
 VALID, DARK, SATURATED, INCONSISTENT = (
     np.uint8(r) for r in (Reason.VALID, Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT)
@@ -19,6 +19,8 @@ PER_TURN = np.float32(1 / (2 * np.pi))
 TURN = np.float32(6.28125)
 TURN_REST = np.float32(2 * np.pi - 6.28125)
 """2 pi in two parts: a whole number times the first is exact in float32."""
+LINE_BYTES = 64
+"""Of the processor's cache."""
 HALF_PI, PI = np.float32(np.pi / 2), np.float32(np.pi)
 
 
@@ -69,17 +71,6 @@ class Scale(NamedTuple):
     white: float
 
 
-class CodeRules(NamedTuple):
-    """How Gray bits are read; see `limits`, and `threshold` for ``mean``."""
-
-    origin_turns: float
-    edge: float
-    weak: float
-    weaker: float
-    mean: float
-    undecided: float
-
-
 @numba.njit(inline="always")
 def arctan2(y, x):
     """float32 arctangent without branches, good to 3e-7 rad (Abramowitz and Stegun, 4.4.49); 0 where both are 0."""
@@ -101,26 +92,84 @@ def arctan2(y, x):
 
 
 @numba.njit(inline="always")
-def shift_row(stack, shift, row, wrapped, modulation, background, peak):
-    """Wrapped phase, modulation, background and largest sample (of the frames' dtype) of one image row."""
-    width = stack.shape[2]
-    cosine, sine, total = np.zeros(width, np.float32), np.zeros(width, np.float32), np.zeros(width, np.float32)
-    first = stack[shift.first, row]
-    for x in range(width):
-        peak[x] = first[x]
-    for k in range(0, len(shift.cosines), 2):  # eight frames to a pass: the sums are read and written less often
+def fetch(stack, frame, row):
+    """Have a frame's next row on its way while this one is worked on: the processor itself looks ahead in one or two
+    frames, not in twenty."""
+    if row + 1 < stack.shape[1]:
+        line = stack[frame, row + 1]
+        for x in range(0, len(line), LINE_BYTES // stack.itemsize):
+            prefetch(line, x)
+
+
+@numba.njit(inline="always")
+def four(a, b, c, d, cos_a, sin_a):
+    """What the samples of a line of `Steps` add: to all samples, to the cosines and to the sines; and the largest."""
+    ac, bd = less(signed(a), signed(c)), less(signed(b), signed(d))
+    total = plus(plus(signed(a), signed(b)), plus(signed(c), signed(d)))
+    cosine, sine = cos_a * np.float32(less(ac, bd)), sin_a * np.float32(plus(ac, bd))
+    return np.float32(total), cosine, sine, max(max(a, b), max(c, d))
+
+
+@numba.njit(inline="always")
+def eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
+    """The same of two lines."""
+    ac, bd = less(signed(a), signed(c)), less(signed(b), signed(d))
+    eg, fh = less(signed(e), signed(g)), less(signed(f), signed(h))
+    one = plus(plus(signed(a), signed(b)), plus(signed(c), signed(d)))
+    two = plus(plus(signed(e), signed(f)), plus(signed(g), signed(h)))
+    cosine = fma(cos_a, np.float32(less(ac, bd)), cos_e * np.float32(less(eg, fh)))
+    sine = fma(sin_a, np.float32(plus(ac, bd)), sin_e * np.float32(plus(eg, fh)))
+    peak = max(max(max(a, b), max(c, d)), max(max(e, f), max(g, h)))
+    return np.float32(plus(one, two)), cosine, sine, peak
+
+
+@numba.njit(inline="always")
+def sums_row(stack, shift, row, cosine, sine, total, peak):
+    """Sums of one image row's samples weighed by cosines and sines, of all samples as the `Steps` count them, and the
+    largest sample, of the frames' dtype."""
+    width, lines = stack.shape[2], len(shift.cosines)
+    for k in range(0, lines - 1, 2):  # two lines to a pass: the sums are read and written less often
         i, j = shift.frames[k], shift.frames[k + 1]
         a, b, c, d = stack[i[0], row], stack[i[1], row], stack[i[2], row], stack[i[3], row]
         e, f, g, h = stack[j[0], row], stack[j[1], row], stack[j[2], row], stack[j[3], row]
         cos_a, sin_a, cos_e, sin_e = shift.cosines[k], shift.sines[k], shift.cosines[k + 1], shift.sines[k + 1]
-        for x in range(width):
-            value_a, value_b, value_c, value_d = np.float32(a[x]), np.float32(b[x]), np.float32(c[x]), np.float32(d[x])
-            value_e, value_f, value_g, value_h = np.float32(e[x]), np.float32(f[x]), np.float32(g[x]), np.float32(h[x])
-            ac, bd, eg, fh = value_a - value_c, value_b - value_d, value_e - value_g, value_f - value_h
-            total[x] += ((value_a + value_b) + (value_c + value_d)) + ((value_e + value_f) + (value_g + value_h))
-            cosine[x] = fma(cos_a, ac - bd, fma(cos_e, eg - fh, cosine[x]))
-            sine[x] = fma(sin_a, ac + bd, fma(sin_e, eg + fh, sine[x]))
-            peak[x] = max(peak[x], max(max(max(a[x], b[x]), max(c[x], d[x])), max(max(e[x], f[x]), max(g[x], h[x]))))
+        for q in range(4):
+            fetch(stack, i[q], row)
+            fetch(stack, j[q], row)
+        if k == 0:
+            for x in range(width):
+                total[x], cosine[x], sine[x], peak[x] = eight(
+                    a[x], b[x], c[x], d[x], e[x], f[x], g[x], h[x], cos_a, sin_a, cos_e, sin_e
+                )
+        else:
+            for x in range(width):
+                all_x, cos_x, sin_x, peak_x = eight(
+                    a[x], b[x], c[x], d[x], e[x], f[x], g[x], h[x], cos_a, sin_a, cos_e, sin_e
+                )
+                total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
+                peak[x] = max(peak[x], peak_x)
+    if lines % 2:
+        k = lines - 1
+        i, cos_a, sin_a = shift.frames[k], shift.cosines[k], shift.sines[k]
+        a, b, c, d = stack[i[0], row], stack[i[1], row], stack[i[2], row], stack[i[3], row]
+        for q in range(4):
+            fetch(stack, i[q], row)
+        if k == 0:
+            for x in range(width):
+                total[x], cosine[x], sine[x], peak[x] = four(a[x], b[x], c[x], d[x], cos_a, sin_a)
+        else:
+            for x in range(width):
+                all_x, cos_x, sin_x, peak_x = four(a[x], b[x], c[x], d[x], cos_a, sin_a)
+                total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
+                peak[x] = max(peak[x], peak_x)
+
+
+@numba.njit(inline="always")
+def shift_row(stack, shift, row, wrapped, modulation, background, peak):
+    """Wrapped phase, modulation, background and largest sample (of the frames' dtype) of one image row."""
+    width, first = stack.shape[2], stack[shift.first, row]
+    cosine, sine, total = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    sums_row(stack, shift, row, cosine, sine, total, peak)
     per_two, per_one, counted = np.float32(2 / shift.steps), np.float32(1 / shift.steps), np.float32(shift.counted)
     for x in range(width):
         wrapped[x] = arctan2(np.float32(0) - sine[x], cosine[x])
@@ -132,10 +181,16 @@ def shift_row(stack, shift, row, wrapped, modulation, background, peak):
 @numba.njit(inline="always")
 def is_dark(modulation, background, scale):
     """Whether the modulation is too small for the noise at this brightness."""
+    return is_dark_squared(modulation * modulation, background, scale)
+
+
+@numba.njit(inline="always")
+def is_dark_squared(squared, background, scale):
+    """The same of the modulation's square."""
     sigmas = np.float32(scale.dark_sigmas)
     variance = np.float32(scale.noise_a) + np.float32(scale.noise_b) * background
     levels = np.float32(scale.dark_levels)
-    return modulation * modulation < max(levels * levels, sigmas * sigmas * variance)
+    return squared < max(levels * levels, sigmas * sigmas * variance)
 
 
 @numba.njit(inline="always")
@@ -161,151 +216,7 @@ def bit_height(stack, frames, inverses, bit, row, x, threshold):
 
 
 @numba.njit(inline="always")
-def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, lower, upper):
-    """One row's binary code, and of its bits' heights above their threshold the least in size, the highest and the
-    lowest, and those of the bits that change at the ``lower`` and at the ``upper`` edge of the code.
-
-    From k - 1 to k the Gray bit changes at whose place k has its last binary 1; from k to k + 1 that of its last 0. A
-    code without such a bit has no such edge: infinite.
-    """
-    width = stack.shape[2]
-    none, nothing = np.float32(np.inf), np.float32(0)
-    digit = np.zeros(width, np.uint8)
-    for x in range(width):
-        code[x] = 0
-    if len(inverses):
-        for x in range(width):
-            top[x] = bottom[x] = nothing
-            least[x] = lower[x] = upper[x] = none
-        for b in range(len(frames)):
-            frame, inverse = stack[frames[b], row], stack[inverses[b], row]
-            for x in range(width):
-                height = (np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
-                one = np.uint8(digit[x] ^ np.uint8(height > 0))
-                at_lower, at_upper = lower[x], upper[x]
-                digit[x] = one
-                code[x] = np.int32(np.int32(code[x] + code[x]) | np.int32(one))
-                least[x] = min(least[x], abs(height))
-                top[x] = max(top[x], height)
-                bottom[x] = min(bottom[x], height)
-                lower[x] = height if one != 0 else at_lower
-                upper[x] = at_upper if one != 0 else height
-        return
-    # Against one threshold the frames' own numbers can be compared: four times as many fit a register.
-    grey = stack.dtype.type
-    full = grey(65535 if stack.itemsize == 2 else 255)
-    level, bits = np.empty(width, stack.dtype), np.empty(width, np.uint8)
-    over_least, under_most = np.empty(width, stack.dtype), np.zeros(width, stack.dtype)
-    most, fewest = np.zeros(width, stack.dtype), np.empty(width, stack.dtype)
-    at_one, at_nought = np.zeros(width, stack.dtype), np.zeros(width, stack.dtype)
-    for x in range(width):
-        level[x] = grey(np.int32(threshold[x]))
-        over_least[x] = fewest[x] = full
-    for start in range(0, len(frames), 8):
-        last = min(start + 8, len(frames))
-        for x in range(width):
-            bits[x] = 0
-        for b in range(start, last):
-            frame = stack[frames[b], row]
-            for x in range(width):
-                value, at_lower, at_upper = frame[x], at_one[x], at_nought[x]
-                over = value > level[x]
-                one = np.uint8(digit[x] ^ np.uint8(over))  # the binary digit is the parity of all Gray bits so far
-                digit[x] = one
-                bits[x] = np.uint8(np.uint8(bits[x] + bits[x]) | one)
-                over_least[x] = min(over_least[x], value if over else full)
-                under_most[x] = max(under_most[x], grey(0) if over else value)
-                most[x] = max(most[x], value)
-                fewest[x] = min(fewest[x], value)
-                at_one[x] = value if one != 0 else at_lower
-                at_nought[x] = at_upper if one != 0 else value
-        more, ones = np.int32(1 << (last - start)), np.int32((1 << len(frames)) - 1)
-        for x in range(width):
-            code[x] = np.int32(np.int32(code[x] * more) + np.int32(bits[x]))
-    for x in range(width):
-        level_x, nearest_over, nearest_under = threshold[x], np.float32(over_least[x]), np.float32(under_most[x])
-        above = nearest_over - level_x if most[x] > level[x] else none
-        below = level_x - nearest_under if fewest[x] <= level[x] else none
-        least[x] = min(above, below)
-    for x in range(width):
-        level_x, highest, lowest = threshold[x], np.float32(most[x]), np.float32(fewest[x])
-        top[x], bottom[x] = max(nothing, highest - level_x), min(nothing, lowest - level_x)
-    for x in range(width):
-        level_x, one_x, nought_x = threshold[x], np.float32(at_one[x]), np.float32(at_nought[x])
-        lower[x] = one_x - level_x if code[x] != 0 else none
-        upper[x] = nought_x - level_x if code[x] != ones else none
-
-
-@numba.njit(inline="always")
 def five(width):
     """Five rows of float32; arrays of their own, so that the compiler knows that none overlap."""
     a, b, c = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return a, b, c, np.empty(width, np.float32), np.empty(width, np.float32)
-
-
-@numba.njit(inline="always")
-def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak, code, room, phase, reason):
-    """One row's absolute phase and reason from what ``shift_row`` left; ``code`` (w,) int32 and what `five`
-    gives are room."""
-    width = stack.shape[2]
-    least, top, bottom, lower, upper = room
-    code_row(stack, gray, inverse, row, A, code, least, top, bottom, lower, upper)
-    origin, undecided = np.float32(rules.origin_turns), np.float32(rules.undecided)
-    edge, far_edge = np.float32(rules.edge), np.float32(1 - rules.edge)
-    per_mean, per_rest = np.float32(1 / rules.mean), np.float32(1 / (1 - rules.mean))
-    off_middle, weak, weaker = np.float32(0.5 - rules.mean), np.float32(rules.weak / 2), np.float32(rules.weaker)
-    none, quarter = np.float32(np.nan), np.float32(0.25)
-    if complementary >= 0:
-        extra = stack[complementary, row]
-        for x in range(width):
-            turns = psi[x] * PER_TURN - origin
-            whole = np.floor(turns)
-            part = turns - whole
-            last = np.float32(extra[x]) - A[x]
-            cell = np.int32(np.int32(code[x] + code[x]) + np.int32(np.int32(code[x] & 1) ^ np.int32(last > 0)))
-            middle = (part >= quarter) & (part < np.float32(0.75))
-            beside = np.int32(np.int32(np.int32(cell + 1) >> 1) - np.int32(part >= np.float32(0.75)))
-            order = np.int32(cell >> 1) if middle else beside
-            unclear = (least[x] if middle else abs(last)) < undecided * B[x]
-            dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
-            reason[x] = verdict(dark, clipped, unclear)
-            periods = np.float32(order) - whole
-            absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
-            phase[x] = none if dark | clipped | unclear else absolute
-    else:
-        for x in range(width):
-            turns = psi[x] * PER_TURN - origin
-            whole = np.floor(turns)
-            part = turns - whole
-            unclear = (least[x] < undecided * B[x]) & (part >= edge) & (part < far_edge)
-            dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
-            reason[x] = verdict(dark, clipped, unclear)
-            # On a blurred edge the bit nearest the middle and the phase may disagree about the side: the phase decides.
-            contrast = max(top[x] * per_rest, np.float32(0) - bottom[x] * per_mean)
-            below, above = abs(lower[x] - off_middle * contrast), abs(upper[x] - off_middle * contrast)
-            ahead = (part < edge) & (above < weak * contrast) & (above < weaker * below)
-            behind = (part >= far_edge) & (below < weak * contrast) & (below < weaker * above)
-            periods = np.float32(code[x]) - whole
-            periods += np.float32(1) if ahead else np.float32(0)
-            periods -= np.float32(1) if behind else np.float32(0)
-            absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
-            phase[x] = none if dark | clipped | unclear else absolute
-
-
-@kernel(parallel=True)
-def decode_coded(
-    stack, shift, gray, inverse, complementary, scale, rules, phase, wrapped, modulation, background, reason
-):
-    """Phase shift with a plain (``complementary`` < 0) or complementary Gray code; fills the five (h, w) maps.
-
-    ``phase`` is NaN where ``reason`` is not VALID, here as in the other kernels.
-    """
-    _, height, width = stack.shape
-    for row in numba.prange(height):
-        peak, code = np.empty(width, stack.dtype), np.empty(width, np.int32)
-        room = five(width)
-        psi, B, A = wrapped[row], modulation[row], background[row]
-        shift_row(stack, shift, row, psi, B, A, peak)
-        coded_row(
-            stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak, code, room, phase[row], reason[row]
-        )

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from slviewer.fringe.kernels import is_clipped, is_dark, period, shift_row, verdict
-from slviewer.geometry.jit import kernel
+from slviewer.fringe.kernels import TURN, TURN_REST, arctan2, five, is_dark_squared, period, sums_row, verdict
+from slviewer.geometry.jit import fma, kernel
 
-TWO_PI = 2 * np.pi
+PER_RAD = 1 / (2 * np.pi)
 
 
 class Ladder(NamedTuple):
@@ -22,67 +22,88 @@ class Ladder(NamedTuple):
 
 
 @numba.njit(inline="always")
-def levels_row(psi, weights, periods, low, misfit, B, A, clipped, scale, coordinate, order, own, worst, phase, reason):
+def levels_row(psi, ladder, weakest, A, clipped, scale, coordinate, order, own, worst, phase, reason):
     """One row's absolute phase and reason from its (m, w) wrapped phases; ``coordinate`` ... ``worst`` (w,) are room.
 
-    ``B`` is the weakest modulation. Loops run along the row, which the compiler turns into vector instructions.
+    ``weakest``: the smallest square of a modulation. float32 knows a coordinate to some 1e-4 px, enough to tell whole
+    periods apart; the phase itself is never a coordinate. Loops run along the row, which the compiler turns into vector
+    instructions.
     """
     count, width = psi.shape
-    for x in range(width):
-        worst[x] = 0.0
-    for level in range(len(periods)):
-        period = periods[level]
-        per_px, per_rad = 1.0 / period, period / TWO_PI
-        for x in range(width):
-            own[x] = 0.0
+    low, misfit = np.float32(ladder.low), np.float32(ladder.misfit)
+    for level in range(len(ladder.periods)):
+        length, per_px = np.float32(ladder.periods[level]), np.float32(1.0 / ladder.periods[level])
+        single, several, to_px = 0, 0, ladder.periods[level] * PER_RAD
         for i in range(count):
-            weight = weights[level, i]
-            if weight != 0.0:
+            if ladder.weights[level, i] != 0.0:
+                single, several = i, several + 1
+        if several == 1:  # a period of its own
+            source, per_rad = psi[single], np.float32(ladder.weights[level, single] * to_px)
+        else:  # the beat of some
+            source, per_rad = own, np.float32(to_px)
+            for x in range(width):
+                own[x] = np.float32(0)
+            for i in range(count):
+                weight, wrapped = np.float32(ladder.weights[level, i]), psi[i]
                 for x in range(width):
-                    own[x] += weight * np.float64(psi[i, x])
+                    own[x] = fma(weight, wrapped[x], own[x])
         if level == 0:
             for x in range(width):
-                position = own[x] * per_rad
-                order[x] = -np.floor((position - low) * per_px)
-                coordinate[x] = position + order[x] * period
+                position = source[x] * per_rad
+                whole = np.float32(0) - np.floor((position - low) * per_px)
+                order[x], worst[x] = whole, np.float32(0)
+                coordinate[x] = fma(whole, length, position)
         else:
             for x in range(width):
-                position = own[x] * per_rad
+                position = source[x] * per_rad
                 turns = (coordinate[x] - position) * per_px
-                order[x] = np.rint(turns)
-                worst[x] = max(worst[x], abs(turns - order[x]))
-                coordinate[x] = position + order[x] * period
+                whole = np.rint(turns)
+                order[x] = whole
+                worst[x] = max(worst[x], abs(turns - whole))
+                coordinate[x] = fma(whole, length, position)
+    finest = psi[count - 1]
     for x in range(width):
-        dark, unclear = is_dark(B[x], A[x], scale), worst[x] > misfit
+        dark, unclear = is_dark_squared(weakest[x], A[x], scale), worst[x] > misfit
         reason[x] = verdict(dark, clipped[x], unclear)
-        absolute = np.float32(psi[count - 1, x] + TWO_PI * order[x])
+        absolute = fma(order[x], TURN, fma(order[x], TURN_REST, finest[x]))
         phase[x] = np.float32(np.nan) if dark | clipped[x] | unclear else absolute
 
 
 @numba.njit(inline="always")
 def levels_room(width):
-    """Room for a row: weakest modulation, whether clipped, and four of float64."""
-    weakest, clipped = np.empty(width, np.float32), np.empty(width, np.bool_)
-    a, b = np.empty(width, np.float64), np.empty(width, np.float64)
-    return weakest, clipped, a, b, np.empty(width, np.float64), np.empty(width, np.float64)
+    """Room for a row: whether clipped, and eight of float32."""
+    a, b, c, d, e = five(width)
+    f, g, h, _, _ = five(width)
+    return np.empty(width, np.bool_), a, b, c, d, e, f, g, h
 
 
 @numba.njit(inline="always")
 def ladder_row(stack, shifts, ladder, scale, row, psi, B, A, peak, room, phase, reason):
-    """One row's absolute phase, reason, modulation B and background A of the finest period, and all wrapped phases."""
-    weakest, clipped, coordinate, order, own, worst = room
-    width = stack.shape[2]
+    """One row's absolute phase, reason, modulation B and background A of the finest period, and all wrapped phases.
+
+    The other periods' modulations are compared as squares, which spares their roots.
+    """
+    clipped, weakest, coordinate, order, own, worst, cosine, sine, total = room
+    width, white = stack.shape[2], np.float32(scale.white)
     for x in range(width):
         weakest[x], clipped[x] = np.float32(np.inf), False
     for i in range(len(shifts.steps)):  # the finest is last, and its values stay
-        shift_row(stack, period(shifts, i), row, psi[i], B, A, peak)
+        steps = period(shifts, i)
+        sums_row(stack, steps, row, cosine, sine, total, peak)
+        first, wrapped = stack[steps.first, row], psi[i]
+        per_two, per_one, counted = np.float32(2 / steps.steps), np.float32(1 / steps.steps), np.float32(steps.counted)
         for x in range(width):
-            weakest[x] = min(weakest[x], B[x])
-            clipped[x] |= is_clipped(B[x], A[x], peak[x], scale)
-    levels_row(
-        psi, ladder.weights, ladder.periods, ladder.low, ladder.misfit, weakest, A, clipped, scale,
-        coordinate, order, own, worst, phase, reason,
-    )  # fmt: skip
+            wrapped[x] = arctan2(np.float32(0) - sine[x], cosine[x])
+            level = np.float32(first[x])
+            middle = fma(total[x] - counted * level, per_one, level)
+            squared = fma(cosine[x], cosine[x], sine[x] * sine[x]) * (per_two * per_two)
+            rest = max(white - middle, np.float32(0))
+            A[x] = middle
+            weakest[x] = min(weakest[x], squared)
+            clipped[x] |= (np.float32(peak[x]) >= white) & (squared >= rest * rest)
+    for x in range(width):
+        B[x] = np.sqrt(fma(cosine[x], cosine[x], sine[x] * sine[x])) * per_two
+    levels_row(psi, ladder, weakest, A, clipped, scale, coordinate, order, own, worst, phase, reason)
 
 
 @kernel(parallel=True)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numba
 from llvmlite import ir
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from slviewer.geometry.jit_cache import folder_for
@@ -51,3 +52,43 @@ def _fused(_typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 fma: Any = intrinsic(_fused)
+
+
+def _signed(_typing: Any, level: Any) -> Any:
+    """A grey level as a number that holds sums and differences of eight such: int16 of uint8, int32 of uint16."""
+
+    def build(_context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.zext(arguments[0], ir.IntType(signature.return_type.bitwidth))
+
+    return numba.types.Integer.from_bitwidth(2 * level.bitwidth, True)(level), build
+
+
+def _plus(_typing: Any, a: Any, b: Any) -> Any:
+    """``a + b``, of integers as wide as both: Python's own grow to 64 bits, of which few fit a register."""
+    return a(a, a), lambda _context, builder, _signature, arguments: builder.add(*arguments)
+
+
+def _less(_typing: Any, a: Any, b: Any) -> Any:
+    """``a - b``, of integers as wide as both."""
+    return a(a, a), lambda _context, builder, _signature, arguments: builder.sub(*arguments)
+
+
+def _prefetch(_typing: Any, array: Any, index: Any) -> Any:
+    """Have the cache line of an array's element (one index, in one dimension) brought near; nothing waits for it."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        view = context.make_array(signature.args[0])(context, builder, arguments[0])
+        byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
+        at = builder.bitcast(builder.gep(view.data, [arguments[1]]), byte)
+        kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(function, [at, flag(0), flag(1), flag(1)])  # to read; into the outer caches; data
+        return context.get_dummy_value()
+
+    return numba.types.void(array, index), build
+
+
+signed: Any = intrinsic(_signed)
+plus: Any = intrinsic(_plus)
+less: Any = intrinsic(_less)
+prefetch: Any = intrinsic(_prefetch)

@@ -9,9 +9,12 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from slviewer.fringe.kernels import coded_row, five, period, shift_row
+from slviewer.calibration.splined.remainder import correct, located
+from slviewer.fringe.kernels import five, period, shift_row
+from slviewer.fringe.kernels_coded import coded_row
 from slviewer.fringe.kernels_levels import ladder_row, levels_room
 from slviewer.geometry.jit import fma, kernel
+from slviewer.geometry.rays import along_rays
 
 ROWS = 4
 """Image rows that one turn of a thread takes: room for intermediate results is asked for once."""
@@ -125,7 +128,7 @@ def _pixelwise(first, last, background, depths, scale, per_step, maps):
     squared, least_B = per_step * gain * gain, np.float32(1e-6)
     noise_a, noise_b = np.float32(scale.noise_a) * squared, np.float32(scale.noise_b) * squared
     width = maps.phase.shape[1]
-    z, slope = np.empty(width, np.float32), np.empty(width, np.float32)
+    z = np.empty(width, np.float32)
     for row in range(first, last):
         phase, A, B = maps.phase[row], background[row - first], maps.modulation[row]
         c0, c1, c2, ray_x, ray_y = c[0, row], c[1, row], c[2, row], c[3, row], c[4, row]
@@ -138,64 +141,38 @@ def _pixelwise(first, last, background, depths, scale, per_step, maps):
             per = contrast * both
             depth = fma(c1[x], s, c0[x]) * per
             z[x] = depth if (s >= least[x]) & (s <= largest[x]) & (depth > zero) else none
-            slope[x] = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
-        for x in range(width):
-            sigma[x] = slope[x] * np.sqrt(fma(noise_b, A[x], noise_a))
-        for x in range(width):
-            points[x, 0], points[x, 1], points[x, 2] = ray_x[x] * z[x], ray_y[x] * z[x], z[x]
+            slope = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
+            sigma[x] = slope * np.sqrt(fma(noise_b, A[x], noise_a))
+        along_rays(ray_x, ray_y, z, points)
 
 
 @kernel()
 def _splined(first, last, background, depths, scale, per_step, maps):
-    """The same by the compiled splined model: the rational function, then what the grid adds to it.
-
-    Loops without look-ups run in the processor's wide registers; unsigned indices are taken as they are, where signed
-    ones would be tested for counting from the end.
-    """
-    one, zero, none = np.float32(1), np.float32(0), np.float32(np.nan)
-    gain, centre, c, grid, step = np.float32(depths.gain), np.float32(depths.centre), depths.c, depths.grid, depths.step
+    """The same by the compiled splined model: the rational function, then what the grid adds to it."""
+    one, none = np.float32(1), np.float32(np.nan)
+    gain, centre, c, grid = np.float32(depths.gain), np.float32(depths.centre), depths.c, depths.grid
     # the phase's standard deviation is the square root of the noise's variance times 2/n, over the modulation
     squared, least_B = per_step * gain * gain, np.float32(1e-6)
     noise_a, noise_b = np.float32(scale.noise_a) * squared, np.float32(scale.noise_b) * squared
-    near, per_mm = np.float32(depths.near), np.float32(depths.per_mm)
-    width, layers, next_one = maps.phase.shape[1], np.uint32(grid.shape[2]), np.uint32(1)
-    deepest, per_px = np.float32(grid.shape[2] - 1.0001), np.float32(1.0 / step)
-    table, slope = np.empty(grid.shape[1] * grid.shape[2], np.float32), np.empty(width, np.float32)
+    near, per_mm, deepest = np.float32(depths.near), np.float32(depths.per_mm), np.float32(grid.shape[2] - 1.0001)
+    width = maps.phase.shape[1]
     z, cell, rest = np.empty(width, np.float32), np.empty(width, np.int32), np.empty(width, np.float32)
     for row in range(first, last):
         phase, A, B = maps.phase[row], background[row - first], maps.modulation[row]
         c0, c1, c2, ray_x, ray_y = c[0, row], c[1, row], c[2, row], c[3, row], c[4, row]
         points, sigma = maps.points[row], maps.sigma_z[row]
-        j = row // step
-        down = np.float32(row - j * step) * per_px
-        above, below = grid[j].ravel(), grid[j + 1].ravel()
-        for i in range(len(above)):
-            table[i] = fma(down, below[i] - above[i], above[i])  # the grid at this row
         for x in range(width):
             s = fma(gain, phase[x], -centre)
             below, contrast = fma(c2[x], s, one), max(B[x], least_B)
             both = np.divide(one, below * contrast)  # one division for two
             per = contrast * both
             rational = fma(c1[x], s, c0[x]) * per
-            depth = (rational - near) * per_mm
-            measured = (depth >= zero) & (depth <= deepest)
-            depth = depth if measured else zero
-            k = np.int32(depth)
-            z[x], cell[x], rest[x] = rational if measured else none, k, depth - np.float32(k)
-            slope[x] = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
-        for x in range(width):
-            sigma[x] = slope[x] * np.sqrt(fma(noise_b, A[x], noise_a))
-        for i in range(grid.shape[1] - 1):
-            start = i * step
-            for q in range(min(step, width - start)):
-                here = np.uint32(start + q)
-                at = np.uint32(i) * layers + np.uint32(cell[here])
-                right, deep = np.float32(q) * per_px, rest[here]
-                a = fma(deep, table[at + next_one] - table[at], table[at])
-                b = fma(deep, table[at + layers + next_one] - table[at + layers], table[at + layers])
-                z[here] += fma(right, b - a, a)
-        for x in range(width):
-            points[x, 0], points[x, 1], points[x, 2] = ray_x[x] * z[x], ray_y[x] * z[x], z[x]
+            inside, cell[x], rest[x] = located(rational, near, per_mm, deepest)
+            z[x] = rational if inside else none
+            slope = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
+            sigma[x] = slope * np.sqrt(fma(noise_b, A[x], noise_a))
+        correct(z, cell, rest, grid, depths.step, row)
+        along_rays(ray_x, ray_y, z, points)
 
 
 @kernel()

@@ -17,7 +17,7 @@ from slviewer.calibration.splined.compiled import CELLS_ACROSS, DEPTHS, Compiled
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import render
-from slviewer.fringe import kernels, kernels_levels
+from slviewer.fringe import kernels_coded, kernels_levels
 from slviewer.fringe.decode import code_rules, decode, grey_scale, ladder_of, shifts_of, steps_of
 from slviewer.fringe.layout import layout
 from slviewer.fringe.noise import measure_noise
@@ -78,13 +78,14 @@ def bench(*, calibration: bool = False, scale: float = 1.0, progress: Progress =
     size = f"{frames.shape[2]}x{frames.shape[1]}"
     rows = [row(f"render one frame, {size}", rendering, frames[0].nbytes / 1e6, target="15 ms")]
     progress(0.1, "decoding")
-    rows += _decoding(sequence, frames)
+    decoding, kernel = _decoding(sequence, frames)
+    rows += decoding
     progress(0.2, "measuring")
     rows += _measuring(sequence, frames)
     progress(0.3, "live")
     rows += _live(rig, renderer)
     progress(0.35, "peers")
-    peers, absent = _peers(rig, renderer, plan)
+    peers, absent = _peers(rig, renderer, plan, kernel)
     memory = None
     if calibration:
         rows += _calibration(scale, part(progress, 0.4, 1.0))
@@ -94,7 +95,8 @@ def bench(*, calibration: bool = False, scale: float = 1.0, progress: Progress =
     return Benchmark(rows + peers, memory, absent)
 
 
-def _decoding(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
+def _decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:
+    """Phase steps and Gray code; the kernel's seconds are told apart."""
     coded = frames[:-1]  # without the texture
     kernel, moved, least = _beside_floor(_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
     whole = median(lambda: decode(sequence, frames, "x"), 5)
@@ -104,7 +106,7 @@ def _decoding(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
         row(f"decode {len(coded)} frames, kernel", kernel, moved, least, note=alone),
         row(f"decode {len(coded)} frames", whole, definition=defined, note="with the noise, spikes and new arrays"),
         row(f"decode {len(coded)} frames, NumPy definition", defined),
-    ]
+    ], kernel
 
 
 def _kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
@@ -119,7 +121,7 @@ def _kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[],
     rules = code_rules(found, fringe_mean(found, frames))
     steps, gray = steps_of(found.shifts[0], found.sign), np.array(found.gray, np.int64)
     inverse, extra = np.array(found.inverse, np.int64), -1 if found.complementary is None else found.complementary
-    return lambda: kernels.decode_coded(frames, steps, gray, inverse, extra, scale, rules, *maps)
+    return lambda: kernels_coded.decode_coded(frames, steps, gray, inverse, extra, scale, rules, *maps)
 
 
 def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
@@ -186,7 +188,10 @@ def _live(rig: SimulatedRig, renderer: Renderer) -> list[Row]:
     ]
 
 
-def _peers(rig: SimulatedRig, renderer: Renderer, plan: dict[str, Any]) -> tuple[list[Row], tuple[str, ...]]:
+def _peers(
+    rig: SimulatedRig, renderer: Renderer, plan: dict[str, Any], coded: float
+) -> tuple[list[Row], tuple[str, ...]]:
+    """Other programs; ``coded`` seconds took our kernel for phase steps and Gray code."""
     rows: list[Row] = []
     absent = tuple(text for text in (missing("fringes"), missing("small-gicp")) if text)
     if not missing("fringes"):
@@ -198,7 +203,7 @@ def _peers(rig: SimulatedRig, renderer: Renderer, plan: dict[str, Any]) -> tuple
         rows.append(row(f"decode {count} frames of three periods, kernel", ours, moved, least, note=note))
         whole = median(lambda: decode(sequence, frames, "x"), 5)
         rows.append(row(f"decode {count} frames of three periods", whole, note="with the noise, spikes and new arrays"))
-        rows.append(fringes_row(count, size, ours))
+        rows += [fringes_row(25, size, coded), fringes_row(count, size, ours)]
     if not missing("small-gicp"):
         truth = Renderer(rig, plan["object_r2"]).truth()
         rows += icp_rows(truth.points[truth.mask])

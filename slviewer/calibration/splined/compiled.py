@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from os import cpu_count
 
 import numpy as np
-from numba import prange
 from scipy.ndimage import binary_erosion
 
 from slviewer.calibration.splined.fields import image_of, ray_of
+from slviewer.calibration.splined.remainder import evaluate
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
@@ -52,7 +52,7 @@ class Compiled:
         numbers = np.array(
             [px_per_rad, self.centre, self.near, (grid.shape[2] - 1) / (self.far - self.near)], np.float32
         )
-        _evaluate(np.ascontiguousarray(phase, np.float32), numbers, self.coefficients, rays, grid, self.step, out)
+        evaluate(np.ascontiguousarray(phase, np.float32), numbers, self.coefficients, rays, grid, self.step, out)
         return out
 
     def depth_per_px(self, phase: np.ndarray, px_per_rad: float) -> np.ndarray:
@@ -233,40 +233,3 @@ def _corrections(rig, row, centre, near, far, step, camera_lit, projector_lit, r
                 if settled and abs(correction) < MOST_CORRECTED * (last - first):
                     grid[j, i, k] = correction
                     known[j, i, k] = seen and _is_lit(projector_lit, pu, pv, rig.projector.size)
-
-
-@kernel(parallel=True)
-def _evaluate(phase, numbers, c, rays, grid, step, out):
-    """Three passes a row: those without look-ups run in the processor's wide registers. Unsigned indices are taken as
-    they are, where signed ones would be tested for counting from the end."""
-    px_per_rad, centre, near, per_mm = numbers[0], numbers[1], numbers[2], numbers[3]
-    one, none, zero = np.float32(1.0), np.float32(np.nan), np.float32(0.0)
-    width, depths, next_one = phase.shape[1], np.uint32(grid.shape[2]), np.uint32(1)
-    deepest, per_step = np.float32(grid.shape[2] - 1.0001), np.float32(1.0 / step)
-    for v in prange(phase.shape[0]):
-        j = v // step
-        down = np.float32(v - j * step) * per_step
-        above, below = grid[j].ravel(), grid[j + 1].ravel()
-        table = np.empty(above.size, np.float32)  # the grid at this row
-        for i in range(above.size):
-            table[i] = above[i] + down * (below[i] - above[i])
-        z, cell, rest = np.empty(width, np.float32), np.empty(width, np.int32), np.empty(width, np.float32)
-        for u in range(width):
-            s = phase[v, u] * px_per_rad - centre
-            rational = (c[0, v, u] + c[1, v, u] * s) / (one + c[2, v, u] * s)
-            depth = (rational - near) * per_mm
-            measured = (depth >= zero) & (depth <= deepest)
-            depth = depth if measured else zero
-            k = np.int32(depth)
-            z[u], cell[u], rest[u] = rational if measured else none, k, depth - np.float32(k)
-        for i in range(grid.shape[1] - 1):
-            first = i * step
-            for q in range(min(step, width - first)):
-                here = np.uint32(first + q)
-                at = np.uint32(i) * depths + np.uint32(cell[here])
-                right, deep = np.float32(q) * per_step, rest[here]
-                a = table[at] + deep * (table[at + next_one] - table[at])
-                b = table[at + depths] + deep * (table[at + depths + next_one] - table[at + depths])
-                z[here] += a + right * (b - a)
-        for u in range(width):
-            out[v, u, 0], out[v, u, 1], out[v, u, 2] = rays[0, v, u] * z[u], rays[1, v, u] * z[u], z[u]

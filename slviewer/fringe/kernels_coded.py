@@ -1,0 +1,197 @@
+"""The Gray code beside a phase shift, compiled; `reference` is what it must agree with."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from slviewer.fringe.kernels import (
+    PER_TURN,
+    TURN,
+    TURN_REST,
+    fetch,
+    five,
+    is_clipped,
+    is_dark,
+    shift_row,
+    verdict,
+)  # fmt: skip
+from slviewer.geometry.jit import fma, kernel
+
+
+class CodeRules(NamedTuple):
+    """How Gray bits are read; see `limits`, and `threshold` for ``mean``."""
+
+    origin_turns: float
+    edge: float
+    weak: float
+    weaker: float
+    mean: float
+    undecided: float
+
+
+@numba.njit(inline="always")
+def read_bit(value, level, digit, over_least, under_most, at_one, at_nought, full):
+    """The next binary digit, the parity of all Gray bits so far, and what `code_row` keeps of the samples so far: the
+    least over the level and the most under it, and the last at a 1 and at a 0."""
+    over = value > level
+    one = np.uint8(digit ^ np.uint8(over))
+    over_least = min(over_least, value if over else full)
+    under_most = max(under_most, under_most if over else value)
+    return one, over_least, under_most, value if one != 0 else at_one, at_nought if one != 0 else value
+
+
+@numba.njit(inline="always")
+def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, lower, upper):
+    """One row's binary code, and of its bits' heights above their threshold the least in size, the highest and the
+    lowest, and those of the bits that change at the ``lower`` and at the ``upper`` edge of the code.
+
+    From k - 1 to k the Gray bit changes at whose place k has its last binary 1; from k to k + 1 that of its last 0. A
+    code without such a bit has no such edge: infinite.
+    """
+    width = stack.shape[2]
+    none, nothing = np.float32(np.inf), np.float32(0)
+    for x in range(width):
+        code[x] = 0
+    if len(inverses):
+        digits = np.zeros(width, np.uint8)
+        for x in range(width):
+            top[x] = bottom[x] = nothing
+            least[x] = lower[x] = upper[x] = none
+        for b in range(len(frames)):
+            frame, inverse = stack[frames[b], row], stack[inverses[b], row]
+            for x in range(width):
+                height = (np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
+                one = np.uint8(digits[x] ^ np.uint8(height > 0))
+                at_lower, at_upper = lower[x], upper[x]
+                digits[x] = one
+                code[x] = np.int32(np.int32(code[x] + code[x]) | np.int32(one))
+                least[x] = min(least[x], abs(height))
+                top[x] = max(top[x], height)
+                bottom[x] = min(bottom[x], height)
+                lower[x] = height if one != 0 else at_lower
+                upper[x] = at_upper if one != 0 else height
+        return
+    # Against one threshold the frames' own numbers can be compared: four times as many fit a register.
+    grey = stack.dtype.type
+    full = grey(65535 if stack.itemsize == 2 else 255)
+    level, bits = np.empty(width, stack.dtype), np.empty(width, np.uint8)
+    over_least, under_most = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
+    most, fewest = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
+    at_one, at_nought = np.empty(width, stack.dtype), np.empty(width, stack.dtype)
+    for x in range(width):
+        level[x] = grey(np.int32(threshold[x]))
+        over_least[x] = fewest[x] = full
+        under_most[x] = most[x] = at_one[x] = at_nought[x] = grey(0)
+        bits[x] = 0
+    for start in range(0, len(frames), 8):
+        last = min(start + 8, len(frames))
+        if (last - start) % 2:
+            frame = stack[frames[start], row]
+            fetch(stack, frames[start], row)
+            for x in range(width):
+                value, digit = frame[x], np.uint8(bits[x] & 1)
+                one, over_least[x], under_most[x], at_one[x], at_nought[x] = read_bit(
+                    value, level[x], digit, over_least[x], under_most[x], at_one[x], at_nought[x], full
+                )
+                bits[x] = np.uint8(np.uint8(bits[x] + bits[x]) | one)
+                most[x], fewest[x] = max(most[x], value), min(fewest[x], value)
+        for b in range(start + (last - start) % 2, last, 2):  # two bits to a pass
+            frame, other = stack[frames[b], row], stack[frames[b + 1], row]
+            fetch(stack, frames[b], row)
+            fetch(stack, frames[b + 1], row)
+            for x in range(width):
+                value, after, digit = frame[x], other[x], np.uint8(bits[x] & 1)
+                one, least_x, most_x, one_x, nought_x = read_bit(
+                    value, level[x], digit, over_least[x], under_most[x], at_one[x], at_nought[x], full
+                )
+                two, over_least[x], under_most[x], at_one[x], at_nought[x] = read_bit(
+                    after, level[x], one, least_x, most_x, one_x, nought_x, full
+                )
+                so_far = np.uint8(np.uint8(bits[x] + bits[x]) | one)
+                bits[x] = np.uint8(np.uint8(so_far + so_far) | two)
+                most[x], fewest[x] = max(most[x], max(value, after)), min(fewest[x], min(value, after))
+        more, held = np.int32(1 << (last - start)), np.uint8((1 << (last - start)) - 1)
+        for x in range(width):
+            code[x] = np.int32(np.int32(code[x] * more) + np.int32(np.uint8(bits[x] & held)))
+    for x in range(width):
+        level_x, nearest_over, nearest_under = threshold[x], np.float32(over_least[x]), np.float32(under_most[x])
+        above = nearest_over - level_x if most[x] > level[x] else none
+        below = level_x - nearest_under if fewest[x] <= level[x] else none
+        least[x] = min(above, below)
+    for x in range(width):
+        level_x, highest, lowest = threshold[x], np.float32(most[x]), np.float32(fewest[x])
+        top[x], bottom[x] = max(nothing, highest - level_x), min(nothing, lowest - level_x)
+    ones = np.int32((1 << len(frames)) - 1)
+    for x in range(width):
+        level_x, one_x, nought_x = threshold[x], np.float32(at_one[x]), np.float32(at_nought[x])
+        lower[x] = one_x - level_x if code[x] != 0 else none
+        upper[x] = nought_x - level_x if code[x] != ones else none
+
+
+@numba.njit(inline="always")
+def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak, code, room, phase, reason):
+    """One row's absolute phase and reason from what ``shift_row`` left; ``code`` (w,) int32 and what `five`
+    gives are room."""
+    width = stack.shape[2]
+    least, top, bottom, lower, upper = room
+    code_row(stack, gray, inverse, row, A, code, least, top, bottom, lower, upper)
+    origin, undecided = np.float32(rules.origin_turns), np.float32(rules.undecided)
+    edge, far_edge = np.float32(rules.edge), np.float32(1 - rules.edge)
+    per_mean, per_rest = np.float32(1 / rules.mean), np.float32(1 / (1 - rules.mean))
+    off_middle, weak, weaker = np.float32(0.5 - rules.mean), np.float32(rules.weak / 2), np.float32(rules.weaker)
+    none, quarter = np.float32(np.nan), np.float32(0.25)
+    if complementary >= 0:
+        extra = stack[complementary, row]
+        for x in range(width):
+            turns = psi[x] * PER_TURN - origin
+            whole = np.floor(turns)
+            part = turns - whole
+            last = np.float32(extra[x]) - A[x]
+            cell = np.int32(np.int32(code[x] + code[x]) + np.int32(np.int32(code[x] & 1) ^ np.int32(last > 0)))
+            middle = (part >= quarter) & (part < np.float32(0.75))
+            beside = np.int32(np.int32(np.int32(cell + 1) >> 1) - np.int32(part >= np.float32(0.75)))
+            order = np.int32(cell >> 1) if middle else beside
+            unclear = (least[x] if middle else abs(last)) < undecided * B[x]
+            dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
+            reason[x] = verdict(dark, clipped, unclear)
+            periods = np.float32(order) - whole
+            absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
+            phase[x] = none if dark | clipped | unclear else absolute
+    else:
+        for x in range(width):
+            turns = psi[x] * PER_TURN - origin
+            whole = np.floor(turns)
+            part = turns - whole
+            unclear = (least[x] < undecided * B[x]) & (part >= edge) & (part < far_edge)
+            dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
+            reason[x] = verdict(dark, clipped, unclear)
+            # On a blurred edge the bit nearest the middle and the phase may disagree about the side: the phase decides.
+            contrast = max(top[x] * per_rest, np.float32(0) - bottom[x] * per_mean)
+            below, above = abs(lower[x] - off_middle * contrast), abs(upper[x] - off_middle * contrast)
+            ahead = (part < edge) & (above < weak * contrast) & (above < weaker * below)
+            behind = (part >= far_edge) & (below < weak * contrast) & (below < weaker * above)
+            periods = np.float32(code[x]) - whole
+            periods += np.float32(1) if ahead else np.float32(0)
+            periods -= np.float32(1) if behind else np.float32(0)
+            absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
+            phase[x] = none if dark | clipped | unclear else absolute
+
+
+@kernel(parallel=True)
+def decode_coded(
+    stack, shift, gray, inverse, complementary, scale, rules, phase, wrapped, modulation, background, reason
+):
+    """Phase shift with a plain (``complementary`` < 0) or complementary Gray code; fills the five (h, w) maps.
+
+    ``phase`` is NaN where ``reason`` is not VALID, here as in the other kernels.
+    """
+    _, height, width = stack.shape
+    for row in numba.prange(height):
+        peak, code = np.empty(width, stack.dtype), np.empty(width, np.int32)
+        room = five(width)
+        psi, B, A = wrapped[row], modulation[row], background[row]
+        shift_row(stack, shift, row, psi, B, A, peak)
+        coded_row(
+            stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak, code, room, phase[row], reason[row]
+        )
