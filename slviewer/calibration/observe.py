@@ -4,6 +4,7 @@ An observation is small whatever the image size, so any number of poses can be h
 """
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import cv2
@@ -177,13 +178,13 @@ def observe(
                 "light the whole board with the projector, and raise the exposure"
             )
     projector, slopes = _projector_pixels(detection, phases, bright, pitch)
-    surfaces: dict[Axis, Surface | Polynomial2D] = {}
     u0, v0, u1, v1 = box
     supported = inside.copy()
+    weighted = {}
     for axis, phase in phases.items():
-        weight = _weight(phase, bright[axis])
-        surfaces[axis] = smooth(phase.phase[v0:v1, u0:u1], weight[v0:v1, u0:u1], box, width, typical_pitch, smoothing)
+        weighted[axis] = phase.phase[v0:v1, u0:u1], _weight(phase, bright[axis])[v0:v1, u0:u1]
         supported &= _near(bright[axis], reach=typical_pitch)
+    surfaces = smooth_axes(weighted, box, width, typical_pitch, smoothing)
     return Observation(
         name=name,
         points=board.points[detection.ids],
@@ -232,6 +233,19 @@ def _weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
     """(h, w): one over the phase's variance, of the bright pixels, the largest 1."""
     weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
     return np.asarray(weight / max(float(weight.max()), 1e-30))
+
+
+def smooth_axes(
+    weighted: Mapping[Axis, tuple[np.ndarray, np.ndarray]],
+    box: tuple[int, int, int, int],
+    width: int,
+    pitch: float,
+    smoothing: Smoothing,
+) -> dict[Axis, Surface | Polynomial2D]:
+    """`smooth` of each axis' (phase, weight), side by side."""
+    with ThreadPoolExecutor(max(1, len(weighted))) as threads:
+        found = threads.map(lambda one: smooth(one[0], one[1], box, width, pitch, smoothing), weighted.values())
+        return dict(zip(weighted, found, strict=True))
 
 
 def smooth(

@@ -127,9 +127,10 @@ def calibrate_pixelwise(
     periods = {axis: used[0].periods_px[axis] for axis in axes}
     fits = {axis: _empty_fit(height, width) for axis in axes}
     band = max(1, min(height, BAND_BYTES // (8 * len(used) * width * (len(axes) + 1))))
+    room = np.empty((len(axes) + 1, len(used) * band * width))  # asked for once: new memory is slow at first
     for first in range(0, height, band):
         rows = slice(first, min(first + band, height))
-        phases, z, rays = _ideal_rows(used, stereo, planes, axes, periods, depth_axis, rows)
+        phases, z, rays = _ideal_rows(used, stereo, planes, axes, periods, depth_axis, rows, room)
         for axis in axes:
             reference = _reference_phase(stereo, axis, periods[axis], z_ref, rows)
             _fit_rows(phases[axis], z, reference, z_ref, rays, rows, fits[axis])
@@ -203,16 +204,19 @@ def _ideal_rows(
     periods: Mapping[Axis, float],
     depth_axis: Axis,
     rows: slice,
+    room: np.ndarray,
 ) -> tuple[dict[Axis, np.ndarray], np.ndarray, np.ndarray]:
     """What all poses say of some image rows: each axis' phase (n, h', w) rad in ``periods``, depth (n, h', w) mm, and
-    sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11).
+    sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11). Phases and depth lie in ``room``.
 
     Stereo's points are moved along the plane's normal onto it (step 4, eq. 13); NaN where a pose's board is not.
     """
     rig, width = stereo.rig, used[0].size[0]
     shape = len(used), rows.stop - rows.start, width
-    phases = {axis: np.full(shape, np.nan) for axis in axes}
-    z, sums = np.full(shape, np.nan), np.zeros((*shape[1:], 6))
+    *kept, z = (each[: np.prod(shape)].reshape(shape) for each in room)
+    phases, sums = dict(zip(axes, kept, strict=True)), np.zeros((*shape[1:], 6))
+    for each in (*kept, z):
+        each.fill(np.nan)
     extent = np.array(rig.projector.size, float)
     for i, o in enumerate(used):
         u0, v0, u1, v1 = o.box

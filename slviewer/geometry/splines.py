@@ -139,19 +139,23 @@ def _second_differences(columns: int, rows: int) -> np.ndarray:
 @kernel()
 def _accumulate(cells_u, basis_u, cells_v, basis_v, weights, values, columns, band, right):
     """Adds the samples' normal equations to ``band`` (lower banded) and ``right``."""
+    products = np.empty(16)
     for k in range(weights.shape[0]):
         if weights[k] == 0.0:
             continue
         for a in range(4):
             for b in range(4):
-                row = (cells_v[k] + a) * columns + cells_u[k] + b
-                w = weights[k] * basis_v[k, a] * basis_u[k, b]
+                products[4 * a + b] = basis_v[k, a] * basis_u[k, b]
+        corner = np.uint64(cells_v[k] * columns + cells_u[k])  # an index with a sign would be tested for its end
+        for a in range(4):
+            for b in range(4):
+                row = corner + np.uint64(a * columns + b)
+                w = weights[k] * products[4 * a + b]
                 right[row] += w * values[k]
                 for c in range(a + 1):
-                    first = (cells_v[k] + c) * columns + cells_u[k]
-                    wc = w * basis_v[k, c]
                     for d in range(4 if c < a else b + 1):
-                        band[row - first - d, first + d] += wc * basis_u[k, d]
+                        below = np.uint64((a - c) * columns + b - d)
+                        band[below, row - below] += w * products[4 * c + d]
 
 
 @kernel()

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.observe import Observation, Smoothing, smooth
+from slviewer.calibration.observe import Observation, Smoothing, smooth_axes
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.compiled import CELLS_ACROSS, DEPTHS, Compiled
 from slviewer.calibration.splined.model import SplinedModel
@@ -249,10 +249,8 @@ def _fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, f
         for o in observations:
             pitch = (o.box[2] - o.box[0]) / len(o.points) ** 0.5
             weight = o.region.astype(float)
-            surfaces = {
-                axis: smooth(measured[o.name, axis], weight, o.box, o.size[0], pitch, Smoothing())
-                for axis in o.surfaces
-            }
+            weighted = {axis: (measured[o.name, axis], weight) for axis in o.surfaces}
+            surfaces = smooth_axes(weighted, o.box, o.size[0], pitch, Smoothing())
             smoothed.append(replace(o, surfaces=surfaces))
         calibrate_pixelwise(smoothed, stereo)
 
