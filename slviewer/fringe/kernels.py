@@ -19,6 +19,8 @@ PER_TURN = np.float32(1 / (2 * np.pi))
 TURN = np.float32(6.28125)
 TURN_REST = np.float32(2 * np.pi - 6.28125)
 """2 pi in two parts: a whole number times the first is exact in float32."""
+ROWS = 4
+"""Image rows that one turn of a thread takes: room for intermediate results is asked for once."""
 LINE_BYTES = 64
 """Of the processor's cache."""
 HALF_PI, PI = np.float32(np.pi / 2), np.float32(np.pi)
@@ -71,7 +73,7 @@ class Scale(NamedTuple):
     white: float
 
 
-@numba.njit(inline="always")
+@numba.njit
 def arctan2(y, x):
     """float32 arctangent without branches, good to 3e-7 rad (Abramowitz and Stegun, 4.4.49); 0 where both are 0."""
     ax, ay = abs(x), abs(y)
@@ -91,7 +93,7 @@ def arctan2(y, x):
     return -r if y < 0 else r
 
 
-@numba.njit(inline="always")
+@numba.njit
 def fetch(stack, frame, row):
     """Have a frame's next row on its way while this one is worked on: the processor itself looks ahead in one or two
     frames, not in twenty."""
@@ -101,7 +103,7 @@ def fetch(stack, frame, row):
             prefetch(line, x)
 
 
-@numba.njit(inline="always")
+@numba.njit
 def four(a, b, c, d, cos_a, sin_a):
     """What the samples of a line of `Steps` add: to all samples, to the cosines and to the sines; and the largest."""
     ac, bd = less(signed(a), signed(c)), less(signed(b), signed(d))
@@ -110,7 +112,7 @@ def four(a, b, c, d, cos_a, sin_a):
     return np.float32(total), cosine, sine, max(max(a, b), max(c, d))
 
 
-@numba.njit(inline="always")
+@numba.njit
 def eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
     """The same of two lines."""
     ac, bd = less(signed(a), signed(c)), less(signed(b), signed(d))
@@ -178,13 +180,13 @@ def shift_row(stack, shift, row, wrapped, modulation, background, peak):
         background[x] = fma(total[x] - counted * level, per_one, level)
 
 
-@numba.njit(inline="always")
+@numba.njit
 def is_dark(modulation, background, scale):
     """Whether the modulation is too small for the noise at this brightness."""
     return is_dark_squared(modulation * modulation, background, scale)
 
 
-@numba.njit(inline="always")
+@numba.njit
 def is_dark_squared(squared, background, scale):
     """The same of the modulation's square."""
     sigmas = np.float32(scale.dark_sigmas)
@@ -193,13 +195,13 @@ def is_dark_squared(squared, background, scale):
     return squared < max(levels * levels, sigmas * sigmas * variance)
 
 
-@numba.njit(inline="always")
+@numba.njit
 def is_clipped(modulation, background, peak, scale):
     """Whether the fringe reaches the white level, in a sample and as fitted: noise alone does not do both."""
     return (np.float32(peak) >= np.float32(scale.white)) & (background + modulation >= np.float32(scale.white))
 
 
-@numba.njit(inline="always")
+@numba.njit
 def verdict(dark, clipped, inconsistent):
     """The first reason that applies: what is clipped in all its frames has no modulation, yet is not dark."""
     unclipped = DARK if dark else (INCONSISTENT if inconsistent else VALID)

@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.fringe.kernels import (
     PER_TURN,
+    ROWS,
     TURN,
     TURN_REST,
     fetch,
@@ -30,7 +31,7 @@ class CodeRules(NamedTuple):
     undecided: float
 
 
-@numba.njit(inline="always")
+@numba.njit
 def read_bit(value, level, digit, over_least, under_most, at_one, at_nought, full):
     """The next binary digit, the parity of all Gray bits so far, and what `code_row` keeps of the samples so far: the
     least over the level and the most under it, and the last at a 1 and at a 0."""
@@ -178,6 +179,24 @@ def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A,
             phase[x] = none if dark | clipped | unclear else absolute
 
 
+@kernel()
+def coded_rows(
+    stack, shift, gray, inverse, complementary, scale, rules, first, phase, wrapped, modulation, background, reason
+):
+    """`decode_coded` of some rows from ``first`` on: the five maps hold only those.
+
+    A function of its own, which decoding and the pass to points share: it takes the compiler ten seconds.
+    """
+    width = stack.shape[2]
+    peak, code, room = np.empty(width, stack.dtype), np.empty(width, np.int32), five(width)
+    for i in range(len(phase)):
+        row, psi, B, A = first + i, wrapped[i], modulation[i], background[i]
+        shift_row(stack, shift, row, psi, B, A, peak)
+        coded_row(
+            stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak, code, room, phase[i], reason[i]
+        )
+
+
 @kernel(parallel=True)
 def decode_coded(
     stack, shift, gray, inverse, complementary, scale, rules, phase, wrapped, modulation, background, reason
@@ -186,12 +205,10 @@ def decode_coded(
 
     ``phase`` is NaN where ``reason`` is not VALID, here as in the other kernels.
     """
-    _, height, width = stack.shape
-    for row in numba.prange(height):
-        peak, code = np.empty(width, stack.dtype), np.empty(width, np.int32)
-        room = five(width)
-        psi, B, A = wrapped[row], modulation[row], background[row]
-        shift_row(stack, shift, row, psi, B, A, peak)
-        coded_row(
-            stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak, code, room, phase[row], reason[row]
-        )
+    height = stack.shape[1]
+    for block in numba.prange((height + ROWS - 1) // ROWS):
+        a, b = block * ROWS, min((block + 1) * ROWS, height)
+        coded_rows(
+            stack, shift, gray, inverse, complementary, scale, rules, a,
+            phase[a:b], wrapped[a:b], modulation[a:b], background[a:b], reason[a:b],
+        )  # fmt: skip

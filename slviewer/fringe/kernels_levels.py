@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from slviewer.fringe.kernels import TURN, TURN_REST, arctan2, five, is_dark_squared, period, sums_row, verdict
+from slviewer.fringe.kernels import ROWS, TURN, TURN_REST, arctan2, five, is_dark_squared, period, sums_row, verdict
 from slviewer.geometry.jit import fma, kernel
 
 PER_RAD = 1 / (2 * np.pi)
@@ -78,8 +78,9 @@ def levels_room(width):
 
 
 @numba.njit(inline="always")
-def ladder_row(stack, shifts, ladder, scale, row, psi, B, A, peak, room, phase, reason):
-    """One row's absolute phase, reason, modulation B and background A of the finest period, and all wrapped phases.
+def ladder_row(stack, shifts, ladder, scale, row, psi, out, B, A, peak, room, phase, reason):
+    """One row's absolute phase, reason, wrapped phase ``out``, modulation B and background A of the finest period, and
+    all wrapped phases ``psi`` (m, w).
 
     The other periods' modulations are compared as squares, which spares their roots.
     """
@@ -101,21 +102,31 @@ def ladder_row(stack, shifts, ladder, scale, row, psi, B, A, peak, room, phase, 
             A[x] = middle
             weakest[x] = min(weakest[x], squared)
             clipped[x] |= (np.float32(peak[x]) >= white) & (squared >= rest * rest)
-    for x in range(width):
-        B[x] = np.sqrt(fma(cosine[x], cosine[x], sine[x] * sine[x])) * per_two
     levels_row(psi, ladder, weakest, A, clipped, scale, coordinate, order, own, worst, phase, reason)
+    finest = psi[len(psi) - 1]
+    for x in range(width):
+        out[x] = finest[x]
+        B[x] = np.sqrt(fma(cosine[x], cosine[x], sine[x] * sine[x])) * per_two
+
+
+@kernel()
+def levels_rows(stack, shifts, ladder, scale, first, phase, wrapped, modulation, background, reason):
+    """`decode_levels` of some rows from ``first`` on: the five maps hold only those."""
+    count, width = len(shifts.steps), stack.shape[2]
+    psi, peak, room = np.empty((count, width), np.float32), np.empty(width, stack.dtype), levels_room(width)
+    for i in range(len(phase)):
+        ladder_row(
+            stack, shifts, ladder, scale, first + i, psi, wrapped[i], modulation[i], background[i], peak, room,
+            phase[i], reason[i],
+        )  # fmt: skip
 
 
 @kernel(parallel=True)
 def decode_levels(stack, shifts, ladder, scale, phase, wrapped, modulation, background, reason):
     """Several periods, each by its own phase steps; fills the five (h, w) maps, of the finest period."""
-    _, height, width = stack.shape
-    count = len(shifts.steps)
-    for row in numba.prange(height):
-        psi, peak = np.empty((count, width), np.float32), np.empty(width, stack.dtype)
-        ladder_row(
-            stack, shifts, ladder, scale, row, psi, modulation[row], background[row], peak, levels_room(width),
-            phase[row], reason[row],
-        )  # fmt: skip
-        for x in range(width):
-            wrapped[row, x] = psi[count - 1, x]
+    height = stack.shape[1]
+    for block in numba.prange((height + ROWS - 1) // ROWS):
+        a, b = block * ROWS, min((block + 1) * ROWS, height)
+        levels_rows(
+            stack, shifts, ladder, scale, a, phase[a:b], wrapped[a:b], modulation[a:b], background[a:b], reason[a:b]
+        )

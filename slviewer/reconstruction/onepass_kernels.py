@@ -10,14 +10,11 @@ import numba
 import numpy as np
 
 from slviewer.calibration.splined.remainder import correct, located
-from slviewer.fringe.kernels import five, period, shift_row
-from slviewer.fringe.kernels_coded import coded_row
-from slviewer.fringe.kernels_levels import ladder_row, levels_room
+from slviewer.fringe.kernels import ROWS, period
+from slviewer.fringe.kernels_coded import coded_rows
+from slviewer.fringe.kernels_levels import levels_rows
 from slviewer.geometry.jit import fma, kernel
 from slviewer.geometry.rays import along_rays
-
-ROWS = 4
-"""Image rows that one turn of a thread takes: room for intermediate results is asked for once."""
 
 
 class Order(NamedTuple):
@@ -76,11 +73,16 @@ def sweep(stack, order, shifts, ladder, rules, scale, depths, maps, peaks):
     per_step = np.float32(2.0 / shifts.steps[-1])
     for block in numba.prange((height + ROWS - 1) // ROWS):
         first, last = block * ROWS, min((block + 1) * ROWS, height)
-        A = np.empty((ROWS, width), np.float32)
+        A, psi = np.empty((last - first, width), np.float32), np.empty((last - first, width), np.float32)
+        phase, B, reason = maps.phase[first:last], maps.modulation[first:last], maps.reason[first:last]
         if len(order.gray):
-            _coded(stack, order, shifts, rules, scale, first, last, A, maps)
+            steps = period(shifts, 0)
+            coded_rows(
+                stack, steps, order.gray, order.inverse, order.complementary, scale, rules, first,
+                phase, psi, B, A, reason,
+            )  # fmt: skip
         else:
-            _levels(stack, shifts, ladder, scale, first, last, A, maps)
+            levels_rows(stack, shifts, ladder, scale, first, phase, psi, B, A, reason)
         if depths.grid.size:
             _splined(first, last, A, depths, scale, per_step, maps)
         else:
@@ -88,35 +90,6 @@ def sweep(stack, order, shifts, ladder, rules, scale, depths, maps, peaks):
         _texture(stack, order, first, last, A, maps)
         if len(peaks):
             peaks[block] = _brightest(stack, order, first, last)
-
-
-@kernel()
-def _coded(stack, order, shifts, rules, scale, first, last, background, maps):
-    width = stack.shape[2]
-    psi, peak, code, room = (
-        np.empty(width, np.float32),
-        np.empty(width, stack.dtype),
-        np.empty(width, np.int32),
-        five(width),
-    )
-    for row in range(first, last):
-        A, B = background[row - first], maps.modulation[row]
-        shift_row(stack, period(shifts, 0), row, psi, B, A, peak)
-        coded_row(
-            stack, order.gray, order.inverse, order.complementary, row, scale, rules, psi, B, A, peak,
-            code, room, maps.phase[row], maps.reason[row],
-        )  # fmt: skip
-
-
-@kernel()
-def _levels(stack, shifts, ladder, scale, first, last, background, maps):
-    psi, peak = np.empty((len(shifts.steps), stack.shape[2]), np.float32), np.empty(stack.shape[2], stack.dtype)
-    room = levels_room(stack.shape[2])
-    for row in range(first, last):
-        ladder_row(
-            stack, shifts, ladder, scale, row, psi, maps.modulation[row], background[row - first], peak, room,
-            maps.phase[row], maps.reason[row],
-        )  # fmt: skip
 
 
 @kernel()
