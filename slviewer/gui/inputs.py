@@ -1,11 +1,16 @@
 """Inputs whose options come and go with the session, and handles that are touched only where something changed."""
 
+import math
+import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import viser
 
 NOTHING = "–"
+TYPING_S = 1.0
+"""Without a keystroke, and an input is taken for entered."""
 
 
 def change(handle: Any, **values: Any) -> None:
@@ -18,17 +23,38 @@ def change(handle: Any, **values: Any) -> None:
 class Follows:
     """Sets a handle's value when the session's changes, and only then: what somebody has just entered and is still on
     its way must not be overwritten by a snapshot that is a moment older.
+
+    While somebody types, the first digits are a value too, and the session's answer to them waits until the typing has
+    stopped.
     """
 
     def __init__(self, handle: Any) -> None:
         self._handle = handle
         self._told: Any = None
+        self._entered = -math.inf
+        self._waiting: threading.Timer | None = None
+        handle.on_update(self._note)
 
     def tell(self, value: Any) -> None:
         """The session says so now."""
         if value != self._told:
             self._told = value
-            change(self._handle, value=value)
+            if self._waiting is None:
+                self._settle()
+
+    async def _note(self, event: Any) -> None:
+        if event.client_id is not None:
+            self._entered = time.monotonic()
+
+    def _settle(self) -> None:
+        self._waiting = None
+        left = self._entered + TYPING_S - time.monotonic()
+        if left <= 0:
+            change(self._handle, value=self._told)
+        else:
+            self._waiting = threading.Timer(left, self._settle)
+            self._waiting.daemon = True
+            self._waiting.start()
 
 
 def titled(name: str, label: str) -> str:

@@ -84,10 +84,10 @@ class Stand:
             self._stage.operator.place(self._thing.value)
 
     def _typed(self, number: Any, what: str) -> Callable[[Any], None]:
-        """Bring it to where somebody typed; not where a number was drawn."""
+        """Bring it to where somebody typed; not where a number was drawn, nor where its first digits would be."""
 
         def changed(event: Any) -> None:
-            if event.client_id is not None:
+            if event.client_id is not None and number.min <= number.value <= number.max:
                 value = number.value  # now: until this has its turn, a snapshot from before may be drawn over it
                 self._stage.safely(lambda: self._stage.operator.bring(**{what: value}))(event)
 
