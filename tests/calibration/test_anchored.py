@@ -1,6 +1,7 @@
 """Stereo corrected pixel by pixel, against a rig whose lenses bend as no pinhole with Brown's distortion does."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,7 +38,9 @@ def bent(o: Observation) -> Observation:
     return replace(o, projector=projector, surfaces=dict(o.surfaces) | {"x": surface})
 
 
-OBSERVATIONS = [bent(observation(TRUE, T, f"pose_{k:02d}", 0.005)) for k, T in enumerate(board_poses(20))]
+@cache  # at its first use, not wherever tests are collected
+def observations() -> list[Observation]:
+    return [bent(observation(TRUE, T, f"pose_{k:02d}", 0.005)) for k, T in enumerate(board_poses(20))]
 
 
 def phase_of_plane(z: float) -> PhaseMap:
@@ -59,16 +62,16 @@ def flatness(points: np.ndarray, seen: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def stereo() -> StereoModel:
-    return calibrate_stereo(OBSERVATIONS, PROJECTOR, str(BOARD))
+    return calibrate_stereo(observations(), PROJECTOR, str(BOARD))
 
 
 @pytest.fixture(scope="module")
 def model(stereo: StereoModel) -> AnchoredModel:
-    return calibrate_anchored(OBSERVATIONS, stereo)
+    return calibrate_anchored(observations(), stereo)
 
 
 def test_planes_are_flatter_than_stereo_and_pixelwise_make_them(stereo: StereoModel, model: AnchoredModel) -> None:
-    pixelwise = calibrate_pixelwise(OBSERVATIONS, stereo)
+    pixelwise = calibrate_pixelwise(observations(), stereo)
     seen = model.corrections["x"].poses >= 8
     for z, share in ((560.0, 0.2), (640.0, 0.2), (470.0, 0.75), (740.0, 0.75)):
         phase = phase_of_plane(z)
@@ -84,7 +87,7 @@ def test_boards_misplaced_by_the_calibration_are_laid_again(stereo: StereoModel)
     poses = {name: T.copy() for name, T in stereo.poses.items()}
     for T in poses.values():
         T[2, 3] += rng.normal(0, 0.1)
-    model = calibrate_anchored(OBSERVATIONS, stereo, poses)
+    model = calibrate_anchored(observations(), stereo, poses)
     assert model.corrections["x"].noise_px < 0.01  # 0.1 mm are 0.05 px
     assert flatness(model.points(phase_of_plane(600.0)), model.corrections["x"].poses >= 8) < 0.03
 
@@ -140,7 +143,7 @@ def test_the_prior_is_what_the_pixels_were_drawn_from() -> None:
 
 def test_too_few_poses_are_rejected(stereo: StereoModel) -> None:
     with pytest.raises(CalibrationRejected, match="at least 4"):
-        calibrate_anchored(OBSERVATIONS[:3], stereo)
+        calibrate_anchored(observations()[:3], stereo)
     with pytest.raises(CalibrationRejected, match="made elsewhere"):
-        calibrate_anchored(OBSERVATIONS, StereoModel.made_elsewhere(TRUE), stereo.poses)
+        calibrate_anchored(observations(), StereoModel.made_elsewhere(TRUE), stereo.poses)
     assert stereo.rig.camera.size == SIZE

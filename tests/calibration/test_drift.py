@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,11 +13,16 @@ from slviewer.calibration.drift.floor import LEAST_POSES, Reference, refer
 from slviewer.calibration.drift.view import View
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
+from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
 RIG = letter(0.5, seed=3)
-LATER = poses(RIG, 20, seed=77)
-FEW = 6  # of them where a movement is looked for: it is seen in every one
+FEW = 6  # later poses where a movement is looked for: it is seen in every one
+
+
+@cache  # at its first use, not wherever tests are collected
+def later() -> list[Pose]:
+    return poses(RIG, 20, seed=77)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +36,7 @@ def reference():
 
 
 def checked(reference, rig, i, name="later", **how) -> Drift:
-    return check_drift(reference, View.of(seen(rig, LATER[i], f"{name}_{i}", **how)))
+    return check_drift(reference, View.of(seen(rig, later()[i], f"{name}_{i}", **how)))
 
 
 def test_an_unmoved_rig_raises_no_alarm(reference):
@@ -92,6 +98,6 @@ def test_an_answer_survives_json(reference):
 
 
 def test_too_few_poses_set_no_floor(reference):
-    views = [View.of(seen(RIG, pose, "few")) for pose in LATER[: LEAST_POSES - 1]]
+    views = [View.of(seen(RIG, pose, "few")) for pose in later()[: LEAST_POSES - 1]]
     with pytest.raises(InputError, match=f"{LEAST_POSES} are needed"):
         refer(reference.rig, views)

@@ -21,7 +21,7 @@ expect.set_options(timeout=40_000)  # a browser that draws in software beside th
 def calm() -> Iterator[None]:
     """Fewer previews, and fewer places tried before one is suggested: a browser draws beside them, in software."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(acquisition, "PREVIEWS_PER_S", 4.0)
+        patch.setattr(acquisition, "PREVIEWS_PER_S", 2.0)
         patch.setattr(choosing, "TRIALS", 20)
         yield
 

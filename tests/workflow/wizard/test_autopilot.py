@@ -15,7 +15,7 @@ from slviewer.errors import Cancelled
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.workflow.measuring import quantities_of
-from slviewer.workflow.wizard import looking, work
+from slviewer.workflow.wizard import acquisition, looking, work
 from slviewer.workflow.wizard.autopilot import TARGET, Autopilot
 from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.operator import Operator
@@ -34,6 +34,7 @@ def operator(tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Itera
     folder = tmp_path_factory.mktemp("flight") / "session"
     with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG) as operator:
         patch.setattr(choosing, "TRIALS", 20)  # the best of fewer poses does
+        patch.setattr(acquisition, "PREVIEWS_PER_S", 2.0)  # nobody looks
         Autopilot(operator, poses=8, before=acts.append).run()
         yield operator
 
