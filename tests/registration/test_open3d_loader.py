@@ -33,6 +33,7 @@ def test_a_break_while_open3d_is_imported_waits_for_its_end() -> None:
     done = run(
         "import os, signal, threading, time\n"
         "from slviewer.registration.open3d_loader import open3d\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background jobs ignore it
         "threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
         "try:\n    open3d(); time.sleep(60)\nexcept KeyboardInterrupt:\n    raise SystemExit(130)"
     )
