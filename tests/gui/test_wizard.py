@@ -127,14 +127,13 @@ def verify(page: Page, operator: Operator) -> None:
 
 
 def bring(page: Page, operator: Operator, depth: float) -> None:
-    """Type a distance, digit by digit, and wait until what stands before the rig is there."""
-    at = field(page, "At, mm")
-    at.fill("")
-    at.press_sequentially(f"{depth:g}", delay=150)
-    assert operator.wait_for(
-        lambda s: s.world is not None and abs(s.world.T_camera_thing[2, 3] - depth) < 0.5, PATIENCE_S
-    )
-    expect(at).to_have_value(f"{depth:g}")
+    """Type a distance until what stands before the rig is there: a busy page may draw an older number over it."""
+    for _ in range(4):
+        for typed in (depth + 1, depth):
+            field(page, "At, mm").fill(str(typed))
+        if operator.wait_for(lambda s: s.world is not None and abs(s.world.T_camera_thing[2, 3] - depth) < 0.5, 15.0):
+            return
+    raise AssertionError(f"nothing came to {depth} mm")
 
 
 def scan(page: Page, operator: Operator) -> None:
