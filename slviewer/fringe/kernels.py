@@ -104,25 +104,28 @@ def fetch(stack, frame, row):
 
 
 @numba.njit
-def four(a, b, c, d, cos_a, sin_a):
-    """What the samples of a line of `Steps` add: to all samples, to the cosines and to the sines; and the largest."""
+def combined(a, b, c, d):
+    """Of the samples (p, q, r, s) of a line of `Steps`: their sum, p - r - q + s, p - r + q - s, and the largest."""
     ac, bd = less(signed(a), signed(c)), less(signed(b), signed(d))
     total = plus(plus(signed(a), signed(b)), plus(signed(c), signed(d)))
-    cosine, sine = cos_a * np.float32(less(ac, bd)), sin_a * np.float32(plus(ac, bd))
-    return np.float32(total), cosine, sine, max(max(a, b), max(c, d))
+    return total, less(ac, bd), plus(ac, bd), max(max(a, b), max(c, d))
+
+
+@numba.njit
+def four(a, b, c, d, cos_a, sin_a):
+    """What the samples of a line add: to all samples, to the cosines and to the sines; and the largest."""
+    total, even, odd, peak = combined(a, b, c, d)
+    return np.float32(total), cos_a * np.float32(even), sin_a * np.float32(odd), peak
 
 
 @numba.njit
 def eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
     """The same of two lines."""
-    ac, bd = less(signed(a), signed(c)), less(signed(b), signed(d))
-    eg, fh = less(signed(e), signed(g)), less(signed(f), signed(h))
-    one = plus(plus(signed(a), signed(b)), plus(signed(c), signed(d)))
-    two = plus(plus(signed(e), signed(f)), plus(signed(g), signed(h)))
-    cosine = fma(cos_a, np.float32(less(ac, bd)), cos_e * np.float32(less(eg, fh)))
-    sine = fma(sin_a, np.float32(plus(ac, bd)), sin_e * np.float32(plus(eg, fh)))
-    peak = max(max(max(a, b), max(c, d)), max(max(e, f), max(g, h)))
-    return np.float32(plus(one, two)), cosine, sine, peak
+    one, even, odd, peak = combined(a, b, c, d)
+    two, even_e, odd_e, peak_e = combined(e, f, g, h)
+    cosine = fma(cos_a, np.float32(even), cos_e * np.float32(even_e))
+    sine = fma(sin_a, np.float32(odd), sin_e * np.float32(odd_e))
+    return np.float32(plus(one, two)), cosine, sine, max(peak, peak_e)
 
 
 @numba.njit(inline="always")

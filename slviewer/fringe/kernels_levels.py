@@ -73,7 +73,7 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, coordinate, order, own, 
 def levels_room(width):
     """Room for a row: whether clipped, and eight of float32."""
     a, b, c, d, e = five(width)
-    f, g, h, _, _ = five(width)
+    f, g, h = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return np.empty(width, np.bool_), a, b, c, d, e, f, g, h
 
 

@@ -133,9 +133,8 @@ class OnePass:
             _maps(scan),
             peaks,
         )
-        if (
-            deep and clip_level(frames.dtype, int(peaks.max())) > scan.light.white
-        ):  # a camera of more bits than it seemed
+        # a camera may turn out to have more bits than it seemed
+        if deep and clip_level(frames.dtype, int(peaks.max())) > scan.light.white:
             return self.sweep(frames, self.light(frames), scan)
         return scan
 
