@@ -18,6 +18,7 @@ def _import_p18(
     prefix: str | None = None,
     projector: str = "912x1140",
     force: bool = False,
+    strict: bool = False,
 ) -> None:
     """Import folders of the p18 layout: pose_XX/{V,H}/P18_FNN.PNG, 18 phase steps and 7 Gray bits an axis.
 
@@ -28,9 +29,12 @@ def _import_p18(
         prefix: Put before each capture's name: planes gives planes_pose_03.
         projector: Width x height of the projector, px.
         force: Replace captures of the same name (the old ones go to the session's trash).
+        strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
     """
     _say_imported(
-        workflow.import_p18(source, session, role=role, prefix=prefix, projector=projector, force=force, **ui())
+        workflow.import_p18(
+            source, session, role=role, prefix=prefix, projector=projector, force=force, strict=strict, **ui()
+        )
     )
 
 
@@ -42,6 +46,7 @@ def _import_procam_calibration(
     prefix: str | None = None,
     projector: str = "1024x768",
     force: bool = False,
+    strict: bool = False,
 ) -> None:
     """Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code with inverses, white, black.
 
@@ -52,10 +57,11 @@ def _import_procam_calibration(
         prefix: Put before each capture's name.
         projector: Width x height of the projector, px.
         force: Replace captures of the same name (the old ones go to the session's trash).
+        strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
     """
     _say_imported(
         workflow.import_procam_calibration(
-            source, session, role=role, prefix=prefix, projector=projector, force=force, **ui()
+            source, session, role=role, prefix=prefix, projector=projector, force=force, strict=strict, **ui()
         )
     )
 
@@ -69,6 +75,7 @@ def _import_frames(
     prefix: str | None = None,
     projector: str | None = None,
     force: bool = False,
+    strict: bool = False,
 ) -> None:
     """Import any folder of images with a TOML that names each frame.
 
@@ -80,10 +87,11 @@ def _import_frames(
         prefix: Put before each capture's name.
         projector: Width x height of the projector, px, where the TOML does not say it.
         force: Replace captures of the same name (the old ones go to the session's trash).
+        strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
     """
     _say_imported(
         workflow.import_frames(
-            source, session, sequence, role=role, prefix=prefix, projector=projector, force=force, **ui()
+            source, session, sequence, role=role, prefix=prefix, projector=projector, force=force, strict=strict, **ui()
         )
     )
 

@@ -1,4 +1,8 @@
-"""Bringing captures and calibrations that other tools made into a session: all of them, or none."""
+"""Bringing captures and calibrations that other tools made into a session.
+
+Of a folder of captures, those that can be read and decoded are saved in one step, and a warning names each other with
+its reason; with `strict`, one fault refuses the folder.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -11,7 +15,7 @@ from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import parse_size
 from slviewer.session.importers import frames as frames_layout
 from slviewer.session.importers import opencv_calibration, p18, procam_calibration
-from slviewer.session.importers.imported import ImportedCapture, Imports
+from slviewer.session.importers.imported import ImportedCapture, Imports, Skipped, none_usable
 from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import available, load_stereo, save_imported_stereo
@@ -30,16 +34,18 @@ def import_p18(
     prefix: str | None = None,
     projector: Size = "912x1140",
     force: bool = False,
+    strict: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> list[str]:
     """Import ``pose_XX/{V,H}/P18_FNN.PNG`` folders; returns the captures' names.
 
     ``source`` is one pose folder or a folder of them; captures are named after their folders, behind ``prefix_``.
-    Either all are saved or, with an InputError that says why, none.
+    Captures that cannot be read or decoded are skipped, and ``warn`` hears why. Raises InputError where none is left,
+    or, with ``strict``, for the first of them; nothing is saved then.
     """
     found = p18.read(Path(source), prefix=prefix, projector=parse_size(projector))
-    return _save(found, session, role, force, progress, warn)
+    return _save(found, session, role, force, strict, progress, warn)
 
 
 def import_procam_calibration(
@@ -50,12 +56,13 @@ def import_procam_calibration(
     prefix: str | None = None,
     projector: Size = "1024x768",
     force: bool = False,
+    strict: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> list[str]:
     """Import ``capture_N/graycode_NN.*`` folders (Gray code with inverses, white, black); as ``import_p18``."""
     found = procam_calibration.read(Path(source), prefix=prefix, projector=parse_size(projector))
-    return _save(found, session, role, force, progress, warn)
+    return _save(found, session, role, force, strict, progress, warn)
 
 
 def import_frames(
@@ -67,6 +74,7 @@ def import_frames(
     prefix: str | None = None,
     projector: Size | None = None,
     force: bool = False,
+    strict: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> list[str]:
@@ -76,7 +84,7 @@ def import_frames(
     """
     size = None if projector is None else parse_size(projector)
     found = frames_layout.read(Path(source), Path(sequence), prefix=prefix, projector=size)
-    return _save(found, session, role, force, progress, warn)
+    return _save(found, session, role, force, strict, progress, warn)
 
 
 def import_opencv_calibration(
@@ -116,17 +124,34 @@ def import_opencv_calibration(
         return load_stereo(store) if known else None
 
 
-def _save(found: Imports, session: Path | str, role: Role, force: bool, progress: Progress, warn: Warn) -> list[str]:
+def _save(
+    found: Imports, session: Path | str, role: Role, force: bool, strict: bool, progress: Progress, warn: Warn
+) -> list[str]:
+    """Save what can be read and decoded, and warn of the rest; with `strict`, raise InputError for the first fault."""
     for message in found.warnings:
         warn(message)
+    skipped = list(found.skipped)
+    if strict and skipped:
+        raise InputError(str(skipped[0]))
 
     def read() -> Iterator[ImportedCapture]:
         for i, recording in enumerate(found.recordings):
             progress(i / len(found), f"reading {recording.name}")
-            yield checked(recording.read(), warn)
+            try:
+                capture = checked(recording.read(), warn)
+            except InputError as error:
+                if strict:
+                    raise
+                skipped.append(Skipped(recording.name, str(error)))
+            else:
+                yield capture
+        if len(skipped) == len(found.skipped) + len(found.recordings):
+            raise none_usable(skipped)
 
     with opened_or_made(session) as store:
         saved = store.save_captures(read(), role, force=force)
+        for each in skipped:
+            warn(f"not imported: {each}")
         for capture in saved:
             progress(1.0, f"looking at {capture.name}")
             for sentence in keep_residuals(store, capture.name):

@@ -87,8 +87,12 @@ def test_p18_says_what_is_missing_before_it_reads(tmp_path):
     write_p18(tmp_path / "pose_01")
     write_p18(tmp_path / "pose_03", numbers=[*range(7), *range(9, 26)])
     (tmp_path / "pose_01/V/P18_F00.PNG").write_bytes(b"no image: not looked at yet")
-    with pytest.raises(InputError, match="pose_03/V lacks P18_F07, 08"):
-        p18.read(tmp_path)
+    found = p18.read(tmp_path)
+    assert [recording.name for recording in found.recordings] == ["pose_01"]
+    (skipped,) = found.skipped
+    assert skipped.name == "pose_03" and "V lacks P18_F07, 08" in skipped.reason
+    with pytest.raises(InputError, match="pose_03: folder V lacks P18_F07, 08"):
+        p18.read(tmp_path / "pose_03")
 
 
 def test_p18_refuses_extra_and_double_frames_and_warns_of_strangers(tmp_path):
@@ -98,7 +102,7 @@ def test_p18_refuses_extra_and_double_frames_and_warns_of_strangers(tmp_path):
     found = p18.read(tmp_path)
     assert "notes" in found.warnings[0] and "pose_1/V: Thumbs.db" in found.warnings[1] and len(found.warnings) == 2
     write(tmp_path / "pose_1/H/P18_F31.PNG", image(0))
-    with pytest.raises(InputError, match=r"pose_1/H holds P18_F31.PNG, beyond"):
+    with pytest.raises(InputError, match=r"pose_1: folder H holds P18_F31.PNG, beyond"):
         p18.read(tmp_path)
     (tmp_path / "pose_1/H/P18_F31.PNG").unlink()
     write(tmp_path / "pose_1/H/P18_F03.bmp", image(0))
@@ -113,12 +117,21 @@ def test_p18_folders_without_poses(tmp_path):
         p18.read(tmp_path / "absent")
     write_p18(tmp_path / "pose_1")
     (tmp_path / "pose_2" / "V").mkdir(parents=True)
-    with pytest.raises(InputError, match="pose_2 holds no frames"):
-        p18.read(tmp_path)
-    (tmp_path / "pose_2").rename(tmp_path / "my pose")
     write_p18(tmp_path / "my pose")
-    with pytest.raises(InputError, match="'my pose' cannot be a name"):
-        p18.read(tmp_path)
+    found = p18.read(tmp_path)
+    assert [recording.name for recording in found.recordings] == ["pose_1"]
+    assert [each.name for each in found.skipped] == ["pose_2", "my pose"]
+    assert "holds no frames" in found.skipped[0].reason and "'my pose' cannot be a name" in found.skipped[1].reason
+
+
+def test_an_error_states_each_reason_once(tmp_path):
+    for n in range(5):
+        write_procam(tmp_path / f"capture_{n}", count=40 if n < 3 else 39)
+    with pytest.raises(InputError) as refused:
+        procam_calibration.read(tmp_path)
+    message = str(refused.value)
+    assert "none of the 5 captures" in message and message.count("holds 40 images") == 1
+    assert message.count("holds 39 images") == 1 and "capture_0, capture_1, capture_2" in message
 
 
 def test_p18_seven_bits_cannot_number_every_projector(tmp_path):
@@ -151,7 +164,7 @@ def test_procam_calibration_counts(tmp_path):
     with pytest.raises(InputError, match="takes 38: there are images too many"):
         procam_calibration.read(tmp_path, projector=(512, 512))
     (tmp_path / "capture_0/graycode_17.png").unlink()
-    with pytest.raises(InputError, match="capture_0 lacks graycode_17"):
+    with pytest.raises(InputError, match="capture_0: it lacks graycode_17"):
         procam_calibration.read(tmp_path)
 
 
@@ -236,7 +249,7 @@ def test_frames_are_what_the_toml_says(tmp_path):
         (lambda t: t.replace("step = 1", 'step = "one"'), "no number"),
         (lambda t: t.replace("step = 1", "step = 0"), "phase step 1 of 3 is missing"),
         (lambda t: t.replace('file = "c.png"', ""), r"\[\[frame\]\] 3 names no file"),
-        (lambda t: t.replace("c.png", "d.png"), "capture lacks d.png"),
+        (lambda t: t.replace("c.png", "d.png"), "capture: it lacks d.png"),
         (lambda t: t.replace("[[frame]]", "[frame]", 1), "is not TOML .*line"),
         (lambda t: t.replace('"a.png"', '"a.png'), "is not TOML .*line 5"),
         (lambda t: 'projector = "96x64"', "names no frames"),

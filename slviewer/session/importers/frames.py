@@ -33,8 +33,7 @@ from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import (
     Imports,
     Recording,
-    capture_name,
-    find_captures,
+    collect_captures,
     listed,
     strangers_warning,
     visible,
@@ -55,17 +54,16 @@ def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tupl
     def is_capture(folder: Path) -> bool:
         return any((folder / name).is_file() for name in names)
 
-    folders, warnings = find_captures(Path(source), is_capture, f"{names[0]} and the other files of {Path(toml).name}")
-    recordings = []
-    for folder in folders:
+    def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
         files = tuple(folder / name for name in names)
         if missing := [name for name, file in zip(names, files, strict=True) if not file.is_file()]:
-            raise InputError(f"{folder.name} lacks {listed(missing)}, which {Path(toml).name} names: add them")
+            raise InputError(f"it lacks {listed(missing)}, which {Path(toml).name} names: add them")
         strangers = [entry for entry in visible(folder) if entry.suffix.lower() in IMAGE_SUFFIXES]
-        warnings += strangers_warning(folder, sorted(set(strangers) - set(files)))
-        settings = {"gray_origin_given": given}
-        recordings.append(Recording(capture_name(folder, prefix), sequence, files, folder, settings))
-    return Imports(recordings, warnings)
+        recording = Recording(name, sequence, files, folder, {"gray_origin_given": given})
+        return recording, strangers_warning(folder, sorted(set(strangers) - set(files)))
+
+    looks_like = f"{names[0]} and the other files of {Path(toml).name}"
+    return collect_captures(Path(source), prefix, is_capture, looks_like, describe)
 
 
 def read_sequence(

@@ -14,6 +14,8 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.importers.images import IMAGE_SUFFIXES, read_frames
 from slviewer.session.names import natural_key, safe_name
 
+_MOST_REASONS = 3
+
 
 @dataclass(frozen=True)
 class ImportedCapture:
@@ -44,11 +46,23 @@ class Recording:
 
 
 @dataclass(frozen=True)
+class Skipped:
+    """A capture folder that cannot be imported, and why."""
+
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.reason.removeprefix(f'{self.name}: ')}"
+
+
+@dataclass(frozen=True)
 class Imports:
     """All captures of a source. Iterating reads them one at a time, so that memory is needed for one."""
 
     recordings: Sequence[Recording]
-    warnings: Sequence[str]  # what was seen and left aside, one sentence each
+    warnings: Sequence[str]  # files and folders that were not used
+    skipped: Sequence[Skipped] = ()  # captures whose files are missing, double or contradict the layout
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -57,29 +71,64 @@ class Imports:
         return (recording.read() for recording in self.recordings)
 
 
-def find_captures(source: Path, is_capture: Callable[[Path], bool], looks_like: str) -> tuple[list[Path], list[str]]:
-    """Capture folders in counting order, and warnings: `source` itself if it is one, else those right inside it.
+def collect_captures(
+    source: Path,
+    prefix: str | None,
+    is_capture: Callable[[Path], bool],
+    looks_like: str,
+    describe: Callable[[Path, str], tuple[Recording, list[str]]],
+) -> Imports:
+    """The captures of a source in counting order: `source` itself if it is one, else the folders right inside it.
 
-    Raises InputError where there are none (it should look like `looks_like`), or where a folder that is named like the
-    captures beside it has nothing of one inside.
+    `describe(folder, name)` returns the recording of one folder and warnings; where it raises InputError, that capture
+    alone is skipped. A folder that is named like the captures beside it and has nothing of one inside is skipped too.
+    Raises InputError where the source holds no captures (they should look like `looks_like`), or none can be used.
     """
+    folders, empty, warnings = _capture_folders(source, is_capture, looks_like)
+    recordings, skipped = [], [Skipped(folder.name, f"it holds no frames ({looks_like})") for folder in empty]
+    for folder in folders:
+        try:
+            recording, more = describe(folder, capture_name(folder, prefix))
+        except InputError as error:
+            skipped.append(Skipped(folder.name, str(error)))
+        else:
+            recordings.append(recording)
+            warnings += more
+    if not recordings:
+        raise none_usable(skipped)
+    return Imports(recordings, warnings, skipped)
+
+
+def none_usable(skipped: Sequence[Skipped]) -> InputError:
+    """The error that states why each capture of a source was skipped; each reason once."""
+    if len(skipped) == 1:
+        return InputError(str(skipped[0]))
+    reasons: dict[str, list[str]] = {}
+    for each in skipped:
+        reasons.setdefault(each.reason.removeprefix(f"{each.name}: "), []).append(each.name)
+    shown = [f"{listed(names, 3)}: {reason}" for reason, names in list(reasons.items())[:_MOST_REASONS]]
+    more = [f"and {len(reasons) - len(shown)} more reasons"] if len(reasons) > len(shown) else []
+    return InputError(f"none of the {len(skipped)} captures can be imported. " + "; ".join(shown + more))
+
+
+def _capture_folders(
+    source: Path, is_capture: Callable[[Path], bool], looks_like: str
+) -> tuple[list[Path], list[Path], list[str]]:
+    """Capture folders in counting order, folders that are only named like these, and warnings about all others."""
     source = Path(os.path.abspath(Path(source).expanduser()))  # a link keeps its own name
     if not source.is_dir():
         raise InputError(f"{source} is no folder: give the folder of a capture, or a folder of such folders")
     if is_capture(source):
-        return [source], []
+        return [source], [], []
     inner = sorted((entry for entry in visible(source) if entry.is_dir()), key=lambda entry: natural_key(entry.name))
     captures = [folder for folder in inner if is_capture(folder)]
     if not captures:
         raise InputError(f"{source} holds no captures: {looks_like} was looked for in it and in the folders inside")
     stems = {_stem(folder) for folder in captures}
-    warnings = []
-    for folder in inner:
-        if folder not in captures and _stem(folder) in stems:
-            raise InputError(f"{folder} holds no frames ({looks_like}): add them, or move the folder away")
-        if folder not in captures:
-            warnings.append(f"folder {folder.name} was left aside: it holds no capture ({looks_like})")
-    return captures, warnings
+    others = [folder for folder in inner if folder not in captures]
+    empty = [folder for folder in others if _stem(folder) in stems]
+    return captures, empty, [f"folder {f.name} was left aside: it holds no capture ({looks_like})"
+                             for f in others if f not in empty]  # fmt: skip
 
 
 def capture_name(folder: Path, prefix: str | None) -> str:

@@ -14,8 +14,7 @@ from slviewer.session.importers.images import IMAGE_SUFFIXES, read_image
 from slviewer.session.importers.imported import (
     Imports,
     Recording,
-    capture_name,
-    find_captures,
+    collect_captures,
     listed,
     strangers_warning,
     visible,
@@ -32,16 +31,13 @@ _FILE = re.compile(r"p18_f(\d+)", re.IGNORECASE)
 def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] = (912, 1140)) -> Imports:
     """Captures named after their folders; each holds the axes whose folder is there, V before H.
 
-    Raises InputError where frames are missing, double or too many, or where the Gray code cannot number the
-    projector's columns or rows.
+    A pose is skipped where frames are missing, double or too many, or where the Gray code cannot number the
+    projector's columns or rows; InputError where none can be used.
     """
-    folders, warnings = find_captures(Path(source), _is_pose, "a folder V or H with P18_FNN images")
-    recordings = []
-    for folder in folders:
-        recording, more = _recording(folder, capture_name(folder, prefix), projector)
-        recordings.append(recording)
-        warnings += more
-    return Imports(recordings, warnings)
+    return collect_captures(
+        Path(source), prefix, _is_pose, "a folder V or H with P18_FNN images",
+        lambda folder, name: _recording(folder, name, projector),
+    )  # fmt: skip
 
 
 def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Recording, list[str]]:
@@ -76,7 +72,7 @@ def _numbered(folder: Path) -> tuple[dict[int, Path], list[str]]:
     """{frame number: file}, complete, and warnings."""
     numbered: dict[int, Path] = {}
     strangers: list[Path] = []
-    where = f"{folder.parent.name}/{folder.name}"
+    where = f"folder {folder.name}"
     for file in sorted(visible(folder)):
         match = _FILE.fullmatch(file.stem)
         if not match or file.suffix.lower() not in IMAGE_SUFFIXES:
@@ -100,7 +96,7 @@ def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
     """V, then H, whichever are there."""
     there = [entry for entry in visible(pose) if entry.is_dir() and entry.name.lower() in _AXES]
     if len({entry.name.lower() for entry in there}) < len(there):
-        raise InputError(f"{pose} holds {listed(sorted(entry.name for entry in there))}: keep one folder an axis")
+        raise InputError(f"it holds {listed(sorted(entry.name for entry in there))}: keep one folder an axis")
     return sorted(((entry, _AXES[entry.name.lower()]) for entry in there), key=lambda found: found[1])
 
 

@@ -13,8 +13,7 @@ from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import (
     Imports,
     Recording,
-    capture_name,
-    find_captures,
+    collect_captures,
     listed,
     strangers_warning,
     visible,
@@ -26,18 +25,18 @@ _FILE = re.compile(r"graycode_?(\d+)", re.IGNORECASE)
 def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] = (1024, 768)) -> Imports:
     """Captures named after their folders. The projector's size says how many bits, and so how many images, there are.
 
-    Raises InputError where images are missing or double, or where their number contradicts the projector's size.
+    A capture is skipped where images are missing or double, or where their number contradicts the projector's size;
+    InputError where none can be used.
     """
     sequence = gray(projector)
-    folders, warnings = find_captures(Path(source), _is_capture, "graycode_NN images")
-    recordings = []
-    for folder in folders:
+
+    def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
         numbered, strangers = _numbered(folder)
         _check_count(folder, set(numbered), len(sequence.frames), projector)
         files = tuple(numbered[number] for number in range(len(sequence.frames)))
-        recordings.append(Recording(capture_name(folder, prefix), sequence, files, folder))
-        warnings += strangers_warning(folder, strangers)
-    return Imports(recordings, warnings)
+        return Recording(name, sequence, files, folder), strangers_warning(folder, strangers)
+
+    return collect_captures(Path(source), prefix, _is_capture, "graycode_NN images", describe)
 
 
 def _numbered(folder: Path) -> tuple[dict[int, Path], list[Path]]:
@@ -48,7 +47,7 @@ def _numbered(folder: Path) -> tuple[dict[int, Path], list[Path]]:
         if not match or file.suffix.lower() not in IMAGE_SUFFIXES:
             strangers.append(file)
         elif (number := int(match[1])) in numbered:
-            raise InputError(f"{folder.name} holds {numbered[number].name} and {file.name}: keep one of them")
+            raise InputError(f"it holds {numbered[number].name} and {file.name}: keep one of them")
         else:
             numbered[number] = file
     return numbered, strangers
@@ -57,13 +56,11 @@ def _numbered(folder: Path) -> tuple[dict[int, Path], list[Path]]:
 def _check_count(folder: Path, numbers: set[int], needed: int, projector: tuple[int, int]) -> None:
     size = f"{projector[0]}x{projector[1]}"
     if gaps := [n for n in range(max(numbers)) if n not in numbers]:
-        raise InputError(
-            f"{folder.name} lacks graycode_{listed([f'{n:02d}' for n in gaps])}: record or copy them again"
-        )
+        raise InputError(f"it lacks graycode_{listed([f'{n:02d}' for n in gaps])}: record or copy them again")
     if len(numbers) != needed:
         fault = "images are missing" if len(numbers) < needed else "there are images too many"
         raise InputError(
-            f"{folder.name} holds {len(numbers)} images, and the Gray code of a {size} projector takes {needed}: "
+            f"it holds {len(numbers)} images, and the Gray code of a {size} projector takes {needed}: "
             f"{fault}, or the projector has another size"
         )
 

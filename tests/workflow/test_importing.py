@@ -1,0 +1,81 @@
+"""Folders that other tools made, through the command line: what is kept, what is skipped, and what is said of it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.fringe.patterns import render
+from slviewer.fringe.presets import gray
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.session.store import Session
+
+Run = Callable[..., tuple[int, str, str]]
+PROJECTOR = (120, 90)
+
+
+def photographed(sequence: PatternSequence, seed: int) -> list[np.ndarray]:
+    """What a camera with the projector's own pixels records: 8 bits, noise of one grey level, ambient light."""
+    rng = np.random.default_rng(seed)
+    return [
+        np.clip(render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1]), 0, 255).round().astype(np.uint8)
+        for i in range(len(sequence.frames))
+    ]
+
+
+def write_captures(source: Path, count: int) -> list[Path]:
+    """Folders of the procam-calibration layout."""
+    sequence = gray(PROJECTOR)
+    folders = [source / f"capture_{n}" for n in range(count)]
+    for seed, folder in enumerate(folders):
+        folder.mkdir(parents=True)
+        for number, frame in enumerate(photographed(sequence, seed)):
+            assert cv2.imwrite(str(folder / f"graycode_{number:02d}.png"), frame)
+    return folders
+
+
+@pytest.fixture
+def faulty(tmp_path: Path) -> Path:
+    """Five captures: one with a file cut short, one with a missing file, one in the dark, two sound."""
+    folders = write_captures(tmp_path / "source", 5)
+    cut = folders[1] / "graycode_03.png"
+    cut.write_bytes(cut.read_bytes()[:200])
+    (folders[2] / "graycode_07.png").unlink()
+    dark = np.full(PROJECTOR[::-1], 3, np.uint8)
+    for file in folders[3].iterdir():
+        cv2.imwrite(str(file), dark)
+    return tmp_path / "source"
+
+
+def test_readable_captures_are_imported_and_the_others_named(faulty: Path, run: Run, tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    status, out, err = run("import", "procam-calibration", faulty, session, "--projector", "120x90")
+    assert status == 0 and "2 captures imported: capture_0, capture_4" in out
+    warnings = [line for line in err.splitlines() if line.startswith("warning: not imported")]
+    assert len(warnings) == 3
+    for name, fact in (("capture_1", "graycode_03.png"), ("capture_2", "graycode_07"), ("capture_3", "no pixel")):
+        assert any(name in line and fact in line for line in warnings), (name, warnings)
+    with Session.open(session) as store:
+        assert store.capture_names() == ["capture_0", "capture_4"]
+
+
+def test_strict_refuses_the_folder(faulty: Path, run: Run, tmp_path: Path) -> None:
+    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90", "--strict")
+    assert status == 1 and "capture_2" in err and "graycode_07" in err
+    (faulty / "capture_2" / "graycode_07.png").write_bytes((faulty / "capture_0" / "graycode_07.png").read_bytes())
+    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90", "--strict")
+    assert status == 1 and "capture_1" in err and "graycode_03.png" in err
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_folder_without_a_readable_capture_is_an_error(faulty: Path, run: Run, tmp_path: Path) -> None:
+    for name in ("capture_0", "capture_4"):
+        for file in (faulty / name).iterdir():
+            file.unlink()
+        (faulty / name).rmdir()
+    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90")
+    assert status == 1 and "none of the 3 captures" in err
+    assert "graycode_03.png" in err and "graycode_07" in err and "no pixel" in err
+    assert not (tmp_path / "s").exists()
