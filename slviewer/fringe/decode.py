@@ -51,7 +51,7 @@ def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
     for axis in sequence.axes:
         if sequence.periods_px(axis):
             shift = layout(sequence, axis).shifts[-1]
-            _, _, background, _ = phase_shift(stack, shift.indices, sequence.phase_sign)
+            _, _, background, _ = phase_shift(stack, shift.indices, sequence.sign(axis))
             return np.rint(background).astype(stack.dtype)
     return stack.max(axis=0)
 

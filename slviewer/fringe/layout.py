@@ -60,6 +60,7 @@ def layout(sequence: PatternSequence, axis: Axis) -> Layout:
     if axis not in sequence.axes:
         there = f"use axis {sequence.axes[0]}" if sequence.axes else "phase steps or Gray bits are needed"
         raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
+    _check_decodable(sequence, axis)
     shifts = tuple(_shift(sequence, axis, period) for period in sequence.periods_px(axis))
     gray, inverse, complementary, white, black = (
         _by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
@@ -67,8 +68,8 @@ def layout(sequence: PatternSequence, axis: Axis) -> Layout:
     found = Layout(
         axis,
         sequence.extent(axis),
-        sequence.phase_sign,
-        sequence.gray_origin_px,
+        sequence.sign(axis),
+        sequence.origin_px(axis),
         shifts,
         gray,
         inverse,
@@ -117,6 +118,12 @@ def _shift(sequence: PatternSequence, axis: Axis, period: float) -> Shift:
 
 def _by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:
     return tuple(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
+
+
+def _check_decodable(sequence: PatternSequence, axis: Axis) -> None:
+    own = (sequence.periods_px(axis) or (1.0,))[0]
+    if sequence.offset_rad(axis) or sequence.gray_cell(axis) != own or sequence.relative:
+        raise InputError(f"axis {axis}: a phase offset, other Gray cells or a relative phase cannot be decoded")
 
 
 def _check_code(found: Layout) -> None:

@@ -44,7 +44,7 @@ def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axi
         raise InputError(f"axis {axis}: {len(phase)} code edges are in view, too few to tell where the code begins")
     if rising.mean() < 1 - MIN_RISING:
         raise InputError(
-            f"axis {axis}: the code falls where the phase rises: set phase_sign to {-sequence.phase_sign}, "
+            f"axis {axis}: the code falls where the phase rises: set phase_sign to {-sequence.sign(axis)}, "
             "or mend the order of the steps"
         )
     mean = np.mean(np.exp(1j * phase))

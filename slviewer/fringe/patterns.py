@@ -27,7 +27,8 @@ def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndar
         return None, np.full(sequence.projector[0], 0 if frame.kind == "black" else 255, np.uint8)
     if frame.kind == "phase":
         u = np.arange(sequence.extent(frame.axis), dtype=np.float64)
-        angle = 2 * np.pi * (u / frame.period_px + sequence.phase_sign * frame.step / frame.steps)
+        turns = u / frame.period_px + sequence.sign(frame.axis) * frame.step / frame.steps
+        angle = 2 * np.pi * turns + sequence.offset_rad(frame.axis)
         cosine = np.floor(127.5 + 127.5 * np.cos(angle) + 0.5).astype(np.uint8)
         return frame.axis, cosine if sequence.levels is None else np.array(sequence.levels, np.uint8)[cosine]
     return frame.axis, np.where(_bit(sequence, frame.axis, frame), 255, 0).astype(np.uint8)
@@ -36,15 +37,15 @@ def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndar
 def _bit(sequence: PatternSequence, axis: Axis, frame: Frame) -> np.ndarray:
     """(extent,) bool: the Gray bit at the centre of each projector column or row."""
     bits = len(sequence.find("gray", axis))
-    period = sequence.periods_px(axis)[0] if sequence.periods_px(axis) else 1.0
+    cell, origin = sequence.gray_cell(axis), sequence.origin_px(axis)
     half = frame.kind == "complementary"
     # A column belongs to the cell that holds its left edge plus half a pixel, less the origin's own half.
-    u = np.arange(sequence.extent(axis), dtype=np.float64) - sequence.gray_origin_px - 0.5
-    code = np.floor((2 if half else 1) * u / period + 1e-9).astype(np.int64)
+    u = np.arange(sequence.extent(axis), dtype=np.float64) - origin - 0.5
+    code = np.floor((2 if half else 1) * u / cell + 1e-9).astype(np.int64)
     if code.min() < 0 or code.max() >= 1 << (bits + half):
         raise InputError(
-            f"{bits} Gray bits cannot number {sequence.extent(axis)} px from {sequence.gray_origin_px:g} px on "
-            f"in periods of {period:g} px: use more bits, or the origin -0.5"
+            f"{bits} Gray bits cannot number {sequence.extent(axis)} px from {origin:g} px on "
+            f"in cells of {cell:g} px: use more bits, or the origin -0.5"
         )
     gray = code ^ (code >> 1)
     bit = (gray >> (0 if half else bits - 1 - frame.bit)) & 1

@@ -3,11 +3,13 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from math import isfinite
+from typing import Any, Generic, Literal, NamedTuple, TypeVar, get_args
 
 from slviewer.errors import InputError
 
 Axis = Literal["x", "y"]
+T = TypeVar("T")
 Kind = Literal["phase", "gray", "inverse", "complementary", "white", "black", "texture"]
 
 _FIELDS = {
@@ -20,6 +22,18 @@ _FIELDS = {
     "texture": (),
 }
 """What a frame of each kind must say about itself."""
+
+SEQUENCE_KEYS = (
+    "projector", "phase_sign", "phase_offset", "gray_origin", "gray_cell_px", "relative", "levels", "frame",
+)  # fmt: skip
+"""The entries of `PatternSequence.to_dict`, and of a `frames` TOML."""
+
+
+class PerAxis(NamedTuple, Generic[T]):
+    """A value of axis x and one of axis y."""
+
+    x: T
+    y: T
 
 
 @dataclass(frozen=True)
@@ -90,30 +104,55 @@ class Frame:
 class PatternSequence:
     """The frames of one capture, in the order in which they are shown, and the conventions they follow.
 
-    ``projector`` is (width, height) in px. ``phase_sign`` -1: the frames were made with cos(phi - 2 pi k / n).
-    ``gray_origin_px`` is the projector coordinate at which Gray code 0 begins; a displayed column u reaches from
-    u - 0.5 to u + 0.5, hence -0.5. ``levels``: for each grey level 0 ... 255 of a cosine the one that is shown in its
-    place, so that a projector whose light is not proportional to it shows cosines; None where they are the same. It
-    records what was shown, and decoding has no use for it. Raises InputError when steps or bits are missing, double, or
-    contradict each other, or the levels are no such table.
+    ``projector_size`` is (width, height) in px, None where it is not known. Phase step k of n shows
+    A + B cos(phi + phase_sign 2 pi k / n + phase_offset_rad). ``gray_origin_px`` is the projector coordinate at which
+    Gray code 0 begins; a displayed column u reaches from u - 0.5 to u + 0.5, hence -0.5. ``gray_cell_px`` is the width
+    of the cells that the Gray bits number (the complementary bit halves them); None: the longest fringe period, or 1 px
+    for Gray code alone. These four are one value for both axes, or a `PerAxis`.
+
+    ``relative``: an axis of phase steps alone, whose periods do not cover the projector, is decoded modulo the longest
+    range that they tell apart; otherwise it is refused. Without a projector size such an axis is always relative.
+    ``levels``: for each grey level 0 ... 255 of a cosine the one that is shown in its place, so that a projector whose
+    light is not proportional to it shows cosines; None where they are the same. It records what was shown, and decoding
+    has no use for it.
+
+    Raises InputError when steps or bits are missing, double, or contradict each other, or a value is none that can be.
     """
 
-    projector: tuple[int, int]
+    projector_size: tuple[int, int] | None
     frames: tuple[Frame, ...]
-    phase_sign: int = 1
-    gray_origin_px: float = -0.5
+    phase_sign: int | PerAxis[int] = 1
+    gray_origin_px: float | PerAxis[float] = -0.5
     levels: tuple[int, ...] | None = None
+    phase_offset_rad: float | PerAxis[float] = 0.0
+    gray_cell_px: float | PerAxis[float | None] | None = None
+    relative: bool = False
 
     def __post_init__(self) -> None:
-        if len(self.projector) != 2 or min(self.projector) < 1:
-            raise InputError(f"a projector of {self.projector} px does not exist: give width and height, like 912x1140")
-        if self.phase_sign not in (1, -1):
-            raise InputError(f"phase_sign is {self.phase_sign}: use 1 or -1")
+        size = self.projector_size
+        if size is not None and (len(size) != 2 or min(size) < 1):
+            raise InputError(f"a projector of {size} px does not exist: give width and height, like 912x1140")
+        for name in ("phase_sign", "gray_origin_px", "phase_offset_rad", "gray_cell_px"):
+            value = getattr(self, name)
+            if isinstance(value, PerAxis) and value.x == value.y:  # one way to write it, so that equal is equal
+                object.__setattr__(self, name, value.x)
+        for axis in get_args(Axis):
+            self._check_values(axis)
         if self.levels is not None:
             _check_levels(self.levels)
         for axis in self.axes:
             self._check_phase(axis)
             self._check_bits(axis)
+
+    @property
+    def projector(self) -> tuple[int, int]:
+        """(width, height) in px. Raises InputError where the size is not known."""
+        if self.projector_size is None:
+            raise InputError(
+                "the size of the projector is not known, and it is needed here: import the capture again with "
+                'projector = "912x1140" (width x height), or --projector'
+            )
+        return self.projector_size
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -130,9 +169,29 @@ class PatternSequence:
         return tuple(sorted({f.period_px for f in self.frames if f.kind == "phase" and f.axis == axis}, reverse=True))
 
     def period_px(self, axis: Axis) -> float:
-        """The finest period; 1.0 for Gray code alone."""
+        """The finest period; the width of a Gray cell for Gray code alone."""
         periods = self.periods_px(axis)
-        return periods[-1] if periods else 1.0
+        return periods[-1] if periods else self.gray_cell(axis)
+
+    def sign(self, axis: Axis) -> int:
+        """``phase_sign`` of the axis."""
+        return _value(self.phase_sign, axis)
+
+    def offset_rad(self, axis: Axis) -> float:
+        """``phase_offset_rad`` of the axis."""
+        return float(_value(self.phase_offset_rad, axis))
+
+    def origin_px(self, axis: Axis) -> float:
+        """``gray_origin_px`` of the axis."""
+        return _value(self.gray_origin_px, axis)
+
+    def gray_cell(self, axis: Axis) -> float:
+        """px: width of the cells that the Gray bits of the axis number."""
+        cell = _value(self.gray_cell_px, axis)
+        if cell is not None:
+            return float(cell)
+        periods = self.periods_px(axis)
+        return periods[0] if periods else 1.0
 
     def select(self, axis: Axis) -> list[int]:
         """Indices of the frames that decoding this axis needs: its own, and white and black."""
@@ -146,6 +205,18 @@ class PatternSequence:
     def find(self, kind: Kind, axis: Axis) -> list[int]:
         """Indices of the axis' frames of one kind, in order."""
         return [i for i in self.select(axis) if self.frames[i].kind == kind]
+
+    def _check_values(self, axis: Axis) -> None:
+        if self.sign(axis) not in (1, -1):
+            raise InputError(f"phase_sign is {self.sign(axis)}: use 1 or -1")
+        if not isfinite(self.offset_rad(axis)) or not isfinite(self.origin_px(axis)):
+            raise InputError(
+                f"axis {axis}: phase_offset is {self.offset_rad(axis)} rad and gray_origin {self.origin_px(axis)} px: "
+                "give finite numbers"
+            )
+        cell = _value(self.gray_cell_px, axis)
+        if cell is not None and not (isfinite(cell) and cell > 0):
+            raise InputError(f"axis {axis}: a Gray cell of {cell} px does not exist: give its width in projector px")
 
     def _check_phase(self, axis: Axis) -> None:
         for period in self.periods_px(axis):
@@ -179,13 +250,22 @@ class PatternSequence:
             raise InputError(f"axis {axis}: a complementary bit without phase steps says nothing: call it a Gray bit")
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON or TOML, in the words of the `frames` TOML."""
-        return {
-            "projector": f"{self.projector[0]}x{self.projector[1]}",
-            "phase_sign": self.phase_sign,
-            "gray_origin": self.gray_origin_px,
-            "frame": [frame.to_dict() for frame in self.frames],
-        } | ({} if self.levels is None else {"levels": list(self.levels)})
+        """Plain values for JSON or TOML, in the words of the `frames` TOML; what was added later only where it is used,
+        so that descriptions that were written before, and their hashes, stay as they are."""
+        size = self.projector_size
+        values: dict[str, Any] = {"projector": f"{size[0]}x{size[1]}"} if size else {}
+        values["phase_sign"] = _plain(self.phase_sign)
+        values["gray_origin"] = _plain(self.gray_origin_px)
+        values["frame"] = [frame.to_dict() for frame in self.frames]
+        if self.levels is not None:
+            values["levels"] = list(self.levels)
+        if self.phase_offset_rad != 0:
+            values["phase_offset"] = _plain(self.phase_offset_rad)
+        if self.gray_cell_px is not None:
+            values["gray_cell_px"] = _plain(self.gray_cell_px)
+        if self.relative:
+            values["relative"] = True
+        return values
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "PatternSequence":
@@ -193,19 +273,20 @@ class PatternSequence:
         frames = data.get("frame")
         if not isinstance(frames, list) or not frames:
             raise InputError("the sequence names no frames: add a [[frame]] table for each image")
-        try:
-            sign, origin = int(data.get("phase_sign", 1)), float(data.get("gray_origin", -0.5))
-        except (TypeError, ValueError) as error:
-            raise InputError(f"phase_sign and gray_origin must be numbers ({error}): mend them") from error
-        levels = data.get("levels")
+        levels, relative = data.get("levels"), data.get("relative", False)
         if levels is not None and not isinstance(levels, list):
             raise InputError(f"levels is {levels!r}: give a list of 256 grey levels, or leave it out")
+        if not isinstance(relative, bool):
+            raise InputError(f"relative is {relative!r}: use true or false")
         return cls(
-            parse_size(data.get("projector")),
+            None if data.get("projector") is None else parse_size(data["projector"]),
             tuple(Frame.from_dict(f) for f in frames),
-            sign,
-            origin,
+            _read_values(data, "phase_sign", 1, int),
+            _read_values(data, "gray_origin", -0.5, float),
             None if levels is None else tuple(levels),
+            _read_values(data, "phase_offset", 0.0, float),
+            _read_values(data, "gray_cell_px", None, float),
+            relative,
         )
 
 
@@ -219,6 +300,29 @@ def parse_size(text: Any) -> tuple[int, int]:
     if width < 1 or height < 1:
         raise InputError(f"'{text}' is no projector size: write width and height like 912x1140")
     return width, height
+
+
+def _value(values: Any, axis: Axis) -> Any:
+    return getattr(values, axis) if isinstance(values, PerAxis) else values
+
+
+def _plain(values: Any) -> Any:
+    if not isinstance(values, PerAxis):
+        return values
+    return {axis: value for axis, value in values._asdict().items() if value is not None}
+
+
+def _read_values(data: Mapping[str, Any], name: str, default: Any, kind: type) -> Any:
+    """One value for both axes, or a `PerAxis`; an axis that is not named has the default."""
+    given = data.get(name, default)
+    if unknown := sorted(set(given) - set(get_args(Axis))) if isinstance(given, Mapping) else []:
+        raise InputError(f"{name} has the unknown entry '{unknown[0]}': use x and y")
+    try:
+        if isinstance(given, Mapping):
+            return PerAxis(*(kind(given[axis]) if axis in given else default for axis in get_args(Axis)))
+        return given if given is default else kind(given)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be a number, or {{x = ..., y = ...}} ({error}): correct it") from error
 
 
 def _check_levels(levels: tuple[int, ...]) -> None:

@@ -42,7 +42,8 @@ def summary(capture: Capture) -> str:
     """A capture in one line."""
     sequence, (width, height) = capture.sequence, capture.size
     periods = ", ".join(f"{axis} {sequence.period_px(axis):g} px" for axis in sequence.axes)
-    projector = f"{sequence.projector[0]}x{sequence.projector[1]}"
+    size = sequence.projector_size
+    projector = f"{size[0]}x{size[1]}" if size else "of unknown size"
     said = (
         f"{capture.name:<16} {capture.role:<12} camera {width}x{height}, projector {projector}, "
         f"{len(sequence.frames)} frames, period {periods}"

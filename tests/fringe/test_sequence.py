@@ -7,7 +7,7 @@ import pytest
 from slviewer.errors import InputError
 from slviewer.fringe.patterns import profile, render
 from slviewer.fringe.presets import PRESETS, complementary, gray, multifrequency, p18
-from slviewer.fringe.sequence import Frame, PatternSequence, parse_size
+from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis, parse_size
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -114,3 +114,82 @@ def test_multifrequency_covers_each_axis():
     sequence = multifrequency((912, 1140))
     assert sequence.periods_px("x")[0] >= 912 and sequence.periods_px("y")[0] >= 1140
     assert sequence.period_px("x") == 16
+
+
+def _through_json(sequence):
+    return PatternSequence.from_dict(json.loads(json.dumps(sequence.to_dict())))
+
+
+def test_conventions_may_differ_by_axis_and_survive_the_description():
+    sequence = replace(
+        p18((912, 1140)),
+        phase_sign=PerAxis(1, -1),
+        gray_origin_px=PerAxis(-0.5, -9.5),
+        phase_offset_rad=PerAxis(0.0, np.pi / 2),
+        gray_cell_px=PerAxis(None, 9.0),
+    )
+    assert _through_json(sequence) == sequence
+    assert (sequence.sign("x"), sequence.sign("y")) == (1, -1)
+    assert sequence.offset_rad("y") == pytest.approx(np.pi / 2) and sequence.origin_px("y") == -9.5
+    assert (sequence.gray_cell("x"), sequence.gray_cell("y")) == (18.0, 9.0)
+    toml = {**p18((912, 1140)).to_dict(), "phase_sign": {"y": -1}, "phase_offset": {"y": np.pi / 2}}
+    read = PatternSequence.from_dict({**toml, "gray_origin": {"y": -9.5}, "gray_cell_px": {"y": 9}})
+    assert read == sequence
+    assert replace(sequence, phase_sign=PerAxis(-1, -1)) == replace(sequence, phase_sign=-1)
+
+
+def test_descriptions_written_before_read_the_same_and_stay_as_they_are():
+    written = {"projector": "912x1140", "phase_sign": 1, "gray_origin": -0.5}
+    written["frame"] = [f.to_dict() for f in p18((912, 1140)).frames]
+    assert p18((912, 1140)).to_dict() == written
+    assert json.dumps(p18((912, 1140)).to_dict()) == json.dumps(written)  # what a capture's hash is made of
+    assert PatternSequence.from_dict(written) == p18((912, 1140))
+
+
+def test_a_sequence_without_a_projector_size():
+    sequence = PatternSequence(None, multifrequency((912, 1140)).frames, relative=True)
+    assert _through_json(sequence) == sequence and "projector" not in sequence.to_dict()
+    with pytest.raises(InputError, match="size of the projector is not known"):
+        _ = sequence.projector
+    with pytest.raises(InputError, match="size of the projector is not known"):
+        render(sequence, 0)
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"phase_sign": 2}, "phase_sign is 2"),
+        ({"phase_sign": {"x": 1, "y": 0}}, "phase_sign is 0"),
+        ({"phase_sign": {"x": 1, "z": 1}}, "unknown entry 'z'"),
+        ({"phase_offset": "quarter"}, "phase_offset must be a number"),
+        ({"phase_offset": float("nan")}, "phase_offset is nan"),
+        ({"gray_cell_px": 0}, "Gray cell of 0"),
+        ({"gray_cell_px": {"x": -2}}, "axis x: a Gray cell of -2"),
+        ({"gray_origin": []}, "gray_origin must be a number"),
+        ({"relative": 1}, "relative is 1"),
+    ],
+)
+def test_conventions_that_cannot_be_are_refused(entry, said):
+    with pytest.raises(InputError, match=said):
+        PatternSequence.from_dict({**p18((912, 1140)).to_dict(), **entry})
+
+
+def test_a_rendered_cosine_has_the_offset_and_the_sign_of_its_axis():
+    sequence = replace(
+        complementary((50, 30), 4, 16.0), phase_sign=PerAxis(1, -1), phase_offset_rad=PerAxis(0.3, np.pi / 2)
+    )
+    for axis, sign, offset in (("x", 1, 0.3), ("y", -1, np.pi / 2)):
+        i = sequence.find("phase", axis)[1]
+        u = np.arange(sequence.extent(axis))
+        expected = 127.5 + 127.5 * np.cos(2 * np.pi * u / 16 + sign * np.pi / 2 + offset)
+        assert np.abs(profile(sequence, i)[1] - expected).max() <= 0.5 + 1e-9
+
+
+def test_rendered_gray_cells_of_another_width():
+    sequence = replace(gray((60, 40)), gray_cell_px=4.0)
+    bits = sequence.find("gray", "x")
+    code, digit = np.zeros(60, int), np.zeros(60, int)
+    for i in bits:
+        digit ^= profile(sequence, i)[1] > 0
+        code = 2 * code + digit
+    np.testing.assert_array_equal(code, np.arange(60) // 4)

@@ -2,8 +2,11 @@
 
 ```toml
 projector = "912x1140"   # width x height, px
-phase_sign = 1           # optional; -1: the steps were made with cos(phi - 2 pi k / n)
-gray_origin = -0.5       # optional; projector px at which Gray code 0 begins
+phase_sign = 1           # optional, like the next: step k of n shows cos(phi + phase_sign 2 pi k / n + phase_offset)
+phase_offset = 0.0       # rad; this and the others may differ by axis: {x = 0.0, y = 1.57}
+gray_origin = -0.5       # projector px at which Gray code 0 begins
+gray_cell_px = 18.0      # width of the cells that the Gray bits number; by default the longest period, or 1 px without
+relative = false         # true: steps alone whose periods do not cover the projector; the phase is not absolute
 
 [[frame]]
 file = "00.png"          # relative to the capture's folder
@@ -28,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import Frame, PatternSequence, parse_size
+from slviewer.fringe.sequence import SEQUENCE_KEYS, Frame, PatternSequence, parse_size
 from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import (
     Imports,
@@ -38,8 +41,6 @@ from slviewer.session.importers.imported import (
     strangers_warning,
     visible,
 )
-
-_KEYS = {"projector", "phase_sign", "gray_origin", "frame", "levels"}
 
 
 def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None) -> Imports:
@@ -80,8 +81,8 @@ def read_sequence(
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{toml.name} is not TOML ({error}): mend it there") from error
-    if unknown := sorted(set(data) - _KEYS):
-        raise InputError(f"{toml.name} has the unknown entry '{unknown[0]}': use {', '.join(sorted(_KEYS))}")
+    if unknown := sorted(set(data) - set(SEQUENCE_KEYS)):
+        raise InputError(f"{toml.name} has the unknown entry '{unknown[0]}': use {', '.join(sorted(SEQUENCE_KEYS))}")
     _check_projector(toml, data, projector)
     frames = data.get("frame")
     if not isinstance(frames, list) or not frames:
