@@ -152,8 +152,9 @@ class Session:
                 if new.name in staged:
                     raise InputError(f"two captures are named {new.name!r}: rename one of their folders")
                 staged[new.name] = self._stage(
-                    new.name, role, new.sequence, new.frames, new.texture, new.source, new.settings, board, force
-                )
+                    new.name, role, new.sequence, new.frames, new.texture, new.source, new.settings, board, force,
+                    new.exposures_ms,
+                )  # fmt: skip
                 del new  # before the next one is made
         except BaseException:
             for folder in staged.values():

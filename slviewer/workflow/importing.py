@@ -4,10 +4,10 @@ Of a folder of captures, those that can be read and decoded are saved in one ste
 its reason; with `strict`, one fault refuses the folder.
 """
 
-import dataclasses
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
@@ -15,7 +15,8 @@ from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import parse_size
 from slviewer.session.importers import frames as frames_layout
 from slviewer.session.importers import opencv_calibration, p18, procam_calibration
-from slviewer.session.importers.imported import ImportedCapture, Imports, Skipped, none_usable
+from slviewer.session.importers.images import Channel
+from slviewer.session.importers.imported import ImportedCapture, Imports, Recording, Skipped, none_usable
 from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import available, load_stereo, save_imported_stereo
@@ -134,17 +135,27 @@ def _save(
     if strict and skipped:
         raise InputError(str(skipped[0]))
 
+    stated: set[str] = set()
+
+    def warn_once(message: str) -> None:
+        if message not in stated:
+            stated.add(message)
+            warn(message)
+
     def read() -> Iterator[ImportedCapture]:
         for i, recording in enumerate(found.recordings):
             progress(i / len(found), f"reading {recording.name}")
             try:
-                capture = checked(recording.read(), warn)
+                capture = recording.read()
+                seen = checked(replace(capture, frames=capture.merged_frames(), exposures_ms=()), warn)
             except InputError as error:
                 if strict:
                     raise
                 skipped.append(Skipped(recording.name, str(error)))
-            else:
-                yield capture
+                continue
+            for message in _assumptions(recording, capture):
+                warn_once(message)
+            yield replace(capture, sequence=seen.sequence)
         if len(skipped) == len(found.skipped) + len(found.recordings):
             raise none_usable(skipped)
 
@@ -160,6 +171,19 @@ def _save(
     return [capture.name for capture in saved]
 
 
+def _assumptions(recording: Recording, capture: ImportedCapture) -> Iterator[str]:
+    """What was assumed of a capture because nothing stated it."""
+    used = capture.settings.get("channel")
+    if used and recording.channel is None:
+        others = ", ".join(channel for channel in get_args(Channel) if channel != used)
+        yield f"the frames are in colour: their {used} channel was used (--channel, or channel in the TOML: {others})"
+    if capture.sequence.projector_size is None:
+        yield (
+            "the size of the projector is not stated: the captures can be decoded, and to calibrate or reconstruct "
+            'them import them again with projector = "912x1140" in the TOML, or --projector'
+        )
+
+
 def checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
     """The capture, with its Gray origin found if it was not given; InputError where codes contradict the projector."""
     sequence = capture.sequence
@@ -168,7 +192,7 @@ def checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
             estimate_gray_origin(sequence, capture.frames, axis) for axis in sequence.axes if sequence.periods_px(axis)
         ]
         if origins:
-            sequence = dataclasses.replace(sequence, gray_origin_px=origins[0])
+            sequence = replace(sequence, gray_origin_px=origins[0])
             warn(f"{capture.name}: Gray code 0 was found to begin at projector px {origins[0]:.2f}")
     check_projector(capture.name, sequence, decode_frames(capture.name, sequence, capture.frames))
-    return dataclasses.replace(capture, sequence=sequence)
+    return replace(capture, sequence=sequence)

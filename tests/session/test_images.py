@@ -86,6 +86,22 @@ def test_what_is_no_frame_is_refused(tmp_path):
 
 def test_grey_stored_as_colour_has_no_colours(tmp_path):
     (tmp_path / "a.png").write_bytes(encoded(".png", np.dstack([PIXELS] * 3)))
-    stack, colours = read_frames([tmp_path / "a.png"], 0)
-    np.testing.assert_array_equal(stack[0], PIXELS)
-    assert colours is None
+    images = read_frames([tmp_path / "a.png"], 0)
+    np.testing.assert_array_equal(images.stack[0], PIXELS)
+    assert images.texture is None and not images.in_colour
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_one_channel_of_colour_frames_is_taken(tmp_path, dtype):
+    blue, green, red = (np.random.default_rng(seed).integers(0, 200, (3, 4)).astype(dtype) for seed in range(3))
+    red[0, 0] = white = 255 if dtype == np.uint8 else 1023
+    bgr = np.dstack([blue, green, red])
+    (tmp_path / "a.png").write_bytes(encoded(".png", bgr))
+    for channel, plane in (("blue", blue), ("green", green), ("red", red), ("max", bgr.max(2))):
+        images = read_frames([tmp_path / "a.png"], 0, channel)
+        np.testing.assert_array_equal(images.stack[0], plane)
+        np.testing.assert_array_equal(images.texture, bgr[..., ::-1])
+        assert images.in_colour and images.stack.dtype == dtype
+    luma = read_frames([tmp_path / "a.png"], None, "luma").stack[0].astype(float)
+    np.testing.assert_allclose(luma.flat[1:], (0.114 * blue + 0.587 * green + 0.299 * red).flat[1:], atol=1)
+    assert luma[0, 0] == white  # one channel is saturated

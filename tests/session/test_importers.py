@@ -241,7 +241,12 @@ def test_frames_are_what_the_toml_says(tmp_path):
     ("edit", "message"),
     [
         (lambda t: t.replace("96x64", "96"), "projector size"),
-        (lambda t: t.replace('projector = "96x64"', ""), "does not say the projector's size"),
+        (lambda t: 'channel = "grey"\n' + t, "channel is 'grey'"),
+        (lambda t: 'order = "time"\n' + t, "order is 'time'"),
+        (lambda t: 'order = "name"\n' + t, r"\[\[frame\]\] 1 names files, and order"),
+        (lambda t: t.replace("step = 1", "step = 1\nexposure_ms = 4"), "3 of 4 images state no exposure_ms"),
+        (lambda t: t + '\n[[frames]]\nkind = "white"\nfiles = "w.png"', "use one of the two"),
+        (lambda t: t.replace('"c.png"', '"../c.png"'), "outside of the capture's folder"),
         (lambda t: t.replace("projector =", "projectr ="), "unknown entry 'projectr'"),
         (lambda t: t.replace('kind = "white"', 'kind = "blue"'), r"\[\[frame\]\] 4 \(white.png\): .*'blue'"),
         (lambda t: t.replace('kind = "white"', 'kind = ["white"]'), "kind must be a word"),
@@ -266,6 +271,7 @@ def test_frames_toml_faults_are_named(tmp_path, edit, message):
 def test_frames_projector_given_beside_the_toml(tmp_path):
     toml = write_frames(tmp_path, edit=lambda text: text.replace('projector = "96x64"', ""))
     assert frames_layout.read(tmp_path, toml, projector=(96, 64)).recordings[0].sequence.projector == (96, 64)
+    assert frames_layout.read(tmp_path, toml).recordings[0].sequence.projector_size is None
     toml = write_frames(tmp_path)
     frames_layout.read(tmp_path, toml, projector=(96, 64))
     with pytest.raises(InputError, match="96x64, and 912x1140 was given"):
@@ -274,21 +280,147 @@ def test_frames_projector_given_beside_the_toml(tmp_path):
         frames_layout.read(tmp_path, tmp_path / "absent.toml")
 
 
+GROUPS = """
+projector = "96x64"
+{top}
+[[frames]]
+kind = "phase"
+axis = "x"
+steps = 3
+period_px = [96.0, 16.0]
+files = "fringe_*.png"
+[[frames]]
+kind = "gray"
+axis = "y"
+bits = 2
+inverse = true
+files = "t*_[0?_*].png"
+[[frames]]
+kind = "white"
+files = ["white.png"]
+"""
+GROUP_FILES = [f"fringe_{n}.png" for n in range(6, 12)] + [f"t{9 + n}.{n}_[0{n % 2}_{n}].png" for n in range(4)]
+
+
+def write_groups(folder: Path, names: list[str], toml: str) -> Path:
+    for seed, name in enumerate(names):
+        write(folder / "capture" / name, image(seed))
+    (folder / "sequence.toml").write_text(toml)
+    return folder / "sequence.toml"
+
+
+def test_groups_take_their_files_by_pattern_in_natural_order(tmp_path):
+    toml = write_groups(tmp_path, [*GROUP_FILES, "white.png"], GROUPS.format(top=""))
+    write(tmp_path / "capture" / "t1_0001.png", image(99))  # no bracket: the pattern's are literal
+    found = frames_layout.read(tmp_path, toml)
+    (capture,) = found
+    np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(11)])
+    assert "t1_0001.png" in found.warnings[0]
+    frames = capture.sequence.frames
+    assert [(f.kind, f.step, f.period_px) for f in frames[2:5]] == [
+        ("phase", 2, 96),
+        ("phase", 0, 16),
+        ("phase", 1, 16),
+    ]
+    assert [(f.kind, f.bit) for f in frames[6:]] == [
+        ("gray", 0), ("inverse", 0), ("gray", 1), ("inverse", 1), ("white", 0)
+    ]  # fmt: skip
+    (tmp_path / "capture" / "fringe_8.png").unlink()
+    with pytest.raises(InputError, match=r'5 files match "fringe_\*.png".*\(phase x\) describes 6'):
+        frames_layout.read(tmp_path, toml)
+
+
+def test_groups_in_order_of_the_names(tmp_path):
+    ordered = "\n".join(
+        line for line in GROUPS.format(top='order = "name"').splitlines() if not line.startswith("files")
+    )
+    toml = write_groups(tmp_path, [f"{n}.bmp" for n in range(11)], ordered)
+    (capture,) = frames_layout.read(tmp_path, toml)
+    np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(11)])
+    write(tmp_path / "capture" / "preview.png", image(0))
+    with pytest.raises(InputError, match="holds 12 images, and 11 are described"):
+        frames_layout.read(tmp_path, toml)
+
+
+@pytest.mark.parametrize(
+    ("text", "kinds"),
+    [
+        ("bits = 3", ["gray 0", "gray 1", "gray 2"]),
+        ("bits = 2\ncomplementary = true", ["gray 0", "gray 1", "complementary 0"]),
+        ("bits = 2\nmsb_first = false\ncomplementary = true", ["complementary 0", "gray 1", "gray 0"]),
+        ("bits = 2\nmsb_first = false\ninverse = true", ["gray 1", "inverse 1", "gray 0", "inverse 0"]),
+    ],
+)
+def test_gray_groups(tmp_path, text, kinds):
+    toml = 'order = "name"\n[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 3\nperiod_px = 16\n[[frames]]\n'
+    path = write_groups(tmp_path, [], f'{toml}kind = "gray"\naxis = "x"\n{text}')
+    frames = frames_layout.read_description(path).sequence.frames
+    assert [f"{frame.kind} {frame.bit}" for frame in frames[3:]] == kinds
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("bits = 2", "bits = 0", r"2 \(gray y\): bits is 0"),
+        ("bits = 2", "bit = 2", "unknown entry 'bit'"),
+        ("steps = 3", "steps = 2", "steps is 2"),
+        ("16.0]", '"16"]', "period_px is '16'"),
+        ("inverse = true", "inverse = 1", "inverse is 1: use true or false"),
+        ('files = ["white.png"]', 'files = ["a.png", "b.png"]', "names 2 files and describes 1 images"),
+        ('kind = "white"', 'kind = "flat"', "the kind 'flat'"),
+        ('files = "fringe_*.png"', "", r"\[\[frames\]\] 1 \(phase x\) names no file"),
+        ('files = ["white.png"]', 'files = "fringe_6.*"', "fringe_6.png would show two patterns"),
+    ],
+)
+def test_faults_in_groups_are_named(tmp_path, old, new, message):
+    toml = write_groups(tmp_path, [*GROUP_FILES, "white.png"], GROUPS.format(top="").replace(old, new))
+    with pytest.raises(InputError, match=message):
+        frames_layout.read(tmp_path, toml)
+
+
+def test_brackets_of_exposures_become_one_capture(tmp_path):
+    text = 'projector = "96x64"\n' + "".join(
+        f'[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 3\nperiod_px = 96\n'
+        f'exposure_ms = {exposure}\nfiles = "{exposure}ms/*.png"\n'
+        for exposure in (20, 5)
+    )
+    names = [f"{exposure}ms/{n}.png" for exposure in (20, 5) for n in range(3)]
+    (capture,) = frames_layout.read(tmp_path, write_groups(tmp_path, names, text))
+    assert capture.exposures_ms == (20.0, 5.0) and len(capture.sequence.frames) == 3
+    np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(6)])
+    longest = capture.frames[:3].max(0) < 255
+    np.testing.assert_array_equal(capture.merged_frames(), np.where(longest, capture.frames[:3], capture.frames[3:]))
+    (tmp_path / "sequence.toml").write_text(text.replace("steps = 3", "steps = 4", 1))
+    with pytest.raises(InputError, match="20 and 5 ms show other frames"):
+        frames_layout.read(tmp_path, tmp_path / "sequence.toml")
+    (tmp_path / "sequence.toml").write_text(text[: text.rindex("[[")])
+    (capture,) = frames_layout.read(tmp_path, tmp_path / "sequence.toml")
+    assert capture.exposures_ms == () and capture.settings["exposure_ms"] == 20.0
+
+
+DAVID = """
+# 32 fringes of 60 px on a projector whose size is not stated
+[[frames]]
+kind = "phase"
+axis = "x"
+steps = 4
+period_px = 60.0
+files = ["0.png", "1.png", "2.png", "3.png"]
+[[frames]]
+kind = "gray"
+axis = "x"
+bits = 5
+complementary = true
+files = ["4.png", "5.png", "6.png", "7.png", "8.png", "9.png"]
+"""
+
+
 def test_frames_of_a_real_scene(real_data, tmp_path):
-    lines = ['projector = "1920x1080"']
-    for n in range(10):
-        what = (
-            f'kind = "phase"\nstep = {n}\nsteps = 4\nperiod_px = 60'
-            if n < 4
-            else 'kind = "complementary"'
-            if n == 9
-            else f'kind = "gray"\nbit = {n - 4}\nbits = 5'
-        )
-        lines.append(f'[[frame]]\nfile = "{n}.png"\naxis = "x"\n{what}')
     toml = tmp_path / "david.toml"
-    toml.write_text("\n".join(lines))
+    toml.write_text(DAVID)
     (capture,) = frames_layout.read(real_data / "slmaster_david" / "L", toml)
     assert capture.name == "L" and capture.frames.shape == (10, 1536, 2048)
+    assert capture.sequence.projector_size is None and capture.sequence.frames[9] == Frame("complementary", "x")
     a, b, c, d = capture.frames[:4, ::8, ::8].astype(float)
     modulation = np.hypot(a - c, b - d) / 2
     assert 0.6 < (modulation > 6).mean() < 0.8  # INFO.md: 70 % of the pixels

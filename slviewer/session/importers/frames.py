@@ -1,15 +1,16 @@
 """Any folder of images, with a TOML that says what each of them shows.
 
 ```toml
-projector = "912x1140"   # width x height, px
+projector = "912x1140"   # width x height, px; not needed where only the phase is wanted
 phase_sign = 1           # optional, like the next: step k of n shows cos(phi + phase_sign 2 pi k / n + phase_offset)
 phase_offset = 0.0       # rad; this and the others may differ by axis: {x = 0.0, y = 1.57}
 gray_origin = -0.5       # projector px at which Gray code 0 begins
 gray_cell_px = 18.0      # width of the cells that the Gray bits number; by default the longest period, or 1 px without
 relative = false         # true: steps alone whose periods do not cover the projector; the phase is not absolute
+channel = "green"        # of colour images: red, green (the default), blue, luma or max
 
-[[frame]]
-file = "00.png"          # relative to the capture's folder
+[[frame]]                # one image
+file = "00.png"          # relative to the capture's folder; * and ? are wildcards, brackets are plain characters
 kind = "phase"           # phase, gray, inverse, complementary, white, black, texture
 axis = "x"               # x varies along projector columns, y along rows; none for white, black, texture
 step = 0                 # phase: step of steps, at a period in projector px
@@ -23,24 +24,107 @@ axis = "x"
 bit = 0                  # 0 = most significant
 bits = 7
 ```
+
+A long sequence is shorter in groups, `[[frames]]` in place of `[[frame]]`. The files of a group are one pattern, in
+natural order of the names (2 before 10), or a list. With `order = "name"` at the top no entry names files: all images
+of a folder are taken in natural order of their names.
+
+```toml
+projector = "1280x800"
+
+[[frames]]
+kind = "phase"
+axis = "x"
+steps = 4                # 4 images, in order of the steps
+period_px = 20.0         # or a list: all steps of the first period, then of the second ...
+files = "fringe_*.png"
+
+[[frames]]
+kind = "gray"            # or inverse: the negatives alone
+axis = "x"
+bits = 6                 # 13 images here
+inverse = true           # each bit is followed by its negative
+complementary = true     # the last image is the complementary bit, which `bits` does not count
+msb_first = true         # the default; false: the finest stripes come first
+files = "*_[00-*]_img.jpg"
+
+[[frames]]
+kind = "white"           # one image; so are black, texture, complementary
+files = "white.png"
+```
+
+A sequence that was taken in several exposures names them: each entry has `exposure_ms`, and every exposure has the same
+frames. They become one capture, in which each pixel comes from the longest exposure that did not saturate it.
 """
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import SEQUENCE_KEYS, Frame, PatternSequence, parse_size
-from slviewer.session.importers.images import IMAGE_SUFFIXES
-from slviewer.session.importers.imported import (
-    Imports,
-    Recording,
-    collect_captures,
-    listed,
-    strangers_warning,
-    visible,
-)
+from slviewer.fringe.sequence import SEQUENCE_KEYS, PatternSequence, parse_size
+from slviewer.session.importers.frame_groups import FrameGroup, has_wildcard, images_by_name, read_groups
+from slviewer.session.importers.images import Channel
+from slviewer.session.importers.imported import Imports, Recording, collect_captures, listed, strangers_warning
+
+_KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a TOML says of every capture of a source.
+
+    `files_order`: index of each stack frame's file among the files of all groups. `gray_origin_given`: whether the TOML
+    states where Gray code 0 begins.
+    """
+
+    sequence: PatternSequence
+    groups: tuple[FrameGroup, ...]
+    files_order: tuple[int, ...]
+    exposures_ms: tuple[float, ...]
+    channel: Channel | None
+    gray_origin_given: bool
+
+    def select_files(self, folder: Path) -> tuple[Path, ...]:
+        """The files of one capture in the order of its stack; InputError that says what is missing or too many."""
+        if self.groups[0].files is None:
+            found, count = images_by_name(folder), len(self.files_order)
+            if len(found) != count:
+                raise InputError(f"it holds {len(found)} images, and {count} are described: add or remove images")
+        else:
+            selected = [group.select(folder) for group in self.groups]
+            self._check_selected(selected)
+            found = [file for files in selected for file in files]
+            if double := {file.name for file in found if found.count(file) > 1}:
+                raise InputError(f"{listed(sorted(double))} would show two patterns: correct the patterns of the names")
+        return tuple(found[index] for index in self.files_order)
+
+    def _check_selected(self, selected: Sequence[Sequence[Path]]) -> None:
+        missing: list[str] = []
+        for group, files in zip(self.groups, selected, strict=True):
+            assert group.files is not None
+            if len(files) == len(group.frames):
+                continue
+            if len(group.files) == 1 and has_wildcard(group.files[0]):
+                raise InputError(
+                    f'{len(files)} files match "{group.files[0]}", and {group.where} describes {len(group.frames)} '
+                    "images: add what is missing, or correct the pattern"
+                )
+            names = {file.name for file in files}
+            missing += [name for name in group.files if has_wildcard(name) or Path(name).name not in names]
+        if missing:
+            raise InputError(f"it lacks {listed(missing)}, which the TOML names: add them")
+
+    def is_capture(self, folder: Path) -> bool:
+        """Whether a folder looks like a capture: a file that is named is there, or more than half of the images."""
+        if self.groups[0].files is None:
+            return 2 * len(images_by_name(folder)) > len(self.files_order)
+        names = [name for group in self.groups for name in group.files or () if not has_wildcard(name)]
+        if any((folder / name).is_file() for name in names):
+            return True
+        return 2 * sum(len(group.select(folder)) for group in self.groups) > len(self.files_order)
 
 
 def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None) -> Imports:
@@ -48,29 +132,27 @@ def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tupl
 
     `projector` is for a TOML that does not say the size. A capture's settings say under `gray_origin_given` whether
     the TOML did: where not, the sequence carries the default, and the origin is better estimated from the phase.
-    Raises InputError for a TOML that is damaged, incomplete or contradicts itself, and for files that are missing.
+    Raises InputError for a TOML that is damaged, incomplete or contradicts itself, and where no capture can be used.
     """
-    sequence, names, given = read_sequence(toml, projector)
-
-    def is_capture(folder: Path) -> bool:
-        return any((folder / name).is_file() for name in names)
+    described = read_description(toml, projector)
 
     def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
-        files = tuple(folder / name for name in names)
-        if missing := [name for name, file in zip(names, files, strict=True) if not file.is_file()]:
-            raise InputError(f"it lacks {listed(missing)}, which {Path(toml).name} names: add them")
-        strangers = [entry for entry in visible(folder) if entry.suffix.lower() in IMAGE_SUFFIXES]
-        recording = Recording(name, sequence, files, folder, {"gray_origin_given": given})
-        return recording, strangers_warning(folder, sorted(set(strangers) - set(files)))
+        files = described.select_files(folder)
+        settings: dict[str, Any] = {"gray_origin_given": described.gray_origin_given}
+        exposures = described.exposures_ms
+        if len(exposures) == 1:
+            settings["exposure_ms"], exposures = exposures[0], ()
+        recording = Recording(name, described.sequence, files, folder, settings, described.channel, exposures)
+        return recording, strangers_warning(folder, sorted(set(images_by_name(folder)) - set(files)))
 
-    looks_like = f"{names[0]} and the other files of {Path(toml).name}"
-    return collect_captures(Path(source), prefix, is_capture, looks_like, describe)
+    files = described.groups[0].files
+    first = "images in the order of their names" if files is None else f"{files[0]} and the other files"
+    looks_like = f"{first} of {Path(toml).name}"
+    return collect_captures(Path(source), prefix, described.is_capture, looks_like, describe)
 
 
-def read_sequence(
-    toml: Path, projector: tuple[int, int] | None = None
-) -> tuple[PatternSequence, tuple[str, ...], bool]:
-    """The sequence that a TOML describes, each frame's file, and whether the TOML says where Gray code 0 begins."""
+def read_description(toml: Path, projector: tuple[int, int] | None = None) -> Description:
+    """What a TOML describes; `projector` is for one that does not state the size. Raises InputError."""
     toml = Path(toml)
     try:
         with open(toml, "rb") as file:
@@ -80,46 +162,50 @@ def read_sequence(
             f"{toml} cannot be read ({error.strerror}): give the TOML that describes the frames"
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{toml.name} is not TOML ({error}): mend it there") from error
-    if unknown := sorted(set(data) - set(SEQUENCE_KEYS)):
-        raise InputError(f"{toml.name} has the unknown entry '{unknown[0]}': use {', '.join(sorted(SEQUENCE_KEYS))}")
+        raise InputError(f"{toml.name} is not TOML ({error}): correct it there") from error
+    if unknown := sorted(set(data) - _KEYS):
+        raise InputError(f"{toml.name} has the unknown entry '{unknown[0]}': use {', '.join(sorted(_KEYS))}")
+    if data.get("channel") not in (None, *get_args(Channel)):
+        raise InputError(f"{toml.name}: channel is {data['channel']!r}: use one of {', '.join(get_args(Channel))}")
     _check_projector(toml, data, projector)
-    frames = data.get("frame")
-    if not isinstance(frames, list) or not frames:
-        raise InputError(f"{toml.name} names no frames: add a [[frame]] table for each image")
-    names = tuple(_checked(toml, number, frame) for number, frame in enumerate(frames, 1))
-    size = {"projector": projector} if projector else {}
+    groups = read_groups(toml.name, data)
     try:
-        return PatternSequence.from_dict({**data, **size}), names, "gray_origin" in data
+        exposures, order = _exposures(groups)
+        frames = [frame for group in groups for frame in group.frames]
+        shown = [frames[index].to_dict() for index in order[: len(order) // max(1, len(exposures))]]
+        size = {"projector": projector} if projector else {}
+        sequence = PatternSequence.from_dict({**data, **size, "frame": shown})
     except InputError as error:
         raise InputError(f"{toml.name}: {error}") from error
+    return Description(sequence, groups, tuple(order), exposures, data.get("channel"), "gray_origin" in data)
 
 
-def _checked(toml: Path, number: int, frame: Any) -> str:
-    """The file of one `[[frame]]`; InputError, saying which, for one that is not understood."""
-    where = f"{toml.name}, [[frame]] {number}"
-    if not isinstance(frame, Mapping):
-        raise InputError(f"{where} is no table: write [[frame]] above its entries")
-    name = frame.get("file")
-    if not isinstance(name, str) or not name:
-        raise InputError(f'{where} names no file: add file = "...", relative to the capture\'s folder')
-    for key in ("kind", "axis"):
-        if not isinstance(frame.get(key, ""), str):
-            raise InputError(f"{where} ({name}): {key} must be a word in quotes, not {frame[key]!r}")
-    try:
-        Frame.from_dict(frame)
-    except InputError as error:
-        raise InputError(f"{where} ({name}): {error}") from error
-    return name
+def _exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], list[int]]:
+    """The exposures, none where no entry states one, and the frames' indices, one exposure after the other, all in the
+    order of the first."""
+    frames = [(frame, group.exposure_ms) for group in groups for frame in group.frames]
+    exposures = tuple(dict.fromkeys(exposure for _, exposure in frames if exposure is not None))
+    if not exposures:
+        return (), list(range(len(frames)))
+    if unstated := [frame for frame, exposure in frames if exposure is None]:
+        raise InputError(f"{len(unstated)} of {len(frames)} images state no exposure_ms: add it to all, or to none")
+    wanted = [frame for frame, exposure in frames if exposure == exposures[0]]
+    order: list[int] = []
+    for each in exposures:
+        there = {frame: index for index, (frame, exposure) in enumerate(frames) if exposure == each}
+        count = sum(exposure == each for _, exposure in frames)
+        if set(there) != set(wanted) or count != len(wanted):
+            raise InputError(
+                f"the exposures of {exposures[0]:g} and {each:g} ms show other frames: describe the whole sequence, "
+                "each frame once, in every exposure"
+            )
+        order += [there[frame] for frame in wanted]
+    return exposures, order
 
 
 def _check_projector(toml: Path, data: Mapping[str, Any], projector: tuple[int, int] | None) -> None:
-    if "projector" not in data and projector is None:
-        raise InputError(
-            f'{toml.name} does not say the projector\'s size: add projector = "912x1140", or give --projector'
-        )
     if "projector" in data and projector is not None and parse_size(data["projector"]) != tuple(projector):
         raise InputError(
             f"{toml.name} says that the projector is {data['projector']}, and {projector[0]}x{projector[1]} was given: "
-            "mend the one that is wrong"
+            "correct the one that is wrong"
         )

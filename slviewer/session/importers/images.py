@@ -4,42 +4,78 @@ import struct
 import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.layout import clip_level
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
+Channel = Literal["red", "green", "blue", "luma", "max"]
+DEFAULT_CHANNEL: Channel = "green"
+
 _THREADS = 4  # decoding releases the interpreter
-_GREEN = 1
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 
 
-def read_frames(paths: Sequence[Path], colour_frame: int | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-    """A stack (n, h, w), uint8 or uint16, and the colours (h, w, 3) RGB of frame `colour_frame` if it has any.
+@dataclass(frozen=True)
+class FrameImages:
+    """Image files as frames of one channel. ``in_colour``: whether the files hold colours, of which one was taken."""
 
-    Colour frames become their green channel: a colour camera samples it most densely, and unlike a mixture it stays
-    linear up to the level at which it saturates, which decoding can see. Raises InputError, naming the file, for an
-    image that is missing, cut short, damaged, of another size or bit depth than the first, or transparent.
+    stack: np.ndarray  # (n, h, w) uint8 or uint16
+    texture: np.ndarray | None  # (h, w, 3) RGB of the frame that was asked for, where it is in colour
+    in_colour: bool
+
+
+def read_frames(
+    paths: Sequence[Path], colour_frame: int | None = None, channel: Channel = DEFAULT_CHANNEL
+) -> FrameImages:
+    """The frames of image files, and the colours of frame `colour_frame` if it has any.
+
+    Colour frames are reduced to one channel, by default green: a colour camera samples it most densely, and unlike a
+    mixture it stays linear up to the level at which it saturates, which decoding can see. Raises InputError, naming the
+    file, for an image that is missing, cut short, damaged, of another size or bit depth than the first, or transparent.
     """
     first = read_image(paths[0])
     stack = np.empty((len(paths), *first.shape[:2]), first.dtype)
-    colours: list[np.ndarray] = []
+    texture: list[np.ndarray] = []
+    in_colour = np.zeros(len(paths), bool)
 
     def read(index: int) -> None:
         image = first if index == 0 else read_image(paths[index])
         _check_alike(image, first, paths[index], paths[0])
-        stack[index] = image if image.ndim == 2 else image[..., _GREEN]
-        if index == colour_frame and image.ndim == 3 and not _is_grey(image):
-            colours.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        if image.ndim == 2:
+            stack[index] = image
+            return
+        stack[index] = reduce_channels(image, channel)
+        in_colour[index] = not _is_grey(image)
+        if index == colour_frame and in_colour[index]:
+            texture.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(read, range(len(paths))))
-    return stack, colours[0] if colours else None
+    return FrameImages(stack, texture[0] if texture else None, bool(in_colour.any()))
+
+
+def reduce_channels(image: np.ndarray, channel: Channel) -> np.ndarray:
+    """(h, w) of a (h, w, 3) BGR image, of its dtype.
+
+    luma is that of ITU-R BT.601, and full scale where one of the channels saturates: the mixture would hide it.
+    """
+    if channel == "max":
+        return image.max(axis=2)
+    if channel != "luma":
+        return image[..., ("blue", "green", "red").index(channel)]
+    luma = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    white = clip_level(image.dtype, int(image.max()))
+    luma[(image >= white).any(axis=2)] = white
+    return luma
 
 
 def read_image(path: Path) -> np.ndarray:

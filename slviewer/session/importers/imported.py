@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.hdr import merge_exposures
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.session.importers.images import IMAGE_SUFFIXES, read_frames
+from slviewer.session.importers.images import DEFAULT_CHANNEL, IMAGE_SUFFIXES, Channel, read_frames
 from slviewer.session.names import natural_key, safe_name
 
 _MOST_REASONS = 3
@@ -23,26 +24,41 @@ class ImportedCapture:
 
     name: str
     sequence: PatternSequence
-    frames: np.ndarray  # (n, h, w) uint8 or uint16, in the sequence's order
+    frames: np.ndarray  # (n, h, w) uint8 or uint16, in the sequence's order; (k n, h, w) of k exposures
     texture: np.ndarray | None  # (h, w, 3) RGB where the source is in colour
     source: str
     settings: Mapping[str, Any] = field(default_factory=dict)
+    exposures_ms: tuple[float, ...] = ()  # empty where there was but one
+
+    def merged_frames(self) -> np.ndarray:
+        """(n, h, w): of several exposures, each pixel from the longest that did not clip it."""
+        if not self.exposures_ms:
+            return self.frames
+        return merge_exposures(np.split(self.frames, len(self.exposures_ms)), self.exposures_ms)[0]
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One capture that was found and is complete by its file names, not yet read."""
+    """One capture that is complete by its file names, not yet read."""
 
     name: str
     sequence: PatternSequence
-    files: tuple[Path, ...]  # one a frame, in the sequence's order
+    files: tuple[Path, ...]  # one a frame, in the sequence's order; of several exposures one after the other
     source: Path
     settings: Mapping[str, Any] = field(default_factory=dict)
+    channel: Channel | None = None  # of colour frames; None: the default
+    exposures_ms: tuple[float, ...] = ()
 
     def read(self) -> ImportedCapture:
-        """The capture with its frames; InputError where an image cannot be used."""
-        frames, texture = read_frames(self.files, _colour_frame(self.sequence))
-        return ImportedCapture(self.name, self.sequence, frames, texture, str(self.source), self.settings)
+        """The capture with its frames; InputError where an image cannot be used. `settings["channel"]` states which
+        channel of colour frames was taken."""
+        channel = self.channel or DEFAULT_CHANNEL
+        shown, middle = _colour_frame(self.sequence), len(self.exposures_ms) // 2 * len(self.sequence.frames)
+        images = read_frames(self.files, None if shown is None else shown + middle, channel)
+        settings = {**self.settings, "channel": channel} if images.in_colour else self.settings
+        return ImportedCapture(
+            self.name, self.sequence, images.stack, images.texture, str(self.source), settings, self.exposures_ms
+        )
 
 
 @dataclass(frozen=True)
