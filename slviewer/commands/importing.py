@@ -1,99 +1,160 @@
 """Bringing in what other tools made."""
 
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
 from slviewer import workflow
-from slviewer.commands.parsing import Role, deferred, ui, union
+from slviewer.commands.parsing import Axis, Role, deferred, ui, union
+
+Channel = Literal["red", "green", "blue", "luma", "max"]
+Codec = Literal["2x3", "nstep", "3", "4", "gray"]
+
+
+@dataclass(frozen=True)
+class _Common:
+    """What the import of every layout takes."""
+
+    role: Role = "calibration"
+    """calibration for target poses, scan for anything else."""
+    prefix: str | None = None
+    """Put before each capture's name: planes gives planes_pose_03."""
+    channel: Channel | None = None
+    """Of colour images; green where nothing states it."""
+    force: bool = False
+    """Replace captures of the same name (the old ones go to the session's trash)."""
+    strict: bool = False
+    """Import nothing where one capture cannot be used, instead of skipping it with a warning."""
+
+
+_COMMON = _Common()
+
+
+@deferred
+def _import_auto(
+    source: Positional[Path], session: Positional[Path], projector: str | None = None, common: _Common = _COMMON
+) -> None:
+    """Import folders whose layout is told by their file names, or by a TOML that lies in the folder.
+
+    Args:
+        source: One capture folder, or a folder of them.
+        session: Session folder; made if it does not exist.
+        projector: Width x height of the projector, px; by default the layout's, or what the session knows.
+        common: What every layout takes.
+    """
+    _import(source, session, "detect", common, projector=projector)
 
 
 @deferred
 def _import_p18(
-    source: Positional[Path],
-    session: Positional[Path],
-    role: Role = "calibration",
-    prefix: str | None = None,
-    projector: str = "912x1140",
-    force: bool = False,
-    strict: bool = False,
+    source: Positional[Path], session: Positional[Path], projector: str = "912x1140", common: _Common = _COMMON
 ) -> None:
     """Import folders of the p18 layout: pose_XX/{V,H}/P18_FNN.PNG, 18 phase steps and 7 Gray bits an axis.
 
     Args:
         source: One pose folder, or a folder of them.
         session: Session folder; made if it does not exist.
-        role: calibration for target poses, scan for anything else.
-        prefix: Put before each capture's name: planes gives planes_pose_03.
         projector: Width x height of the projector, px.
-        force: Replace captures of the same name (the old ones go to the session's trash).
-        strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
+        common: What every layout takes.
     """
-    _say_imported(
-        workflow.import_p18(
-            source, session, role=role, prefix=prefix, projector=projector, force=force, strict=strict, **ui()
-        )
-    )
+    _import(source, session, "p18", common, projector=projector)
 
 
 @deferred
 def _import_procam_calibration(
-    source: Positional[Path],
-    session: Positional[Path],
-    role: Role = "calibration",
-    prefix: str | None = None,
-    projector: str = "1024x768",
-    force: bool = False,
-    strict: bool = False,
+    source: Positional[Path], session: Positional[Path], projector: str = "1024x768", common: _Common = _COMMON
 ) -> None:
     """Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code with inverses, white, black.
 
     Args:
         source: One capture folder, or a folder of them.
         session: Session folder; made if it does not exist.
-        role: calibration for target poses, scan for anything else.
-        prefix: Put before each capture's name.
         projector: Width x height of the projector, px.
-        force: Replace captures of the same name (the old ones go to the session's trash).
-        strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
+        common: What every layout takes.
     """
-    _say_imported(
-        workflow.import_procam_calibration(
-            source, session, role=role, prefix=prefix, projector=projector, force=force, strict=strict, **ui()
-        )
-    )
+    _import(source, session, "procam-calibration", common, projector=projector)
+
+
+@deferred
+def _import_opencv_graycode(
+    source: Positional[Path],
+    session: Positional[Path],
+    projector: str | None = None,
+    files: str | None = None,
+    common: _Common = _COMMON,
+) -> None:
+    """Import the images of OpenCV's structured_light GrayCodePattern: columns, then rows, each bit with its inverse.
+
+    Args:
+        source: One capture folder, or a folder of them; images are taken in natural order of their names.
+        session: Session folder; made if it does not exist.
+        projector: Width x height of the projector, px; by default what the session knows.
+        files: Pattern of the names to take, such as "pattern_cam1_*"; * and ? are wildcards.
+        common: What every layout takes.
+    """
+    _import(source, session, "opencv-graycode", common, projector=projector, files=files)
+
+
+@deferred
+def _import_sltk(
+    source: Positional[Path], session: Positional[Path], projector: str | None = None, common: _Common = _COMMON
+) -> None:
+    """Import folders of the sltk layout: TIME_[AA-BB-CC_NN]_img.jpg, Gray code with inverses.
+
+    Args:
+        source: One capture folder, or a folder of them.
+        session: Session folder; made if it does not exist.
+        projector: Width x height of the projector, px; by default what the session knows.
+        common: What every layout takes.
+    """
+    _import(source, session, "sltk", common, projector=projector)
+
+
+@deferred
+def _import_slstudio(
+    source: Positional[Path],
+    session: Positional[Path],
+    projector: str | None = None,
+    codec: Codec | None = None,
+    axis: Axis = "x",
+    common: _Common = _COMMON,
+) -> None:
+    """Import the frames that SLStudio writes: frameSeq_NN.bmp.
+
+    Args:
+        source: One capture folder, or a folder of them.
+        session: Session folder; made if it does not exist.
+        projector: Width x height of the projector, px (with the diamond pattern twice its columns); by default what
+            the session knows.
+        codec: What was shown; needed where the number of frames does not tell it.
+        axis: Of a codec along a single axis.
+        common: What every layout takes.
+    """
+    _import(source, session, "slstudio", common, projector=projector, codec=codec, axis=axis)
 
 
 @deferred
 def _import_frames(
     source: Positional[Path],
     session: Positional[Path],
-    sequence: Path,
-    role: Role = "calibration",
-    prefix: str | None = None,
+    sequence: Path | None = None,
     projector: str | None = None,
-    force: bool = False,
-    strict: bool = False,
+    common: _Common = _COMMON,
 ) -> None:
-    """Import any folder of images with a TOML that names each frame.
+    """Import any folder of images with a TOML that describes them.
 
     Args:
         source: One folder of images, or a folder of such folders.
         session: Session folder; made if it does not exist.
-        sequence: The TOML that says what each file shows; the README describes it, and `slviewer patterns` writes one.
-        role: calibration for target poses, scan for anything else.
-        prefix: Put before each capture's name.
+        sequence: The TOML that says what each file shows, by default the one in the source; the README describes it,
+            and `slviewer patterns` writes one.
         projector: Width x height of the projector, px, where the TOML does not say it.
-        force: Replace captures of the same name (the old ones go to the session's trash).
-        strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
+        common: What every layout takes.
     """
-    _say_imported(
-        workflow.import_frames(
-            source, session, sequence, role=role, prefix=prefix, projector=projector, force=force, strict=strict, **ui()
-        )
-    )
+    _import(source, session, "frames", common, sequence=sequence, projector=projector)
 
 
 @deferred
@@ -129,13 +190,21 @@ def bring_in(command: Any) -> Callable[[], None]:
 
 bring_in.__annotations__["command"] = union(
     {
+        "auto": _import_auto,
         "p18": _import_p18,
         "procam-calibration": _import_procam_calibration,
+        "opencv-graycode": _import_opencv_graycode,
+        "sltk": _import_sltk,
+        "slstudio": _import_slstudio,
         "frames": _import_frames,
         "opencv-calibration": _import_opencv_calibration,
     }
 )
 
 
-def _say_imported(names: list[str]) -> None:
+def _import(source: Path, session: Path, layout: str, common: _Common, **options: Any) -> None:
+    if layout == "detect":
+        layout = workflow.detect_layout(source)
+        print(f"layout {layout}")
+    names = workflow.import_captures(source, session, layout, **asdict(common), **options, **ui())
     print(f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}")

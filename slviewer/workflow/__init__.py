@@ -7,6 +7,8 @@ import importlib
 from typing import Any
 
 _HOMES = {
+    "import_captures": "importing",
+    "detect_layout": "importing",
     "import_p18": "importing",
     "import_procam_calibration": "importing",
     "import_frames": "importing",

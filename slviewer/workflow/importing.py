@@ -7,16 +7,17 @@ its reason; with `strict`, one fault refuses the folder.
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import parse_size
-from slviewer.session.importers import frames as frames_layout
-from slviewer.session.importers import opencv_calibration, p18, procam_calibration
+from slviewer.session.importers import opencv_calibration
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportedCapture, Imports, Recording, Skipped, none_usable
+from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
+from slviewer.session.store import Session, is_session
 from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import available, load_stereo, save_imported_stereo
@@ -27,65 +28,69 @@ Role = Literal["calibration", "scan"]
 Size = str | tuple[int, int]
 
 
-def import_p18(
+def import_captures(
     source: Path | str,
     session: Path | str,
+    layout: str = "detect",
     *,
-    role: Role = "calibration",
-    prefix: str | None = None,
-    projector: Size = "912x1140",
-    force: bool = False,
-    strict: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
-) -> list[str]:
-    """Import ``pose_XX/{V,H}/P18_FNN.PNG`` folders; returns the captures' names.
-
-    ``source`` is one pose folder or a folder of them; captures are named after their folders, behind ``prefix_``.
-    Captures that cannot be read or decoded are skipped, and ``warn`` hears why. Raises InputError where none is left,
-    or, with ``strict``, for the first of them; nothing is saved then.
-    """
-    found = p18.read(Path(source), prefix=prefix, projector=parse_size(projector))
-    return _save(found, session, role, force, strict, progress, warn)
-
-
-def import_procam_calibration(
-    source: Path | str,
-    session: Path | str,
-    *,
-    role: Role = "calibration",
-    prefix: str | None = None,
-    projector: Size = "1024x768",
-    force: bool = False,
-    strict: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
-) -> list[str]:
-    """Import ``capture_N/graycode_NN.*`` folders (Gray code with inverses, white, black); as ``import_p18``."""
-    found = procam_calibration.read(Path(source), prefix=prefix, projector=parse_size(projector))
-    return _save(found, session, role, force, strict, progress, warn)
-
-
-def import_frames(
-    source: Path | str,
-    session: Path | str,
-    sequence: Path | str,
-    *,
+    sequence: Path | str | None = None,
     role: Role = "calibration",
     prefix: str | None = None,
     projector: Size | None = None,
+    channel: Channel | None = None,
     force: bool = False,
     strict: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
+    **options: Any,
 ) -> list[str]:
-    """Import any folder of images that a TOML describes frame by frame; as ``import_p18``.
+    """Import a folder of captures that another tool made; returns the captures' names.
 
-    Where the TOML does not say at which projector coordinate Gray code 0 begins, that is found from the images.
+    ``layout`` is one of `layouts.LAYOUTS`, or "detect": the one that the file names show. ``source`` is one capture
+    folder or a folder of them; captures are named after their folders, behind ``prefix_``. ``sequence`` is the TOML of
+    the layout frames, by default the one in ``source``. ``projector`` is by default the layout's own, else what
+    the session knows of its projector. ``channel`` is that of colour frames, green where nothing states it. ``options``
+    are those of the layout's `read`.
+
+    Captures that cannot be read or decoded are skipped, and ``warn`` hears why. Raises InputError where none is left,
+    or, with ``strict``, for the first of them; nothing is saved then.
     """
-    size = None if projector is None else parse_size(projector)
-    found = frames_layout.read(Path(source), Path(sequence), prefix=prefix, projector=size)
+    source = Path(source).expanduser()
+    if layout == "detect":
+        layout = "frames" if sequence is not None else detect_layout(source)
+    if layout not in LAYOUTS:
+        raise InputError(f"the layout {layout!r} is unknown: use {', '.join(LAYOUTS)}")
+    size = LAYOUTS[layout].projector if projector is None else parse_size(projector)
+    if layout == "frames":
+        toml = sequence or find_description(source)
+        if toml is None:
+            raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
+        options["toml"] = Path(toml)
+    elif size is None and (size := _known_projector(session)) is not None:
+        warn(f"the projector is taken to have {size[0]}x{size[1]} px, as in the session: --projector for another size")
+    found = LAYOUTS[layout].read(source, prefix=prefix, projector=size, **options)
+    if channel is not None:
+        found = replace(found, recordings=[replace(recording, channel=channel) for recording in found.recordings])
     return _save(found, session, role, force, strict, progress, warn)
+
+
+def import_p18(source: Path | str, session: Path | str, **options: Any) -> list[str]:
+    """Import ``pose_XX/{V,H}/P18_FNN.PNG`` folders, as ``import_captures``; the projector is 912x1140 by default."""
+    return import_captures(source, session, "p18", **options)
+
+
+def import_procam_calibration(source: Path | str, session: Path | str, **options: Any) -> list[str]:
+    """Import ``capture_N/graycode_NN.*`` folders (Gray code with inverses, white, black), as ``import_captures``; the
+    projector is 1024x768 by default."""
+    return import_captures(source, session, "procam-calibration", **options)
+
+
+def import_frames(source: Path | str, session: Path | str, sequence: Path | str, **options: Any) -> list[str]:
+    """Import any folder of images that a TOML describes, as ``import_captures``.
+
+    Where the TOML does not state at which projector coordinate Gray code 0 begins, that is estimated from the images.
+    """
+    return import_captures(source, session, "frames", sequence=sequence, **options)
 
 
 def import_opencv_calibration(
@@ -169,6 +174,18 @@ def _save(
                 warn(f"{capture.name}: {sentence}")
     progress(1.0, "imported")
     return [capture.name for capture in saved]
+
+
+def _known_projector(session: Path | str) -> tuple[int, int] | None:
+    """The projector's size by the session's captures, else by its imported calibration; None where neither says one."""
+    if not is_session(Path(session).expanduser()):
+        return None
+    with Session.open(session) as store:
+        sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
+        if not sizes and "stereo" in available(store):
+            meta = store.load_result("calibration/stereo", only=())[0]
+            return tuple(meta["projector"]) if meta.get("projector") else None
+    return sizes.pop() if len(sizes) == 1 else None
 
 
 def _assumptions(recording: Recording, capture: ImportedCapture) -> Iterator[str]:

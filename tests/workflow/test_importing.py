@@ -1,5 +1,6 @@
 """Folders that other tools made, through the command line: what is kept, what is skipped, and what is said of it."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 
 from slviewer.fringe.patterns import render
-from slviewer.fringe.presets import gray
+from slviewer.fringe.presets import gray, phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.store import Session
+from slviewer.workflow.decoding import decode_capture
 
 Run = Callable[..., tuple[int, str, str]]
 PROJECTOR = (120, 90)
@@ -79,3 +81,51 @@ def test_a_folder_without_a_readable_capture_is_an_error(faulty: Path, run: Run,
     assert status == 1 and "none of the 3 captures" in err
     assert "graycode_03.png" in err and "graycode_07" in err and "no pixel" in err
     assert not (tmp_path / "s").exists()
+
+
+def write_colour(source: Path, exposures: tuple[float, ...] = ()) -> Path:
+    """Four steps of a fringe along both axes, in red light on a colour camera, described by a TOML in the folder."""
+    lines = ['order = "name"'] if not exposures else []
+    sequence = PatternSequence(PROJECTOR, (*phase_steps("x", 4, 132.0), *phase_steps("y", 4, 99.0)))
+    for exposure in exposures or (1.0,):
+        for axis, period in (("x", 132.0), ("y", 99.0)):
+            lines += ["[[frames]]", 'kind = "phase"', f'axis = "{axis}"', "steps = 4", f"period_px = {period}"]
+            if exposures:
+                lines += [f"exposure_ms = {exposure}", f'files = "{exposure:g}ms/{axis}*.png"']
+        for i, frame in enumerate(photographed(sequence, 7)):
+            light = np.clip(frame * exposure, 0, 255)
+            image = np.dstack([0.1 * light, 0.3 * light, light]).round().astype(np.uint8)
+            folder = source / "scan" / (f"{exposure:g}ms" if exposures else "")
+            folder.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(folder / f"{sequence.frames[i].axis}{i}.png"), image)
+    (source / "frames.toml").write_text("\n".join(lines) + "\n")
+    return source
+
+
+def test_the_default_channel_of_colour_frames_is_stated_once(run: Run, tmp_path: Path) -> None:
+    source, session = write_colour(tmp_path / "source"), tmp_path / "session"
+    shutil.copytree(source / "scan", source / "scan_2")
+    status, out, err = run("import", "auto", source, session, "--projector", "120x90", "--role", "scan")
+    assert status == 0 and "layout frames" in out and err.count("green channel") == 1
+    status, _, err = run(
+        "import", "frames", source, session, "--projector", "120x90", "--channel", "red", "--prefix", "red"
+    )
+    assert status == 0 and "channel" not in err
+    with Session.open(session) as store:
+        green, red = store.load_capture("scan"), store.load_capture("red_scan")
+        assert red.frames.max() > 2 * green.frames.max()
+        assert green.meta["settings"]["channel"] == "green" and red.meta["settings"]["channel"] == "red"
+
+
+def test_exposures_of_a_toml_become_those_of_the_session(run: Run, tmp_path: Path) -> None:
+    source, session = write_colour(tmp_path / "source", (4.0, 1.0)), tmp_path / "session"
+    status, _, err = run(
+        "import", "auto", source, session, "--projector", "120x90", "--channel", "red", "--role", "scan"
+    )
+    assert status == 0, err
+    with Session.open(session) as store:
+        capture = store.load_capture("scan")
+        assert capture.exposures_ms == (4.0, 1.0) and len(capture.frames) == 8
+        phase = decode_capture(capture)["x"]
+    error = (phase.coordinate - np.arange(120.0))[phase.mask]
+    assert phase.mask.mean() > 0.95 and np.sqrt(np.mean(error**2)) < 2.0

@@ -35,7 +35,7 @@ def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] 
     projector's columns or rows; InputError where none can be used.
     """
     return collect_captures(
-        Path(source), prefix, _is_pose, "a folder V or H with P18_FNN images",
+        Path(source), prefix, is_capture, "a folder V or H with P18_FNN images",
         lambda folder, name: _recording(folder, name, projector),
     )  # fmt: skip
 
@@ -100,7 +100,8 @@ def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
     return sorted(((entry, _AXES[entry.name.lower()]) for entry in there), key=lambda found: found[1])
 
 
-def _is_pose(folder: Path) -> bool:
+def is_capture(folder: Path) -> bool:
+    """Whether a folder holds a pose of this layout."""
     return any(
         entry.is_dir() and entry.name.lower() in _AXES and any(_FILE.match(file.stem) for file in visible(entry))
         for entry in visible(folder)

@@ -36,7 +36,7 @@ def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] 
         files = tuple(numbered[number] for number in range(len(sequence.frames)))
         return Recording(name, sequence, files, folder), strangers_warning(folder, strangers)
 
-    return collect_captures(Path(source), prefix, _is_capture, "graycode_NN images", describe)
+    return collect_captures(Path(source), prefix, is_capture, "graycode_NN images", describe)
 
 
 def _numbered(folder: Path) -> tuple[dict[int, Path], list[Path]]:
@@ -65,5 +65,6 @@ def _check_count(folder: Path, numbers: set[int], needed: int, projector: tuple[
         )
 
 
-def _is_capture(folder: Path) -> bool:
+def is_capture(folder: Path) -> bool:
+    """Whether a folder holds images of this layout."""
     return any(_FILE.fullmatch(entry.stem) and entry.is_file() for entry in visible(folder))

@@ -1,0 +1,109 @@
+"""The frames that SLStudio writes: `frameSeq_NN.bmp`, in the order of one of its codecs.
+
+All codecs show (1 + cos(2 pi u / pitch - 2 pi k / n)) / 2 in step k of n, u counted from 0 at the first column, and
+along both axes first the columns, then the rows:
+
+- 2x3 (also the calibration's): 3 steps at a sixteenth of the projector, then 3 at the whole of it;
+- nstep: 9 steps at an eighth, then 3 at the whole;
+- 3 (also FastWrap) and 4: so many steps at the whole projector;
+- gray: white, black, the 10 most significant bits of the columns' Gray code, the 6 most significant of the rows'.
+
+With the diamond pattern SLStudio counts twice as many columns: give the projector's size so. Source:
+github.com/jakobwilm/slstudio, src/codec.
+"""
+
+import re
+from math import ceil, log2
+from pathlib import Path
+from typing import Literal, get_args
+
+from slviewer.errors import InputError
+from slviewer.fringe.presets import AXES, gray_bits, phase_steps
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
+from slviewer.session.importers.frame_groups import images_by_name
+from slviewer.session.importers.imported import Imports, Recording, collect_captures, listed, strangers_warning
+
+Codec = Literal["2x3", "nstep", "3", "4", "gray"]
+_FILE = re.compile(r"frameSeq_(\d+)", re.IGNORECASE)
+_STEPS: dict[Codec, tuple[tuple[int, int], ...]] = {
+    "2x3": ((3, 16), (3, 1)),
+    "nstep": ((9, 8), (3, 1)),
+    "3": ((3, 1),),
+    "4": ((4, 1),),
+}
+"""Steps, and periods over the projector."""
+_SHOWN_BITS: dict[Axis, int] = {"x": 10, "y": 6}
+_SINGLE_AXIS: tuple[Codec, ...] = ("3", "4")
+
+
+def read(
+    source: Path,
+    *,
+    prefix: str | None = None,
+    projector: tuple[int, int] | None = None,
+    codec: Codec | None = None,
+    axis: Axis = "x",
+) -> Imports:
+    """Captures named after their folders. Without `codec` it is told by the number of frames, where that is enough;
+    `axis` is the one that a codec along a single axis showed.
+
+    A capture is skipped where its frames are not those of the codec.
+    """
+    if projector is None:
+        raise InputError("the fringes of SLStudio depend on the projector's size: give it with --projector 912x1140")
+
+    def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
+        numbered = {int(match[1]): file for file in images_by_name(folder) if (match := _FILE.fullmatch(file.stem))}
+        if missing := [number for number in range(max(numbered)) if number not in numbered]:
+            raise InputError(f"it lacks frameSeq_{listed([f'{n:02d}' for n in missing])}: copy or record them again")
+        files = tuple(numbered[number] for number in sorted(numbered))
+        others = sorted(set(images_by_name(folder)) - set(files))
+        sequence = _sequence(projector, len(files), codec, axis)
+        return Recording(name, sequence, files, folder), strangers_warning(folder, others)
+
+    return collect_captures(Path(source), prefix, is_capture, "frameSeq_NN images", describe)
+
+
+def is_capture(folder: Path) -> bool:
+    """Whether a folder holds frames that SLStudio wrote."""
+    return any(_FILE.fullmatch(file.stem) for file in images_by_name(folder))
+
+
+def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis: Axis) -> PatternSequence:
+    candidates = [
+        (each, axes)
+        for each in get_args(Codec)
+        for axes in ([(axis,)] if each in _SINGLE_AXIS else [(axis,), AXES])
+        if codec in (None, each) and len(_frames(each, projector, axes)) == images
+    ]
+    if not candidates:
+        what = f"codec {codec}" if codec else "any codec"
+        raise InputError(f"it holds {images} frames, which {what} does not show: choose another --codec, or use a TOML")
+    if len(candidates) > 1:
+        shown = listed([f"{each} along {' and '.join(axes)}" for each, axes in candidates])
+        raise InputError(f"{images} frames may be {shown}: choose with --codec")
+    found, axes = candidates[0]
+    cells: PerAxis[float | None] | None = (
+        PerAxis(*(_gray_cell(each, projector) for each in AXES)) if found == "gray" else None
+    )
+    return PatternSequence(projector, _frames(found, projector, axes), phase_sign=-1, gray_cell_px=cells)
+
+
+def _frames(codec: Codec, projector: tuple[int, int], axes: tuple[Axis, ...]) -> tuple[Frame, ...]:
+    frames = [Frame("white"), Frame("black")] if codec == "gray" else []
+    for axis in axes:
+        extent = projector[AXES.index(axis)]
+        if codec == "gray":
+            frames += gray_bits(axis, _SHOWN_BITS[axis])
+        for steps, periods in _STEPS.get(codec, ()):
+            frames += phase_steps(axis, steps, extent / periods)
+    return tuple(frames)
+
+
+def _gray_cell(axis: Axis, projector: tuple[int, int]) -> float:
+    """px: the width of the finest cell; SLStudio does not show the least significant bits."""
+    extent = projector[AXES.index(axis)]
+    hidden = ceil(log2(extent)) - _SHOWN_BITS[axis]
+    if hidden < 0:
+        raise InputError(f"SLStudio's Gray code of {_SHOWN_BITS[axis]} bits does not fit {extent} px along {axis}")
+    return float(2**hidden)
