@@ -15,7 +15,7 @@ from slviewer.commands.batching import batch
 from slviewer.commands.comparing import compare
 from slviewer.commands.devices import capture, devices, preflight
 from slviewer.commands.dimensions import measure, measurements
-from slviewer.commands.exporting import export
+from slviewer.commands.exporting import decode, export
 from slviewer.commands.importing import bring_in
 from slviewer.commands.measuring import calibrate, merge, reconstruct, validate, verify
 from slviewer.commands.meshing import mesh
@@ -35,6 +35,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "import": bring_in,
     "calibrate": calibrate,
     "validate": validate,
+    "decode": decode,
     "reconstruct": reconstruct,
     "verify": verify,
     "merge": merge,

@@ -59,3 +59,21 @@ def export(
         **ui(),
     )
     print(found.text())
+
+
+@deferred
+def decode(
+    session: Positional[Path],
+    capture: Positional[str],
+    out: Path,
+    format: Literal["npy", "exr"] = "npy",
+) -> None:
+    """Decode a capture: absolute phase and projector coordinate of each pixel, the mask with its reasons, a picture.
+
+    Args:
+        session: Session folder.
+        capture: Name of the capture.
+        out: Folder for the files; made if it does not exist. decoded.json in it explains them.
+        format: npy (NumPy) or exr (OpenEXR) for the maps, float32, NaN where masked.
+    """
+    print(workflow.decode(session, capture, out, file_format=format, **ui()).text())

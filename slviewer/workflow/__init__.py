@@ -37,6 +37,7 @@ _HOMES = {
     "measure": "dimensions",
     "tell_measurements": "dimensions",
     "export": "exporting",
+    "decode": "exporting_phase",
     "batch": "batching",
     "check": "drifting",
     "accept": "accepting",
