@@ -55,7 +55,12 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL
         axes.imshow(cover, aspect="equal", interpolation="nearest")
         colour_bar(drawing, image, axes, f"projector {'column' if axis == 'x' else 'row'}, px", orientation="vertical")
         patches = [
-            Patch(facecolor=colour, edgecolor=INK, linewidth=0.5, label=f"{REASON_LABELS[code]} {100 * shares[code]:.1f} %")
+            Patch(
+                facecolor=colour,
+                edgecolor=INK,
+                linewidth=0.5,
+                label=f"{REASON_LABELS[code]} {100 * shares[code]:.1f} %",
+            )
             for code, colour in REASON_COLOURS.items()
         ]
         axes.legend(
