@@ -114,7 +114,7 @@ def decode(
 ) -> DecodedFiles:
     """Decode a capture and write its maps into the folder ``out``, replacing files of the same names.
 
-    For each axis ``phase`` (rad), ``coordinate`` and ``sigma`` (projector px) and ``modulation`` (grey levels) as (h, w)
+    For each axis ``phase`` (rad), ``coordinate`` and ``sigma`` (projector px), ``modulation`` (grey levels) as (h, w)
     float32 .npy or .exr, NaN where masked (not the modulation), and ``reason``, uint8 codes, as .npy or .png; one
     ``decoded.json`` that explains them, and the picture ``decoded.png``. Raises InputError like `decode_capture`.
     """
