@@ -52,6 +52,25 @@ class StereoModel:
         """Distance between the two devices' centres."""
         return float(np.linalg.norm(self.rig.t))
 
+    @property
+    def pinholes(self) -> StereoRig:
+        """The rig itself."""
+        return self.rig
+
+    @property
+    def residual_px(self) -> float:
+        """How far, in projector px, the target poses' features miss their epipolar lines (1 sigma): lens distortion
+        that Brown's polynomial lacks, and noise; 0 for a calibration made elsewhere."""
+        rms = self.reprojection_rms_px
+        if not rms:
+            return 0.0
+        magnification = self.rig.projector.K[1, 1] / self.rig.camera.K[1, 1]
+        return float(np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2))  # of one coordinate
+
+    def sight(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2)."""
+        return self.rig.camera.undistort(pixels), self.rig.projector.undistort(projector)
+
     def points(self, phase: PhaseMap) -> np.ndarray:
         """(h, w, 3) float32 mm from one axis (eq. 6-8, the distorted projection met exactly); NaN where invalid."""
         z = triangulate(self.rig, phase.coordinate, phase.axis)

@@ -16,15 +16,15 @@ from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, meas
 from slviewer.evaluation.acceptance.result import Acceptance, conclude
 from slviewer.evaluation.budget import Budget, Contribution, budget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
-from slviewer.reconstruction.reconstruct import reconstruct
 from slviewer.session.store import Session
+from slviewer.workflow.capture_clouds import capture_cloud
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.drifting import Checked, history
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import best, check_accepted, load_model, load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.reconstructing import board_region
-from slviewer.workflow.scaling import apply_scale, scale_factor, scaled
+from slviewer.workflow.scaling import apply_scale, scale_factor
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def accept(
         found: list[Position] = []
         for i, (shot, frames, phases) in enumerate(decoded(store, list(captures))):
             measuring(i / len(captures), f"measuring {shot.name}")
-            cloud = scaled(reconstruct(chosen, phases), factor)
+            cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
             plate = None
             if thing.kind == "plane" and shot.role == "calibration":
                 plate = board_region(store, shot, capture_texture(shot, frames), warn)
@@ -108,7 +108,7 @@ def accept(
             def clouds() -> Any:
                 for i, (shot, _, phases) in enumerate(decoded(store, list(still))):
                     watching(i / len(still), f"repeating {shot.name}")
-                    cloud = scaled(reconstruct(chosen, phases), factor)
+                    cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
                     yield cloud.points[..., 2], cloud.sigma_z
 
             steady = repeatability(clouds())

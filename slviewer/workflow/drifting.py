@@ -10,6 +10,7 @@ from slviewer.calibration.drift.view import View
 from slviewer.calibration.observe import Smoothing, observe
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
+from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
@@ -88,11 +89,7 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
         frames = shot.stack()
         phases = decode_capture(shot, frames)
         check_projector(capture, shot.sequence, phases)
-        if (shot.size, shot.sequence.projector) != (stereo.rig.camera.size, stereo.rig.projector.size):
-            raise InputError(
-                f"{capture} was taken with another camera or projector size than the calibration: "
-                "capture the board with the rig that was calibrated"
-            )
+        check_sizes(capture, shot.size, shot.sequence.projector, stereo.rig)
         board = Board.parse(stereo.board)
         observation = observe(capture, board, detect(board, capture_texture(shot, frames)), phases, _smoothing(store))
         progress(0.3, "what the calibration's own poses say")

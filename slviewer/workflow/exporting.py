@@ -130,9 +130,11 @@ def export(
         if what not in ("report", "table", "merge", "merged-mesh"):  # a merge says by itself that it is stale
             warn_if_stale(store, warn)
         if what in ("mesh", "merged-mesh"):
-            words = _write_shape(store, what, name, target, model, plan or MeshingPlan(), progress, warn)
+            words = _write_shape(
+                store, what, name, target, model, plan or MeshingPlan(), accept_rejected, progress, warn
+            )
         elif what in ("cloud", "merge"):
-            words = _write_shape(store, what, name, target, model, None, progress, warn)
+            words = _write_shape(store, what, name, target, model, None, accept_rejected, progress, warn)
         elif what == "report":
             report(store, target, progress=progress, warn=warn)
             words = "report"
@@ -150,12 +152,13 @@ def _write_shape(
     target: Path,
     model: str | None,
     plan: MeshingPlan | None,
+    accept_rejected: bool,
     progress: Progress,
     warn: Warn,
 ) -> str:
     making = part(progress, 0, 0.8)
     if what in ("cloud", "mesh"):
-        made = scan_shape(store, name, model, plan, making, warn)
+        made = scan_shape(store, name, model, plan, making, warn, accept_rejected)
     else:
         made = merge_shape(store, name, plan, making, warn)
     progress(0.85, f"writing {target.name}")

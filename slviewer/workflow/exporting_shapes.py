@@ -14,10 +14,11 @@ from slviewer.session.ply import Ply, read_ply
 from slviewer.session.store import Session
 from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
 from slviewer.surface.shapes import Mesh, PointSet
+from slviewer.workflow.capture_clouds import capture_cloud
 from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, part
 from slviewer.workflow.models import load_model, preferred
-from slviewer.workflow.scaling import corrected_cloud, scale_factor, told_scale
+from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.trust import told
 
 
@@ -48,10 +49,16 @@ def is_fresh(store: Session, result: str) -> bool:
 
 
 def scan_shape(
-    store: Session, name: str, model: str | None, plan: MeshingPlan | None, progress: Progress, warn: Warn
+    store: Session,
+    name: str,
+    model: str | None,
+    plan: MeshingPlan | None,
+    progress: Progress,
+    warn: Warn,
+    accept_rejected: bool = False,
 ) -> Described:
     """A scan's measured points with normals, colours and sigmas, or where there is a ``plan`` a mesh of them."""
-    cloud = scan_cloud(store, name, model, part(progress, 0, 0.5), warn)
+    cloud = scan_cloud(store, name, model, part(progress, 0, 0.5), warn, accept_rejected)
     mask = cloud.mask
     if not mask.any():
         raise InputError(f"{name}: no pixel was measured: does the calibration belong to this camera and projector?")
@@ -66,7 +73,9 @@ def scan_shape(
     return Described(PointSet(cloud.measured, normals, colours), name, cloud.sigmas(mask), (*notes, said))
 
 
-def scan_cloud(store: Session, name: str, model: str | None, progress: Progress, warn: Warn) -> Cloud:
+def scan_cloud(
+    store: Session, name: str, model: str | None, progress: Progress, warn: Warn, accept_rejected: bool = False
+) -> Cloud:
     """A capture's cloud: the one that is kept, where it is up to date and of the model wanted, else made now."""
     capture, model, kept = store.load_capture(name), model or None, f"clouds/{name}"
     if store.has_result(kept) and is_fresh(store, kept):
@@ -82,7 +91,8 @@ def scan_cloud(store: Session, name: str, model: str | None, progress: Progress,
         warn(f"{name}: {sentence}")
     progress(0.4, f"reconstructing {name}")
     phases = decode_capture(capture, frames)
-    return corrected_cloud(store, fitted, phases, texture=capture_texture(capture, frames))
+    texture = capture_texture(capture, frames)
+    return capture_cloud(store, fitted, capture, phases, texture=texture, accept_rejected=accept_rejected, warn=warn)
 
 
 def merge_name(store: Session, name: str) -> str:

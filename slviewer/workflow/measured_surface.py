@@ -116,7 +116,7 @@ def surface(
             return merged_surface(store, scan, warn)
         check_accepted(store, accept_rejected)
         warn_if_stale(store, warn)
-        cloud = scan_cloud(store, scan, model or preferred(store), progress, warn)
+        cloud = scan_cloud(store, scan, model or preferred(store), progress, warn, accept_rejected)
         found = surface_of(store, scan, cloud, load_model(store, cloud.model))
         progress(1.0, "reconstructed")
     return found

@@ -17,11 +17,12 @@ from slviewer.registration.turntable import Axis
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
+from slviewer.workflow.capture_clouds import capture_cloud
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_model, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
-from slviewer.workflow.scaling import corrected_cloud, scale_factor, told_scale
+from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.trust import told
 
 StartKind = Literal["features", "turntable", "identity"]
@@ -164,7 +165,15 @@ def merge(
             for sentence in told(store, shot.name, frames):
                 warn(f"{shot.name}: {sentence}")
             progress(0.4 * i / len(names), f"reconstructing {shot.name}")
-            clouds[shot.name] = corrected_cloud(store, fitted, phases, texture=capture_texture(shot, frames))
+            clouds[shot.name] = capture_cloud(
+                store,
+                fitted,
+                shot,
+                phases,
+                texture=capture_texture(shot, frames),
+                accept_rejected=accept_rejected,
+                warn=warn,
+            )
         registering, fusing = part(progress, 0.4, 0.75), part(progress, 0.75, 0.9)
         alignment = register_all(clouds, reference, starts, lambda done: registering(done, "registering"))
         for why in alignment.dropped.values():

@@ -86,7 +86,7 @@ def mesh(
             shape = merged_points(store, sources[0].removeprefix(MERGE), warn)
         else:
             warn_if_stale(store, warn)
-            shape = scan_cloud(store, sources[0], model, before, warn)
+            shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected)
     meshed = mesh_of(shape, plan, part(progress, 0.5, 0.95))
     progress(0.95, f"writing {path.name}")
     write_shape(path, meshed.mesh, notes=(f"of {', '.join(sources)}", *meshed.text().splitlines()))

@@ -19,11 +19,12 @@ from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
+from slviewer.workflow.capture_clouds import capture_cloud
 from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, check_accepted, load_models, load_stereo, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
-from slviewer.workflow.scaling import corrected_cloud, told_scale
+from slviewer.workflow.scaling import told_scale
 from slviewer.workflow.trust import told
 
 
@@ -98,7 +99,12 @@ def reconstruct(
         is_pose = shot.role == "calibration"
         chosen = load_models(store, () if is_pose and model is None else (name,))
         progress(0.6, "reconstructing")
-        clouds = {n: corrected_cloud(store, m, phases, axis=axis, texture=texture) for n, m in chosen.items()}
+        clouds = {
+            n: capture_cloud(
+                store, m, shot, phases, axis=axis, texture=texture, accept_rejected=accept_rejected, warn=warn
+            )
+            for n, m in chosen.items()
+        }
         cloud = clouds[name]
         region = board_region(store, shot, texture, warn) if is_pose else None
         board = None
@@ -150,12 +156,19 @@ def lit(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndar
 
 
 def reconstruct_models(
-    store: Session, chosen: Mapping[str, Model], phases: Mapping[Axis, PhaseMap], axis: Axis | None
+    store: Session,
+    chosen: Mapping[str, Model],
+    shot: Capture,
+    phases: Mapping[Axis, PhaseMap],
+    axis: Axis | None,
+    *,
+    accept_rejected: bool = False,
+    warn: Warn = unwarned,
 ) -> dict[str, Cloud]:
     """One cloud a model, all from the same axis so that they can be compared pixel by pixel."""
     clouds: dict[str, Cloud] = {}
     for name, model in chosen.items():
-        clouds[name] = corrected_cloud(store, model, phases, axis=axis)
+        clouds[name] = capture_cloud(store, model, shot, phases, axis=axis, accept_rejected=accept_rejected, warn=warn)
         axis = axis or clouds[name].axis
     return clouds
 

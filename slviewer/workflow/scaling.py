@@ -1,6 +1,5 @@
 """A scale that an acceptance test found and the operator applied: what later clouds are multiplied by."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -8,12 +7,8 @@ from typing import Any
 import numpy as np
 
 from slviewer.evaluation.acceptance.result import Acceptance
-from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import reconstruct
 from slviewer.session.store import Session
-from slviewer.workflow.models import Model
 
 
 def correction(store: Session, model: str) -> dict[str, Any] | None:
@@ -42,18 +37,6 @@ def told_scale(store: Session, model: str) -> str:
         return ""
     ppm = f"{1e6 * (applied['factor'] - 1):+.0f}".replace("-", "−")
     return f"scale corrected by {ppm} ppm, by certificate {applied['certificate']}"
-
-
-def corrected_cloud(
-    store: Session,
-    model: Model,
-    phases: Mapping[Axis, PhaseMap],
-    *,
-    axis: Axis | None = None,
-    texture: np.ndarray | None = None,
-) -> Cloud:
-    """What a capture's phases give by one of the session's calibrations, with the scale that was applied to it."""
-    return scaled(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
 
 
 def scaled(cloud: Cloud, factor: float) -> Cloud:

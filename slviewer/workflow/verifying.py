@@ -111,7 +111,7 @@ def verify(
             for sentence in told(store, shot.name, frames):
                 warn(f"{shot.name}: {sentence}")
             progress(i / len(captures), f"measuring {shot.name}")
-            clouds = reconstruct_models(store, chosen, phases, axis)
+            clouds = reconstruct_models(store, chosen, shot, phases, axis, accept_rejected=accept_rejected, warn=warn)
             region: np.ndarray | None = None
             if shape == "plane" and shot.role == "calibration":
                 region = board_region(store, shot, capture_texture(shot, frames), warn)

@@ -50,6 +50,13 @@ def roughness(coefficients: np.ndarray) -> np.ndarray:
     return np.asarray(form.toarray())
 
 
+def undistort(device: Device, pixels: np.ndarray) -> np.ndarray:
+    """Undistorted normalised coordinates (n, 2) of ``pixels`` (n, 2); NaN for NaN and where the inversion fails."""
+    rays = np.empty((len(pixels), 2))
+    _undistort_all(device, np.ascontiguousarray(pixels, np.float64), rays)
+    return rays
+
+
 @kernel()
 def spline_basis(position, length, cells, weights, slopes):
     """The cell of a position px, with the four splines' values and slopes a px there."""
@@ -133,3 +140,12 @@ def ray_of(device, u, v, basis):
     k = device.numbers
     x, y = undisplaced(device, u, v, basis)
     return unbrown((x - k[2]) / k[0], (y - k[3]) / k[1], k)
+
+
+@kernel()
+def _undistort_all(device, pixels, rays):
+    basis = np.zeros((4, 4))
+    for n in range(pixels.shape[0]):
+        rays[n, 0], rays[n, 1] = np.nan, np.nan
+        if np.isfinite(pixels[n, 0]) and np.isfinite(pixels[n, 1]):
+            rays[n, 0], rays[n, 1] = ray_of(device, pixels[n, 0], pixels[n, 1], basis)

@@ -10,12 +10,15 @@ import numpy as np
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.calibration.splined.bundle import Bundle, adjust
 from slviewer.calibration.splined.compiled import Compiled, compile_axis, pixel_rays
+from slviewer.calibration.splined.fields import undistort
 from slviewer.calibration.splined.uncertainty import SigmaMap, sigma_map
-from slviewer.calibration.splined.unknowns import Arrangement
+from slviewer.calibration.splined.unknowns import Arrangement, lens_of
+from slviewer.calibration.splined.volume import is_lit
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.rig import StereoRig
 
 NEAR, FAR = 0.7, 1.4
 """Of the nearest and the farthest calibrated depth: between them points are measured."""
@@ -46,6 +49,25 @@ class SplinedModel:
         """Nearest and farthest depth that is measured."""
         near, far = self.bundle.depth_range_mm
         return NEAR * near, FAR * far
+
+    @cached_property
+    def pinholes(self) -> StereoRig:
+        """Both lenses without their displacement fields, and their arrangement."""
+        return StereoRig(lens_of(self.rig.camera), lens_of(self.rig.projector), self.rig.R, self.rig.t)
+
+    @property
+    def residual_px(self) -> float:
+        """How far, in projector px, the target poses' samples scatter beyond their predicted noise (1 sigma)."""
+        return float(max(self.bundle.noise.excess_px))
+
+    def sight(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2); NaN
+        where no target pose supports one of them."""
+        rays = undistort(self.rig.camera, pixels), undistort(self.rig.projector, projector)
+        known = is_lit(self.rig.camera, pixels, self.bundle.camera_poses > 0) & is_lit(
+            self.rig.projector, projector, self.bundle.projector_poses > 0
+        )
+        return np.where(known[:, None], rays[0], np.nan), np.where(known[:, None], rays[1], np.nan)
 
     @cached_property
     def rays(self) -> np.ndarray:

@@ -18,7 +18,7 @@ from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.store import Session
 from slviewer.workflow.capturing import keep
-from slviewer.workflow.models import check_accepted, insisted, load_model, preferred
+from slviewer.workflow.models import check_accepted, insisted, load_model, load_stereo, preferred
 from slviewer.workflow.scaling import scale_factor
 from slviewer.workflow.wizard.engine import Engine
 from slviewer.workflow.wizard.live_frames import Shot, Stream
@@ -150,7 +150,7 @@ class Calibrated:
                 f"the {name} calibration has no axis {self._axis}, which a live scan needs: capture a scan"
             )
         self._key = key
-        return Measuring(self._sequence, self._axis, model, factor)
+        return Measuring(self._sequence, self._axis, model, factor, load_stereo(store).rig)
 
 
 def start_live(engine: Engine) -> None:

@@ -6,6 +6,8 @@ import numpy as np
 
 from slviewer.fringe.decode import decode
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.rig import StereoRig
+from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.onepass import OnePass, Scan
 from slviewer.reconstruction.onepass_cuda import has_pass, one_pass
 from slviewer.reconstruction.reconstruct import Model
@@ -14,12 +16,14 @@ from slviewer.workflow.wizard.live_motion import hide_moved
 
 @dataclass(eq=False)
 class Measuring:
-    """A short sequence, a calibration, and the scale that was applied to it. For one thread at a time."""
+    """A short sequence, a calibration, and the scale that was applied to it; ``calibrated``: the rig whose sizes the
+    frames must have. For one thread at a time."""
 
     sequence: PatternSequence
     axis: Axis
     model: Model
     factor: float = 1.0
+    calibrated: StereoRig | None = None
     _fast: OnePass | None = field(init=False, repr=False, default=None)
     _before: Scan | None = field(init=False, repr=False, default=None)
 
@@ -33,6 +37,9 @@ class Measuring:
         As `reconstruct` has them, but that what moved between the frames is NaN too. Raises InputError for frames that
         are not those of the sequence, or of another camera.
         """
+        if self.calibrated is not None:
+            height, width = frames.shape[1:]
+            check_sizes("the live scan", (width, height), self.sequence.projector, self.calibrated)
         if self._fast is not None:
             scan = self._fast.run(frames, out=self._room())
             self._before, points = scan, scan.points

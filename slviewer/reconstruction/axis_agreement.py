@@ -1,0 +1,357 @@
+"""Whether a capture belongs to a calibration: sizes, and what its second axis says of the first.
+
+A camera ray and the projector ray of both measured coordinates must meet. By how much they miss each other, as the
+distance of the projector point from its epipolar line, needs no depth: it exposes exchanged axes, an inverted
+transform, another rig, and a rig that was bumped, whichever axis depth is taken from.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.triangulation import triangulate_pixels
+
+SAMPLE = 20_000
+"""Pixels compared; more do not change a median."""
+LEAST_PIXELS = 200
+"""Fewer say nothing about a rig."""
+RAISED_RATIO = 3.0
+"""Times the predicted misfit, beyond which noise and the calibration's own residuals do not explain a median of
+thousands of pixels: the predicted sigma is then raised."""
+REFUSED_RATIO = 6.0
+REFUSED_PX = 2.0
+"""A capture that misses its calibration by more than both does not belong to it: 2 px is also the reprojection error at
+which a calibration itself is rejected."""
+LEAST_IN_FRONT = 0.8
+"""Share of the points that lie before both devices: all of them, by the right calibration, but for decoding errors."""
+LEAST_MEASURED = (0.5, 0.8)
+"""Share of the decoded pixels of one axis whose point the projector could have lit: below the first the capture is
+refused, below the second there is a warning."""
+EXPLAINED = 0.25
+"""A hypothesis explains a misfit that it brings down to this share, or below the limit of refusal."""
+DEPTHS = (0.7, 1.4)
+"""Of the nearest and the farthest calibrated depth: beyond, no calibration of ours measures (as ``splined.model``)."""
+LEAST_WITHIN = 0.5
+"""Share of the points between these depths, below which the depths themselves are doubtful."""
+
+
+class Calibration(Protocol):
+    """A calibration as far as rays are concerned. ``rig``: its pinholes and their arrangement."""
+
+    def sight(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and of ``projector`` pixels (n, 2);
+        NaN where not calibrated."""
+
+    @property
+    def pinholes(self) -> StereoRig:
+        """Both lenses by their best pinhole and Brown models, and their arrangement."""
+
+    @property
+    def residual_px(self) -> float:
+        """How far, in projector px, its own target poses miss their epipolar lines beyond noise (1 sigma); 0 where it
+        is not known."""
+
+
+@dataclass(frozen=True)
+class AxisAgreement:
+    """How far projector points lie from the epipolar lines of their camera pixels, px of the projector.
+
+    ``median_px`` (signed) and ``spread_px`` (1.4826 MAD); ``misfit_px``: both together, 1.4826 times the median
+    distance; ``predicted_px``: what noise and the calibration's residuals make of it (1 sigma). ``in_front``: share of
+    the points that lie before both devices; ``depths_mm``: those of these points.
+    """
+
+    median_px: float
+    spread_px: float
+    misfit_px: float
+    predicted_px: float
+    in_front: float
+    depths_mm: np.ndarray
+    pixels: int
+
+    @property
+    def ratio(self) -> float:
+        """Misfit over what is predicted."""
+        return self.misfit_px / self.predicted_px
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the capture cannot belong to the calibration."""
+        beyond = self.misfit_px > max(REFUSED_PX, REFUSED_RATIO * self.predicted_px)
+        return beyond or self.in_front < LEAST_IN_FRONT
+
+
+@dataclass(frozen=True)
+class CaptureCheck:
+    """What a check found: by how much the predicted sigma is too small (1 where it is not), and what to warn of."""
+
+    sigma_factor: float = 1.0
+    warnings: tuple[str, ...] = ()
+    agreement: AxisAgreement | None = None
+
+
+def check_sizes(name: str, camera: tuple[int, int], projector: tuple[int, int] | None, calibrated: StereoRig) -> None:
+    """Raise InputError where a capture's camera or projector has not the size that was calibrated."""
+    wanted = calibrated.camera.size, calibrated.projector.size
+    if tuple(camera) != wanted[0]:
+        raise InputError(
+            f"{name}: the capture was taken with a camera image of {_size(camera)} px, the calibration was made with "
+            f"{_size(wanted[0])}{_scale(camera, wanted[0])}: use captures of the calibrated camera, at the same "
+            "resolution and without cropping, or calibrate at this one"
+        )
+    if projector is not None and tuple(projector) != wanted[1]:
+        raise InputError(
+            f"{name}: the capture was taken with a projector of {_size(projector)} px, the calibration was made with "
+            f"{_size(wanted[1])}{_scale(projector, wanted[1])}: import the capture with the projector's true size, or "
+            "calibrate with patterns of the same size"
+        )
+
+
+def check_phases(
+    name: str,
+    phases: Mapping[Axis, PhaseMap],
+    calibration: Calibration,
+    depth_range: tuple[float, float] | None = None,
+    accept: bool = False,
+) -> CaptureCheck:
+    """Whether the decoded axes of a capture agree with each other by a calibration.
+
+    ``depth_range`` mm: the calibrated depths. With both axes their misfit decides, with one the share of its pixels
+    that the projector could have lit. Raises InputError, with the likely reason, where the capture cannot belong to the
+    calibration, unless that is ``accept``-ed: then it is a warning.
+    """
+    warnings: list[str] = []
+
+    def refuse(reason: str) -> None:
+        if not accept:
+            raise InputError(reason)
+        warnings.append(reason)
+
+    rig = calibration.pinholes
+    if len(phases) < 2:
+        depths, share = _single_axis(phases, rig)
+        if share < LEAST_MEASURED[0]:
+            refuse(
+                f"{name}: {100 * (1 - share):.0f} % of the decoded pixels meet no point that the calibrated projector "
+                "could light: the calibration does not belong to this capture; import the projector's true size and "
+                "axes, or calibrate this rig"
+            )
+        elif share < LEAST_MEASURED[1]:
+            warnings.append(
+                f"{name}: {100 * (1 - share):.0f} % of the decoded pixels meet no point that the calibrated projector "
+                "could light: see that the calibration belongs to this rig"
+            )
+        return CaptureCheck(1.0, (*warnings, *_depth_warning(name, depths, depth_range)))
+    pixels, measured, sigma = _samples(phases)
+    found = measure_agreement(calibration, pixels, measured, sigma)
+    if found is None:
+        return CaptureCheck()
+    if found.is_refused:
+        refuse(f"{name}: {_contradiction(found)}: {_likely_reason(found, rig, pixels, measured)}")
+    factor = found.ratio if found.ratio > RAISED_RATIO else 1.0
+    if factor > 1.0 and not found.is_refused:
+        warnings.append(
+            f"{name}: the x and y patterns miss each other by {found.misfit_px:.2f} px by this calibration, and "
+            f"{found.predicted_px:.2f} px is predicted: sigma was raised by a factor of {factor:.1f}; the rig may have "
+            "moved since it was calibrated (run `slviewer check`), or the frames are disturbed"
+        )
+    return CaptureCheck(factor, (*warnings, *_depth_warning(name, found.depths_mm, depth_range)), found)
+
+
+def measure_agreement(
+    calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
+) -> AxisAgreement | None:
+    """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px, of noise ``sigma``
+    (n, 2) px, miss each other; None where fewer than 200 are calibrated."""
+    rig = calibration.pinholes
+    found = _agreement(rig, *calibration.sight(pixels, measured), sigma, calibration.residual_px)
+    return found if found.pixels >= LEAST_PIXELS else None
+
+
+def epipolar_distance(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) px, signed: how far projector points lie from the epipolar lines of their camera rays, and (n, 2) the lines'
+    unit normals. ``camera``, ``projector`` (n, 2): undistorted normalised coordinates."""
+    along = np.column_stack([camera, np.ones(len(camera))]) @ rig.R.T
+    line = np.cross(rig.t, along)
+    K = rig.projector.K
+    normal = line[:, :2] / np.array([K[0, 0], K[1, 1]])
+    length = np.linalg.norm(normal, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        offset = np.einsum("ni,ni->n", line, np.column_stack([projector, np.ones(len(projector))]))
+        return offset / length, normal / length[:, None]
+
+
+def ray_depths(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
+    """(n, 2) mm: depths before camera and projector at which the rays of undistorted normalised coordinates (n, 2) come
+    nearest to each other; negative behind a device."""
+    a = np.column_stack([camera, np.ones(len(camera))]) @ rig.R.T
+    b = np.column_stack([projector, np.ones(len(projector))])
+    aa, bb, ab = (np.einsum("ni,ni->n", p, q) for p, q in ((a, a), (b, b), (a, b)))
+    at, bt = a @ rig.t, b @ rig.t
+    with np.errstate(invalid="ignore", divide="ignore"):
+        determinant = aa * bb - ab * ab
+        return np.column_stack([(ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant])
+
+
+def _agreement(
+    rig: StereoRig, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray, residual_px: float
+) -> AxisAgreement:
+    distance, normal = epipolar_distance(rig, camera, projector)
+    known = np.isfinite(distance)
+    if not known.any():
+        return AxisAgreement(np.nan, np.nan, np.inf, 1.0, 0.0, np.empty(0), 0)
+    d = distance[known]
+    predicted = float(np.sqrt(np.median(np.sum((normal[known] * sigma[known]) ** 2, axis=1)) + residual_px**2))
+    middle = float(np.median(d))
+    depths = ray_depths(rig, camera[known], projector[known])
+    front = (depths > 0).all(axis=1)
+    return AxisAgreement(
+        median_px=middle,
+        spread_px=1.4826 * float(np.median(np.abs(d - middle))),
+        misfit_px=1.4826 * float(np.median(np.abs(d))),
+        predicted_px=max(predicted, 1e-6),
+        in_front=float(front.mean()),
+        depths_mm=depths[front, 0],
+        pixels=len(d),
+    )
+
+
+def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their noise (n, 2) px."""
+    v, u = np.nonzero(np.logical_and.reduce([phase.mask for phase in phases.values()]))
+    some = slice(None, None, max(1, -(-len(v) // SAMPLE)))
+    v, u = v[some], u[some]
+    measured, sigma = np.empty((2, len(v), 2))
+    for column, axis in enumerate(("x", "y")):
+        phase = phases[axis]  # type: ignore[index]
+        measured[:, column] = phase.coordinate[v, u]
+        sigma[:, column] = phase.sigma_phase[v, u] * (phase.period_px / (2 * np.pi))
+    return np.column_stack([u, v]).astype(float), measured, sigma
+
+
+def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[np.ndarray, float]:
+    """Depths (n,) mm of one axis' points, and the share of the decoded pixels that have one."""
+    ((axis, phase),) = phases.items()
+    v, u = np.nonzero(phase.mask)
+    if len(v) < LEAST_PIXELS:
+        return np.empty(0), 1.0
+    some = slice(None, None, max(1, -(-len(v) // SAMPLE)))
+    v, u = v[some], u[some]
+    points = triangulate_pixels(rig, np.column_stack([u, v]).astype(float), phase.coordinate[v, u], axis)
+    known = np.isfinite(points[:, 2])
+    return points[known, 2], float(known.mean())
+
+
+def _depth_warning(name: str, depths: np.ndarray, depth_range: tuple[float, float] | None) -> tuple[str, ...]:
+    if depth_range is None or len(depths) < LEAST_PIXELS:
+        return ()
+    near, far = depth_range
+    outside = float(np.mean((depths < DEPTHS[0] * near) | (depths > DEPTHS[1] * far)))
+    if outside <= 1 - LEAST_WITHIN:
+        return ()
+    return (
+        f"{name}: {100 * outside:.0f} % of the points lie nearer than {DEPTHS[0] * near:.0f} mm or farther than "
+        f"{DEPTHS[1] * far:.0f} mm (median {np.median(depths):.0f} mm), and the target poses lay at {near:.0f}-"
+        f"{far:.0f} mm: see that the calibration belongs to this capture; it says little at such depths",
+    )
+
+
+def _contradiction(found: AxisAgreement) -> str:
+    if found.misfit_px > max(REFUSED_PX, REFUSED_RATIO * found.predicted_px):
+        return (
+            f"by this calibration the x and y patterns miss each other by {found.misfit_px:.1f} px (robust; median "
+            f"{found.median_px:+.1f}, spread {found.spread_px:.1f}), and {found.predicted_px:.2f} px is predicted"
+        )
+    return (
+        f"by this calibration {100 * (1 - found.in_front):.0f} % of the points lie behind the camera or the projector"
+    )
+
+
+def _likely_reason(found: AxisAgreement, rig: StereoRig, pixels: np.ndarray, measured: np.ndarray) -> str:
+    """The hypothesis that explains the frames best, in words."""
+    best, reason = np.inf, ""
+    for words, other, at, coordinates in _hypotheses(rig, pixels, measured):
+        tried = _agreement(
+            other, other.camera.undistort(at), other.projector.undistort(coordinates), np.zeros_like(at), 0.0
+        )
+        enough = tried.pixels > 0.5 * found.pixels and tried.in_front >= LEAST_IN_FRONT
+        if enough and tried.misfit_px < best:
+            best, reason = tried.misfit_px, words
+    explained = max(REFUSED_PX, REFUSED_RATIO * found.predicted_px)
+    if found.misfit_px > explained:
+        explained = max(explained, EXPLAINED * found.misfit_px)
+    if best < explained:
+        return f"{reason} (then they miss each other by {best:.1f} px)"
+    return "the calibration is of another rig, or the rig was moved since: calibrate the rig as it stands"
+
+
+def _hypotheses(
+    rig: StereoRig, pixels: np.ndarray, measured: np.ndarray
+) -> Iterator[tuple[str, StereoRig, np.ndarray, np.ndarray]]:
+    """What may be wrong, in words, and rig, pixels and coordinates as they would be without."""
+    size, image = np.array(rig.projector.size), np.array(rig.camera.size)
+    yield (
+        "the axes are exchanged; exchange x and y in the description of the frames",
+        rig, pixels, measured[:, ::-1],
+    )  # fmt: skip
+    for flip, words in (
+        ((True, False), "the x axis is reversed; number the projector's columns from the other end"),
+        ((False, True), "the y axis is reversed; number the projector's rows from the other end"),
+        ((True, True), "the projector's image is turned by 180 degrees; number columns and rows from the other end"),
+    ):
+        yield words, rig, pixels, np.where(flip, size - 1 - measured, measured)
+    yield (
+        "R and T are inverted: they map the projector to the camera; import their inverse",
+        StereoRig(rig.camera, rig.projector, rig.R.T, -rig.R.T @ rig.t),
+        pixels,
+        measured,
+    )
+    yield (
+        "the matrices of camera and projector are exchanged; import them the other way round",
+        StereoRig(
+            Lens(rig.projector.K, rig.projector.D, rig.camera.size),
+            Lens(rig.camera.K, rig.camera.D, rig.projector.size),
+            rig.R,
+            rig.t,
+        ),
+        pixels,
+        measured,
+    )
+    for factors in ((2, 2), (0.5, 0.5), (2, 1), (0.5, 1), (1, 2), (1, 0.5)):
+        which = {1: "", 2: "half", 0.5: "twice"}
+        said = " and ".join(
+            f"{which[f]} as many {word}" for f, word in zip(factors, ("columns", "rows"), strict=True) if f != 1
+        )
+        yield (
+            f"the patterns were described with {said} as the calibrated projector has; give the projector's size and "
+            "the fringe period as in the calibration",
+            rig,
+            pixels,
+            (measured + 0.5) * factors - 0.5,
+        )
+    for flip, words in (
+        ((True, False), "the camera's image is mirrored"),
+        ((False, True), "the camera's image is upside down and mirrored"),
+        ((True, True), "the camera's image is turned by 180 degrees"),
+    ):
+        yield f"{words}; record it as for the calibration", rig, np.where(flip, image - 1 - pixels, pixels), measured
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def _scale(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
+    """In words, where one is a simple multiple of the other."""
+    ratio: Callable[[int], float] = lambda i: size[i] / calibrated[i]  # noqa: E731
+    for factor, words in ((0.5, "half"), (2.0, "twice"), (0.25, "a quarter of"), (4.0, "four times")):
+        if ratio(0) == factor and ratio(1) == factor:
+            return f" (the capture's is {words} the calibrated size)"
+    return ""

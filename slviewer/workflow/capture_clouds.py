@@ -1,0 +1,64 @@
+"""The cloud of a capture by one of the session's calibrations, once it is known that they belong together."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
+from slviewer.reconstruction.axis_agreement import CaptureCheck, check_phases, check_sizes
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+from slviewer.workflow.feedback import Warn, unwarned
+from slviewer.workflow.models import Model, load_stereo
+from slviewer.workflow.scaling import scale_factor, scaled
+
+
+def capture_cloud(
+    store: Session,
+    model: Model,
+    capture: Capture,
+    phases: Mapping[Axis, PhaseMap],
+    *,
+    axis: Axis | None = None,
+    texture: np.ndarray | None = None,
+    accept_rejected: bool = False,
+    warn: Warn = unwarned,
+) -> Cloud:
+    """The organised cloud of a decoded capture, with the scale that was applied to the calibration.
+
+    Raises InputError where capture and calibration do not belong together: by their sizes, or by how far the axes of
+    the capture miss each other, which is a warning if ``accept_rejected``. Where they miss each other by more than
+    noise explains, the cloud's sigmas are raised by that factor, and ``warn`` says so.
+    """
+    check = check_capture(store, model, capture, phases, accept_rejected)
+    for message in check.warnings:
+        warn(message)
+    cloud = scaled(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
+    return raised(cloud, check.sigma_factor)
+
+
+def check_capture(
+    store: Session,
+    model: Model,
+    capture: Capture,
+    phases: Mapping[Axis, PhaseMap],
+    accept_rejected: bool = False,
+) -> CaptureCheck:
+    """Whether a capture belongs to a calibration, as ``axis_agreement.check_phases`` finds it."""
+    stereo = load_stereo(store)
+    check_sizes(capture.name, capture.size, capture.sequence.projector, stereo.rig)
+    calibration = model if isinstance(model, SplinedModel) else stereo
+    return check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
+
+
+def raised(cloud: Cloud, factor: float) -> Cloud:
+    """The cloud with sigmas larger by a factor."""
+    if factor == 1.0:
+        return cloud
+    left = None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor)
+    return replace(cloud, sigma_z=cloud.sigma_z * np.float32(factor), sigma_calibration=left)
