@@ -17,7 +17,7 @@ from slviewer.evaluation.acceptance.result import Acceptance, conclude
 from slviewer.evaluation.budget import Budget, Contribution, budget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
 from slviewer.session.store import Session
-from slviewer.workflow.capture_clouds import capture_cloud
+from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.drifting import Checked, history
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
@@ -87,6 +87,7 @@ def accept(
         if apply_scale_found and thing.kind == "plane":
             raise InputError("a plane says nothing of scale: apply that of a ball bar or a sphere")
         captures = _captures(store, thing)
+        check_capture_sizes(store, [*captures, *still])
         depth_range = load_stereo(store).depth_range_mm
         measuring = part(progress, 0, 0.9 if not still else 0.5)
         found: list[Position] = []

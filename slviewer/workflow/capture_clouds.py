@@ -1,6 +1,6 @@
 """The cloud of a capture by one of the session's calibrations, once it is known that they belong together."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +16,14 @@ from slviewer.session.store import Session
 from slviewer.workflow.feedback import Warn, unwarned
 from slviewer.workflow.models import Model, load_stereo
 from slviewer.workflow.scaling import scale_factor, scaled
+
+
+def check_capture_sizes(store: Session, names: Iterable[str]) -> None:
+    """Raise InputError where a capture's camera or projector has not the size that the session's calibration has:
+    before anything is decoded, which would fail for reasons that follow from it."""
+    rig = load_stereo(store).rig
+    for capture in (store.load_capture(name) for name in names):
+        check_sizes(capture.name, capture.size, capture.sequence.projector_size, rig)
 
 
 def capture_cloud(
@@ -51,7 +59,7 @@ def check_capture(
 ) -> CaptureCheck:
     """Whether a capture belongs to a calibration, as ``axis_agreement.check_phases`` finds it."""
     stereo = load_stereo(store)
-    check_sizes(capture.name, capture.size, capture.sequence.projector, stereo.rig)
+    check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
     calibration = model if isinstance(model, SplinedModel) else stereo
     return check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
 

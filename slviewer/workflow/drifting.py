@@ -89,7 +89,7 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
         frames = shot.stack()
         phases = decode_capture(shot, frames)
         check_projector(capture, shot.sequence, phases)
-        check_sizes(capture, shot.size, shot.sequence.projector, stereo.rig)
+        check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
         board = Board.parse(stereo.board)
         observation = observe(capture, board, detect(board, capture_texture(shot, frames)), phases, _smoothing(store))
         progress(0.3, "what the calibration's own poses say")

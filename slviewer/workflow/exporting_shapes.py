@@ -14,7 +14,7 @@ from slviewer.session.ply import Ply, read_ply
 from slviewer.session.store import Session
 from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
 from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.workflow.capture_clouds import capture_cloud
+from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, part
 from slviewer.workflow.models import load_model, preferred
@@ -86,6 +86,7 @@ def scan_cloud(
             return Cloud(axis=meta["axis"], model=meta["model"], **arrays)
     fitted = load_model(store, model or preferred(store))
     progress(0.1, f"reading {name}")
+    check_capture_sizes(store, [name])
     frames = capture.stack()
     for sentence in told(store, name, frames):
         warn(f"{name}: {sentence}")

@@ -17,7 +17,7 @@ from slviewer.registration.turntable import Axis
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
-from slviewer.workflow.capture_clouds import capture_cloud
+from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_model, preferred, warn_if_stale
@@ -160,6 +160,7 @@ def merge(
         check_accepted(store, accept_rejected)
         fitted = load_model(store, model or preferred(store))
         warn_if_stale(store, warn)
+        check_capture_sizes(store, names)
         scale, clouds = told_scale(store, fitted.name), {}
         for i, (shot, frames, phases) in enumerate(decoded(store, names)):
             for sentence in told(store, shot.name, frames):

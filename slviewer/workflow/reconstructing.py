@@ -19,7 +19,7 @@ from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
-from slviewer.workflow.capture_clouds import capture_cloud
+from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, check_accepted, load_models, load_stereo, preferred, warn_if_stale
@@ -89,6 +89,7 @@ def reconstruct(
         name = model or preferred(store)
         warn_if_stale(store, warn)
         shot = store.load_capture(capture)
+        check_capture_sizes(store, [capture])
         progress(0.1, "reading frames")
         frames = shot.stack()
         for sentence in told(store, capture, frames):

@@ -13,6 +13,7 @@ from slviewer.evaluation.compare import Comparison, compare
 from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
+from slviewer.workflow.capture_clouds import check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_models, load_stereo, warn_if_stale
@@ -107,6 +108,7 @@ def verify(
         chosen = load_models(store, models)
         warn_if_stale(store, warn)
         reach = depth_range or load_stereo(store).depth_range_mm
+        check_capture_sizes(store, captures)
         for i, (shot, frames, phases) in enumerate(decoded(store, captures)):
             for sentence in told(store, shot.name, frames):
                 warn(f"{shot.name}: {sentence}")

@@ -39,7 +39,7 @@ class Measuring:
         """
         if self.calibrated is not None:
             height, width = frames.shape[1:]
-            check_sizes("the live scan", (width, height), self.sequence.projector, self.calibrated)
+            check_sizes("the live scan", (width, height), self.sequence.projector_size, self.calibrated)
         if self._fast is not None:
             scan = self._fast.run(frames, out=self._room())
             self._before, points = scan, scan.points
