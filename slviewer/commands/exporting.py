@@ -36,7 +36,8 @@ def export(
         name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model of coefficients.
         out: The file, whose suffix says how it is written, or a folder; by default the session's exports.
         format: ply, stl, obj, glb, xyz, yml, xml, json, …, where out is a folder or left out.
-        model: Which calibration to make a cloud with; by default the one that the scan is kept from, or the best.
+        model: Which calibration to make a cloud with, by default the one that the scan is kept from, or the best; or
+            which to write (of splined the pinhole and Brown lenses that come nearest, and what they leave).
         method: Of a mesh: triangles between the pixels of one scan, one surface fitted to all points, or the mean
             surface in small cells; by default grid for a scan, poisson for a merge.
         fill_holes: Of a mesh: fill holes up to so many mm across; by default those of a few points.

@@ -16,7 +16,7 @@ from slviewer.errors import CalibrationRejected, InputError
 from slviewer.target.board import Board
 from slviewer.workflow.diagnosing import attempt, keep_rejected, rejected, save_verdict
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import save_fitted, save_stereo
+from slviewer.workflow.models import available, preferred, save_fitted, save_stereo, warn_if_frame_changed
 from slviewer.workflow.opening import SessionLike, opened
 
 _LENGTH = {"pixelwise": 1.0, "anchored": 1.0, "splined": 2.0}
@@ -128,6 +128,7 @@ def calibrate(
     step_2 = Smoothing(smoothing, degree)
     with opened(session, write=True) as store:
         excluded = store.excluded()
+        before = preferred(store) if available(store) else ""
         names = store.capture_names("calibration")
         if not names:
             raise InputError(
@@ -161,6 +162,7 @@ def calibrate(
             if model is not None:
                 save_fitted(store, model, inputs, settings)
         save_verdict(store, found.verdict, names)
+        warn_if_frame_changed(store, before, warn)
         progress(1.0, "calibrated")
     return replace(made, verdict=found.verdict)
 

@@ -118,7 +118,8 @@ def export(
     ``name``: the scan of a cloud or a mesh (not needed where there is one alone), the number of a merge (the last one
     by default), the model of the coefficients. ``out``: the file, whose suffix says how it is written, or a folder; by
     default the session's exports, as ``file_format`` or the first of ``FORMATS``. ``model``: the calibration that
-    clouds are made with, by default the one they are kept from, else the preferred one. ``plan``: how to mesh.
+    clouds are made with, or that is written, by default the one they are kept from, else the preferred one.
+    ``plan``: how to mesh.
     """
     with opened(session) as store:
         chosen = file_format.lower().removeprefix(".")
@@ -168,8 +169,8 @@ def _write_shape(
 
 def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:
     if what == "calibration":
-        write_calibration_file(store, target)
-        return "calibration of camera and projector"
+        chosen = model or preferred(store)
+        return f"{chosen} calibration of camera and projector, {write_calibration_file(store, target, chosen)}"
     if what == "coefficients":
         return f"coefficients of each pixel by the {write_coefficients(store, name, target)} model"
     if what == "poses":

@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 
 from slviewer import __version__
+from slviewer.calibration.pinhole_fit import fit_splined, residuals_of_pixelwise
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
+from slviewer.geometry.rig import StereoRig
 from slviewer.session.atomic import arriving_file, replace_file
 from slviewer.session.exporters import write_calibration
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.workflow.exporting_shapes import is_fresh
-from slviewer.workflow.models import available, load_model, load_stereo
+from slviewer.workflow.models import available, frame_of, load_model, load_stereo
 from slviewer.workflow.scaling import scale_factor
 
 _FRAMES = (
@@ -26,6 +28,7 @@ _FRAMES = (
 _CALIBRATION = {
     "units": "lengths in mm, image coordinates in px; pixel (0, 0) is the centre of the top left one",
     "model": "pinhole cameras with OpenCV's distortion; what the pixels learnt beyond it is in the coefficients' file",
+    "frame": "the frame that X_camera means here and in clouds of this model; another model's may be turned against it",
     "target": "the board of the target poses: kind, columns x rows, pitch in mm",
     "camera_size": "width and height of the camera's image, px",
     "projector_size": "width and height of the projector's image, px",
@@ -41,6 +44,10 @@ _CALIBRATION = {
     "scale_factor": "correction of the scale by a certified artefact, which is in T already",
     "depth_range_mm": "nearest and farthest depth of the target poses, mm",
     "target_poses": "number of target poses that it was made from",
+    "fit_rms_px_camera": "RMS distance of these lenses' image of the model's own rays from their pixels, camera, px",
+    "fit_max_px_camera": "the largest of these distances, px",
+    "fit_rms_px_projector": "RMS distance of these lenses' image of the model's own rays from their pixels, projector",
+    "fit_max_px_projector": "the largest of these distances, px",
     "reprojection_rms_px_stereo": "RMS distance of measured from predicted features in both devices, px",
     "reprojection_rms_px_camera": "the camera's alone, px",
     "reprojection_rms_px_projector": "the projector's alone, px",
@@ -60,15 +67,34 @@ _POSES = {
 }
 
 
-def write_calibration_file(store: Session, path: Path) -> None:
-    """The stereo calibration with names, units and quality, as OpenCV's YAML or XML, or as JSON."""
-    stereo = load_stereo(store)
-    rig, factor = stereo.rig, scale_factor(store, "stereo")
+def write_calibration_file(store: Session, path: Path, model: str) -> str:
+    """A model's pinholes and Brown lenses with names, units and quality, as OpenCV's YAML or XML, or as JSON; returns
+    what they leave, in words.
+
+    Of the splined model the best fit in the frame of its own clouds; the others stand on stereo's lenses.
+    """
+    stereo, factor = load_stereo(store), scale_factor(store, model)
+    fitted = load_model(store, model)
+    rig, fits = stereo.rig, {}
+    if isinstance(fitted, SplinedModel):
+        camera, projector = fit_splined(fitted)
+        rig, fits = (
+            StereoRig(camera.lens, projector.lens, fitted.rig.R, fitted.rig.t),
+            {
+                "camera": camera,
+                "projector": projector,
+            },
+        )
+    elif isinstance(fitted, PixelwiseModel):
+        fits = {"camera": residuals_of_pixelwise(fitted, rig.camera)}
     T = _moved(rig.T_projector_camera, factor)
+    depths = fitted.bundle.depth_range_mm if isinstance(fitted, SplinedModel) else stereo.depth_range_mm
+    poses = fitted.bundle.poses if isinstance(fitted, SplinedModel) else tuple(stereo.poses)
     entries: dict[str, Any] = {
         "program": f"slviewer {__version__}",
         "units": "mm, px",
-        "model": "stereo",
+        "model": model,
+        "frame": frame_of(store, model),
         **({"target": stereo.board} if stereo.board else {}),
         "camera_size": np.array(rig.camera.size),
         "projector_size": np.array(rig.projector.size),
@@ -80,13 +106,20 @@ def write_calibration_file(store: Session, path: Path) -> None:
         "T": factor * rig.t,
         "T_projector_camera": T,
         "T_camera_projector": np.linalg.inv(T),
-        "baseline_mm": factor * stereo.baseline_mm,
+        "baseline_mm": factor * float(np.linalg.norm(rig.t)),
         **({"scale_factor": factor} if factor != 1 else {}),
-        **({"depth_range_mm": factor * np.array(stereo.depth_range_mm)} if stereo.depth_range_mm else {}),
-        **({"target_poses": len(stereo.poses)} if stereo.poses else {}),
-        **{f"reprojection_rms_px_{name}": float(value) for name, value in stereo.reprojection_rms_px.items()},
+        **({"depth_range_mm": factor * np.array(depths)} if depths else {}),
+        **({"target_poses": len(poses)} if poses else {}),
     }
+    for device, fit in fits.items():
+        entries |= {f"fit_rms_px_{device}": fit.rms_px, f"fit_max_px_{device}": fit.max_px}
+    if not isinstance(fitted, SplinedModel):
+        entries |= {f"reprojection_rms_px_{name}": float(value) for name, value in stereo.reprojection_rms_px.items()}
     write_calibration(path, entries, {name: said for name, said in _CALIBRATION.items() if name in entries})
+    left = ", ".join(
+        f"{fit.rms_px:.3f} px RMS and {fit.max_px:.3f} px at most in the {device}" for device, fit in fits.items()
+    )
+    return f"in the frame of the {entries['frame']}" + (f"; pinhole and Brown distortion leave {left}" if left else "")
 
 
 def write_coefficients(store: Session, name: str, path: Path) -> str:

@@ -17,7 +17,7 @@ from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, part
-from slviewer.workflow.models import load_model, preferred
+from slviewer.workflow.models import frame_of, load_model, preferred
 from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.trust import told
 
@@ -62,7 +62,8 @@ def scan_shape(
     mask = cloud.mask
     if not mask.any():
         raise InputError(f"{name}: no pixel was measured: does the calibration belong to this camera and projector?")
-    notes = (f"scan {name}, frame: the camera's, x right, y down, z away", *_of_model(store, cloud.model))
+    frame = f"frame: {frame_of(store, cloud.model)}, x right, y down, z away"
+    notes = (f"scan {name}, {frame}", *_of_model(store, cloud.model))
     if plan is not None:
         return _meshed(name, mesh_of(cloud, plan, part(progress, 0.5, 1)), notes)
     progress(0.7, "normals")
@@ -111,9 +112,10 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
     name = merge_name(store, name)
     progress(0.1, "reading the merged points")
     meta, merged = _kept_merge(store, name, warn)
+    model = str(meta.get("model", ""))
     notes = (
-        f"merge {name} of {', '.join(meta['scans'])}, frame: the camera's at {meta['reference']}",
-        *_of_model(store, str(meta.get("model", ""))),
+        f"merge {name} of {', '.join(meta['scans'])}, frame: {frame_of(store, model)}, at {meta['reference']}",
+        *_of_model(store, model),
     )
     if plan is None:
         said = "sigma: expected error along the normal, mm"

@@ -20,7 +20,7 @@ from slviewer.surface.fuse import Fused, fuse
 from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decoded
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import check_accepted, load_model, preferred, warn_if_stale
+from slviewer.workflow.models import check_accepted, frame_of, load_model, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.trust import told
@@ -184,7 +184,8 @@ def merge(
         surface = fused.surface
         scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
         scalars |= {"seen_by": fused.seen_by, "source": fused.source}
-        notes = (f"scans {', '.join(names)}, frame: the camera's at {reference}", f"calibration {fitted.name}")
+        frame = f"{frame_of(store, fitted.name)}, at {reference}"
+        notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {fitted.name}")
         number = 0 if out is not None else next_merge(store)
         path = store.exports / f"merged_{number}.ply" if out is None else out
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -190,6 +190,30 @@ def insisted(store: Session) -> bool:
     return bool(decided == store.input_hashes("calibration/stereo")["calibration/stereo"])
 
 
+def frame_family(name: str) -> str:
+    """The calibration whose camera frame a model's clouds are in: splined has its own, the others stand on stereo's."""
+    return "splined" if name == "splined" else "stereo"
+
+
+def frame_of(store: Session, name: str) -> str:
+    """The frame of a model's clouds, in words: "camera of calibration splined 1a2b3c4d"."""
+    family = frame_family(name)
+    calibration = f"calibration/{family}"
+    if not store.has_result(calibration):
+        return f"camera of calibration {family}"
+    return f"camera of calibration {family} {store.input_hashes(calibration)[calibration][:8]}"
+
+
+def warn_if_frame_changed(store: Session, before: str, warn: Warn) -> None:
+    """Say so where another model is used than ``before`` (empty: none was), whose clouds lie in another frame."""
+    after = preferred(store) if available(store) else ""
+    if before and after and frame_family(before) != frame_family(after):
+        warn(
+            f"the {after} calibration is used from now on instead of {before}, and its clouds lie in another frame: "
+            f"the {frame_of(store, after)}. Reconstruct earlier scans again before you combine them with new ones"
+        )
+
+
 def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:
     """Calibrations by name; all there are where none is named."""
     load_stereo(store)

@@ -22,7 +22,7 @@ from slviewer.target.detect import board_mask, detect
 from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
-from slviewer.workflow.models import Model, check_accepted, load_models, load_stereo, preferred, warn_if_stale
+from slviewer.workflow.models import Model, check_accepted, frame_of, load_models, load_stereo, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.scaling import told_scale
 from slviewer.workflow.trust import told
@@ -33,6 +33,7 @@ class Reconstruction:
     """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
     measures the board. ``scale`` says, in words, what correction of scale is in it; ``masked`` is the share of the
     pixels that were left out because no target pose lit what they look through, None for models that leave out none.
+    ``frame``: the one that the points are in, in words.
     """
 
     cloud: Cloud
@@ -42,6 +43,7 @@ class Reconstruction:
     board: Comparison | None = None
     scale: str = ""
     masked: float | None = None
+    frame: str = ""
 
     def text(self) -> str:
         """For people."""
@@ -54,9 +56,11 @@ class Reconstruction:
         if cloud.sigma_calibration is not None:
             left = cloud.sigma_calibration[cloud.mask]
             lines.append(
-                f"the calibration leaves {np.median(left):.4f} mm of depth uncertain in the median, "
-                f"{np.percentile(left, 95):.4f} mm at 95 % (1 sigma)"
+                f"apart from a rigid motion, the calibration leaves {np.median(left):.4f} mm of depth uncertain in the "
+                f"median, {np.percentile(left, 95):.4f} mm at 95 % (1 sigma)"
             )
+        if self.frame:
+            lines.append(f"frame: {self.frame}")
         if self.scale:
             lines.append(self.scale)
         if self.masked is not None and self.masked > 0.005:
@@ -122,14 +126,14 @@ def reconstruct(
         progress(0.8, "writing")
         ply.parent.mkdir(parents=True, exist_ok=True)
         faces = triangles(cloud.points, keep) if mesh else None
-        notes = (f"scan {capture}, frame: the camera's", f"calibration {name}")
+        notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}")
         write_ply(ply, cloud.points[keep], texture[keep], scalars=cloud.sigmas(keep), faces=faces, notes=notes)
         if grid is not None:
             write_grid(Path(grid), cloud.points)
-        scale, fitted = told_scale(store, name), chosen[name]
+        scale, fitted, frame = told_scale(store, name), chosen[name], frame_of(store, name)
         masked = unsupported(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
         progress(1.0, "reconstructed")
-    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked)
+    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked, frame)
 
 
 def triangles(points: np.ndarray, keep: np.ndarray) -> np.ndarray:

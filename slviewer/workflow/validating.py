@@ -15,7 +15,15 @@ from slviewer.errors import CalibrationRejected, InputError, UsageError
 from slviewer.evaluation.crossvalidation import FOLDS, CrossValidation, HeldOut, gathered, measure_held_out, split
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.workflow.models import MODELS, VALIDATION, available, load_stereo, warn_if_stale
+from slviewer.workflow.models import (
+    MODELS,
+    VALIDATION,
+    available,
+    load_stereo,
+    preferred,
+    warn_if_frame_changed,
+    warn_if_stale,
+)
 from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.poses import load_observations
 
@@ -61,7 +69,9 @@ def validate(
             warn(f"{model} is not judged: {why}")
         judged = [f"calibration/{name}" for name in found.models if name in available(store)]
         inputs = store.input_hashes(*stereo.poses, *dict.fromkeys(["calibration/stereo", *judged]))
+        before = preferred(store)
         store.save_result(VALIDATION, {"validation": found.to_json(), "inputs": inputs}, {})
+        warn_if_frame_changed(store, before, warn)
         progress(1.0, "validated")
     return found
 
