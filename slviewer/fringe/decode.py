@@ -2,12 +2,13 @@
 
 import numpy as np
 
-from slviewer.fringe import kernels, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
+from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
 from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
+from slviewer.fringe.levels import cell_misfit, code_cell_px, found_levels, lowest_coordinate, unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.reference import dark_sigmas, decode_reference, found_levels, lowest_coordinate, phase_shift
-from slviewer.fringe.reference_spikes import border_rad, cell_rad, is_plain
+from slviewer.fringe.reference import code_bits, dark_sigmas, decode_reference, phase_shift
+from slviewer.fringe.reference_spikes import border_rad, cell_rad, is_plain, repeat_cells
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
 
@@ -28,13 +29,18 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
     scale = grey_scale(found, noise, white)
     if not found.shifts:
         maps = _gray_alone(found, stack, scale)
-    elif found.gray:
+    elif found.numbers_periods:
         maps = _coded(found, stack, scale)
+    elif found.gray:
+        maps = _cells(found, stack, scale)
     else:
         maps = _levels(found, stack, scale)
     phase, wrapped, modulation, background, reason = maps
     phase = _settled(found, phase, reason)
-    return PhaseMap(axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps)
+    unambiguous = unambiguous_px(found)
+    return PhaseMap(
+        axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps, unambiguous
+    )
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
@@ -62,7 +68,7 @@ def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.n
     rules = code_rules(found, fringe_mean(found, stack) if is_plain(found) else MIDDLE)
     kernels_coded.decode_coded(
         stack,
-        steps_of(found.shifts[0], found.sign),
+        steps_of(found.shifts[0], found.sign, found.offset_rad),
         np.array(found.gray, np.int64),
         np.array(found.inverse, np.int64),
         -1 if found.complementary is None else found.complementary,
@@ -83,11 +89,39 @@ def _levels(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.
     return maps
 
 
+def _cells(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
+    maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
+    bits = code_bits(found)
+    inverses = [*found.inverse, *[-1] * (len(bits) - len(found.inverse))]
+    rules = kernels_cells.CellRules(
+        found.gray_origin_px,
+        code_cell_px(found),
+        limits.WEAK_BIT,
+        limits.WEAKER,
+        fringe_mean(found, stack),
+        limits.UNDECIDED_BIT,
+    )
+    kernels_cells.decode_cells(
+        stack,
+        shifts_of(found),
+        ladder_of(found),
+        np.array(bits, np.int64),
+        np.array(inverses, np.int64),
+        scale,
+        rules,
+        *maps,
+    )
+    return maps
+
+
 def _gray_alone(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
     phase, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(3))
     reason = np.empty(stack.shape[1:], np.uint8)
     rules = kernels_gray.GrayRules(
-        found.gray_origin_px + 0.5,
+        found.gray_origin_px,
+        found.gray_cell_px,
+        -0.5,
+        found.extent - 0.5,
         np.sqrt(0.5 if found.inverse else 1.5),
         limits.GRAY_UNDECIDED_SIGMAS,
         limits.GRAY_UNDECIDED_PART,
@@ -151,11 +185,13 @@ def spike_rules(found: Layout) -> kernels_spikes.SpikeRules:
         limits.LONELY,
         limits.LONELY_NEIGHBOURS,
         *border_rad(found),
+        repeat_cells(found),
     )
 
 
-def steps_of(shift: Shift, sign: int) -> kernels.Steps:
-    """The frames of a period and the cosines and sines that they are weighed with, as the kernels read them."""
+def steps_of(shift: Shift, sign: int, offset_rad: float = 0.0) -> kernels.Steps:
+    """The frames of a period and the cosines and sines that they are weighed with, as the kernels read them; ``sign``
+    and ``offset_rad`` are the sequence's."""
     n = len(shift.indices)
     half = n // 2
     if n % 2:  # less the first frame, steps k and n - k
@@ -169,12 +205,15 @@ def steps_of(shift: Shift, sign: int) -> kernels.Steps:
         cosines[-1:] *= half % 2  # a quarter of a turn, exactly
     counted = n - 1 + sum(line.count(0) for line in lines)
     frames = np.array(shift.indices, np.int64)[np.array(lines)]
-    return kernels.Steps(frames, cosines.astype(np.float32), sines.astype(np.float32), shift.indices[0], n, counted)
+    turn = float(np.cos(offset_rad)), float(np.sin(offset_rad))
+    return kernels.Steps(
+        frames, cosines.astype(np.float32), sines.astype(np.float32), shift.indices[0], n, counted, *turn
+    )
 
 
 def shifts_of(found: Layout) -> kernels.Shifts:
     """All periods of a layout, as the kernels read them."""
-    shifts = [steps_of(shift, found.sign) for shift in found.shifts]
+    shifts = [steps_of(shift, found.sign, found.offset_rad) for shift in found.shifts]
     return kernels.Shifts(
         np.concatenate([shift.frames for shift in shifts]),
         np.concatenate([shift.cosines for shift in shifts]),
@@ -183,27 +222,27 @@ def shifts_of(found: Layout) -> kernels.Shifts:
         np.array([shift.first for shift in shifts], np.int64),
         np.array([shift.steps for shift in shifts], np.int64),
         np.array([shift.counted for shift in shifts], np.int64),
+        shifts[0].turn_cosine,
+        shifts[0].turn_sine,
     )
 
 
 def ladder_of(found: Layout) -> kernels_levels.Ladder:
-    """How a layout's periods become one absolute phase; empty where a Gray code tells it."""
-    if found.gray:
-        return kernels_levels.Ladder(np.zeros((0, 0)), np.zeros(0), 0.0, 0.0)
+    """How a layout's periods become one absolute phase; empty where Gray bits number the periods."""
+    if found.numbers_periods:
+        return kernels_levels.Ladder(np.zeros((0, 0)), np.zeros(0), 0.0, 0.0, 0.0)
     levels = found_levels(found)
+    extent = min(found.extent, unambiguous_px(found))
     return kernels_levels.Ladder(
         np.array([level.weights for level in levels], np.float64),
         np.array([level.period_px for level in levels], np.float64),
-        lowest_coordinate(levels[0].period_px, found.extent),
+        0.0 if found.gray else lowest_coordinate(levels[0].period_px, extent),
         limits.LEVEL_MISFIT,
+        cell_misfit(found),
     )
 
 
-def waves(shift: Shift, sign: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def waves(shift: Shift, sign: int, offset_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frame indices of a period by step, and the cosines and sines that they are weighed with."""
-    angle = 2 * np.pi * np.arange(len(shift.indices)) / len(shift.indices)
-    return (
-        np.array(shift.indices, np.int64),
-        np.cos(angle).astype(np.float32),
-        (sign * np.sin(angle)).astype(np.float32),
-    )
+    angle = 2 * np.pi * sign * np.arange(len(shift.indices)) / len(shift.indices) + offset_rad
+    return np.array(shift.indices, np.int64), np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)

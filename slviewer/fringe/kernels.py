@@ -32,6 +32,7 @@ class Steps(NamedTuple):
 
     Steps k, n/2 - k, n/2 + k and n - k share their cosine and sine but for signs: one product serves four frames. The
     first frame stands in where there are fewer. ``first``: its index; ``counted``: how often all frames are read.
+    ``turn_cosine`` and ``turn_sine``: of the phase offset, by which the sums are turned back.
     """
 
     frames: np.ndarray
@@ -40,11 +41,13 @@ class Steps(NamedTuple):
     first: int
     steps: int
     counted: int
+    turn_cosine: float
+    turn_sine: float
 
 
 class Shifts(NamedTuple):
     """The `Steps` of all periods, longest first: of period i, lines ``starts[i]`` to ``starts[i + 1]``, and
-    entry i of ``first``, ``steps`` and ``counted``."""
+    entry i of ``first``, ``steps`` and ``counted``; the phase offset is that of all."""
 
     frames: np.ndarray
     cosines: np.ndarray
@@ -53,6 +56,8 @@ class Shifts(NamedTuple):
     first: np.ndarray
     steps: np.ndarray
     counted: np.ndarray
+    turn_cosine: float
+    turn_sine: float
 
 
 @numba.njit(inline="always")
@@ -60,7 +65,8 @@ def period(shifts, i):
     """The `Steps` of one period."""
     a, b = shifts.starts[i], shifts.starts[i + 1]
     lines = shifts.frames[a:b], shifts.cosines[a:b], shifts.sines[a:b]
-    return Steps(lines[0], lines[1], lines[2], shifts.first[i], shifts.steps[i], shifts.counted[i])
+    turn = shifts.turn_cosine, shifts.turn_sine
+    return Steps(lines[0], lines[1], lines[2], shifts.first[i], shifts.steps[i], shifts.counted[i], turn[0], turn[1])
 
 
 class Scale(NamedTuple):
@@ -167,6 +173,11 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
                 all_x, cos_x, sin_x, peak_x = four(a[x], b[x], c[x], d[x], cos_a, sin_a)
                 total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
                 peak[x] = max(peak[x], peak_x)
+    if shift.turn_sine != 0.0 or shift.turn_cosine < 0.0:
+        turn, across = np.float32(shift.turn_cosine), np.float32(shift.turn_sine)
+        for x in range(width):
+            cos_x, sin_x = cosine[x], sine[x]
+            cosine[x], sine[x] = turn * cos_x - across * sin_x, turn * sin_x + across * cos_x
 
 
 @numba.njit(inline="always")

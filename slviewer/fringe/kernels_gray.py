@@ -8,13 +8,17 @@ import numpy as np
 from slviewer.fringe.kernels import bit_height, is_dark, verdict
 from slviewer.geometry.jit import kernel
 
-TWO_PI = np.float32(2 * np.pi)
+TWO_PI = 2 * np.pi
 
 
 class GrayRules(NamedTuple):
-    """How bits without a phase are read; see `limits`. ``sigma_part``: noise of a bit over that of a grey level."""
+    """How bits without a phase are read; see `limits`. Cells of ``cell`` px begin at ``origin``, and the projector
+    reaches from ``low`` to ``high``. ``sigma_part``: noise of a bit over that of a grey level."""
 
-    centre: float
+    origin: float
+    cell: float
+    low: float
+    high: float
     sigma_part: float
     undecided_sigmas: float
     undecided_part: float
@@ -25,6 +29,7 @@ class GrayRules(NamedTuple):
 def decode_gray(stack, gray, inverse, white, black, scale, rules, phase, modulation, background, reason):
     """Projector column or row from Gray bits; ``white`` and ``black`` are frames, or -1. Fills the four (h, w) maps."""
     _, height, width = stack.shape
+    per_px = TWO_PI / rules.cell
     for row in numba.prange(height):
         for x in range(width):
             B, A = np.float32(0), np.float32(0)
@@ -52,5 +57,10 @@ def decode_gray(stack, gray, inverse, white, black, scale, rules, phase, modulat
             modulation[row, x], background[row, x] = B, A
             dark = (doubts >= rules.dark_bits) | is_dark(B, A, scale)
             reason[row, x] = verdict(dark, False, unclear)
-            absolute = TWO_PI * np.float32(np.float64(0.5) * (code + other) + np.float32(rules.centre))
-            phase[row, x] = np.float32(np.nan) if dark | unclear else absolute
+            start, end = (
+                rules.origin + rules.cell * min(code, other),
+                rules.origin + rules.cell * (max(code, other) + 1),
+            )
+            first, last = max(start, rules.low), min(end, rules.high)
+            centre = 0.5 * (first + last if first < last else start + end)
+            phase[row, x] = np.float32(np.nan) if dark | unclear else np.float32(per_px * centre)

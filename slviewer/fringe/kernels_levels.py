@@ -13,21 +13,24 @@ PER_RAD = 1 / (2 * np.pi)
 
 class Ladder(NamedTuple):
     """How several periods become one absolute phase; ``weights`` (levels, m) of the m wrapped
-    phases and ``periods`` (levels,) px describe the levels, longest first; ``low`` px is where the first is cut."""
+    phases and ``periods`` (levels,) px describe the levels, longest first; ``low`` px is where the first is cut.
+    ``misfit`` and ``cell_misfit``: see `limits.LEVEL_MISFIT` and `levels.cell_misfit`."""
 
     weights: np.ndarray
     periods: np.ndarray
     low: float
     misfit: float
+    cell_misfit: float
 
 
 @numba.njit(inline="always")
-def levels_row(psi, ladder, weakest, A, clipped, scale, coordinate, order, own, worst, phase, reason):
+def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase, reason):
     """One row's absolute phase and reason from its (m, w) wrapped phases; ``coordinate`` ... ``worst`` (w,) are room.
 
-    ``weakest``: the smallest square of a modulation. float32 knows a coordinate to some 1e-4 px, enough to tell whole
-    periods apart; the phase itself is never a coordinate. Loops run along the row, which the compiler turns into vector
-    instructions.
+    ``cell``: the coordinates px (w,) near which the first level's are, with ``worst`` infinite where they are not
+    known; empty where the first level is cut at ``low`` instead. ``weakest``: the smallest square of a modulation.
+    float32 knows a coordinate to some 1e-4 px, enough to tell whole periods apart; the phase itself is never a
+    coordinate. Loops run along the row, which the compiler turns into vector instructions.
     """
     count, width = psi.shape
     low, misfit = np.float32(ladder.low), np.float32(ladder.misfit)
@@ -47,7 +50,16 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, coordinate, order, own, 
                 weight, wrapped = np.float32(ladder.weights[level, i]), psi[i]
                 for x in range(width):
                     own[x] = fma(weight, wrapped[x], own[x])
-        if level == 0:
+        if level == 0 and len(cell):
+            per_misfit = np.float32(ladder.misfit / ladder.cell_misfit)
+            for x in range(width):
+                position = source[x] * per_rad
+                turns = (cell[x] - position) * per_px
+                whole = np.rint(turns)
+                order[x] = whole
+                worst[x] = max(worst[x], abs(turns - whole) * per_misfit)
+                coordinate[x] = fma(whole, length, position)
+        elif level == 0:
             for x in range(width):
                 position = source[x] * per_rad
                 whole = np.float32(0) - np.floor((position - low) * per_px)
@@ -78,13 +90,13 @@ def levels_room(width):
 
 
 @numba.njit(inline="always")
-def ladder_row(stack, shifts, ladder, scale, row, psi, out, B, A, peak, room, phase, reason):
-    """One row's absolute phase, reason, wrapped phase ``out``, modulation B and background A of the finest period, and
-    all wrapped phases ``psi`` (m, w).
+def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, room):
+    """One row's wrapped phases ``psi`` (m, w), and that ``out`` of the finest period with its modulation B and
+    background A; the room's ``clipped`` and ``weakest`` are of all periods.
 
     The other periods' modulations are compared as squares, which spares their roots.
     """
-    clipped, weakest, coordinate, order, own, worst, cosine, sine, total = room
+    clipped, weakest, _, _, _, _, cosine, sine, total = room
     width, white = stack.shape[2], np.float32(scale.white)
     for x in range(width):
         weakest[x], clipped[x] = np.float32(np.inf), False
@@ -102,7 +114,6 @@ def ladder_row(stack, shifts, ladder, scale, row, psi, out, B, A, peak, room, ph
             A[x] = middle
             weakest[x] = min(weakest[x], squared)
             clipped[x] |= (np.float32(peak[x]) >= white) & (squared >= rest * rest)
-    levels_row(psi, ladder, weakest, A, clipped, scale, coordinate, order, own, worst, phase, reason)
     finest = psi[len(psi) - 1]
     for x in range(width):
         out[x] = finest[x]
@@ -114,10 +125,13 @@ def levels_rows(stack, shifts, ladder, scale, first, phase, wrapped, modulation,
     """`decode_levels` of some rows from ``first`` on: the five maps hold only those."""
     count, width = len(shifts.steps), stack.shape[2]
     psi, peak, room = np.empty((count, width), np.float32), np.empty(width, stack.dtype), levels_room(width)
+    clipped, weakest, coordinate, order, own, worst, _, _, _ = room
+    anywhere = np.empty(0, np.float32)
     for i in range(len(phase)):
-        ladder_row(
-            stack, shifts, ladder, scale, first + i, psi, wrapped[i], modulation[i], background[i], peak, room,
-            phase[i], reason[i],
+        phases_row(stack, shifts, scale, first + i, psi, wrapped[i], modulation[i], background[i], peak, room)
+        levels_row(
+            psi, ladder, weakest, background[i], clipped, scale, anywhere, coordinate, order, own, worst, phase[i],
+            reason[i],
         )  # fmt: skip
 
 

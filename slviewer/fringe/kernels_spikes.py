@@ -31,6 +31,7 @@ class SpikeRules(NamedTuple):
     lonely_neighbours: int
     low_rad: float
     high_rad: float
+    repeat: float
 
 
 @numba.njit(inline="always")
@@ -63,6 +64,8 @@ def votes(phase, row, x, rules):
             cells = (phase[v, u] - phase[row, x]) * per_cell
             if (v == row and u == x) or np.isnan(cells):
                 continue
+            if rules.repeat < np.inf:
+                cells -= np.float32(rules.repeat) * np.rint(cells * np.float32(1 / rules.repeat))
             nearest = np.rint(cells)
             valid += 1
             if nearest == 0:

@@ -11,6 +11,8 @@ WHITE_LEVELS = (255, 1023, 4095, 16383, 65535)
 """Full scale of the cameras whose grey levels arrive as uint16."""
 LEFT_ALIGNED_WHITE = (65472, 65520, 65532)
 """Full scale of 10, 12 and 14 bits that fill a uint16 from its top."""
+SAME_WIDTH = 1e-6
+"""Relative difference up to which a Gray cell is a fringe period: over a thousand cells they part by a hundredth px."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,13 @@ class Shift:
 class Layout:
     """Frame indices of one axis, and the conventions of its sequence.
 
-    ``shifts`` longest period first; ``gray`` most significant bit first; ``inverse`` like ``gray``, or empty.
+    ``extent`` is that of the projector in px, infinite where its size is not known. ``shifts`` longest period first;
+    ``gray`` most significant bit first; ``inverse`` like ``gray``, or empty. ``relative``: whether a phase that is not
+    absolute will do.
     """
 
     axis: Axis
-    extent: int
+    extent: float
     sign: int
     gray_origin_px: float
     shifts: tuple[Shift, ...]
@@ -38,11 +42,26 @@ class Layout:
     complementary: int | None
     white: int | None
     black: int | None
+    offset_rad: float = 0.0
+    gray_cell_px: float = 1.0
+    relative: bool = False
 
     @property
     def period_px(self) -> float:
-        """The finest period; 1.0 for Gray code alone."""
-        return self.shifts[-1].period_px if self.shifts else 1.0
+        """The finest period; the width of a cell for Gray code alone."""
+        return self.shifts[-1].period_px if self.shifts else self.gray_cell_px
+
+    @property
+    def numbers_periods(self) -> bool:
+        """Whether Gray bits number the periods of the one phase shift, edge to edge."""
+        if len(self.shifts) != 1 or not self.gray:
+            return False
+        return abs(self.gray_cell_px - self.period_px) <= SAME_WIDTH * self.period_px
+
+    @property
+    def numbers_cells(self) -> bool:
+        """Whether Gray bits beside phase shifts number cells that are no single shift's periods."""
+        return bool(self.shifts and self.gray) and not self.numbers_periods
 
     @property
     def steps(self) -> int:
@@ -60,14 +79,13 @@ def layout(sequence: PatternSequence, axis: Axis) -> Layout:
     if axis not in sequence.axes:
         there = f"use axis {sequence.axes[0]}" if sequence.axes else "phase steps or Gray bits are needed"
         raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
-    _check_decodable(sequence, axis)
     shifts = tuple(_shift(sequence, axis, period) for period in sequence.periods_px(axis))
     gray, inverse, complementary, white, black = (
         _by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
     )
     found = Layout(
         axis,
-        sequence.extent(axis),
+        np.inf if sequence.projector_size is None else sequence.extent(axis),
         sequence.sign(axis),
         sequence.origin_px(axis),
         shifts,
@@ -76,6 +94,9 @@ def layout(sequence: PatternSequence, axis: Axis) -> Layout:
         complementary[0] if complementary else None,
         white[0] if white else None,
         black[0] if black else None,
+        sequence.offset_rad(axis),
+        sequence.gray_cell(axis),
+        sequence.relative or sequence.projector_size is None,
     )
     if not shifts and not inverse and not (white and black):
         raise InputError(f"axis {axis}: Gray code alone needs its inverses, or a white and a black frame: add them")
@@ -120,21 +141,17 @@ def _by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...
     return tuple(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
 
 
-def _check_decodable(sequence: PatternSequence, axis: Axis) -> None:
-    own = (sequence.periods_px(axis) or (1.0,))[0]
-    if sequence.offset_rad(axis) or sequence.gray_cell(axis) != own or sequence.relative:
-        raise InputError(f"axis {axis}: a phase offset, other Gray cells or a relative phase cannot be decoded")
-
-
 def _check_code(found: Layout) -> None:
     where = f"axis {found.axis}"
     if not found.gray:
         raise InputError(f"{where}: a complementary bit without Gray bits says nothing: add them")
-    if len(found.shifts) > 1:
-        raise InputError(f"{where}: Gray code and {len(found.shifts)} fringe periods: use one period with Gray code")
-    cells = (found.extent - 0.5 - found.gray_origin_px) / found.period_px
+    if found.extent == np.inf:
+        return
+    cells = (found.extent - 0.5 - found.gray_origin_px) / found.gray_cell_px
     if 2 ** len(found.gray) < cells - 0.5:
+        what = "periods" if found.numbers_periods else f"cells of {found.gray_cell_px:g} px"
         raise InputError(
-            f"{where}: {len(found.gray)} Gray bits number {2 ** len(found.gray)} periods, and {found.extent} px hold "
-            f"{cells:.0f}: give the fringe period and the size of the projector that were used, or the missing bits"
+            f"{where}: {len(found.gray)} Gray bits number {2 ** len(found.gray)} {what}, and {found.extent:g} px hold "
+            f"{cells:.0f}: give the fringe period, gray_cell_px and the size of the projector that were used, or the "
+            "missing bits"
         )

@@ -1,4 +1,5 @@
-"""Multi-frequency unwrapping: from a phase that covers the projector down to the finest, level by level."""
+"""Multi-frequency unwrapping: from a phase that covers the projector, or a Gray cell, down to the finest, level by
+level."""
 
 from dataclasses import dataclass
 from itertools import combinations, pairwise
@@ -6,6 +7,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.layout import SAME_WIDTH, Layout
 from slviewer.fringe.limits import LEVEL_SIGMA
 
 LONGEST = 3
@@ -20,7 +22,62 @@ class Level:
     weights: tuple[int, ...]
 
 
-def plan_levels(periods_px: tuple[float, ...], extent: int) -> tuple[Level, ...]:
+WHOLE = 1e-3
+"""How far from whole a ratio of periods may be: over fifty repetitions it comes to a twentieth of a period."""
+
+
+def found_levels(found: Layout) -> tuple[Level, ...]:
+    """The levels of a layout whose Gray code, if any, does not number the periods of its one phase shift.
+
+    Raises InputError where the periods do not cover what they must: a Gray cell, the projector, or, where a relative
+    phase will do, a range of whole periods.
+    """
+    periods, where = tuple(shift.period_px for shift in found.shifts), f"axis {found.axis}: "
+    if found.gray:
+        cell = code_cell_px(found)
+        try:
+            return plan_levels(periods, cell * (1 - SAME_WIDTH))
+        except InputError as error:
+            raise InputError(
+                f"{where}{error}, which a Gray cell spans: set gray_cell_px if the cells are narrower, or add Gray "
+                f"bits or the steps of a period of {cell:g} px or more"
+            ) from error
+    try:
+        return plan_levels(periods, found.extent)
+    except InputError as error:
+        if not found.relative:
+            raise InputError(
+                f"{where}{error}, which the projector spans: add a longer period or Gray code, or set relative = true "
+                "for a phase that is not absolute"
+            ) from error
+    return plan_levels(periods, repeating_range(periods))
+
+
+def unambiguous_px(found: Layout) -> float:
+    """The range of projector px that a layout tells apart, where it is less than the projector; else infinite."""
+    if found.gray or not found.shifts:
+        return np.inf
+    reach = found_levels(found)[0].period_px
+    return np.inf if reach >= found.extent else reach
+
+
+def lowest_coordinate(period_px: float, extent: float) -> float:
+    """Where the longest period is cut: what it has beyond the projector is split evenly between both ends."""
+    return -0.5 - (period_px - extent) / 2
+
+
+def code_cell_px(found: Layout) -> float:
+    """Width of the cells that all `code_bits` number."""
+    return found.gray_cell_px / (1 if found.complementary is None else 2)
+
+
+def cell_misfit(found: Layout) -> float:
+    """Largest distance, in periods of the first level, between a coordinate and the middle of the cell that holds it:
+    half way between half a cell, where the cell ends, and half a period, where the next order begins."""
+    return 0.25 * (1 + code_cell_px(found) / found_levels(found)[0].period_px)
+
+
+def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ...]:
     """Levels from one whose period covers ``extent`` px down to the finest period; weights are per period, as given.
 
     ``periods_px`` are longest first. Where none covers the extent, beats of two, then of three of the longest take
@@ -41,10 +98,22 @@ def plan_levels(periods_px: tuple[float, ...], extent: int) -> tuple[Level, ...]
             beat = min(beats, key=lambda level: level.period_px if level.weights[1] else np.inf)
             return (both[0], beat, *singles)
     reached = max([periods_px[0], *(beat.period_px for beat in beats)])
-    listed = ", ".join(f"{p:g}" for p in periods_px)
+    raise InputError(f"fringe periods of {_listed(periods_px)} px tell only {reached:.0f} px apart, not {extent:g}")
+
+
+def repeating_range(periods_px: tuple[float, ...]) -> float:
+    """px after which all phases of the periods repeat, and up to which they tell coordinates apart: the longest period
+    or a beat of two. Raises InputError where no such range holds whole numbers of all periods."""
+    count = min(LONGEST, len(periods_px))
+    beats = [_combine(periods_px, {j: 1, i: -1}).period_px for i, j in combinations(range(count), 2)]
+    for reach in sorted({periods_px[0], *beats}, reverse=True):
+        turns = reach / np.array(periods_px)
+        if reach < np.inf and (np.abs(turns - np.rint(turns)) <= WHOLE).all():
+            return float(reach)
     raise InputError(
-        f"fringe periods of {listed} px tell only {reached:.0f} px apart, and the projector "
-        f"has {extent}: add a longer period or Gray code"
+        f"fringe periods of {_listed(periods_px)} px share no range of which each is a whole part, so that even a "
+        "relative phase cannot be decoded: give the size of a projector that the longest covers, or leave out the "
+        f"steps of all but {periods_px[-1]:g} px"
     )
 
 
@@ -61,6 +130,10 @@ def needed_modulation(levels: tuple[Level, ...], steps: int) -> float:
         default=0.0,
     )
     return float(spread * np.sqrt(2 / steps) / (2 * np.pi * LEVEL_SIGMA))
+
+
+def _listed(periods_px: tuple[float, ...]) -> str:
+    return ", ".join(f"{p:g}" for p in periods_px)
 
 
 def _combine(periods_px: tuple[float, ...], weights: dict[int, int]) -> Level:

@@ -46,3 +46,5 @@ LONELY_NEIGHBOURS = 3
 """... and so is one with fewer valid neighbours than this: nothing vouches for it."""
 GRAY_CELL_PX = 16.0
 """Gray code alone has no period: neighbours that differ by less than half of this many px agree."""
+GRAY_CELLS = 3.0
+"""... or by less than half of this many cells: those on either side of a cell's border do."""

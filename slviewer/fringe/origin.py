@@ -59,7 +59,7 @@ def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axi
 
 def _edges(found: Layout, stack: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray]:
     """Wrapped phase (rad) at every code edge between neighbours, and whether it rises with the code there."""
-    wrapped, modulation, background, _ = phase_shift(stack, found.shifts[0].indices, found.sign)
+    wrapped, modulation, background, _ = phase_shift(stack, found.shifts[0].indices, found.sign, found.offset_rad)
     lit = modulation >= dark_limit(background, measure_noise(found, stack, white), white, dark_sigmas(found))
     bits = [*found.gray] + ([] if found.complementary is None else [found.complementary])
     code, digit = np.zeros(lit.shape, np.int32), np.zeros(lit.shape, np.int32)

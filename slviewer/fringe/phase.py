@@ -8,8 +8,8 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 
-GRAY_SIGMA_PX = 0.29
-"""Standard deviation of a coordinate known only to its projector column: 1 / sqrt(12)."""
+GRAY_SIGMA_CELLS = 12**-0.5
+"""Standard deviation of a coordinate known only to its Gray cell, 0.29 px where cells are projector columns."""
 
 
 class Reason(IntEnum):
@@ -33,7 +33,9 @@ class PhaseMap:
     ``phase`` float32 rad, absolute (2 pi u / period_px), NaN where ``reason`` (uint8, a `Reason`) is not VALID.
     ``wrapped`` float32 rad of the finest period, in -pi ... pi, also where masked; all NaN for Gray code alone.
     ``modulation`` and ``background`` float32 grey levels. ``noise`` = (a, b): the variance of one frame's grey level is
-    a + b * level, measured from this capture. ``steps``: phase steps of the finest period, 0 for Gray code alone.
+    a + b * level, measured from this capture. ``steps``: phase steps of the finest period, 0 for Gray code alone, whose
+    ``period_px`` is the width of its cells. ``unambiguous_px``: the coordinate is known only modulo so many px of the
+    projector; infinite where it is absolute.
     """
 
     axis: Axis
@@ -45,6 +47,7 @@ class PhaseMap:
     reason: np.ndarray
     noise: tuple[float, float]
     steps: int
+    unambiguous_px: float = np.inf
 
     def __post_init__(self) -> None:
         maps = (self.phase, self.wrapped, self.modulation, self.background, self.reason)
@@ -64,18 +67,22 @@ class PhaseMap:
         return self.reason != Reason.DARK
 
     @property
+    def is_relative(self) -> bool:
+        """Whether the coordinate is known only modulo ``unambiguous_px``."""
+        return bool(np.isfinite(self.unambiguous_px))
+
+    @property
     def coordinate(self) -> np.ndarray:
         """(h, w) float32 px: the projector column (axis x) or row (axis y), NaN where invalid."""
         return self.phase * np.float32(self.period_px / (2 * np.pi))
 
     @property
     def sigma_phase(self) -> np.ndarray:
-        """(h, w) float32 rad: standard deviation of the phase, sqrt(2 / n) sigma_I / B; 2 pi 0.29 for Gray code alone.
-
-        NaN where the phase is.
+        """(h, w) float32 rad: standard deviation of the phase, sqrt(2 / n) sigma_I / B; 2 pi / sqrt(12) for Gray code
+        alone. NaN where the phase is.
         """
         if self.steps == 0:
-            sigma = np.full_like(self.phase, 2 * np.pi * GRAY_SIGMA_PX / self.period_px)
+            sigma = np.full_like(self.phase, 2 * np.pi * GRAY_SIGMA_CELLS)
         else:
             a, b = self.noise
             variance = np.float32(a) + np.float32(b) * self.background

@@ -4,7 +4,14 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import Layout, check_stack, layout, white_level
-from slviewer.fringe.levels import Level, needed_modulation, plan_levels
+from slviewer.fringe.levels import (
+    cell_misfit,
+    code_cell_px,
+    found_levels,
+    lowest_coordinate,
+    needed_modulation,
+    unambiguous_px,
+)
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference_spikes import settle
@@ -25,14 +32,15 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
         wrapped = np.full_like(phase, np.nan)
         weakest, saturated = modulation, np.zeros(phase.shape, bool)
     else:
-        shifted = [phase_shift(stack, shift.indices, found.sign) for shift in found.shifts]
+        shifted = [phase_shift(stack, shift.indices, found.sign, found.offset_rad) for shift in found.shifts]
         wrapped, modulation, background, _ = shifted[-1]
         weakest = np.minimum.reduce([b for _, b, _, _ in shifted])
         saturated = np.logical_or.reduce([(peak >= white) & (a + b >= white) for _, b, a, peak in shifted])
-        if found.gray:
+        if found.numbers_periods:
             order, inconsistent = _order(found, stack, wrapped, modulation, background)
         else:
-            order, inconsistent = _order_by_levels(found, [psi for psi, _, _, _ in shifted])
+            cell = _cell(found, stack, modulation, background) if found.gray else None
+            order, inconsistent = _order_by_levels(found, [psi for psi, _, _, _ in shifted], cell)
         phase = (wrapped + TWO_PI * order).astype(np.float32)
         dark = np.zeros(phase.shape, bool)
     dark |= weakest < dark_limit(background, noise, white, dark_sigmas(found))
@@ -41,13 +49,17 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
     phase, reason = settle(found, phase, reason)
-    return PhaseMap(axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps)
+    unambiguous = unambiguous_px(found)
+    return PhaseMap(
+        axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps, unambiguous
+    )
 
 
 def phase_shift(
-    stack: np.ndarray, indices: tuple[int, ...], sign: int
+    stack: np.ndarray, indices: tuple[int, ...], sign: int, offset_rad: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(wrapped phase rad, modulation, background, largest sample) of one period, float32 (h, w) each."""
+    """(wrapped phase rad, modulation, background, largest sample) of one period, float32 (h, w) each; ``sign`` and
+    ``offset_rad`` are the sequence's."""
     n = len(indices)
     first = stack[indices[0]].astype(np.float32)
     cosine, sine, total = np.zeros_like(first), np.zeros_like(first), np.zeros_like(first)
@@ -59,13 +71,17 @@ def phase_shift(
         cosine += np.float32(np.cos(TWO_PI * k / n)) * frame
         sine += np.float32(np.sin(TWO_PI * k / n)) * frame
         total += frame
-    wrapped = np.arctan2(0 - sign * sine, cosine)  # a zero without sign, for pi rather than -pi
+    sine *= np.float32(sign)
+    if offset_rad:
+        turn, across = np.float32(np.cos(offset_rad)), np.float32(np.sin(offset_rad))
+        cosine, sine = turn * cosine - across * sine, turn * sine + across * cosine
+    wrapped = np.arctan2(0 - sine, cosine)  # a zero without sign, for pi rather than -pi
     return wrapped, np.hypot(cosine, sine) * np.float32(2 / n), first + total * np.float32(1 / n), peak
 
 
 def dark_sigmas(found: Layout) -> float:
     """The modulation, in standard deviations of a grey level, below which a pixel is DARK."""
-    if found.gray:
+    if found.numbers_periods or not found.shifts:
         return limits.DARK_SIGMAS
     steps = min(len(shift.indices) for shift in found.shifts)
     return max(limits.DARK_SIGMAS, needed_modulation(found_levels(found), steps))
@@ -143,16 +159,59 @@ def _misread(
     return ahead.astype(np.int32) - behind.astype(np.int32)
 
 
-def _order_by_levels(found: Layout, wrapped: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """What to add to the finest wrapped phase, in periods, and where the levels contradict each other."""
+def _cell(
+    found: Layout, stack: np.ndarray, modulation: np.ndarray, background: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(coordinate px, undecided): the middle of the cell that the Gray bits name, or its border where the bit that
+    changes there lies near the middle of black and white. Undecided where any other bit is."""
+    bits = code_bits(found)
+    heights = [bit_heights(found, stack, i, background) for i in bits]
+    code, bit = (np.zeros(background.shape, np.int32) for _ in range(2))
+    for height in heights:
+        bit ^= height > 0
+        code = 2 * code + bit
+    top = np.maximum(np.max(heights, axis=0), np.float32(0))
+    bottom = np.minimum(np.min(heights, axis=0), np.float32(0))
+    mean = np.float32(fringe_mean(found, stack))
+    contrast = np.maximum(top / (1 - mean), -bottom / mean)
+    middle = (np.float32(0.5) - mean) * contrast
+    lower, upper, least = (np.full(code.shape, np.inf, np.float32) for _ in range(3))
+    for from_least, height in enumerate(reversed(heights)):
+        low_bits = code & ((2 << from_least) - 1)
+        at_lower, at_upper = low_bits == 1 << from_least, low_bits == (1 << from_least) - 1
+        lower = np.where(at_lower, np.abs(height - middle), lower)
+        upper = np.where(at_upper, np.abs(height - middle), upper)
+        least = np.where(at_lower | at_upper, least, np.minimum(least, np.abs(height)))
+    weak, weaker = np.float32(limits.WEAK_BIT / 2) * contrast, np.float32(limits.WEAKER)
+    ahead, behind = (upper < weak) & (upper < weaker * lower), (lower < weak) & (lower < weaker * upper)
+    part = np.where(ahead, 1.0, np.where(behind, 0.0, 0.5))
+    return found.gray_origin_px + code_cell_px(found) * (code + part), least < np.float32(
+        limits.UNDECIDED_BIT
+    ) * modulation
+
+
+def code_bits(found: Layout) -> tuple[int, ...]:
+    """The frames of all Gray bits, the most significant first and the complementary one last."""
+    return (*found.gray, *(() if found.complementary is None else (found.complementary,)))
+
+
+def _order_by_levels(
+    found: Layout, wrapped: list[np.ndarray], cell: tuple[np.ndarray, np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What to add to the finest wrapped phase, in periods, and where the levels contradict each other, or the cell (see
+    `_cell`) where there is one."""
     levels = found_levels(found)
     inconsistent = np.zeros(wrapped[0].shape, bool)
     coordinate, order = np.zeros(wrapped[0].shape), np.zeros(wrapped[0].shape)
     for number, level in enumerate(levels):
         angle = sum(w * psi.astype(np.float64) for w, psi in zip(level.weights, wrapped, strict=True) if w)
         own = angle * (level.period_px / TWO_PI)
-        if number == 0:
-            low = lowest_coordinate(level.period_px, found.extent)
+        if number == 0 and cell is not None:
+            turns = (cell[0] - own) / level.period_px
+            order = np.rint(turns)
+            inconsistent = cell[1] | (np.abs(turns - order) > cell_misfit(found))
+        elif number == 0:
+            low = lowest_coordinate(level.period_px, min(found.extent, unambiguous_px(found)))
             order = -np.floor((own - low) / level.period_px)
         else:
             turns = (coordinate - own) / level.period_px
@@ -160,16 +219,6 @@ def _order_by_levels(found: Layout, wrapped: list[np.ndarray]) -> tuple[np.ndarr
             inconsistent |= np.abs(turns - order) > limits.LEVEL_MISFIT
         coordinate = own + order * level.period_px
     return order, inconsistent
-
-
-def found_levels(found: Layout) -> tuple[Level, ...]:
-    """The levels of a multi-frequency layout."""
-    return plan_levels(tuple(shift.period_px for shift in found.shifts), found.extent)
-
-
-def lowest_coordinate(period_px: float, extent: int) -> float:
-    """Where the longest period is cut: what it has beyond the projector is split evenly between both ends."""
-    return -0.5 - (period_px - extent) / 2
 
 
 def _gray_alone(
@@ -196,8 +245,12 @@ def _gray_alone(
         code, other = 2 * code + bit, 2 * other + flipped
         doubts += doubt
     inconsistent = (doubts > 1) | (np.abs(code - other) > 1)
-    centre = np.float32(0.5) * (code + other) + np.float32(found.gray_origin_px + 0.5)
-    phase = (np.float32(TWO_PI) * centre).astype(np.float32)
+    # At the projector's ends only a part of a cell may have been shown.
+    cell, origin = found.gray_cell_px, found.gray_origin_px
+    start, end = origin + cell * np.minimum(code, other), origin + cell * (np.maximum(code, other) + 1.0)
+    first, last = np.maximum(start, -0.5), np.minimum(end, found.extent - 0.5)
+    centre = 0.5 * np.where(first < last, first + last, start + end)
+    phase = (TWO_PI / cell * centre).astype(np.float32)
     return phase, modulation, background, inconsistent, doubts >= limits.DARK_BITS
 
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import Layout
+from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.phase import Reason
 
 TWO_PI = 2 * np.pi
@@ -26,7 +27,7 @@ def settle(found: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.nda
     if is_plain(found):
         phase = _repaired(found, phase, cell)
     reason = reason.copy()
-    v, u, votes = _votes(phase, cell)
+    v, u, votes = _votes(phase, cell, repeat_cells(found))
     few = votes["valid"] < limits.LONELY_NEIGHBOURS
     lonely = votes["agree"] < limits.LONELY * votes["valid"]
     wrong = few | lonely
@@ -39,22 +40,30 @@ def settle(found: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.nda
 
 def is_plain(found: Layout) -> bool:
     """Whether the order comes from a plain Gray code, whose edges coincide with the wraps of the phase."""
-    return bool(found.shifts and found.gray) and found.complementary is None
+    return found.numbers_periods and found.complementary is None
 
 
 def cell_rad(found: Layout) -> float:
-    """Phase by which neighbours must differ to count as a cell apart."""
-    return TWO_PI if found.shifts else TWO_PI * limits.GRAY_CELL_PX
+    """Phase by which neighbours must differ to count as a cell apart: a period, or for Gray code alone so much that
+    neighbouring cells agree."""
+    return TWO_PI if found.shifts else TWO_PI * max(limits.GRAY_CELL_PX / found.gray_cell_px, limits.GRAY_CELLS)
+
+
+def repeat_cells(found: Layout) -> float:
+    """Cells after which a relative phase repeats; infinite for an absolute one."""
+    return unambiguous_px(found) / found.period_px
 
 
 def border_rad(found: Layout) -> tuple[float, float]:
-    """The phases of the projector's two borders, a tolerance outside."""
+    """The phases of the projector's two borders, a tolerance outside; infinite for a relative phase."""
+    if np.isfinite(unambiguous_px(found)):
+        return -np.inf, np.inf
     scale = TWO_PI / found.period_px
     return (-0.5 - limits.OUTSIDE_PX) * scale, (found.extent - 0.5 + limits.OUTSIDE_PX) * scale
 
 
 def _repaired(found: Layout, phase: np.ndarray, cell: float) -> np.ndarray:
-    v, u, votes = _votes(phase, cell)
+    v, u, votes = _votes(phase, cell, np.inf)
     enough = (votes["valid"] >= limits.SPIKE_NEIGHBOURS) & _at_edge(found, phase[v, u])
     phase = phase.copy()
     for word, shift in (("above", 1), ("below", -1)):
@@ -69,10 +78,11 @@ def _at_edge(found: Layout, phase: np.ndarray) -> np.ndarray:
     return (part < np.float32(limits.EDGE)) | (part >= np.float32(1 - limits.EDGE))
 
 
-def _votes(phase: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def _votes(phase: np.ndarray, cell: float, repeat: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Pixels that differ from one of their four neighbours, and how their window votes.
 
-    ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``.
+    ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``. The phase is
+    known modulo ``repeat`` cells.
     """
     margin = limits.WINDOW
     padded = np.pad(phase, margin, constant_values=np.nan)
@@ -87,6 +97,8 @@ def _votes(phase: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, dict
         votes = {word: np.zeros(len(v), np.int32) for word in ("valid", "agree", "above", "below")}
         for dv, du in OFFSETS:
             cells = (padded[v + margin + dv, u + margin + du] - phase[v, u]) * per_cell
+            if np.isfinite(repeat):
+                cells -= np.float32(repeat) * np.rint(cells * np.float32(1 / repeat))
             nearest = np.rint(cells)
             whole = np.abs(cells - nearest) < np.float32(limits.WHOLE_PERIOD)
             votes["valid"] += np.isfinite(cells)

@@ -11,6 +11,7 @@ from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of,
 from slviewer.fringe.kernels import Shifts
 from slviewer.fringe.kernels_levels import Ladder
 from slviewer.fringe.layout import Layout, check_stack, clip_level, layout, white_level
+from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.reference_spikes import is_plain
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -74,9 +75,7 @@ class OnePass:
     _lists: tuple[np.ndarray, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._layout = layout(self.sequence, self.axis)
-        if not self._layout.shifts:
-            raise InputError("Gray code without phase steps is not measured in one pass: decode and reconstruct it")
+        self._layout = one_pass_layout(self.sequence, self.axis)
         if self.axis not in self.model.axes:
             raise InputError(f"The {self.model.name} calibration has no axis {self.axis}: choose another axis.")
         if isinstance(self.model, PixelwiseModel):
@@ -173,12 +172,26 @@ class OnePass:
         return Scan(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, texture, light)
 
 
+def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
+    """The layout of one axis. Raises InputError for a sequence that takes more than one pass to decode."""
+    found = layout(sequence, axis)
+    if not found.shifts:
+        what = "Gray code without phase steps"
+    elif found.numbers_cells:
+        what = "Gray code whose cells are not the periods of one phase shift"
+    elif np.isfinite(unambiguous_px(found)):
+        what = "A relative phase"
+    else:
+        return found
+    raise InputError(f"{what} is not measured in one pass: decode and reconstruct it")
+
+
 def _maps(scan: Scan) -> kernels.Maps:
     return kernels.Maps(scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture)
 
 
 def _order(sequence: PatternSequence, found: Layout) -> kernels.Order:
-    turned = [waves(shift, found.sign) for shift in found.shifts]
+    turned = [waves(shift, found.sign, found.offset_rad) for shift in found.shifts]
     frames, cosines, sines = (np.concatenate(parts) for parts in zip(*turned, strict=True))
     read = {*frames.tolist(), *found.gray, *found.inverse}
     kinds = [frame.kind for frame in sequence.frames]

@@ -11,11 +11,11 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, ladder_of, texture
 from slviewer.fringe.kernels_levels import Ladder
-from slviewer.fringe.layout import Layout, clip_level, layout
+from slviewer.fringe.layout import Layout, clip_level
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry import cuda_device
 from slviewer.geometry.rig import StereoRig
-from slviewer.reconstruction.onepass import Light, OnePass, Scan, _order
+from slviewer.reconstruction.onepass import Light, OnePass, Scan, _order, one_pass_layout
 from slviewer.reconstruction.onepass_kernels import Depths, Order
 
 if TYPE_CHECKING:  # it imports CUDA
@@ -65,9 +65,7 @@ class CudaPass(OnePass):
 
     def __post_init__(self) -> None:
         if isinstance(self.model, StereoModel):
-            self._layout = layout(self.sequence, self.axis)
-            if not self._layout.shifts:
-                raise InputError("Gray code without phase steps is not measured in one pass: decode and reconstruct it")
+            self._layout = one_pass_layout(self.sequence, self.axis)
             if self.axis not in self.model.axes:
                 raise InputError(f"The stereo calibration has no axis {self.axis}: choose another axis.")
             self._order, self._ladder = _order(self.sequence, self._layout), ladder_of(self._layout)

@@ -95,7 +95,7 @@ def _code_begins(found: Layout, stack: np.ndarray, white: float) -> float:
     An edge lies somewhere between the phases of two neighbouring pixels: the place that lies in the most of such
     intervals is known better than any of them.
     """
-    wrapped, modulation, background, _ = phase_shift(stack, found.shifts[0].indices, found.sign)
+    wrapped, modulation, background, _ = phase_shift(stack, found.shifts[0].indices, found.sign, found.offset_rad)
     lit = modulation >= dark_limit(background, measure_noise(found, stack, white), white, dark_sigmas(found))
     code, digit = np.zeros(lit.shape, np.int32), np.zeros(lit.shape, np.int32)
     for i in [*found.gray] + ([] if found.complementary is None else [found.complementary]):
