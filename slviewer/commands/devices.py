@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from slviewer import terminal, workflow
 from slviewer.commands.parsing import Role, deferred, ui, write_json
-from slviewer.errors import DeviceError
+from slviewer.errors import DeviceError, InputError, UsageError
 
 if TYPE_CHECKING:
     from slviewer.devices.channel import Channel
@@ -76,23 +76,36 @@ def capture(
 
 @deferred
 def preflight(
-    rig: str,
+    rig: str | None = None,
+    capture: tuple[Path, str] | None = None,
     session: Path | None = None,
     exposure_ms: float | None = None,
     gain: float | None = None,
     port: int = 8080,
     json: Path | None = None,
 ) -> None:
-    """Check a rig in about 10 s: right screen, delay, order of frames, light, stillness; say how to mend what is wrong.
+    """Check a rig in about 10 s: right screen, delay, order of frames, light, stillness; or the frames of a capture.
+
+    Says of each what is wrong, and what to do. Ends with status 1 where something is bad.
 
     Args:
         rig: A TOML file that describes the rig, or the name of one that `slviewer devices` lists.
+        capture: Session folder and name of a recorded capture, to check its frames instead of a rig.
         session: A session, whose own rigs are known by name too.
         exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
         gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
         port: Port of the projector page, where the rig's projector is one; 0 takes any free one.
         json: Write the result to this file too.
     """
+    if (rig is None) == (capture is None):
+        raise UsageError("give --rig to check a rig, or --capture SESSION NAME to check the frames of a capture")
+    if capture is not None:
+        recorded = workflow.check_capture(*capture, progress=terminal.progress)
+        write_json(json, recorded.to_dict())
+        print(workflow.in_words(recorded))
+        if recorded.verdict == "bad":
+            raise InputError("the capture is not fit to measure with: correct what is marked bad, then capture again")
+        return
     with _set_up(port) as set_up:
         found = workflow.check_rig(rig, session=session, exposure_ms=exposure_ms, gain=gain, set_up=set_up, **ui())
     write_json(json, found.to_dict())

@@ -17,6 +17,7 @@ _HOMES = {
     "rigs": "rig_presets",
     "capture": "capturing",
     "check_rig": "checking",
+    "check_capture": "checking",
     "in_words": "checking",
     "summary": "inspecting",
     "calibrate": "calibrating",

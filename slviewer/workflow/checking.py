@@ -1,4 +1,4 @@
-"""The preflight without a browser: is a rig fit to capture with?"""
+"""The preflight without a browser: is a rig fit to capture with, and is a capture fit to measure with?"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,7 +7,9 @@ from typing import Any
 from slviewer.session.store import Session
 from slviewer.workflow.capturing import set_camera
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
+from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.preflight.checks import Preflight
+from slviewer.workflow.preflight.recorded import preflight_capture
 from slviewer.workflow.preflight.run import preflight
 from slviewer.workflow.rig_presets import load_rig
 from slviewer.workflow.wizard.rigs import SetUp, set_up
@@ -37,6 +39,14 @@ def check_rig(
     with set_up(choice, None).rig.opened() as devices:
         set_camera(devices, choice, exposure_ms, gain, warn)
         return preflight(devices, progress=progress)
+
+
+def check_capture(session: SessionLike, capture: str, *, progress: Progress = unheard) -> Preflight:
+    """What the frames of a recorded capture say about the rig that took them: order, light, exposure, response, noise,
+    description, decoded share. Raises SessionError for a capture that cannot be read, and whatever `progress` raises.
+    """
+    with opened(session) as store:
+        return preflight_capture(store.load_capture(capture), progress)
 
 
 def in_words(found: Preflight) -> str:

@@ -6,8 +6,10 @@ from slviewer.workflow.preflight.bench import Bench
 from slviewer.workflow.preflight.checks import Check, Verdict
 
 _TARGET = 0.85  # of full scale, for the 99.5th percentile of what is lit
-_CLIPPED, _MUCH_CLIPPED = 0.005, 0.05  # shares of what is lit
-_WEAK, _TOO_WEAK = 0.4, 0.12  # of full scale
+CLIPPED, MUCH_CLIPPED = 0.005, 0.05
+"""Shares of the illuminated pixels that are saturated: a warning, and bad."""
+WEAK, TOO_WEAK = 0.4, 0.12
+"""Of full scale, that the brightest illuminated pixels should reach: below, a warning, and bad."""
 _BACK_OFF = 0.5  # how much light is too much cannot be seen: half of it, then look again
 
 
@@ -29,14 +31,14 @@ def exposure(bench: Bench) -> tuple[Check, float | None]:
         "suggested_factor": round(factor, 2),
     }
     change = f"by {factor:.2g} times" if wanted is None else f"from {present:g} ms to {wanted:g} ms"
-    if clipped > _CLIPPED:
-        verdict: Verdict = "bad" if clipped > _MUCH_CLIPPED else "warning"
+    if clipped > CLIPPED:
+        verdict: Verdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         said = f"{100 * clipped:.1f} % of what the projector lights is saturated in white light."
         if bright < 0.985 * full:
             return Check("exposure", verdict, said, "Turn what shines, or capture with two exposures.", figures), None
         return Check("exposure", verdict, said, f"Change the exposure {change}, then check again.", figures), wanted
-    if bright < _WEAK * full:
-        verdict = "bad" if bright < _TOO_WEAK * full else "warning"
+    if bright < WEAK * full:
+        verdict = "bad" if bright < TOO_WEAK * full else "warning"
         said = f"White light reaches only {100 * bright / full:.0f} % of the camera's range."
         return Check("exposure", verdict, said, f"Change the exposure {change}, or open the aperture.", figures), wanted
     said = f"White light reaches {100 * bright / full:.0f} % of the camera's range; {100 * clipped:.1f} % is saturated."

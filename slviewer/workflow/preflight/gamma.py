@@ -7,7 +7,8 @@ from slviewer.workflow.preflight.bench import Bench
 from slviewer.workflow.preflight.checks import Check
 
 _LEVELS = np.arange(18) * 15
-_CURVED = 0.03
+CURVED = 0.03
+"""Deviation from a straight line, as a share of white, from which the response is named."""
 _FEWEST = 500  # pixels
 _UNSTEADY = 0.02
 
@@ -38,7 +39,7 @@ def gamma(bench: Bench) -> tuple[Check, tuple[int, ...] | None, float]:
     }
     levels = linearising(_LEVELS, seen)
     middle = float(np.interp(127.5, _LEVELS, seen))
-    if curved <= _CURVED:
+    if curved <= CURVED:
         said = f"Light is proportional to grey levels within {100 * curved:.1f} %."
         return Check("gamma", "good", said, "", figures), levels, middle
     said = (

@@ -30,7 +30,7 @@ def order(bench: Bench) -> tuple[Check, Check]:
     bench.show(None, "order of the frames")
     bench.wait()
     stack = capture(replace(bench.rig, settle_ms=bench.settle_ms), sequence)
-    return _judged(bench, sequence, stack), _repeats(sequence, stack)
+    return _judged(bench, sequence, stack), repeated_images(sequence, stack)
 
 
 def _judged(bench: Bench, sequence: PatternSequence, stack: np.ndarray) -> Check:
@@ -88,7 +88,7 @@ def _behind(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:
     return all(abs(share - on) < 0.3 for share, on in pairs)
 
 
-def _repeats(sequence: PatternSequence, stack: np.ndarray) -> Check:
+def repeated_images(sequence: PatternSequence, stack: np.ndarray) -> Check:
     """Images that are the very one before, although another pattern was shown; a camera may be without noise."""
     changed = [k for k in range(1, len(stack)) if sequence.frames[k] != sequence.frames[k - 1]]
     same = [k for k in changed if np.array_equal(stack[k], stack[k - 1])]
