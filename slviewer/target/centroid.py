@@ -10,6 +10,12 @@ RING_PX = 5.0
 """Width of the ring beyond the soft edge from which the paper's brightness is read."""
 CORE = 0.6
 """Share of a bright circle's radius that is surely free of its edge."""
+FIRST_GATE = 0.35
+"""Share of the circle's contrast by which the ground's brightness may vary around it: light that falls by half over
+one circle."""
+GATE_SIGMAS = 4.0
+FLAT = 0.04
+"""Pixels of the ring belong to the ground within so many standard deviations of it, or this share of the contrast."""
 SMALLEST_RING = 8
 """Pixels that a plane through the ring needs."""
 
@@ -61,7 +67,7 @@ def _centroid(
     if np.count_nonzero(ring) < SMALLEST_RING:
         return np.nan, np.nan
     within = beyond < soft
-    ground = _plane(du, dv, patch, ring)
+    ground = _ground(du, dv, patch, ring, _quantile(patch[radius < CORE], 0.5))
     if inverted:
         light = _plane(du, dv, patch, radius < CORE)
         ink = (patch - ground) / np.maximum(light, 1.0)
@@ -72,6 +78,34 @@ def _centroid(
     if total <= 0:
         return np.nan, np.nan
     return float(centre[0] + ink @ du[within] / total), float(centre[1] + ink @ dv[within] / total)
+
+
+def _ground(du: np.ndarray, dv: np.ndarray, patch: np.ndarray, ring: np.ndarray, ink: float) -> np.ndarray:
+    """(h, w): the plane through the brightness next to a circle, of the ring's pixels that show no edge or blob.
+
+    Where not all of the ring lies on one plane, the ground is what differs most from the circle's own level ``ink``:
+    begun with the quarter of the ring that does, pixels count that lie on one plane within the noise.
+    """
+    plane = _plane(du, dv, patch, ring)
+    levels = patch[ring]
+    ground = _quantile(levels, 0.75 if ink < _quantile(levels, 0.5) else 0.25)
+    contrast = abs(ground - ink)
+    if np.abs(levels - plane[ring]).max() < FLAT * contrast:
+        return plane
+    near = ring & (np.abs(patch - ground) < FIRST_GATE * contrast)
+    for _ in range(2):
+        if np.count_nonzero(near) < SMALLEST_RING:
+            return plane
+        plane = _plane(du, dv, patch, near)
+        off = np.abs(patch - plane)
+        near = ring & (off < max(GATE_SIGMAS * 1.4826 * _quantile(off[near], 0.5), FLAT * contrast))
+    return _plane(du, dv, patch, near) if np.count_nonzero(near) >= SMALLEST_RING else plane
+
+
+def _quantile(values: np.ndarray, share: float) -> float:
+    """The value below which a share of some values lies; quicker for few values than NumPy's, which interpolates."""
+    k = int(share * (len(values) - 1))
+    return float(np.partition(values, k)[k])
 
 
 def _plane(du: np.ndarray, dv: np.ndarray, values: np.ndarray, where: np.ndarray) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""Find a grid of circles, dark on bright or bright on dark."""
+"""Detect a grid of circles, dark on bright or bright on dark, among whatever else the image shows."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError
@@ -10,10 +11,10 @@ from slviewer.target.blobs import Blobs, find_blobs
 from slviewer.target.board import Board
 from slviewer.target.centroid import refine_centres
 from slviewer.target.images import SEARCH_PX, BoardImage, advice, resized
-from slviewer.target.lattice import Lattice, grow_lattices, lay_pattern
+from slviewer.target.lattice import ALIKE, NEAR, Lattice, complete_lattice, grow_lattices, lay_pattern
 from slviewer.target.mark import marked_numbering
-from slviewer.target.numbering import check_grid, upright
-from slviewer.target.planar import fit_homography, jacobians
+from slviewer.target.numbering import MOST_OFF, OUTLYING, check_grid, upright
+from slviewer.target.planar import GridMap, fit_grid_map, fit_homography, jacobians
 
 GOOD_PART = 1 / 3
 """Share of the board's circles in one lattice that no clutter has."""
@@ -25,41 +26,65 @@ WELL_SHAPED_PX = 60.0
 """Area of a circle from which on its roundness can be judged."""
 RESOLVED_PX = 80.0
 """Area of a circle beyond which more pixels do not help to find it."""
+BEYOND = 1 / 3
+"""Share of one more row or column of circles with which the board is larger than stated."""
+MUCH_LARGER = 2.0
+"""Area in the image over that of a second board of the same kind, from which on the larger one is meant."""
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A lattice among blobs."""
+class _Attempt:
+    """The blobs of one binarisation, in pixels of the full image, and the lattices among them."""
 
-    lattice: Lattice
     blobs: Blobs
+    lattices: list[Lattice]
 
-    def __len__(self) -> int:
-        return len(self.lattice.nodes)
+
+@dataclass(frozen=True)
+class _Grid:
+    """All circles of a board: the equally valid ``numberings`` (n,) of ``blobs``."""
+
+    blobs: Blobs
+    numberings: list[np.ndarray]
+
+    @property
+    def area_px(self) -> float:
+        """Of the quadrilateral that the grid covers in the image."""
+        hull = cv2.convexHull(np.asarray(self.blobs.centres[self.numberings[0]], np.float32))
+        return float(cv2.contourArea(hull))
 
 
 def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float, bool]:
     """((n, 2) float64 px of every circle, their radius in mm, whether the board's mark was seen); raises DetectionError
     with how many circles were."""
-    most: _Seen | None = None
-    for seen in _attempts(board, image.grey):
-        numberings = lay_pattern(board, seen.lattice)
-        if numberings:
-            _refuse_larger(board, seen.lattice, numberings)
-            marked = marked_numbering(board, image.deep, seen.blobs.centres, numberings)
-            order = upright(board, seen.blobs.centres, numberings) if marked is None else marked
-            blobs = seen.blobs.chosen(order)
-            _refuse_misshapen(board, blobs)
-            pixels = _centres(board, image, blobs)
-            return pixels, _radius(board, blobs), marked is not None
-        if most is None or len(seen) > len(most):
-            most = seen
-    raise DetectionError(_not_found(board, image, most))
+    tried: list[_Attempt] = []
+    for attempt in _attempts(board, image.grey):
+        tried.append(attempt)
+        grids = [grid for lattice in attempt.lattices if (grid := _grid(board, lattice, attempt.blobs, image))]
+        if grids:
+            return _measured(board, image, _only_one(board, grids))
+    most = max(tried, key=_size_of_largest, default=None)
+    if most is not None and _size_of_largest(most) > GOOD_PART * len(board.points):
+        # what one binarisation lacks, another may have: reflections and shadows cover parts of the board
+        inverted = most.blobs.inverted
+        pool = _pooled(most.blobs, [attempt.blobs for attempt in tried if attempt.blobs.inverted == inverted])
+        grid = _grid(board, complete_lattice(max(most.lattices, key=_nodes), pool), pool, image)
+        if grid:
+            return _measured(board, image, grid)
+    raise DetectionError(_not_detected(board, image, most))
 
 
-def _attempts(board: Board, grey: np.ndarray) -> Iterator[_Seen]:
-    """Lattices at the search resolution, then coarser, where noise averages out, then in the full image; at last twice
-    as large, if circles of a few pixels have been seen.
+def _nodes(lattice: Lattice) -> int:
+    return len(lattice.nodes)
+
+
+def _size_of_largest(attempt: _Attempt) -> int:
+    return max((len(lattice.nodes) for lattice in attempt.lattices), default=0)
+
+
+def _attempts(board: Board, grey: np.ndarray) -> Iterator[_Attempt]:
+    """Binarisations at the search resolution, then coarser, where noise averages out, then in the full image; at last
+    twice as large, if circles of a few pixels have been seen.
 
     Once a good part of the board has been seen, its circles are known to be dark or bright, and to be large enough for
     the search resolution or not, and what remains to be tried is little.
@@ -75,29 +100,113 @@ def _attempts(board: Board, grey: np.ndarray) -> Iterator[_Seen]:
         pitch = max(small.shape) / (min(board.columns, board.rows) - 1)
         for inverted in colours:
             for blobs in find_blobs(small, pitch, inverted):
-                for lattice in grow_lattices(blobs):
+                lattices = list(grow_lattices(blobs))
+                for lattice in lattices:
                     if len(lattice.nodes) > GOOD_PART * len(board.points):
                         colours = [inverted]
                         resolved |= float(np.median(blobs.areas[lattice.blobs])) > RESOLVED_PX
-                    yield _Seen(lattice, blobs.scaled(scale))
+                yield _Attempt(blobs.scaled(scale), lattices)
             if colours == [inverted]:
                 break
 
 
-def _refuse_larger(board: Board, lattice: Lattice, numberings: list[np.ndarray]) -> None:
-    extra = len(lattice.nodes) - len(board.points)
-    places = {tuple(np.sort(numbering)) for numbering in numberings}
-    if len(places) > 1 or extra >= min(board.columns, board.rows) / 3:
+def _grid(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage) -> _Grid | None:
+    """The board in a lattice, if all of it is there; raises DetectionError where the grid is larger than the board."""
+    if len(lattice.nodes) <= GOOD_PART * len(board.points):
+        return None
+    for candidate in (lattice, complete_lattice(lattice, blobs)):
+        places: dict[bytes, list[np.ndarray]] = {}
+        for numbering in lay_pattern(board, candidate):
+            places.setdefault(np.sort(numbering).tobytes(), []).append(numbering)
+        fitting = [
+            (numberings, seen)
+            for numberings in places.values()
+            if (seen := _fit(board, blobs.chosen(numberings[0]))) is not None
+        ]
+        if fitting:
+            numberings, seen = fitting[0]
+            if len(fitting) > 1 or _goes_on(board, seen, blobs, numberings[0]):
+                raise DetectionError(
+                    f"{len(candidate.nodes)} circles in one grid detected where {board} has {len(board.points)}: "
+                    "check the board's columns and rows"
+                )
+            return _Grid(blobs, numberings)
+    return None
+
+
+def _fit(board: Board, blobs: Blobs) -> GridMap | None:
+    """Where the board's circles are seen, if these blobs lie in a grid and are alike in size; else None."""
+    points = board.points[:, :2] / board.pitch_mm
+    try:
+        seen = fit_grid_map(points, blobs.centres, robust=True)
+    except DetectionError:
+        return None
+    pitch = seen.pitch_px(points)
+    size = np.sqrt(blobs.areas) / np.maximum(pitch, 1e-9)
+    alike = np.abs(np.log(size / np.median(size))) < np.log(ALIKE) / 2
+    return seen if (alike & (np.linalg.norm(seen.residuals, axis=1) < NEAR * pitch)).all() else None
+
+
+def _goes_on(board: Board, seen: GridMap, blobs: Blobs, numbering: np.ndarray) -> bool:
+    """Whether circles of the grid's size lie where one more row or column of it would be.
+
+    A blob is one of the grid only if it lies as near to its place as the grid's own circles do, of which the place is
+    an extrapolation; most of what happens to lie beside a board does not.
+    """
+    points = board.points[:, :2] / board.pitch_mm
+    size = float(np.median(np.sqrt(blobs.areas[numbering]) / np.maximum(seen.pitch_px(points), 1e-9)))
+    others = np.delete(np.arange(len(blobs.centres)), numbering)
+    if not len(others):
+        return False
+    for side in _sides(board):
+        pitch = seen.pitch_px(side)
+        apart = np.linalg.norm(seen.to_image(side)[:, None] - blobs.centres[others][None], axis=2)
+        nearest = apart.argmin(1)
+        gate = np.maximum(MOST_OFF * pitch, 2 * OUTLYING * seen.sigma_px)
+        ratio = np.sqrt(blobs.areas[others[nearest]]) / np.maximum(size * pitch, 1e-9)
+        on = (pitch > 0) & (apart.min(1) < gate) & (np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(1.25))
+        if np.count_nonzero(on) >= max(2.0, BEYOND * len(side)):
+            return True
+    return False
+
+
+def _sides(board: Board) -> list[np.ndarray]:
+    """Where one more row or column of circles would be at each side, (k, 2) in pitches."""
+    columns, rows = board.features
+    i, j = np.arange(rows), np.arange(columns)
+    if board.kind == "acircles":
+        above, below = (np.stack([2 * j + row % 2, np.full(columns, row)], axis=1) for row in (-1, rows))
+        left, right = (np.stack([2 * column + i % 2, i], axis=1) for column in (-1, columns))
+    else:
+        above, below = (np.stack([j, np.full(columns, row)], axis=1) for row in (-1, rows))
+        left, right = (np.stack([np.full(rows, column), i], axis=1) for column in (-1, columns))
+    return [side.astype(float) for side in (above, below, left, right)]
+
+
+def _only_one(board: Board, grids: list[_Grid]) -> _Grid:
+    """The board that is meant; raises DetectionError where two may be."""
+    grids = sorted(grids, key=lambda grid: -grid.area_px)
+    if len(grids) > 1 and grids[0].area_px < MUCH_LARGER * grids[1].area_px:
+        (a, b), (c, d) = (grid.blobs.centres[grid.numberings[0]].mean(0) for grid in grids[:2])
         raise DetectionError(
-            f"{len(lattice.nodes)} circles in one grid found where {board} has {len(board.points)}: "
-            "check the board's columns and rows"
+            f"{len(grids)} boards {board} detected, around pixels {a:.0f}, {b:.0f} and {c:.0f}, {d:.0f}: "
+            "take one out of view; a mirror image counts as well"
         )
+    return grids[0]
+
+
+def _measured(board: Board, image: BoardImage, grid: _Grid) -> tuple[np.ndarray, float, bool]:
+    marked = marked_numbering(board, image.deep, grid.blobs.centres, grid.numberings)
+    order = upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
+    blobs = grid.blobs.chosen(order)
+    _refuse_misshapen(board, blobs)
+    return _centres(board, image, blobs), _radius(board, blobs), marked is not None
 
 
 def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
     large = blobs.areas > WELL_SHAPED_PX
     if large.all() and np.median(blobs.roundness) < ROUND:
-        raise DetectionError(f"a grid of squares found where {board} has circles: check the board's kind")
+        raise DetectionError(f"a grid of squares detected where {board} has circles: check the board's kind")
     covered = np.count_nonzero(large & (blobs.roundness < PARTLY_COVERED))
     if covered:
         raise DetectionError(
@@ -125,14 +234,44 @@ def _radius(board: Board, blobs: Blobs) -> float:
     return float(np.sqrt(np.median(blobs.areas / scale) / np.pi))
 
 
-def _not_found(board: Board, image: BoardImage, most: _Seen | None) -> str:
+def _pooled(first: Blobs, others: list[Blobs]) -> Blobs:
+    """The blobs of several binarisations, each circle once, as the ``first`` has it where it does."""
+    pool = first
+    for blobs in others:
+        apart = np.linalg.norm(blobs.centres[:, None] - pool.centres[None], axis=2).min(1)
+        new = apart > 0.5 * np.sqrt(blobs.areas)
+        pool = Blobs(
+            np.concatenate([pool.centres, blobs.centres[new]]),
+            np.concatenate([pool.areas, blobs.areas[new]]),
+            np.concatenate([pool.covariances, blobs.covariances[new]]),
+            pool.inverted,
+        )
+    return pool
+
+
+def _not_detected(board: Board, image: BoardImage, most: _Attempt | None) -> str:
+    """What the operator reads: how many circles of how many, what lies around them, and what to do."""
     total = len(board.points)
-    if most is None or len(most) < 6:
-        return f"no grid of circles found where {board} has {total}: {advice(image.grey)}"
-    if len(most) >= total:
-        longer, shorter = most.lattice.extent
+    if most is None or _size_of_largest(most) < 6:
+        return f"no grid of circles detected where {board} has {total}: {advice(image.grey)}"
+    lattice = max(most.lattices, key=_nodes)
+    seen = len(lattice.nodes)
+    longer, shorter = lattice.extent
+    others = len(most.blobs.centres) - seen
+    if seen >= total:
         return (
-            f"{len(most)} circles found in a grid of {longer}x{shorter} that does not hold all of {board}: "
+            f"{seen} circles detected in a grid of {longer}x{shorter} that does not hold all of {board}: "
             "check the board's columns and rows, and that nothing covers it"
         )
-    return f"{len(most)} of {total} circles found: {advice(image.grey)}"
+    facts = [f"{seen} of {total} circles of {board} detected"]
+    if others:
+        facts.append(f"beside {others} other round blobs")
+    centres = most.blobs.centres[lattice.blobs]
+    step = float(np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / seen))
+    height, width = image.grey.shape
+    gaps = {"left": centres[:, 0].min(), "right": width - 1 - centres[:, 0].max()}
+    gaps |= {"upper": centres[:, 1].min(), "lower": height - 1 - centres[:, 1].max()}
+    sides = [side for side, gap in gaps.items() if gap < step]
+    if sides:
+        facts.append(f"up to the {' and the '.join(sides)} border of the image")
+    return f"{', '.join(facts)}: {advice(image.grey)}"

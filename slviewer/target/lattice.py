@@ -10,15 +10,25 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from slviewer.errors import DetectionError
 from slviewer.target.blobs import Blobs
 from slviewer.target.board import Board
+from slviewer.target.planar import fit_grid_map
 
 REACH = 0.27
 """How far, in steps, a neighbour may lie from where its predecessors point."""
 ALIKE = 2.2
 """Ratio of areas up to which neighbouring blobs count as alike."""
+NEAR = 0.15
+"""How far, in pitches, a blob may lie from the node that the map of the whole lattice predicts."""
+COMPLETIONS = 4
+"""Rows that a lattice may gain at each side beyond those that it was grown to."""
+LONGEST = 200
+"""Nodes of a lattice along one side."""
 SEEDS = 60
 """Lattices that are grown before an attempt gives up."""
+NEIGHBOURS = 25
+"""Blobs around one among which its neighbours of like size are sought."""
 SHEARS = np.array([[[1, 0], [0, 1]], [[1, 0], [1, 1]], [[1, 1], [0, 1]], [[1, 0], [-1, 1]], [[1, -1], [0, 1]]])
 """Changes of basis, for a strong slant where a diagonal of the grid looks shorter than its sides."""
 TURNS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
@@ -59,6 +69,37 @@ def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
             return
 
 
+def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
+    """The lattice with every blob in it that lies where its map puts a node, without those that lie elsewhere.
+
+    Growing from neighbour to neighbour ends at a gap, and may be led astray by what lies beside a grid; the map of all
+    nodes together is not.
+    """
+    for _ in range(COMPLETIONS):
+        try:
+            seen = fit_grid_map(lattice.nodes.astype(float), blobs.centres[lattice.blobs], robust=True)
+        except DetectionError:
+            return lattice
+        low, high = lattice.nodes.min(0) - 1, lattice.nodes.max(0) + 1
+        if (high - low).max() > LONGEST:
+            return lattice
+        nodes = np.stack(np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)), -1).reshape(-1, 2)
+        pitch = seen.pitch_px(nodes.astype(float))
+        typical = np.median(np.sqrt(blobs.areas[lattice.blobs]) / np.maximum(seen.pitch_px(lattice.nodes * 1.0), 1e-9))
+        apart, nearest = cKDTree(blobs.centres).query(seen.to_image(nodes.astype(float)))
+        ratio = np.sqrt(blobs.areas[nearest]) / np.maximum(typical * pitch, 1e-9)
+        on = (pitch > 0) & (apart < NEAR * pitch) & (np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(ALIKE) / 2)
+        _, first = np.unique(np.where(on, nearest, -1 - np.arange(len(nodes))), return_index=True)
+        chosen = np.sort(first[on[first]])
+        if len(chosen) < 6:
+            return lattice
+        same = len(chosen) == len(lattice.blobs) and set(nearest[chosen]) == set(lattice.blobs)
+        lattice = Lattice(nodes[chosen], nearest[chosen])
+        if same:
+            break
+    return lattice
+
+
 def lay_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
     """Every numbering of the board's features by the lattice's blobs, (n,) indices each; empty where some are missing.
 
@@ -90,11 +131,13 @@ def lay_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
 def _seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """(blob, step, step) where like neighbours lie opposite each other in two directions, the most regular first."""
     centres, areas = blobs.centres, blobs.areas
-    _, near = tree.query(centres, k=min(9, len(centres)))
+    _, near = tree.query(centres, k=min(NEIGHBOURS, len(centres)))
     near = near[:, 1:]
+    alike = np.abs(np.log(areas[near] / areas[:, None])) < np.log(ALIKE)
+    first = np.argsort(~alike, axis=1, kind="stable")[:, :8]  # the nearest eight of its size, past what lies between
+    near, alike = np.take_along_axis(near, first, axis=1), np.take_along_axis(alike, first, axis=1)
     step = centres[near] - centres[:, None]
     length = np.linalg.norm(step, axis=2)
-    alike = np.abs(np.log(areas[near] / areas[:, None])) < np.log(ALIKE)
     gap = np.linalg.norm(step[:, :, None] + step[:, None], axis=3)
     shorter = np.minimum(length[:, :, None], length[:, None])
     regular = np.where(alike[:, :, None] & alike[:, None], gap / np.maximum(shorter, 1e-9), np.inf)

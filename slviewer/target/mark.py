@@ -1,7 +1,10 @@
-"""The mark that tells which way round a board of circles is: a dot beside its first circle.
+"""The mark that orients a board of circles: a dot beside its first circle.
 
 A symmetric grid looks the same turned by 180 degrees. The dot lies outside the grid, on the first circle's diagonal, so
-far from it that neither finding nor measuring circles meets it; half as wide as a circle, it is never taken for one.
+far from it that neither detecting nor measuring circles meets it; half as wide as a circle, it is never taken for one.
+
+Whatever else lies beside a board (a screw, a label, something warm in a thermal image) is no mark: only a dot counts
+that has the place, the size, the polarity and the contrast of the printed one, on the paper of the board.
 """
 
 from dataclasses import dataclass
@@ -10,7 +13,7 @@ import cv2
 import numpy as np
 
 from slviewer.target.board import Board
-from slviewer.target.planar import fit_homography, jacobians, to_image
+from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_image
 
 PLACE = 5 / 8
 RADIUS = 1 / 8
@@ -18,12 +21,20 @@ QUIET = 1 / 8
 """How far the dot lies left of and above the first circle, its radius and the paper around it, in distances between
 neighbouring circles."""
 NEAREST = 16
-"""Circles by which the dot's place in the image is told; farther ones know less of the lens there."""
+"""Circles that predict the dot's place in the image; farther ones know less of the lens there."""
 CUT_OFF = 0.3
 """Share of the paper around a dot that may lie outside the image."""
 SEEN = 0.4
 ABSENT = 0.2
 """Contrast of a dot over a circle's, above which it is there, and below which it is not."""
+MOST_OFF = 0.4
+"""Distance of the dot's centroid from its place, in its radii: what a lens adds to a prediction over one pitch."""
+SIZES = (0.6, 1.5)
+"""Radius at half contrast over the printed one, from the smallest to the largest that blur and ink make of it."""
+LEAST_PAPER = 0.5
+"""The paper around a dot may differ from that around the first circle by this share of the circle's contrast."""
+_RADII = np.linspace(0.0, 2.2, 12)
+_ANGLES = 20
 
 
 @dataclass(frozen=True)
@@ -59,45 +70,77 @@ def marked_numbering(
     mark = mark_of(board)
     if mark is None:
         return None
-    contrasts = np.array([_contrast(board, mark, image, centres[order]) for order in numberings])
+    dots = [_dot(board, mark, image, centres[order]) for order in numberings]
+    contrasts = np.array([contrast for contrast, _ in dots])
     best = int(np.argmax(contrasts))
     others = np.delete(contrasts, best)
-    return numberings[best] if contrasts[best] > SEEN and (others < ABSENT).all() else None
+    return numberings[best] if contrasts[best] > SEEN and dots[best][1] and (others < ABSENT).all() else None
 
 
-def _contrast(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray) -> float:
-    """How much the mark's place differs from the paper around it, over how much the first circle does."""
+def _dot(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray) -> tuple[float, bool]:
+    """(How much the mark's place differs from the paper around it, over how much the first circle does; whether a dot
+    lies there that may be the mark)."""
     points = board.points[:, :2]
     centre = np.array([mark.x, mark.y])
     near = np.argsort(np.linalg.norm(points - centre, axis=1))[:NEAREST]
     H = fit_homography(points[near], pixels[near])
+    bent = fit_grid_map(points / board.pitch_mm, pixels).to_image(centre[None] / board.pitch_mm)[0]
     if not np.linalg.det(jacobians(H, centre[None]))[0] > 0:
-        return 0.0
-    dot = _darkness(image, H, centre, mark.radius)
-    circle = _darkness(image, H, points[0], 2 * mark.radius)
-    return dot / circle if abs(circle) > 0.05 else 0.0
+        return 0.0, False
+    shift = np.eye(3)
+    shift[:2, 2] = bent - to_image(H, centre[None])[0]
+    dot = _profile(image, shift @ H, centre, mark.radius)
+    circle = _profile(image, H, points[0], 2 * mark.radius)
+    if dot is None or circle is None or abs(circle.contrast) < 0.05:
+        return 0.0, False
+    same_paper = abs(dot.paper - circle.paper) < LEAST_PAPER * abs(circle.paper - circle.ink)
+    is_mark = dot.off < MOST_OFF and SIZES[0] < dot.size < SIZES[1] and same_paper and dot.is_alone
+    return dot.contrast / circle.contrast, is_mark
 
 
-def _darkness(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float) -> float:
-    """Brightness of the paper around a dot less its own, over the larger; negative for bright dots.
+@dataclass(frozen=True)
+class _Profile:
+    """A dot's grey levels: of its middle (``ink``) and of the paper around it; their difference over the larger,
+    negative for bright dots; its centroid's distance ``off`` from where it should be and its radius at half contrast
+    (``size``), both in its radii; whether there is paper on all sides (``is_alone``)."""
 
-    The fifth of the ring that is least like paper counts: an edge that runs through is no dot.
+    ink: float
+    paper: float
+    contrast: float
+    off: float
+    size: float
+    is_alone: bool
+
+
+def _profile(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float) -> _Profile | None:
+    """Of what lies around a point of the board, out to 2.2 radii; None where too little of it is in the image.
+
+    For paper counts the fifth of the outer rings that is least like it: an edge that runs through is no dot.
     """
-    inner = _around(image, H, centre, radius * np.array([0.0, 0.3, 0.6]))
-    outer = _around(image, H, centre, radius * np.array([1.8, 2.2]))
-    if np.isnan(inner).any() or np.isnan(outer).mean() > CUT_OFF:
-        return 0.0
-    outer = outer[np.isfinite(outer)]
-    own = float(inner.mean())
-    paper = float(np.quantile(outer, 0.2 if own < np.median(outer) else 0.8))
-    return (paper - own) / max(paper, own, 1.0)
-
-
-def _around(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """(n,) the image on circles about a point of the board; NaN outside it."""
-    angles = np.arange(20) * 2 * np.pi / 20
-    rings = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    pixels = to_image(H, centre + rings.reshape(-1, 2)).astype(np.float32)
-    return cv2.remap(
+    angles = np.arange(_ANGLES) * 2 * np.pi / _ANGLES
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    places = _RADII[:, None, None] * radius * directions
+    pixels = to_image(H, centre + places.reshape(-1, 2)).astype(np.float32)
+    levels = cv2.remap(
         image, pixels[:, 0], pixels[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
-    ).ravel()
+    ).reshape(len(_RADII), _ANGLES)
+    inner, outer = levels[_RADII <= 0.6], levels[_RADII >= 1.8]
+    if np.isnan(inner).any() or np.isnan(outer).mean() > CUT_OFF:
+        return None
+    own = float(inner.mean())
+    ring = np.nanmean(outer, axis=0) if np.isfinite(outer).all() else outer[np.isfinite(outer)]
+    flat = outer[np.isfinite(outer)]
+    paper = float(np.quantile(flat, 0.2 if own < np.median(flat) else 0.8))
+    difference = paper - own
+    if abs(difference) < 1e-3:
+        return _Profile(own, paper, 0.0, np.inf, np.inf, False)
+    share = np.nan_to_num((paper - levels) / difference, nan=0.0)
+    middle = float(np.median(ring))
+    is_alone = bool(np.abs(ring - middle).max() < 0.5 * abs(difference))
+    ink = np.clip(share, 0.0, 1.0) * (_RADII < 1.9)[:, None] * _RADII[:, None]  # the area that a sample stands for
+    centroid = np.einsum("ra,r,ac->c", ink, _RADII, directions) / max(float(ink.sum()), 1e-9)
+    means = share.mean(axis=1) / max(float(share[:2].mean()), 1e-9)
+    below = np.nonzero(means < 0.5)[0]
+    size = float(_RADII[below[0]]) if len(below) else np.inf
+    contrast = difference / max(paper, own, 1.0)
+    return _Profile(own, paper, contrast, float(np.linalg.norm(centroid)), size, is_alone)

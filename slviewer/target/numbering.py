@@ -12,7 +12,7 @@ import numpy as np
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
-from slviewer.target.planar import fit_homography, jacobians, to_image
+from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_image
 
 MOST_OFF = 0.08
 """How far, in pitches, a feature may lie from the grid that all features together describe."""
@@ -38,8 +38,8 @@ def x_direction(board: Board, pixels: np.ndarray) -> np.ndarray:
 def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> None:
     """Raises DetectionError unless the features lie, one by one, where a flat board behind a real lens shows them.
 
-    A homography must explain them up to a lens's distortion, which is smooth: of what the homography leaves over, a
-    cubic of the board's coordinates is taken away, and the rest must be small. The numbering must be right-handed.
+    A homography must explain them up to a lens's distortion, which is smooth (``planar.GridMap``). The numbering must
+    be right-handed.
     """
     advice = "keep the board flat and in focus, without reflections, and take the pose again"
     points = board.points[ids][:, :2] / board.pitch_mm
@@ -48,16 +48,12 @@ def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> 
     if areas.max() <= 0:
         raise DetectionError(f"the {what} appear mirrored: show the board to the camera directly, not in a mirror")
     pitch = np.sqrt(np.maximum(areas, 1e-9))
-    left_over = pixels - to_image(H, points)
-    if (np.linalg.norm(left_over, axis=1) > MOST_BENT * pitch).any():
-        raise DetectionError(f"the {what} found do not lie on a flat grid: {advice}")
-    x, y = (2 * (points - points.min(0)) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1).T
-    degree = 3 if len(points) >= 25 else 1
-    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
-    smooth = terms @ np.linalg.lstsq(terms, left_over, rcond=None)[0]
-    off = np.linalg.norm(left_over - smooth, axis=1)
-    sigma = 1.26 * float(np.median(off))  # of two coordinates, robustly
-    wrong = off > np.clip(OUTLYING * sigma, np.maximum(0.3, 0.01 * pitch), np.maximum(0.5, MOST_OFF * pitch))
+    if (np.linalg.norm(pixels - to_image(H, points), axis=1) > MOST_BENT * pitch).any():
+        raise DetectionError(f"the {what} detected do not lie on a flat grid: {advice}")
+    fitted = fit_grid_map(points, pixels)
+    off = np.linalg.norm(fitted.residuals, axis=1)
+    limit = OUTLYING * fitted.sigma_px
+    wrong = off > np.clip(limit, np.maximum(0.3, 0.01 * pitch), np.maximum(0.5, MOST_OFF * pitch))
     if wrong.any():
         worst = int(np.argmax(off / pitch))
         u, v = pixels[worst]

@@ -1,17 +1,23 @@
-"""The homography between a flat board and its image."""
+"""The homography between a flat board and its image, and what a lens adds to it."""
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError
 
+HUBER_SIGMAS = 3.0
+"""Features farther from a grid's map than so many robust standard deviations weigh less in its fit."""
 
-def fit_homography(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+
+def fit_homography(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -> np.ndarray:
     """(3, 3) float64 from points (n, 2) mm to pixels (n, 2) px by least squares, positive in depth on the board.
 
-    Raises DetectionError where they do not determine one.
+    ``robust``: by the least median of squares, of which up to half of the points may be wrong. Raises DetectionError
+    where they do not determine one.
     """
-    H = cv2.findHomography(points, pixels)[0] if len(points) >= 4 else None
+    H = cv2.findHomography(points, pixels, cv2.LMEDS if robust else 0)[0] if len(points) >= 4 else None
     if H is None or abs(np.linalg.det(H)) < 1e-12:
         raise DetectionError(f"the {len(points)} features found lie on one line: turn the board towards the camera")
     return np.asarray(H * np.sign(points.mean(0) @ H[2, :2] + H[2, 2]))
@@ -26,3 +32,56 @@ def jacobians(H: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(n, 2, 2) px per mm at points (n, 2) mm."""
     w = points @ H[2, :2] + H[2, 2]
     return np.asarray((H[None, :2, :2] - to_image(H, points)[:, :, None] * H[2, :2]) / w[:, None, None])
+
+
+@dataclass(frozen=True)
+class GridMap:
+    """Where a flat grid of features is seen: a homography ``H`` from pitches to pixels, plus a polynomial of the place
+    on the board, which is how a lens bends it.
+
+    ``residuals`` (n, 2) px of the features that it was fitted to, ``sigma_px`` the robust standard deviation of their
+    lengths.
+    """
+
+    H: np.ndarray
+    low: np.ndarray
+    span: np.ndarray
+    degree: int
+    coefficients: np.ndarray
+    residuals: np.ndarray
+    sigma_px: float
+
+    def to_image(self, points: np.ndarray) -> np.ndarray:
+        """(n, 2) px of points (n, 2) in pitches; beyond the features as far as the polynomial can be trusted."""
+        return to_image(self.H, points) + _terms(points, self.low, self.span, self.degree) @ self.coefficients
+
+    def pitch_px(self, points: np.ndarray) -> np.ndarray:
+        """(n,) px: the side of a square of one pitch, at points (n, 2) in pitches; 0 behind the camera."""
+        return np.sqrt(np.maximum(np.linalg.det(jacobians(self.H, points)), 0.0))
+
+
+def fit_grid_map(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -> GridMap:
+    """The map of features at points (n, 2) in pitches to pixels (n, 2).
+
+    ``robust``: up to a third of the features may be misplaced, and weigh little (Huber's weights). Raises
+    DetectionError where the features do not determine a map.
+    """
+    H = fit_homography(points, pixels, robust)
+    low, span = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-9)
+    degree = 3 if len(points) >= 25 else 1
+    terms = _terms(points, low, span, degree)
+    bent = pixels - to_image(H, points)
+    weight = np.ones(len(points))
+    for _ in range(8 if robust else 1):
+        coefficients = np.linalg.lstsq(terms * weight[:, None], bent * weight[:, None], rcond=None)[0]
+        residuals = bent - terms @ coefficients
+        off = np.linalg.norm(residuals, axis=1)
+        sigma = 1.26 * float(np.median(off))  # of two coordinates, robustly
+        weight = np.sqrt(np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(off, 1e-9)))
+    return GridMap(H, low, span, degree, coefficients, residuals, sigma)
+
+
+def _terms(points: np.ndarray, low: np.ndarray, span: np.ndarray, degree: int) -> np.ndarray:
+    """(n, m): the monomials up to a degree, of points (n, 2) scaled to -1 to 1 over the features."""
+    x, y = (2 * (points - low) / span - 1).T
+    return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)

@@ -172,7 +172,7 @@ def test_hidden_circles_are_counted_not_guessed(notation: str, hide: tuple[float
     board = Board.parse(notation)
     x, y = board.points[:, :2].T
     left = np.count_nonzero(~((x > hide[0]) & (y > hide[1]) & (x < hide[2]) & (y < hide[3])))
-    with pytest.raises(DetectionError, match=f"^{left} of {len(x)} circles found: .*move the board"):
+    with pytest.raises(DetectionError, match=f"^{left} of {len(x)} circles of .* detected.*: .*move the board"):
         detect(board, replace(SMALL, hide=hide, tilt=10).render(board))
 
 
@@ -193,18 +193,18 @@ def test_a_stain_on_one_circle_is_refused() -> None:
 
 
 def test_a_board_partly_out_of_view_is_refused() -> None:
-    with pytest.raises(DetectionError, match="of 63 circles found"):
+    with pytest.raises(DetectionError, match=r"of 63 circles of .* detected"):
         detect(BOARD, replace(SMALL, shift=(70, 0)).render(BOARD))
 
 
 @pytest.mark.parametrize("wrong", ["circles:8x7:20", "circles:9x6:20", "circles:7x7:20"])
 def test_a_larger_grid_than_stated_is_refused(wrong: str) -> None:
-    with pytest.raises(DetectionError, match=r"63 circles in one grid found where .* check the board's columns"):
+    with pytest.raises(DetectionError, match=r"63 circles in one grid detected where .* check the board's columns"):
         detect(Board.parse(wrong), replace(SMALL, tilt=15).render(BOARD))
 
 
 def test_a_smaller_grid_than_stated_is_refused() -> None:
-    with pytest.raises(DetectionError, match="63 of 70 circles found"):
+    with pytest.raises(DetectionError, match=r"63 of 70 circles of .* detected"):
         detect(Board.parse("circles:10x7:20"), replace(SMALL, tilt=15).render(BOARD))
 
 
@@ -227,12 +227,12 @@ def test_overexposure_is_named() -> None:
 
 def test_an_empty_image_is_refused() -> None:
     for level in (0, 128):
-        with pytest.raises(DetectionError, match="no grid of circles found"):
+        with pytest.raises(DetectionError, match="no grid of circles detected"):
             detect(BOARD, np.full((300, 400), level, np.uint8))
 
 
 def test_noise_is_refused() -> None:
-    with pytest.raises(DetectionError, match="circles found"):
+    with pytest.raises(DetectionError, match=r"circles .*detected"):
         detect(BOARD, np.random.default_rng(0).integers(0, 255, (300, 400), np.uint8))
 
 
