@@ -13,6 +13,7 @@ import tyro
 from slviewer import __version__, terminal
 from slviewer.commands.batching import batch
 from slviewer.commands.comparing import compare
+from slviewer.commands.detecting import detect
 from slviewer.commands.devices import capture, devices, preflight
 from slviewer.commands.dimensions import measure, measurements
 from slviewer.commands.exporting import decode, export
@@ -52,6 +53,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "prove": prove,
     "patterns": patterns,
     "target": target,
+    "detect": detect,
     "report": report,
     "inspect": inspect,
     "bench": bench,

@@ -47,6 +47,7 @@ _HOMES = {
     "prove": "proving",
     "patterns": "printing",
     "target": "printing",
+    "detect_board": "detecting",
     "report": "reporting",
     "inspect": "inspecting",
     "bench": "benchmarking",
