@@ -1,4 +1,4 @@
-"""One camera frame: light on the surface, through the camera's lens, with noise, to 8 bits."""
+"""One camera frame: light on the surface, through the camera's lens, with noise, to 8 or 16 bits."""
 
 import numba
 import numpy as np
@@ -31,20 +31,16 @@ def _mix(x):
 
 
 @kernel(parallel=True, fastmath=True)
-def expose(coordinate, level, gain, table, offset, per_px, taps, stray, noise, quantiles, keys, out):
-    """Write one frame into `out` (h, w) uint8.
+def image_light(coordinate, level, gain, table, offset, per_px, taps, stray, out):
+    """Write the light of one frame into `out` (h, w) float32 grey levels above dark.
 
     Light gain * table(level, coordinate) is blurred by `taps` (2 r + 1) in both directions; coordinate, level and gain
-    (h + 2 r, w + 2 r) reach r pixels beyond the frame. `stray` (h, w), blurred before, is added. noise: dark level,
-    read variance, shot variance. The noise depends on the pixel and on `keys` (two uint32) alone, not on how the rows
-    are shared among threads.
+    (h + 2 r, w + 2 r) reach r pixels beyond the frame. `stray` (h, w), blurred before, is added.
     """
     h, w = out.shape
     radius = taps.size // 2
     last = np.float32(table.shape[1] - 1.001)
-    dark, read, shot = np.float32(noise[0]), np.float32(noise[1]), np.float32(noise[2])
     start, scale = np.float32(offset), np.float32(per_px)
-    key0, key1 = keys[0], keys[1]
     for task in numba.prange((h + _ROWS - 1) // _ROWS):
         first, end = task * _ROWS, min((task + 1) * _ROWS, h)
         blurred = np.zeros((_ROWS + 2 * radius, w), np.float32)
@@ -65,20 +61,33 @@ def expose(coordinate, level, gain, table, offset, per_px, taps, stray, noise, q
                 weight = taps[tap]
                 for j in range(w):
                     blurred[k, j] += weight * line[tap + j]
-        light = np.empty(w, np.float32)
-        bits = np.empty(w, np.uint32)
         for i in range(first, end):
             for j in range(w):
-                light[j] = stray[i, j]
+                out[i, j] = stray[i, j]
             for tap in range(taps.size):
                 weight = taps[tap]
                 source = blurred[i - first + tap]
                 for j in range(w):
-                    light[j] += weight * source[j]
-            for j in range(w):
-                x = _mix(np.uint32(np.uint32(i * w + j) ^ key0))
-                bits[j] = _mix(np.uint32(x + key1)) >> np.uint32(16)
-            for j in range(w):
-                spread = np.sqrt(read + shot * max(light[j], np.float32(0)))
-                value = dark + light[j] + spread * quantiles[bits[j]] + np.float32(0.5)
-                out[i, j] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))
+                    out[i, j] += weight * source[j]
+
+
+@kernel(parallel=True, fastmath=True)
+def digitise(light, noise, top, quantiles, keys, out):
+    """Write `light` (h, w) float32 with its noise into `out` (h, w) uint8 or uint16, clipped at 0 and `top`.
+
+    noise: dark level, read variance, shot variance, in units of `out`. The noise depends on the pixel and on `keys`
+    (two uint32) alone, not on how the rows are shared among threads.
+    """
+    h, w = out.shape
+    dark, read, shot = np.float32(noise[0]), np.float32(noise[1]), np.float32(noise[2])
+    full = np.float32(top)
+    key0, key1 = keys[0], keys[1]
+    for i in numba.prange(h):
+        bits = np.empty(w, np.uint32)
+        for j in range(w):
+            x = _mix(np.uint32(np.uint32(i * w + j) ^ key0))
+            bits[j] = _mix(np.uint32(x + key1)) >> np.uint32(16)
+        for j in range(w):
+            spread = np.sqrt(read + shot * max(light[i, j], np.float32(0)))
+            value = dark + light[i, j] + spread * quantiles[bits[j]] + np.float32(0.5)
+            out[i, j] = int(min(max(value, np.float32(0)), full))

@@ -10,7 +10,7 @@ from scipy.ndimage import correlate1d
 from slviewer.errors import InputError
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.simulation.film import NORMAL_QUANTILES, expose, psf_taps
+from slviewer.simulation.film import NORMAL_QUANTILES, digitise, image_light, psf_taps
 from slviewer.simulation.light import OVERSAMPLING, blur_levels, blurred_profile, window
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
@@ -36,12 +36,12 @@ class Truth:
 class _Maps:
     """A scene at unit exposure, (h + 2 r, w + 2 r) float32 with r the PSF's radius.
 
-    gain: full white light; stray: the room's light; level: blur, as a place among the tabulated `sigmas`; coordinates:
-    projector px along each axis.
+    gain: full white light; even: the room's light, if it were as strong; level: blur, as a place among the tabulated
+    `sigmas`; coordinates: projector px along each axis.
     """
 
     gain: np.ndarray
-    stray: np.ndarray
+    even: np.ndarray
     level: np.ndarray
     sigmas: np.ndarray
     coordinates: dict[Axis, np.ndarray]
@@ -104,26 +104,43 @@ class Renderer:
         `keys` (2,) uint32 decide the noise, `lamp` is the relative light of this frame, `exposure` replaces the
         renderer's own, and `gain` multiplies the signal and its noise before they become 8 bits.
         """
-        rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
-        width, height = rig.camera.size
+        width, height = self.rig.camera.size
         if out.shape != (height, width) or out.dtype != np.uint8:
             raise InputError(f"a frame needs an array of shape {(height, width)} uint8, got {out.shape} {out.dtype}")
-        lit, stray = self._light((self.exposure if exposure is None else exposure) * gain)
+        light = self.light(pattern, lamp=lamp, exposure=(self.exposure if exposure is None else exposure) * gain)
+        sensor = self.rig.sensor
+        noise = np.array([sensor.dark_level, gain**2 * sensor.read_variance, gain * sensor.shot_variance])
+        digitise(light, noise, 255.0, NORMAL_QUANTILES, keys, out)
+
+    def light(
+        self, pattern: tuple[Axis | None, np.ndarray], *, lamp: float = 1.0, exposure: float | None = None
+    ) -> np.ndarray:
+        """(h, w) float32: the light of one frame in grey levels above dark, before noise and clipping; as `frame`."""
+        rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
+        lit, stray = self._light(self.exposure if exposure is None else exposure)
         # Rows and columns are blurred alike in space, hence by different numbers of pixels.
         sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
         light = blurred_profile((grey_levels / 255.0) ** rig.light.gamma, sigmas)
-        sensor = rig.sensor
-        noise = np.array([sensor.dark_level, gain**2 * sensor.read_variance, gain * sensor.shot_variance])
-        expose(
+        width, height = rig.camera.size
+        out = np.empty((height, width), np.float32)
+        image_light(
             maps.coordinates[varies or "x"], maps.level, lit, np.float32(lamp) * light.table, light.offset,
-            OVERSAMPLING, self._taps, stray, noise, NORMAL_QUANTILES, keys, out,
+            OVERSAMPLING, self._taps, stray, out,
         )  # fmt: skip
+        return out
+
+    def room_light(self) -> np.ndarray:
+        """(h, w) float32: grey levels of even room light as strong as full white light from the projector."""
+        even = self._maps.even * np.float32(self.exposure)
+        for direction in (0, 1):
+            even = correlate1d(even, self._taps, axis=direction)
+        return np.ascontiguousarray(even[self._frame])
 
     def _light(self, exposure: float) -> tuple[np.ndarray, np.ndarray]:
         """Grey levels: of full white light as `_Maps.gain`, and of all that no pattern changes, blurred, (h, w)."""
         if exposure not in self._lights:
             maps, black = self._maps, self.rig.light.black
-            stray = exposure * (black * maps.gain + maps.stray)
+            stray = exposure * (black * maps.gain + self.rig.light.ambient * maps.even)
             for direction in (0, 1):
                 stray = correlate1d(stray, self._taps, axis=direction)
             self._lights.clear()  # an exposure is kept for many frames
@@ -137,7 +154,7 @@ class Renderer:
     def exposure(self) -> float:
         """Grey levels of full white light on an albedo of 1 that faces the projector at its focus."""
         maps, sensor = self._maps, self.rig.sensor
-        lit = (maps.gain + maps.stray)[self._frame][maps.truth.mask]
+        lit = (maps.gain + self.rig.light.ambient * maps.even)[self._frame][maps.truth.mask]
         if not lit.size:
             raise InputError("nothing in the scene is lit by the projector: move it to where both fields meet")
         return (sensor.peak_level - sensor.dark_level) / float(np.quantile(lit, _EXPOSURE_QUANTILE))
@@ -182,7 +199,7 @@ class Renderer:
         sigmas, level = blur_levels(blur)
         return _Maps(
             gain=(seen * shade * reached * lit).astype(np.float32),
-            stray=(seen * light.ambient * hit).astype(np.float32),
+            even=(seen * hit).astype(np.float32),
             level=level,
             sigmas=sigmas,
             coordinates={"x": _finite(u), "y": _finite(v)},

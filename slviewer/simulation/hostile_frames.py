@@ -1,0 +1,263 @@
+"""Faults of light, signal and frame order, as pure functions of a capture's (n, h, w) arrays."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from slviewer.fringe.sequence import PatternSequence
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What a fault may ask of the capture that it spoils: its number among its kind, its sequence, and a generator of
+    its own. ``room``: (h, w) float32, even light as strong as the projector's white, in grey levels.
+    """
+
+    number: int
+    sequence: PatternSequence
+    rng: np.random.Generator
+    room: np.ndarray
+
+
+# Light before the sensor
+
+
+def scale_frames(light: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Each of the frames (n, h, w) times its gain (n,)."""
+    return light * np.asarray(gains, np.float32)[:, None, None]
+
+
+def drifting_gains(n: int, rms: float, rng: np.random.Generator) -> np.ndarray:
+    """(n,) gains around 1 with exactly this relative rms, independent from frame to frame."""
+    gains = rng.standard_normal(n)
+    gains = (gains - gains.mean()) / gains.std()
+    return 1 + rms * np.clip(gains, -2.5, 2.5) / np.clip(gains, -2.5, 2.5).std()
+
+
+def exposure_loop_gains(light: np.ndarray, off: float, speed: float = 0.15) -> np.ndarray:
+    """(n,) gains of an exposure control that starts too bright by ``off`` and follows the mean level of the last frame.
+
+    Its target is the mean level of all frames; each frame it takes this share of the way that is left.
+    """
+    means = light.mean((1, 2))
+    target, gain = float(means.mean()), 1 + off
+    gains = []
+    for mean in means:
+        gains.append(gain)
+        gain *= (target / (gain * max(float(mean), 1e-3))) ** speed
+    return np.array(gains)
+
+
+def add_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
+    """Mains light under a rolling shutter: bands of 1 + depth sin that stand elsewhere in each frame."""
+    n, height, _ = light.shape
+    rows = 1.6 * np.arange(height) / height
+    phase = 0.37 * np.arange(n)[:, None] + shot.rng.uniform(0, 1, (n, 1)) * 0.1
+    return light * (1 + depth * np.sin(2 * np.pi * (rows + phase))).astype(np.float32)[:, :, None]
+
+
+def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
+    """A lamp in the room, a fifth as strong as the projector, that flickers by ``depth`` of its light."""
+    n, height, _ = light.shape
+    rows = 1.6 * np.arange(height) / height
+    bands = 0.2 * (1 + depth * np.sin(2 * np.pi * (rows + 0.29 * np.arange(n)[:, None])))
+    return 0.8 * light + bands.astype(np.float32)[:, :, None] * shot.room
+
+
+def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
+    """A lamp switched on half way: even light, as a share of the projector's."""
+    lit = light.copy()
+    lit[len(light) // 2 :] += np.float32(share) * shot.room
+    return lit
+
+
+def add_colour_wheel(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
+    """A short exposure that sees part of the colour wheel's turn: fast bands of the projector's light alone."""
+    n, height, _ = light.shape
+    dark = light.min(0, keepdims=True)
+    rows = 5.0 * np.arange(height) / height
+    phase = shot.rng.uniform(0, 1, (n, 1))
+    bands = 1 + depth * (np.sin(2 * np.pi * (rows + phase)) + 0.5 * np.sin(4 * np.pi * (rows + phase)))
+    return dark + (light - dark) * bands.astype(np.float32)[:, :, None]
+
+
+def add_crosstalk(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
+    """A display that answers slowly: each image holds a share of the one before."""
+    before = np.concatenate([light[:1], light[:-1]])
+    return np.float32(1 - share) * light + np.float32(share) * before
+
+
+def add_vignetting(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
+    """Light that falls off to the image's corners by ``loss``."""
+    y, x = (np.linspace(-1, 1, size) for size in light.shape[1:])
+    return light * (1 - loss * (x[None] ** 2 + y[:, None] ** 2) / 2).astype(np.float32)
+
+
+def add_lens_dust(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
+    """Blurred spots and scratches on the camera's lens, the same in every frame and every capture."""
+    _, height, width = light.shape
+    rng = np.random.default_rng(0xD7)
+    spots = np.zeros((height, width), np.float32)
+    for _ in range(25):
+        centre = (int(rng.integers(width)), int(rng.integers(height)))
+        cv2.circle(spots, centre, int(rng.integers(2, 9)) * width // 400, float(rng.uniform(0.3, 1)), -1)
+    for _ in range(6):
+        (a, b), (c, d) = rng.integers(0, [width, height], (2, 2)).tolist()
+        cv2.line(spots, (a, b), (c, d), 0.6, max(1, width // 400))
+    blurred = cv2.GaussianBlur(spots, (0, 0), 3.0 * width / 400)
+    return np.asarray(light * (1 - np.float32(loss) * blurred), np.float32)
+
+
+def add_defocus_gradient(light: np.ndarray, sigma_px: float, shot: Shot) -> np.ndarray:
+    """A tilted camera lens: sharp at the left edge, blurred by up to ``sigma_px`` (of 400 px of width) at the right."""
+    width = light.shape[2]
+    widest = sigma_px * width / 400
+    steps = 5
+    share = (steps - 1) * np.arange(width) / (width - 1)
+    out = np.zeros_like(light)
+    for k in range(steps):
+        weight = np.clip(1 - np.abs(share - k), 0, 1).astype(np.float32)
+        for i, frame in enumerate(light):
+            out[i] += weight * (cv2.GaussianBlur(frame, (0, 0), widest * k / (steps - 1)) if k else frame)
+    return out
+
+
+# The sensor's signal, and what is recorded of it
+
+
+def encode_srgb(signal: np.ndarray, share: float, shot: Shot) -> np.ndarray:
+    """Video levels instead of light: this share of the way from a straight line to the sRGB curve."""
+    x = np.clip(signal / 255, 0, 1)
+    curve = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.asarray(255 * ((1 - share) * x + share * curve), np.float32)
+
+
+def shift_white_balance(signal: np.ndarray, rms: float, shot: Shot) -> np.ndarray:
+    """A digital gain that wanders from frame to frame."""
+    walk = np.cumsum(shot.rng.standard_normal(len(signal)))
+    walk -= walk.mean()
+    return scale_frames(signal, 1 + rms * walk / walk.std())
+
+
+def compress_jpeg(frames: np.ndarray, quality: float, shot: Shot | None = None) -> np.ndarray:
+    """Each frame (n, h, w) uint8 through a JPEG encoder and back."""
+    out = np.empty_like(frames)
+    for k, frame in enumerate(frames):
+        encoded, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
+        assert encoded
+        out[k] = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    return out
+
+
+def add_hot_pixels(frames: np.ndarray, share: float, shot: Shot) -> np.ndarray:
+    """This share of the pixels hot or dead, the same ones in every capture."""
+    kind = np.random.default_rng(0x407).random(frames.shape[1:])
+    return np.where(kind < share / 2, np.uint8(255), np.where(kind > 1 - share / 2, np.uint8(0), frames))
+
+
+# Frames in another order than described
+
+
+def delay_frames(frames: np.ndarray, by: int = 1) -> np.ndarray:
+    """Every frame shows what was projected so many frames before."""
+    return np.roll(frames, by, axis=0)
+
+
+def drop_frame(frames: np.ndarray, index: int) -> np.ndarray:
+    """Without one frame: those that follow come a place earlier, and the last comes twice."""
+    return np.concatenate([np.delete(frames, index, axis=0), frames[-1:]])
+
+
+def duplicate_frame(frames: np.ndarray, index: int) -> np.ndarray:
+    """A frame is that before it once more."""
+    out = frames.copy()
+    out[index] = frames[index - 1]
+    return out
+
+
+def swap_frames(frames: np.ndarray, first: int, second: int | None = None) -> np.ndarray:
+    """Two frames, by default neighbours, have changed places."""
+    out = frames.copy()
+    second = first + 1 if second is None else second
+    out[[first, second]] = frames[[second, first]]
+    return out
+
+
+def exchange_axes(frames: np.ndarray, sequence: PatternSequence, kinds: Sequence[str] = ()) -> np.ndarray:
+    """The frames of x and y, or those of some ``kinds``, have changed places; both axes must have as many."""
+    of = {axis: [i for i, f in enumerate(sequence.frames) if f.axis == axis and (not kinds or f.kind in kinds)]
+          for axis in ("x", "y")}  # fmt: skip
+    return swap_groups(frames, of["x"], of["y"])
+
+
+def swap_groups(frames: np.ndarray, first: Sequence[int], second: Sequence[int]) -> np.ndarray:
+    """Groups of equally many frames have changed places."""
+    order = np.arange(len(frames))
+    order[list(first)], order[list(second)] = list(second), list(first)
+    return frames[order]
+
+
+def reorder(frames: np.ndarray, indices: Sequence[int], order: Sequence[int]) -> np.ndarray:
+    """Of the frames at ``indices``, the k-th place shows what belonged at place ``order[k]``."""
+    out = frames.copy()
+    out[list(indices)] = frames[[indices[k] for k in order]]
+    return out
+
+
+def _indices(shot: Shot, kind: str, axis: str) -> list[int]:
+    return [i for i, f in enumerate(shot.sequence.frames) if (f.kind, f.axis) == (kind, axis)]
+
+
+def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+    """A Gray frame of y lost (level 0), a phase step of x (1), both (2)."""
+    phase_x, gray_y = _indices(shot, "phase", "x"), _indices(shot, "gray", "y")
+    if level == 0:
+        return drop_frame(frames, gray_y[2])
+    frames = drop_frame(frames, phase_x[3])
+    return drop_frame(frames, gray_y[2]) if level == 2 else frames
+
+
+def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+    """A Gray frame of x repeated (level 0), a phase step (1), two phase steps and a Gray frame (2)."""
+    phase, gray = _indices(shot, "phase", "x"), _indices(shot, "gray", "x")
+    places = {0: [gray[-2]], 1: [phase[2]], 2: [phase[1], phase[-2], gray[-1]]}[int(level)]
+    for place in places:
+        frames = duplicate_frame(frames, place)
+    return frames
+
+
+def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+    """Two Gray frames of x swapped (level 0), two phase steps (1), the last phase step and the first Gray frame (2)."""
+    phase, gray = _indices(shot, "phase", "x"), _indices(shot, "gray", "x")
+    first = {0: gray[-2], 1: phase[1], 2: phase[-1]}[int(level)]
+    return swap_frames(frames, first)
+
+
+def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+    """All frames of x and y exchanged (level 0), the phase steps alone (1), the Gray frames alone (2)."""
+    kinds = {0: (), 1: ("phase",), 2: ("gray", "complementary")}[int(level)]
+    return exchange_axes(frames, shot.sequence, kinds)
+
+
+def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+    """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary one (2)."""
+    for axis in ("x",) if level == 0 else ("x", "y"):
+        places = _indices(shot, "gray", axis) + (_indices(shot, "complementary", axis) if level == 2 else [])
+        frames = reorder(frames, places, range(len(places))[::-1])
+    return frames
+
+
+def reorder_steps(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+    """Phase steps that begin a quarter period late (level 0), run backwards (1), or come as 0 2 4 ... 1 3 5 (2)."""
+    for axis in ("x", "y"):
+        places = _indices(shot, "phase", axis)
+        n = len(places)
+        orders: Mapping[int, list[int]] = {
+            0: [(k + n // 4) % n for k in range(n)],
+            1: [(-k) % n for k in range(n)],
+            2: [*range(0, n, 2), *range(1, n, 2)],
+        }
+        frames = reorder(frames, places, orders[int(level)])
+    return frames

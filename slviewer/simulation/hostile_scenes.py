@@ -1,0 +1,262 @@
+"""Faults of rigs and scenes: what moves, bends or is set wrongly, and what stands in the view beside the thing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+from slviewer.simulation.boards import BoardScene, Pose, Shape, blank_board
+from slviewer.simulation.mesh import MeshScene
+from slviewer.simulation.plans import rotation
+from slviewer.simulation.rig import SimulatedRig
+from slviewer.simulation.scenes import Scene, Spheres, Surface
+
+Pattern = tuple[Axis | None, np.ndarray]
+"""What `fringe.profile` gives: the axis and the grey levels along it."""
+
+_FINGERS_MM = (-24.0, -8.0, 8.0, 24.0)
+_FINGER_RADIUS_MM = 11.0
+_SPECK_CELL_MM = 2.0
+_THICKNESS_MM = 2.0  # more than any board's bow
+
+
+@dataclass(frozen=True, eq=False)
+class SceneGroup:
+    """Several scenes in one view: each ray meets the nearest surface, and each scene shades the others' points."""
+
+    scenes: Sequence[Scene]
+
+    def trace(self, rays: np.ndarray) -> Surface:
+        """The nearest of what the scenes' own surfaces give."""
+        first, *others = (scene.trace(rays) for scene in self.scenes)
+        points, normals, albedo = first.points.copy(), first.normals.copy(), first.albedo.copy()
+        for surface in others:
+            with np.errstate(invalid="ignore"):
+                nearer = np.isfinite(surface.points[..., 2]) & ~(points[..., 2] <= surface.points[..., 2])
+            points[nearer], normals[nearer] = surface.points[nearer], surface.normals[nearer]
+            albedo[nearer] = surface.albedo[nearer]
+        return Surface(points, normals, albedo)
+
+    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """Whether any of the scenes stands on the way."""
+        blocked = [scene.occluded(points, source) for scene in self.scenes]
+        blocked += [_is_behind_plate(scene, points, source) for scene in self.scenes if isinstance(scene, BoardScene)]
+        return np.logical_or.reduce(blocked)
+
+
+@dataclass(frozen=True, eq=False)
+class DirtyBoard:
+    """A board with specks of dust and scratches: of the cells of its surface, `share` reflect only `left` of the light.
+
+    The dirt is fixed to the board; `seed` draws it.
+    """
+
+    scene: BoardScene
+    share: float
+    left: float = 0.35
+    seed: int = 0
+
+    def trace(self, rays: np.ndarray) -> Surface:
+        """The board's surface, darker where dirt lies."""
+        surface = self.scene.trace(rays)
+        hit = surface.albedo > 0
+        pose = self.scene.pose
+        xy = ((surface.points[hit] - pose.t) @ pose.R)[:, :2]
+        cells = np.floor((xy - np.array(self.scene.corner)) / _SPECK_CELL_MM).astype(int)
+        shape = np.ceil(np.array(self.scene.plate) / _SPECK_CELL_MM).astype(int) + 1
+        rng = np.random.default_rng([self.seed, 0xD1])
+        dirty = rng.random(shape) < self.share
+        for _ in range(round(40 * self.share * 10)):  # scratches: lines of cells
+            begin, way = rng.uniform(0, 1, 2) * shape, rng.normal(size=2)
+            line = begin + np.arange(rng.integers(10, 40))[:, None] * way / np.linalg.norm(way)
+            line = np.clip(line.astype(int), 0, shape - 1)
+            dirty[line[:, 0], line[:, 1]] = True
+        cells = np.clip(cells, 0, shape - 1)
+        albedo = surface.albedo.copy()
+        albedo[hit] = np.where(dirty[cells[:, 0], cells[:, 1]], self.left, 1.0) * albedo[hit]
+        return Surface(surface.points, surface.normals, albedo.astype(np.float32))
+
+    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """As of the clean board."""
+        return self.scene.occluded(points, source)
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorTable:
+    """A polished table below a thing: rays that pass the thing and meet the table see the thing mirrored.
+
+    `normal` (3,) and `offset_mm`: the table is n . X = offset. `reflectivity` 0 ... 1. Points and normals of mirrored
+    pixels are those of the real surface, which the projector lights; `is_direct` says which pixels see it directly.
+    """
+
+    scene: Scene
+    normal: np.ndarray
+    offset_mm: float
+    reflectivity: float
+
+    def trace(self, rays: np.ndarray) -> Surface:
+        """The thing, and below it its mirror image."""
+        surface = self.scene.trace(rays)
+        direct = np.isfinite(surface.points[..., 2])
+        image = _mirrored(self.scene, self.normal, self.offset_mm).trace(rays)
+        # The table lies between camera and mirror image, so that the image's points are behind the mirror.
+        with np.errstate(invalid="ignore"):
+            behind = image.points @ self.normal > self.offset_mm
+        seen = ~direct & behind & np.isfinite(image.points[..., 2])
+        points, normals, albedo = surface.points.copy(), surface.normals.copy(), surface.albedo.copy()
+        M, shift = _reflection(self.normal, self.offset_mm)
+        points[seen], normals[seen] = image.points[seen] @ M.T + shift, image.normals[seen] @ M.T
+        albedo[seen] = np.float32(self.reflectivity) * image.albedo[seen]
+        return Surface(points, normals, albedo)
+
+    def is_direct(self, rays: np.ndarray) -> np.ndarray:
+        """(h, w) bool: the pixels that see the thing itself, and not its mirror image."""
+        return np.isfinite(self.scene.trace(rays).points[..., 2])
+
+    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """As of the thing alone: a polished table is below, and shades nothing of it."""
+        return self.scene.occluded(points, source)
+
+    def second_projector(self, rig: SimulatedRig) -> SimulatedRig:
+        """The rig with the projector's mirror image in the table: its light is `reflectivity` as strong."""
+        M, shift = _reflection(self.normal, self.offset_mm)
+        light = replace(rig.light, ambient=0.0)
+        return replace(rig, R=rig.R @ M, t=rig.R @ shift + rig.t, light=light)
+
+
+def with_hand(scene: Scene, reach_mm: float) -> Scene:
+    """The scene with a hand that reaches `reach_mm` over it: over a board's right edge, or over a sphere's front."""
+    lengths = np.arange(0.0, reach_mm + 20.0, 12.0)
+    offsets = np.array([(x, y, -_FINGER_RADIUS_MM - 3.0) for x in lengths for y in _FINGERS_MM])
+    if isinstance(scene, BoardScene):
+        (x, y), (width, height) = scene.corner, scene.plate
+        fingers = scene.pose.to_camera(offsets + np.array([x + width - reach_mm, y + 0.5 * height, 0.0]))
+    elif isinstance(scene, Spheres):
+        fingers = offsets + scene.centres[0] + np.array([scene.radius_mm - reach_mm, 0.0, -scene.radius_mm])
+    else:
+        raise InputError(f"no hand holds a scene of type {type(scene).__name__}: use a board or spheres")
+    return SceneGroup((scene, Spheres(fingers, _FINGER_RADIUS_MM, albedo=0.55)))
+
+
+def _is_behind_plate(board: BoardScene, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """(n,) bool: the way from `points` (n, 3) to `source` (3,) crosses the plate; points on it are not behind it."""
+    begin, end = (points - board.pose.t) @ board.pose.R, (source - board.pose.t) @ board.pose.R
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = begin[:, 2] / (begin[:, 2] - end[2])
+    crossing = (begin + share[:, None] * (end - begin))[:, :2] - np.array(board.corner)
+    inside = ((crossing > 0) & (crossing < np.array(board.plate))).all(1)
+    return np.asarray(inside & (share > 0) & (share < 1) & (np.abs(begin[:, 2]) > _THICKNESS_MM))
+
+
+def moved_scene(scene: Scene, by_mm: np.ndarray, turn_rad: np.ndarray) -> Scene:
+    """The scene moved by (3,) mm in the camera frame, and turned about its own origin."""
+    if isinstance(scene, Spheres):
+        return replace(scene, centres=scene.centres + by_mm)
+    if isinstance(scene, BoardScene | MeshScene):
+        return replace(scene, pose=Pose(rotation(turn_rad) @ scene.pose.R, scene.pose.t + by_mm))
+    raise InputError(f"a scene of type {type(scene).__name__} cannot be moved: use a board, spheres or a mesh")
+
+
+def _reflection(normal: np.ndarray, offset_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """M (3, 3) and shift (3,): X' = M X + shift is X mirrored in the plane n . X = offset."""
+    n = np.asarray(normal, float)
+    return np.eye(3) - 2 * np.outer(n, n), 2 * offset_mm * n
+
+
+def _mirrored(scene: Scene, normal: np.ndarray, offset_mm: float) -> Scene:
+    M, shift = _reflection(normal, offset_mm)
+    if isinstance(scene, Spheres):
+        return replace(scene, centres=scene.centres @ M.T + shift)
+    if isinstance(scene, BoardScene):
+        return replace(scene, pose=Pose(M @ scene.pose.R, M @ scene.pose.t + shift))
+    raise InputError(f"a scene of type {type(scene).__name__} has no mirror image: use a board or spheres")
+
+
+def set_gamma(rig: SimulatedRig, gamma: float, number: int) -> SimulatedRig:
+    """A projector with this gamma."""
+    return replace(rig, light=replace(rig.light, gamma=gamma))
+
+
+def dim_projector(rig: SimulatedRig, amplitude: float, number: int) -> SimulatedRig:
+    """A projector whose fringes have this amplitude in grey levels on white, with the camera's exposure as it is."""
+    white = 2 * amplitude / (1 - rig.light.black)
+    return replace(rig, sensor=replace(rig.sensor, peak_level=rig.sensor.dark_level + white * (1 + rig.light.ambient)))
+
+
+def overexpose(rig: SimulatedRig, times: float, number: int) -> SimulatedRig:
+    """White light reaches so many times the camera's full scale."""
+    sensor = rig.sensor
+    return replace(rig, sensor=replace(sensor, peak_level=sensor.dark_level + times * 255))
+
+
+def refocus_camera(rig: SimulatedRig, share: float, number: int) -> SimulatedRig:
+    """The camera refocuses for every pose: its focal length changes by up to ``share``."""
+    factor = 1 + share * float(np.random.default_rng([rig.seed, number, 0xFB]).uniform(-1, 1))
+    fx, fy = rig.camera.focal_px
+    return replace(rig, camera=replace(rig.camera, focal_px=(fx * factor, fy * factor)))
+
+
+def drift_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig:
+    """The projector's mount warms up, and turns by ``mrad`` over eight captures."""
+    turn = rotation(1e-3 * mrad * min(number, 8) / 8 * np.array([0.6, 0.7, 0.4]))
+    return replace(rig, R=turn @ rig.R, t=turn @ rig.t)
+
+
+def knock_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig:
+    """The projector was knocked after the calibration."""
+    turn = rotation(1e-3 * mrad * np.array([0.6, 0.7, 0.4]))
+    return replace(rig, R=turn @ rig.R, t=turn @ rig.t)
+
+
+def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
+    """A board that bends anew in each pose."""
+    if not isinstance(scene, BoardScene):
+        return scene
+    bow = bow_mm * np.random.default_rng([number, 0xF1]).uniform(-1, 1, 3)
+    return replace(scene, shape=Shape(float(bow[0]), float(bow[1]), float(bow[2])))
+
+
+def moving_scenes(scene: Scene, by_mm: float) -> list[Scene]:
+    """A hand that trembles and sinks: four places, ``by_mm`` from the first to the last."""
+    way, turn = np.array([0.7, 0.5, 0.5]), np.array([0.3, -0.5, 0.2]) / 100
+    return [moved_scene(scene, share * by_mm * way, share * by_mm * turn) for share in (0.0, 1 / 3, 2 / 3, 1.0)]
+
+
+def dirty_scene(scene: Scene, share: float, number: int) -> Scene:
+    """Dust and scratches on boards."""
+    return DirtyBoard(scene, share) if isinstance(scene, BoardScene) else scene
+
+
+def put_on_table(scene: Scene, reflectivity: float, number: int) -> Scene:
+    """The thing stands on a polished table, which ends its view 3 mm below it."""
+    if isinstance(scene, BoardScene):
+        (x, y), (width, height) = scene.corner, scene.plate
+        corners = np.array([(x + a * width, y + b * height, 0.0) for a in (0, 1) for b in (0, 1)])
+        lowest = scene.pose.to_camera(corners)[:, 1].max()
+    elif isinstance(scene, Spheres):
+        lowest = scene.centres[:, 1].max() + scene.radius_mm
+    else:
+        return scene
+    return MirrorTable(scene, np.array([0.0, 1.0, 0.0]), float(lowest) + 3.0, reflectivity)
+
+
+def add_second_board(scene: Scene, size_mm: float, number: int) -> Scene:
+    """Another white plate of this width stands 70 mm behind the thing, to the left of it."""
+    if isinstance(scene, BoardScene):
+        middle = scene.pose.to_camera(np.array([*(np.array(scene.corner) + np.array(scene.plate) / 2), 0.0]))
+    elif isinstance(scene, Spheres):
+        middle = scene.centres[0]
+    else:
+        return scene
+    place = middle + np.array([-0.18 * middle[2], -0.09 * middle[2], 70.0])
+    turn = rotation(np.radians([5.0, -12.0, 8.0]))
+    return SceneGroup((scene, blank_board(Pose(turn, place), (size_mm, 0.8 * size_mm))))
+
+
+def reverse_pattern(pattern: Pattern, level: float) -> Pattern:
+    """The projector numbers its columns (level 0), rows (1) or both (2) from the other end."""
+    axis, levels = pattern
+    hit = (axis == "x" and level != 1) or (axis == "y" and level != 0)
+    return (axis, levels[::-1].copy()) if hit else pattern
