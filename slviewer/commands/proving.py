@@ -11,7 +11,8 @@ from slviewer.errors import SlviewerError
 @deferred
 def prove(
     quick: bool = False,
-    only: tuple[Literal["accuracy", "causes", "guidance", "registration", "uncertainty"], ...] = (),
+    only: tuple[Literal["accuracy", "causes", "guidance", "hostile", "registration", "uncertainty"], ...] = (),
+    case: tuple[str, ...] = (),
     seed: int = 0,
     json: Path | None = None,
 ) -> None:
@@ -22,11 +23,13 @@ def prove(
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
         only: What to prove: accuracy on planes and spheres, causes of bad calibrations, guidance of an operator to
-            good poses, registration of scans, uncertainty against true errors; by default all.
+            good poses, captures of a hostile rig, registration of scans, uncertainty against true errors; by default
+            all.
+        case: Of the hostile rig only these faults, such as flicker, jpeg:mild or gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.
         json: Write all figures to this file too.
     """
-    result = workflow.prove(only, quick=quick, seed=seed, progress=terminal.progress)
+    result = workflow.prove(only, quick=quick, cases=case, seed=seed, progress=terminal.progress)
     write_json(json, result.to_json())
     print(result.text())
     if result.failed:

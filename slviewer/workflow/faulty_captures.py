@@ -21,6 +21,7 @@ from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.simulation.boards import Pose, Shape, printed_board
+from slviewer.simulation.hostile_frames import delay_frames, drop_frame, swap_groups
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
@@ -251,22 +252,11 @@ def _few(count: int) -> Fault:
     return lambda bench: bench.attempt([bench.looked(i) for i in range(count)])
 
 
-def _missing(frame: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Without one frame, those that follow a place earlier, and what is shown at last once more."""
-    return lambda frames: np.concatenate([np.delete(frames, frame, axis=0), frames[-1:]])
-
-
-def _lagging(frames: np.ndarray) -> np.ndarray:
-    return np.roll(frames, 1, axis=0)
-
-
-def _exchanged(frames: np.ndarray) -> np.ndarray:
-    half = len(frames) // 2  # as many frames of one axis as of the other
-    return np.concatenate([frames[half:], frames[:half]])
-
-
 FAULTS: Mapping[str, tuple[Cause, Fault]] = {
-    "x and y frames exchanged": ("axes-swapped", _spoilt(_exchanged)),
+    "x and y frames exchanged": (
+        "axes-swapped",
+        _spoilt(lambda frames: swap_groups(frames, *np.array_split(np.arange(len(frames)), 2))),
+    ),
     "columns from right to left": ("axis-reversed", _rendered(reverse="x")),
     "rows from bottom to top": ("axis-reversed", _rendered(reverse="y")),
     "period 18 described as 16": ("fringe-period", _described(x=16.0, y=16.0)),
@@ -281,11 +271,11 @@ FAULTS: Mapping[str, tuple[Cause, Fault]] = {
     "one pose moved between the axes": ("moved", _moved((0.5, 0.2, 0.0), 0.5)),
     "one pose moved among the frames of x": ("moved", _moved((1.0, -0.5, 0.5), 0.18)),
     "one pose moved a little": ("moved", _moved((0.15, 0.0, 0.15), 0.5)),
-    "lag of one frame": ("frame-lag", _spoilt(_lagging)),
-    "lag of one frame in one pose": ("frame-lag", _spoilt(_lagging, 3)),
-    "fifth frame missing": ("missing-frame", _spoilt(_missing(4))),
-    "Gray bit missing": ("missing-frame", _spoilt(_missing(-7))),
-    "fifth frame missing in one pose": ("missing-frame", _spoilt(_missing(4), 3)),
+    "lag of one frame": ("frame-lag", _spoilt(delay_frames)),
+    "lag of one frame in one pose": ("frame-lag", _spoilt(delay_frames, 3)),
+    "fifth frame missing": ("missing-frame", _spoilt(lambda frames: drop_frame(frames, 4))),
+    "Gray bit missing": ("missing-frame", _spoilt(lambda frames: drop_frame(frames, -7))),
+    "fifth frame missing in one pose": ("missing-frame", _spoilt(lambda frames: drop_frame(frames, 4), 3)),
     "overexposed": ("saturation", _rendered(exposure=1.8)),
     "much overexposed": ("saturation", _rendered(exposure=4.0)),
     "gamma 2.2": ("gamma", _gamma(2.2)),

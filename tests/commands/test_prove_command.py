@@ -29,7 +29,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[float, int]]:
     ran: dict[str, tuple[float, int]] = {}
 
     def stand_in(claim: str):
-        def run(scale, *, seed, progress):
+        def run(scale, *, seed, progress, **options):
             ran[claim] = scale, seed
             progress(1.0, "proven")
             return Outcome(claim != "causes")
@@ -45,13 +45,14 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
     out = tmp_path / "figures.json"
     assert main(["prove", "--json", str(out)]) == 1
     said = capsys.readouterr()
-    assert asked == {claim: (1.0, 0) for claim in ("accuracy", "causes", "guidance", "registration", "uncertainty")}
-    assert said.out.count("a table") == 5 and said.out.count("pass  ") == 4
+    assert asked == {claim: (1.0, 0) for claim in proving.CLAIMS}
+    assert said.out.count("a table") == 6 and said.out.count("pass  ") == 5
     assert "FAIL  faults called by their names" in said.out and "not proven: causes:" in said.err
     assert {claim: proof["holds"] for claim, proof in json.loads(out.read_text()).items()} == {
         "accuracy": True,
         "causes": False,
         "guidance": True,
+        "hostile": True,
         "registration": True,
         "uncertainty": True,
     }
