@@ -252,10 +252,15 @@ def _few(count: int) -> Fault:
     return lambda bench: bench.attempt([bench.looked(i) for i in range(count)])
 
 
+def _exchange_halves(frames: np.ndarray) -> np.ndarray:
+    half = len(frames) // 2  # as many frames of one axis as of the other
+    return swap_groups(frames, range(half), range(half, 2 * half))
+
+
 FAULTS: Mapping[str, tuple[Cause, Fault]] = {
     "x and y frames exchanged": (
         "axes-swapped",
-        _spoilt(lambda frames: swap_groups(frames, *np.array_split(np.arange(len(frames)), 2))),
+        _spoilt(_exchange_halves),
     ),
     "columns from right to left": ("axis-reversed", _rendered(reverse="x")),
     "rows from bottom to top": ("axis-reversed", _rendered(reverse="y")),

@@ -179,14 +179,15 @@ def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direct
         for severity in SEVERITIES
         if direction in fault.directions
     ]
-    chosen = [
-        case for case in every if not wanted or any(case[: w.count(":") + 1] == tuple(w.split(":")) for w in wanted)
-    ]
-    for w in wanted:
-        if not any(case[: w.count(":") + 1] == tuple(w.split(":")) for case in every):
+    chosen: list[tuple[str, Severity, Direction]] = []
+    for pattern in wanted or ("",):
+        parts = pattern.split(":")
+        matching = [case for case in every if all(part in ("", word) for part, word in zip(parts, case, strict=False))]
+        if not matching or len(parts) > 3:
             raise UsageError(
-                f"no hostile case is called {w!r}: use {', '.join(FAULTS)}, with :mild, :medium or :severe"
+                f"no hostile case is called {pattern!r}: use {', '.join(FAULTS)}; :mild, :medium or :severe"
             )
+        chosen += [case for case in matching if case not in chosen]
     return chosen
 
 
