@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from slviewer import workflow
+from slviewer import terminal, workflow
 from slviewer.commands.parsing import Axis, Role, deferred, ui, union
 
 Channel = Literal["red", "green", "blue", "luma", "max"]
@@ -161,7 +161,7 @@ def _import_frames(
 def _import_opencv_calibration(
     file: Positional[Path],
     session: Positional[Path],
-    keys: tuple[str, str, str, str, str, str],
+    keys: tuple[str, str, str, str, str, str] | None = None,
     projector: str | None = None,
     camera: str | None = None,
     force: bool = False,
@@ -172,14 +172,25 @@ def _import_opencv_calibration(
         file: The .yml, .xml or .json file.
         session: Session folder; made if it does not exist.
         keys: The file's names for the matrices K_camera D_camera K_projector D_projector R T; R and T (mm) map camera
-            to projector.
-        projector: Width x height of the projector, px; by default the one of the session's captures.
-        camera: Width x height of the camera, px; by default the one of the session's captures.
+            to projector. By default the common names are recognised, and what was taken is printed.
+        projector: Width x height of the projector, px; by default what the file states, else the session's captures.
+        camera: Width x height of the camera, px; by default what the file states, else the session's captures.
         force: Replace the session's stereo calibration (the old one goes to the session's trash).
     """
-    model = workflow.import_opencv_calibration(file, session, keys, projector=projector, camera=camera, force=force)
-    baseline = f": baseline {model.baseline_mm:.1f} mm" if model else "; import the scans that it belongs to"
-    print(f"stereo calibration imported{baseline}")
+    if keys is None:
+        identified = workflow.identify_calibration_keys(file)
+        print("taken from the file: " + ", ".join(f"{entry} = {key}" for entry, key in identified.items()))
+    model = workflow.import_opencv_calibration(
+        file, session, keys, projector=projector, camera=camera, force=force, warn=terminal.warn
+    )
+    if model is None:
+        print("stereo calibration imported; import the scans that it belongs to")
+        return
+    sizes = (
+        f"{name} {w}x{h}"
+        for name, (w, h) in (("camera", model.rig.camera.size), ("projector", model.rig.projector.size))
+    )
+    print(f"stereo calibration imported: {', '.join(sizes)}, baseline {model.baseline_mm:.1f} mm")
 
 
 def bring_in(command: Any) -> Callable[[], None]:

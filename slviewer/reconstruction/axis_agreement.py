@@ -329,12 +329,21 @@ def _hypotheses(
         said = " and ".join(
             f"{which[f]} as many {word}" for f, word in zip(factors, ("columns", "rows"), strict=True) if f != 1
         )
+        matrix = f", or correct its matrix: {_rescaling(factors[0])}" if factors[0] == factors[1] else ""
         yield (
             f"the patterns were described with {said} as the calibrated projector has; give the projector's size and "
-            "the fringe period as in the calibration",
+            f"the fringe period as in the calibration{matrix}",
             rig,
             pixels,
             (measured + 0.5) * factors - 0.5,
+        )
+    for factor in (2.0, 0.5):
+        yield (
+            f"the camera's matrix is at {'twice' if factor > 1 else 'half'} the pixel scale of the images: "
+            f"{_rescaling(factor)}",
+            rig,
+            (pixels + 0.5) * factor - 0.5,
+            measured,
         )
     for flip, words in (
         ((True, False), "the camera's image is mirrored"),
@@ -342,6 +351,11 @@ def _hypotheses(
         ((True, True), "the camera's image is turned by 180 degrees"),
     ):
         yield f"{words}; record it as for the calibration", rig, np.where(flip, image - 1 - pixels, pixels), measured
+
+
+def _rescaling(factor: float) -> str:
+    """What to do with a matrix whose pixels are so many times as fine as those of the images."""
+    return f"{'halve' if factor > 1 else 'double'} fx, fy, cx and cy"
 
 
 def _size(size: tuple[int, int]) -> str:

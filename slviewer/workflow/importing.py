@@ -1,27 +1,25 @@
-"""Bringing captures and calibrations that other tools made into a session.
+"""Bringing captures that other tools made into a session.
 
 Of a folder of captures, those that can be read and decoded are saved in one step, and a warning names each other with
 its reason; with `strict`, one fault refuses the folder.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import parse_size
-from slviewer.session.importers import opencv_calibration
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportedCapture, Imports, Recording, Skipped, none_usable
 from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
 from slviewer.session.store import Session, is_session
 from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
-from slviewer.workflow.models import available, load_stereo, save_imported_stereo
-from slviewer.workflow.opening import opened_or_made
+from slviewer.workflow.models import available
+from slviewer.workflow.opening import SessionLike, opened, opened_or_made
 from slviewer.workflow.trust import keep_residuals
 
 Role = Literal["calibration", "scan"]
@@ -30,7 +28,7 @@ Size = str | tuple[int, int]
 
 def import_captures(
     source: Path | str,
-    session: Path | str,
+    session: SessionLike,
     layout: str = "detect",
     *,
     sequence: Path | str | None = None,
@@ -38,6 +36,7 @@ def import_captures(
     prefix: str | None = None,
     projector: Size | None = None,
     channel: Channel | None = None,
+    origin: str | None = None,
     force: bool = False,
     strict: bool = False,
     progress: Progress = unheard,
@@ -49,8 +48,8 @@ def import_captures(
     ``layout`` is one of `layouts.LAYOUTS`, or "detect": the one that the file names show. ``source`` is one capture
     folder or a folder of them; captures are named after their folders, behind ``prefix_``. ``sequence`` is the TOML of
     the layout frames, by default the one in ``source``. ``projector`` is by default the layout's own, else what
-    the session knows of its projector. ``channel`` is that of colour frames, green where nothing states it. ``options``
-    are those of the layout's `read`.
+    the session knows of its projector. ``channel`` is that of colour frames, green where nothing states it. ``origin``
+    is recorded as where the captures come from, by default their folders. ``options`` are those of the layout's `read`.
 
     Captures that cannot be read or decoded are skipped, and ``warn`` hears why. Raises InputError where none is left,
     or, with ``strict``, for the first of them; nothing is saved then.
@@ -71,21 +70,21 @@ def import_captures(
     found = LAYOUTS[layout].read(source, prefix=prefix, projector=size, **options)
     if channel is not None:
         found = replace(found, recordings=[replace(recording, channel=channel) for recording in found.recordings])
-    return _save(found, session, role, force, strict, progress, warn)
+    return _save(found, session, role, origin, force, strict, progress, warn)
 
 
-def import_p18(source: Path | str, session: Path | str, **options: Any) -> list[str]:
+def import_p18(source: Path | str, session: SessionLike, **options: Any) -> list[str]:
     """Import ``pose_XX/{V,H}/P18_FNN.PNG`` folders, as ``import_captures``; the projector is 912x1140 by default."""
     return import_captures(source, session, "p18", **options)
 
 
-def import_procam_calibration(source: Path | str, session: Path | str, **options: Any) -> list[str]:
+def import_procam_calibration(source: Path | str, session: SessionLike, **options: Any) -> list[str]:
     """Import ``capture_N/graycode_NN.*`` folders (Gray code with inverses, white, black), as ``import_captures``; the
     projector is 1024x768 by default."""
     return import_captures(source, session, "procam-calibration", **options)
 
 
-def import_frames(source: Path | str, session: Path | str, sequence: Path | str, **options: Any) -> list[str]:
+def import_frames(source: Path | str, session: SessionLike, sequence: Path | str, **options: Any) -> list[str]:
     """Import any folder of images that a TOML describes, as ``import_captures``.
 
     Where the TOML does not state at which projector coordinate Gray code 0 begins, that is estimated from the images.
@@ -93,45 +92,15 @@ def import_frames(source: Path | str, session: Path | str, sequence: Path | str,
     return import_captures(source, session, "frames", sequence=sequence, **options)
 
 
-def import_opencv_calibration(
-    file: Path | str,
-    session: Path | str,
-    keys: Sequence[str],
-    *,
-    projector: Size | None = None,
-    camera: Size | None = None,
-    force: bool = False,
-) -> StereoModel | None:
-    """Make a stereo calibration from an OpenCV FileStorage file the session's own.
-
-    ``keys`` are the file's names for K_camera, D_camera, K_projector, D_projector, R and T (camera to projector, mm).
-    Image sizes that are not given are those of the session's captures. Returns the model, or None while the session
-    holds no capture to tell a missing size. The session's pixelwise calibration, if any, goes to the trash with the
-    stereo one that it was made from.
-    """
-    matrices = opencv_calibration.read(Path(file), list(keys))
-    with opened_or_made(session) as store:
-        there = available(store)
-        if there and not force:
-            raise InputError(
-                f"{store.folder} holds a {' and a '.join(there)} calibration already: "
-                "replace it with --force (it goes to the session's trash)"
-            )
-        for name in there:
-            store.trash_result(f"calibration/{name}")
-        save_imported_stereo(
-            store,
-            matrices,
-            source=str(file),
-            camera=None if camera is None else parse_size(camera),
-            projector=None if projector is None else parse_size(projector),
-        )
-        known = bool(store.capture_names()) or (camera is not None and projector is not None)
-        return load_stereo(store) if known else None
-
-
 def _save(
-    found: Imports, session: Path | str, role: Role, force: bool, strict: bool, progress: Progress, warn: Warn
+    found: Imports,
+    session: SessionLike,
+    role: Role,
+    origin: str | None,
+    force: bool,
+    strict: bool,
+    progress: Progress,
+    warn: Warn,
 ) -> list[str]:
     """Save what can be read and decoded, and warn of the rest; with `strict`, raise InputError for the first fault."""
     for message in found.warnings:
@@ -160,7 +129,7 @@ def _save(
                 continue
             for message in _assumptions(recording, capture):
                 warn_once(message)
-            yield replace(capture, sequence=seen.sequence)
+            yield replace(capture, sequence=seen.sequence, source=origin or capture.source)
         if len(skipped) == len(found.skipped) + len(found.recordings):
             raise none_usable(skipped)
 
@@ -176,11 +145,11 @@ def _save(
     return [capture.name for capture in saved]
 
 
-def _known_projector(session: Path | str) -> tuple[int, int] | None:
+def _known_projector(session: SessionLike) -> tuple[int, int] | None:
     """The projector's size by the session's captures, else by its imported calibration; None where neither says one."""
-    if not is_session(Path(session).expanduser()):
+    if not isinstance(session, Session) and not is_session(Path(session).expanduser()):
         return None
-    with Session.open(session) as store:
+    with opened(session) as store:
         sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
         if not sizes and "stereo" in available(store):
             meta = store.load_result("calibration/stereo", only=())[0]

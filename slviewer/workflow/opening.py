@@ -21,8 +21,11 @@ def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
 
 
 @contextmanager
-def opened_or_made(session: Path | str) -> Iterator[Session]:
-    """The session, open for writing; one that had to be made goes again if nothing was saved in it."""
+def opened_or_made(session: SessionLike) -> Iterator[Session]:
+    """The session, open for writing, or one that is; one that had to be made goes again if nothing was saved in it."""
+    if isinstance(session, Session):
+        yield session
+        return
     folder = Path(session).expanduser().absolute()
     fresh, parent_fresh = not is_session(folder), not folder.exists()
     store = Session.open_or_create(folder)

@@ -7,6 +7,7 @@ import numpy as np
 import viser
 
 from slviewer.gui.coverage import coverage_chart
+from slviewer.gui.import_inputs import ImportInputs
 from slviewer.gui.inputs import Choice, Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.pose_list import PoseBoards, pose_table
@@ -76,6 +77,7 @@ class Panel:
             self._acts = gui.add_button_group("This pose", ("Exclude", "Include", "Retake", "Delete"))
             self._acts.on_click(stage.safely(lambda: self._act(self._acts.value)))
             self._undelete = Undelete(stage)
+        self._import = ImportInputs(stage, "calibration")
         self._sound = Sound(gui)
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -90,6 +92,7 @@ class Panel:
         change(self._place, disabled=session is None or session.suggestion is None or session.planning)
         self._follows.tell(snapshot.hands_free)
         self._draw_world(snapshot)
+        self._import.draw(snapshot)
         if session is self._session:
             return
         self._session = session

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from slviewer.gui.import_inputs import ImportInputs
 from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.live import LAYER as LIVE
 from slviewer.gui.live import LiveScreen
@@ -82,6 +83,7 @@ class Panel:
             )
             delete.on_click(safely(lambda: operator.delete(self._scan.value)))
         self._undelete = Undelete(self._stage)
+        self._import = ImportInputs(self._stage, "scan")
         self._scan.on_change(safely(self._refresh))
         self._colour.on_update(safely(self._refresh))
 
@@ -94,6 +96,7 @@ class Panel:
             change(self._capture, disabled=not ready or rig.state != "open" or rig.capture is not None)
             self._draw_live(snapshot.live, ready and rig.state == "open" and rig.capture is None)
             self._stand.draw(snapshot)
+            self._import.draw(snapshot)
             self._undelete.offer(session.deleted_scans if session else ())
             scans = ordered(session.scans) if session else []
             change(self._cloud_folder, visible=bool(scans))

@@ -1,6 +1,7 @@
 """A stereo calibration made elsewhere, in an OpenCV FileStorage file (YAML, XML or JSON)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,48 @@ _ROTATION_TOLERANCE = 1e-4  # a matrix written with five digits still passes
 _SHORTEST_BASELINE_MM = 1.0
 
 
-def read(path: Path, keys: Sequence[str] = ENTRIES) -> dict[str, np.ndarray]:
+_SPELLINGS: tuple[tuple[str, ...], ...] = (
+    ENTRIES,
+    ("cam_K", "cam_kc", "pro_K", "pro_kc", "R", "T"),  # sltk
+    ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),  # SLStudio
+    ("cam_int", "cam_dist", "proj_int", "proj_dist", "roration", "translation"),  # procam-calibration, as it spells it
+    ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
+    ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
+    ("K_cam", "D_cam", "K_proj", "D_proj", "R", "T"),
+    ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "R", "T"),
+    ("camera_matrix", "camera_distortion", "projector_matrix", "projector_distortion", "R", "T"),
+    ("cameraMatrix", "distCoeffs", "projectorMatrix", "projectorDistCoeffs", "R", "T"),
+    ("M1", "D1", "M2", "D2", "R", "T"),  # OpenCV's stereo_calib
+    ("K1", "D1", "K2", "D2", "R", "T"),
+    ("K1", "dist1", "K2", "dist2", "R", "T"),
+)
+"""Common names of the entries, each row in the order of `ENTRIES`; a file is taken to use one row as a whole, but for R
+and T."""
+_TRANSFORMS = ("R", "T"), ("rotation", "translation"), ("rot", "trans")
+_SIZES = {
+    "camera": ("camera_size", "cam_size", "image_size", "imageSize", ("frameWidth", "frameHeight")),
+    "projector": ("projector_size", "pro_size", "proj_size", ("screenResX", "screenResY")),
+}
+"""Where a file may state sizes, width before height."""
+
+
+def read(path: Path, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
     """The matrices under the file's own `keys`, given in the order of `ENTRIES`, and named by these.
 
     K (3, 3) px; D (5,) = (k1, k2, p1, p2, k3); R (3, 3), the nearest rotation to what the file says; T (3,) mm; all
-    float64. R and T map camera to projector. Raises InputError where an entry is missing, has another shape, or says
-    what pinhole and Brown distortion with square axes cannot.
+    float64. R and T map camera to projector. Without `keys`, those of `identify_keys`. Raises InputError where an entry
+    is missing, has another shape, or says what pinhole and Brown distortion with square axes cannot.
     """
+    keys = identify_keys(path) if keys is None else keys
     if len(keys) != len(ENTRIES):
         raise InputError(f"{len(keys)} keys were given: name those of {' '.join(ENTRIES)}, in this order")
-    found = _matrices(Path(path), keys)
+    with _opened(Path(path)) as storage:
+        there = list(storage.root().keys())
+        if missing := [key for key in keys if key not in there]:
+            raise InputError(
+                f"{Path(path).name} has no {', '.join(missing)}: its keys are {', '.join(there) or 'none'}"
+            )
+        found = [_matrix(storage.getNode(key), f"{Path(path).name}: {key}") for key in keys]
     where = {entry: f"{Path(path).name}: {key}" for entry, key in zip(ENTRIES, keys, strict=True)}
     values = dict(zip(ENTRIES, found, strict=True))
     return {
@@ -37,7 +70,42 @@ def read(path: Path, keys: Sequence[str] = ENTRIES) -> dict[str, np.ndarray]:
     }
 
 
-def _matrices(path: Path, keys: Sequence[str]) -> list[np.ndarray]:
+def identify_keys(path: Path) -> tuple[str, ...]:
+    """The file's names for the entries of `ENTRIES`, by the names that are common.
+
+    Raises InputError where they are none of these, or where several would do.
+    """
+    with _opened(Path(path)) as storage:
+        there = list(storage.root().keys())
+    rows = [(*row[:4], *transform) for row in _SPELLINGS for transform in dict.fromkeys((row[4:], *_TRANSFORMS))]
+    found = list(dict.fromkeys(row for row in rows if set(row) <= set(there)))
+    if len(found) == 1:
+        return found[0]
+    asked = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {', '.join(there) or 'none'}"
+    if found:
+        raise InputError(f"{Path(path).name} holds {' and '.join(', '.join(row) for row in found)}: {asked}")
+    raise InputError(f"the entries of {Path(path).name} have no names that are known here: {asked}")
+
+
+def read_sizes(path: Path) -> dict[str, tuple[tuple[int, int], str]]:
+    """What a file states as sizes (width, height) px: {"camera" or "projector": (the size, the key that states it)}."""
+    sizes = {}
+    with _opened(Path(path)) as storage:
+        there = list(storage.root().keys())
+        for device, spellings in _SIZES.items():
+            for spelling in spellings:
+                keys = (spelling,) if isinstance(spelling, str) else spelling
+                if not set(keys) <= set(there):
+                    continue
+                values = np.concatenate([_matrix(storage.getNode(key), key).ravel() for key in keys])
+                if values.shape == (2,) and (values >= 1).all() and (values == values.round()).all():
+                    sizes[device] = (int(values[0]), int(values[1])), " and ".join(keys)
+                    break
+    return sizes
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     if not path.is_file():
         raise InputError(f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)")
     unreadable = f"{path.name} is no OpenCV FileStorage file (.yml, .xml or .json): export the calibration again"
@@ -48,10 +116,7 @@ def _matrices(path: Path, keys: Sequence[str]) -> list[np.ndarray]:
     try:
         if not storage.isOpened():
             raise InputError(unreadable)
-        there = list(storage.root().keys())
-        if missing := [key for key in keys if key not in there]:
-            raise InputError(f"{path.name} has no {', '.join(missing)}: its keys are {', '.join(there) or 'none'}")
-        return [_matrix(storage.getNode(key), f"{path.name}: {key}") for key in keys]
+        yield storage
     finally:
         storage.release()
 
@@ -67,6 +132,8 @@ def _matrix(node: Any, where: str) -> np.ndarray:
         raise ValueError
 
     try:
+        if node.isInt() or node.isReal():
+            return np.array([node.real()])
         matrix = node.mat() if node.isMap() else np.array(numbers(node), np.float64)
         if matrix is None:
             raise ValueError

@@ -32,6 +32,7 @@ from slviewer.workflow.wizard.acquisition import LIGHTS
 from slviewer.workflow.wizard.autopilot import Autopilot
 from slviewer.workflow.wizard.engine import Engine
 from slviewer.workflow.wizard.exporting import export_file
+from slviewer.workflow.wizard.import_requests import ImportRequests
 from slviewer.workflow.wizard.jobs import Reporter
 from slviewer.workflow.wizard.live_requests import LiveRequests
 from slviewer.workflow.wizard.measure_requests import MeasureRequests
@@ -52,7 +53,7 @@ _CHECKED: dict[Verdict, tuple[Level, str]] = {
 T = TypeVar("T")
 
 
-class Operator(LiveRequests, MergeRequests, MeasureRequests):
+class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:

@@ -119,7 +119,7 @@ def _poses_blocked(facts: Facts) -> str:
     if not facts.session.target:
         return "Choose the target first."
     if facts.rig.state == "none" and not facts.session.poses:
-        return "Choose a rig first."
+        return "Choose a rig first, or import captures below."
     return ""
 
 

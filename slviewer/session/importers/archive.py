@@ -1,0 +1,99 @@
+"""A zip of captures, unpacked where nothing outside can be touched and no more is written than was announced."""
+
+import re
+import shutil
+import stat
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from slviewer.errors import InputError
+from slviewer.session.atomic import megabytes
+from slviewer.session.importers.images import IMAGE_SUFFIXES
+from slviewer.session.importers.imported import listed, visible
+from slviewer.session.importers.layouts import LAYOUTS
+
+MOST_BYTES = 20 * 10**9
+"""Unpacked; a hundred poses of 50 frames of 4 MB."""
+MOST_FILES = 20_000
+_DRIVE = re.compile("[A-Za-z]:")
+_TAKEN = IMAGE_SUFFIXES | {".toml"}
+
+
+def unpacked_size(archive: IO[bytes]) -> int:
+    """Bytes that the images and TOMLs of a zip take. Raises InputError as `unpack` does."""
+    with _opened(archive) as zipped:
+        return sum(info.file_size for info in _members(zipped)[0])
+
+
+def unpack(archive: IO[bytes], folder: Path, progress: Callable[[float], None]) -> tuple[Path, list[str]]:
+    """Write the images and TOMLs of a zip into an empty folder; returns the folder that holds the captures, and a
+    warning that names the files that are none of these.
+
+    Raises InputError for what is no zip, is damaged or encrypted, is too large, or names a place outside of itself.
+    """
+    with _opened(archive) as zipped:
+        members, others = _members(zipped)
+        total, done = sum(info.file_size for info in members), 0
+        for info in members:
+            target = folder.joinpath(*PurePosixPath(info.filename).parts)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                with zipped.open(info) as source, open(target, "xb") as out:
+                    shutil.copyfileobj(source, out, 1 << 20)
+            except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+                raise InputError(f"{info.filename} in the zip is damaged ({error}): make the zip again") from error
+            except FileExistsError as error:
+                raise InputError(f"the zip holds {info.filename} twice: make the zip again") from error
+            done += info.file_size
+            progress(done / max(total, 1))
+    warnings = [f"{listed(others)} in the zip: neither an image nor a TOML, and not used"] if others else []
+    return _innermost(folder), warnings
+
+
+def _opened(archive: IO[bytes]) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(archive)
+    except (zipfile.BadZipFile, OSError) as error:
+        raise InputError("the file is no zip, or is cut short: put the folder of captures into a zip") from error
+
+
+def _members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]:
+    """What is unpacked, and the names of what is not."""
+    members, others = [], []
+    for info in zipped.infolist():
+        path = PurePosixPath(info.filename)
+        outside = path.is_absolute() or ".." in path.parts or "\\" in info.filename or _DRIVE.match(info.filename)
+        if outside or stat.S_ISLNK(info.external_attr >> 16):
+            raise InputError(
+                f"{info.filename!r} in the zip leads outside of it: make the zip of plain files and folders"
+            )
+        if info.is_dir() or any(part.startswith((".", "__MACOSX")) for part in path.parts):
+            continue
+        if path.suffix.lower() not in _TAKEN:
+            others.append(info.filename)
+            continue
+        if info.flag_bits & 1:
+            raise InputError(f"{info.filename} in the zip is encrypted: make the zip without a password")
+        members.append(info)
+    total = sum(info.file_size for info in members)
+    if total > MOST_BYTES or len(members) > MOST_FILES:
+        raise InputError(
+            f"the zip holds {len(members)} files of {megabytes(total)} together: {MOST_FILES} files and "
+            f"{megabytes(MOST_BYTES)} are allowed; import the folder by its path on the server instead"
+        )
+    if not members:
+        raise InputError("the zip holds no images: put the folder of captures into a zip")
+    return members, others
+
+
+def _innermost(folder: Path) -> Path:
+    """The folder itself, or the one inside that alone holds everything, as a zip of a folder has it."""
+    while not any(layout.is_capture(folder) for layout in LAYOUTS.values()):
+        inside = visible(folder)
+        if len(inside) != 1 or not inside[0].is_dir():
+            break
+        folder = inside[0]
+    return folder

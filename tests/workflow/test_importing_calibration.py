@@ -1,0 +1,156 @@
+"""Calibrations from other programs, against the file's own statements and against a capture of the session."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.fringe.presets import multifrequency
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.session.exporters import write_calibration
+from slviewer.session.store import Session
+
+Run = Callable[..., tuple[int, str, str]]
+CAMERA, PROJECTOR = (160, 120), (456, 570)
+R = cv2.Rodrigues(np.array([0.01, 0.3, -0.02]))[0]
+RIG = StereoRig(
+    Lens(np.array([[400.0, 0, 78], [0, 402.0, 57], [0, 0, 1]]), np.array([-0.05, 0.01, 1e-3, 0, 0]), CAMERA),
+    Lens(np.array([[700.0, 0, 230.0], [0, 1400.0, 280.0], [0, 0, 1]]), np.zeros(5), PROJECTOR),
+    R,
+    -R @ np.array([180.0, 5.0, 8.0]),
+)
+
+
+def entries(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    matrices = {
+        "K_camera": RIG.camera.K, "D_camera": RIG.camera.D, "K_projector": RIG.projector.K,
+        "D_projector": RIG.projector.D, "R": RIG.R, "T": RIG.t,
+    }  # fmt: skip
+    return matrices | changes
+
+
+def scaled(K: np.ndarray, factor: float) -> np.ndarray:
+    return np.diag([factor, factor, 1.0]) @ K
+
+
+def save_wall(session: Path) -> None:
+    """A capture of a slanted wall along both axes, noise of one grey level."""
+    u, v = np.meshgrid(np.arange(CAMERA[0], dtype=float), np.arange(CAMERA[1], dtype=float))
+    rays = np.column_stack([RIG.camera.undistort(np.column_stack([u.ravel(), v.ravel()])), np.ones(u.size)])
+    depth = 600 / (1 + 0.3 * rays[:, 0] + 0.2 * rays[:, 1])
+    seen = RIG.project(rays * depth[:, None])
+    sequence, rng = multifrequency(PROJECTOR, steps=4), np.random.default_rng(5)
+    frames = [
+        110 + 80 * np.cos(2 * np.pi * (seen[:, int(frame.axis == "y")] / frame.period_px + frame.step / frame.steps))
+        if frame.kind == "phase"
+        else np.full(u.size, 190.0)
+        for frame in sequence.frames
+    ]
+    stack = np.array(frames).reshape(-1, *u.shape) + rng.normal(0, 1, (len(frames), *u.shape))
+    with Session.open_or_create(session) as store:
+        store.save_capture("wall", "scan", sequence, stack.round().astype(np.uint8), source="simulated")
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    save_wall(tmp_path / "session")
+    return tmp_path / "session"
+
+
+def file(folder: Path, matrices: dict, names: tuple[str, ...] = (), **more: object) -> Path:
+    renamed = dict(zip(names, matrices.values(), strict=True)) if names else matrices
+    write_calibration(folder / "rig.yml", {**renamed, **more})
+    return folder / "rig.yml"
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("M1", "D1", "M2", "D2", "R", "T"),
+        ("cam_K", "cam_kc", "pro_K", "pro_kc", "R", "T"),
+        ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
+        ("cam_int", "cam_dist", "proj_int", "proj_dist", "roration", "translation"),
+        ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "rotation", "translation"),
+    ],
+)
+def test_common_names_are_recognised_and_stated(
+    session: Path, run: Run, tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    path = file(tmp_path, entries(), names)
+    status, out, err = run("import", "opencv-calibration", path, session)
+    assert status == 0 and err == ""
+    assert all(f"{entry} = {name}" in out for entry, name in zip(entries(), names, strict=True))
+    assert "camera 160x120" in out and "projector 456x570" in out and "180.2 mm" in out
+    assert run("reconstruct", session, "wall", "--grid", tmp_path / "wall.npy")[0] == 0
+    z = np.load(tmp_path / "wall.npy")[..., 2]
+    assert 450 < np.nanmin(z) < np.nanmax(z) < 750
+
+
+def test_names_that_are_not_known_or_not_unique_are_asked_for(run: Run, tmp_path: Path) -> None:
+    path = file(tmp_path, entries(), ("A", "B", "C", "D", "R", "T"))
+    status, _, err = run("import", "opencv-calibration", path, tmp_path / "s")
+    assert status == 1 and "--keys" in err and "its keys are A, B, C, D, R, T" in err
+    path = file(tmp_path, entries(), M1=np.eye(3), D1=np.zeros(5), M2=np.eye(3), D2=np.zeros(5))
+    status, _, err = run("import", "opencv-calibration", path, tmp_path / "s")
+    assert status == 1 and "K_camera, D_camera" in err and "M1, D1, M2, D2" in err and "--keys" in err
+    assert not (tmp_path / "s").exists()
+
+
+INVERSE = {"R": RIG.R.T, "T": -RIG.R.T @ RIG.t}
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        (INVERSE, ["wall", "R and T are inverted"]),
+        ({"K_projector": scaled(RIG.projector.K, 2)}, ["wall", "half as many", "halve fx"]),
+        ({"K_projector": scaled(RIG.projector.K, 0.5)}, ["wall", "twice as many", "double fx"]),
+        ({"K_camera": scaled(RIG.camera.K, 2)}, ["wall", "camera's matrix", "halve fx"]),
+    ],
+)
+def test_a_capture_contradicts_a_calibration(
+    session: Path, run: Run, tmp_path: Path, changes: dict, facts: list[str]
+) -> None:
+    assert run("import", "opencv-calibration", file(tmp_path, entries()), session)[0] == 0
+    status, _, err = run("import", "opencv-calibration", file(tmp_path, entries(**changes)), session, "--force")
+    assert status == 1 and all(fact in err for fact in facts), err
+    with Session.open(session) as store:  # nothing was replaced
+        kept = store.load_result("calibration/stereo", only=())[0]["imported"]
+        np.testing.assert_allclose(kept["K_projector"], RIG.projector.K)
+        np.testing.assert_allclose(kept["T"], RIG.t)
+        assert store.deleted_results() == []
+
+
+def test_sizes_that_contradict_each_other_are_refused(session: Path, run: Run, tmp_path: Path) -> None:
+    path = file(tmp_path, entries(), cam_size=np.array([320, 240]), pro_size=np.array(PROJECTOR))
+    status, _, err = run("import", "opencv-calibration", path, session)
+    assert status == 1 and "camera" in err and "320x240" in err and "cam_size" in err and "160x120" in err
+    status, _, err = run("import", "opencv-calibration", path, tmp_path / "new", "--projector", "912x1140")
+    assert status == 1 and "912x1140" in err and "456x570" in err and not (tmp_path / "new").exists()
+    status, out, _ = run("import", "opencv-calibration", path, tmp_path / "new")
+    assert status == 0 and "camera 320x240" in out
+
+
+def test_a_principal_point_outside_of_the_image_is_noticed(run: Run, tmp_path: Path) -> None:
+    path = file(tmp_path, entries(K_projector=scaled(RIG.projector.K, 2.2)))
+    status, _, err = run(
+        "import", "opencv-calibration", path, tmp_path / "s", "--projector", "456x570", "--camera", "160x120"
+    )
+    assert status == 0 and "(506, 616)" in err and "456x570" in err and "scale" in err
+
+
+def test_inspect_describes_a_session_with_an_imported_calibration_alone(run: Run, tmp_path: Path) -> None:
+    session = tmp_path / "s"
+    assert run("import", "opencv-calibration", file(tmp_path, entries()), session)[0] == 0
+    status, out, err = run("inspect", session)
+    assert status == 0 and err == ""
+    assert "0 captures" in out and "rig.yml" in out and "not stated" in out
+    assert "400.0, 402.0" in out and "700.0, 1400.0" in out and "180.2 mm" in out
+    save_wall(session)
+    _, out, _ = run("inspect", session)
+    line = next(line for line in out.splitlines() if "wall" in line)
+    assert "camera 160x120" in line and "projector 456x570" in line and "axes x and y" in line
+    assert "25 frames" in line and "x period 16 px" in line
