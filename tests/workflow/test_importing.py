@@ -129,3 +129,11 @@ def test_exposures_of_a_toml_become_those_of_the_session(run: Run, tmp_path: Pat
         phase = decode_capture(capture)["x"]
     error = (phase.coordinate - np.arange(120.0))[phase.mask]
     assert phase.mask.mean() > 0.95 and np.sqrt(np.mean(error**2)) < 2.0
+
+
+def test_a_projector_size_that_is_not_stated_is_said(run: Run, tmp_path: Path) -> None:
+    source, session = write_colour(tmp_path / "source"), tmp_path / "session"
+    status, _, err = run("import", "auto", source, session, "--role", "scan")
+    assert status == 0 and "projector" in err and "not stated" in err
+    status, out, _ = run("inspect", session)
+    assert status == 0 and "unknown size" in out
