@@ -1,0 +1,52 @@
+"""A zip that is uploaded in a browser becomes poses, and what is wrong with it is said there."""
+
+import io
+import re
+import zipfile
+
+import cv2
+import numpy as np
+from playwright.sync_api import expect
+from wizard_page import PATIENCE_MS, Opened, button, choose, field
+
+from slviewer.fringe.patterns import render
+from slviewer.fringe.presets import gray
+from slviewer.workflow.wizard.operator import Operator
+
+PROJECTOR = (120, 90)
+
+
+def zip_of_captures() -> bytes:
+    """Two captures of Gray code with inverses, one of which lacks an image, and a file that is no image."""
+    sequence, data, rng = gray(PROJECTOR), io.BytesIO(), np.random.default_rng(1)
+    with zipfile.ZipFile(data, "w") as out:
+        for name in ("capture_0", "capture_1"):
+            for i in range(len(sequence.frames)):
+                frame = (render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1])).round().astype(np.uint8)
+                if (name, i) != ("capture_1", 4):
+                    out.writestr(f"set/{name}/graycode_{i:02d}.png", cv2.imencode(".png", frame)[1].tobytes())
+        out.writestr("set/notes.txt", "x")
+    return data.getvalue()
+
+
+def test_an_uploaded_zip_becomes_poses(opened: Opened, operator: Operator) -> None:
+    page = opened.page
+    button(page, "3. Poses").click()
+    page.get_by_text("Import captures", exact=True).click()
+    choose(page, "Layout", "procam-calibration")
+    expect(page.get_by_text("Empty: 1024x768, as this layout has it.")).to_be_visible()
+    field(page, "Projector").fill("120x90")
+    page.wait_for_timeout(1200)  # an input is entered once nobody types
+    for name, content in (("broken.zip", b"no zip"), ("set.zip", zip_of_captures())):
+        with page.expect_file_chooser() as chooser:
+            button(page, "Upload a zip").click()
+        chooser.value.set_files({"name": name, "mimeType": "application/zip", "buffer": content})
+        if name == "broken.zip":
+            expect(page.get_by_text(re.compile("the file is no zip")).first).to_be_visible()
+            expect(button(page, "Upload a zip")).to_be_enabled()
+    expect(page.get_by_text("1 capture imported: capture_0").first).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_text(re.compile("not imported: capture_1: it lacks graycode_04")).first).to_be_visible()
+    expect(page.get_by_text(re.compile("notes.txt in the zip")).first).to_be_visible()
+    session = operator.session
+    assert session is not None and session.load_capture("capture_0").sequence.projector == PROJECTOR
+    assert session.load_capture("capture_0").role == "calibration" and opened.errors == []
