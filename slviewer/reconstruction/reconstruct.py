@@ -38,6 +38,14 @@ class Model(Protocol):
 
 
 @runtime_checkable
+class Scattered(Protocol):
+    """A calibration that knows what phases scatter by beyond their predicted noise."""
+
+    def excess_px(self, axis: Axis) -> float:
+        """Projector px, 1 sigma."""
+
+
+@runtime_checkable
 class Sure(Protocol):
     """A calibration that knows how far it may be off."""
 
@@ -100,8 +108,15 @@ def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
 
 
 def _measure(model: Model, phase: PhaseMap) -> tuple[np.ndarray, np.ndarray]:
+    """Points (h, w, 3) mm and the standard deviation (h, w) mm of their depth: from the phase noise, and from what the
+    calibration's own phases scatter by beyond theirs."""
     points = model.points(phase)
-    return points, model.sigma_z(phase, points)
+    sigma = model.sigma_z(phase, points)
+    excess = model.excess_px(phase.axis) if isinstance(model, Scattered) else 0.0
+    if excess > 0.0:
+        noise_px = phase.sigma_phase * np.float32(phase.period_px / (2 * np.pi))
+        sigma = sigma * np.sqrt(1 + (np.float32(excess) / np.maximum(noise_px, np.float32(1e-9))) ** 2)
+    return points, sigma
 
 
 def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, tuple[np.ndarray, np.ndarray]]:

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from slviewer.calibration.anchored import AnchoredModel, calibrate_anchored
+from slviewer.calibration.diagnosis.splined_rules import judge_splined
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
@@ -155,16 +156,24 @@ def calibrate(
             if finding.severity == "doubtful":
                 warn(finding.text())
         made = _made(models, stereo, found.observations, part(progress, 0.66, 0.97), warn)
+        verdict = judge_splined(found.verdict, made.splined.bundle.noise) if made.splined else found.verdict
+        for finding in verdict.findings:
+            if finding not in found.verdict.findings:
+                warn(finding.text())
+        if verdict.level == "rejected":
+            keep_rejected(store, stereo, settings, verdict)
+            save_verdict(store, verdict, names)
+            raise rejected(verdict, kept=True)
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
-        save_stereo(store, stereo, inputs, settings, found.verdict)
+        save_stereo(store, stereo, inputs, settings, verdict)
         for model in (made.pixelwise, made.anchored, made.splined):
             if model is not None:
                 save_fitted(store, model, inputs, settings)
-        save_verdict(store, found.verdict, names)
+        save_verdict(store, verdict, names)
         warn_if_frame_changed(store, before, warn)
         progress(1.0, "calibrated")
-    return replace(made, verdict=found.verdict)
+    return replace(made, verdict=verdict)
 
 
 def _made(

@@ -27,13 +27,17 @@ from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.scaling import told_scale
 from slviewer.workflow.trust import told
 
+SAID_FROM = 1.2
+"""Times its predicted noise that a calibration's residual is, from which raising sigma is worth a sentence."""
+
 
 @dataclass(frozen=True)
 class Reconstruction:
     """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
     measures the board. ``scale`` says, in words, what correction of scale is in it; ``masked`` is the share of the
     pixels that were left out because no target pose lit what they look through, None for models that leave out none.
-    ``frame``: the one that the points are in, in words.
+    ``frame``: the one that the points are in, in words. ``raised``: the calibration's residuals over their predicted
+    noise, by which sigmas are raised.
     """
 
     cloud: Cloud
@@ -44,6 +48,7 @@ class Reconstruction:
     scale: str = ""
     masked: float | None = None
     frame: str = ""
+    raised: float = 1.0
 
     def text(self) -> str:
         """For people."""
@@ -58,6 +63,11 @@ class Reconstruction:
             lines.append(
                 f"apart from a rigid motion, the calibration leaves {np.median(left):.4f} mm of depth uncertain in the "
                 f"median, {np.percentile(left, 95):.4f} mm at 95 % (1 sigma)"
+            )
+        if self.raised > SAID_FROM:
+            lines.append(
+                f"sigma was raised: the calibration's residuals in {cloud.axis} are {self.raised:.1f} times their "
+                "predicted noise, and what disturbs its phases disturbs this capture's as well"
             )
         if self.frame:
             lines.append(f"frame: {self.frame}")
@@ -132,8 +142,9 @@ def reconstruct(
             write_grid(Path(grid), cloud.points)
         scale, fitted, frame = told_scale(store, name), chosen[name], frame_of(store, name)
         masked = unsupported(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
+        raised = fitted.residuals_over_noise(cloud.axis) if isinstance(fitted, SplinedModel) else 1.0
         progress(1.0, "reconstructed")
-    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked, frame)
+    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked, frame, raised)
 
 
 def triangles(points: np.ndarray, keep: np.ndarray) -> np.ndarray:

@@ -76,6 +76,21 @@ def test_sigma_is_compared_on_the_same_pixels() -> None:
     assert choose_axis(Uneven({"x": 1, "y": 1}), both) == "y"  # nothing in common, and y measures more
 
 
+def test_what_the_calibrations_own_phases_scatter_by_is_part_of_sigma() -> None:
+    @dataclass
+    class Measured(FakePhase):
+        sigma_phase: np.ndarray
+        period_px: float
+
+    class Scattering(FakeModel):
+        def excess_px(self, axis: str) -> float:
+            return 0.4
+
+    phase = Measured("x", np.zeros(SHAPE), np.full(SHAPE, 0.3), 2 * np.pi)
+    cloud = reconstruct(Scattering({"x": 0.02}), {"x": phase})
+    np.testing.assert_allclose(cloud.sigma_z, 0.02 * 0.5 / 0.3, rtol=1e-5)
+
+
 def test_missing_axes_are_named() -> None:
     with pytest.raises(InputError, match="capture holds no axis y, only x"):
         reconstruct(FakeModel({"x": 1, "y": 1}), phases("x"), axis="y")

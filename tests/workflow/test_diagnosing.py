@@ -125,3 +125,13 @@ def test_a_pose_that_moved_is_left_out_with_its_reason(bench: Bench, session: Pa
     status, text, error = run("calibrate", session, "--target", BOARD, "--models", "stereo")
     assert status == 0 and "pose_02 is left out: the board moved by" in error
     assert "verdict: good" in text and "note: pose_02: the board moved by" in text
+
+
+def test_gamma_below_five_steps_is_named_and_not_taken_for_another_period() -> None:
+    three = Bench(letter(0.2, 3), count=6, steps=3)
+    curve = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
+    sound = three.attempt([three.looked(i) for i in range(6)])
+    bent = three.attempt([three.look(i, curve[three.frames(i)]) for i in range(6)])
+    assert "gamma" not in sound.verdict.causes
+    assert bent.verdict.level == "doubtful" and "gamma" in bent.verdict.causes
+    assert "fringe-period" not in bent.verdict.causes

@@ -20,6 +20,11 @@ ASPECTS = (0.5, 1.0, 2.0)
 """Of square pixels, and of the diamond pixels of some DMDs."""
 ASPECT_OFF = 0.05
 
+CODE_BEGINS_PX = 0.5
+"""Beside column 0: where most Gray codes begin, and by where that is seen in the fringe its period is judged."""
+RIPPLE_PEAK = 2.0
+"""Times the RMS of a ripple: about its largest value, by which the phase there may be off."""
+
 _ORDER_REMEDY: dict[Cause, str] = {
     "frame-lag": "let the camera wait longer after each pattern (the preflight measures the delay), and capture again",
     "missing-frame": "trigger the camera by the projector or wait longer for each frame, and capture again; of "
@@ -115,7 +120,11 @@ def period(e: Evidence) -> Iterator[Finding]:
         said = float(np.median([p.axes[axis].period_px for p in sound if axis in p.axes]))
         middle = float(np.median(seen))
         sigma = 1.4826 * 1.2533 * float(np.median(np.abs(seen - middle))) / np.sqrt(len(seen))
-        if abs(middle / said - 1) > PERIOD_OFF and abs(middle - said) > PERIOD_SIGMAS * sigma:
+        if (
+            abs(middle / said - 1) > PERIOD_OFF
+            and abs(middle - said) > PERIOD_SIGMAS * sigma
+            and CODE_BEGINS_PX * abs(said / middle - 1) > RIPPLE_PEAK * ripple_px(e)
+        ):
             wrong[axis] = (said, middle)
     if wrong:
         both = " and ".join(
@@ -186,6 +195,41 @@ def board_size(e: Evidence) -> Iterator[Finding]:
         f"give the board as circles:{grid[0]}x{grid[1]}:{rest.split(':', 1)[-1]}",
         tuple(pose.name for pose in e.poses if pose.grid == grid),
     )
+
+
+def ripple_px(e: Evidence) -> float:
+    """px, RMS: residuals that repeat with the fringe, on the axis where they are larger: where a camera pixel covers
+    much of a fringe, its axis hides them; 0 where they are not known."""
+    return max((found.rms_px for found in e.solution.ripple.values()), default=0.0) if e.solution else 0.0
+
+
+def rippled(e: Evidence) -> Iterator[Finding]:
+    """Residuals that repeat with the fringe and exceed the samples' noise: the light is no cosine of the pattern."""
+    found = {axis: r for axis, r in (e.solution.ripple if e.solution else {}).items() if r.rms_px > r.noise_px}
+    if not found:
+        return
+    axis, worst = max(found.items(), key=lambda item: item[1].rms_px / item[1].noise_px)
+    steps = min((a.steps for p in e.poses for a in p.axes.values() if a.steps), default=0)
+    seen = (
+        f"the phase has an error that repeats {worst.waves} times a fringe period ({worst.rms_px:.2f} px RMS in "
+        f"{axis}, beside {worst.noise_px:.2f} px of predicted noise)"
+    )
+    if steps and worst.waves % steps == 0:
+        yield Finding(
+            "gamma",
+            "doubtful",
+            f"{seen}, as where the light does not grow evenly with the grey level (gamma) and is read with {steps} "
+            "phase steps",
+            "set the gamma of projector and camera to 1, or let the preflight make light linear, and take eight phase "
+            "steps or more",
+        )
+    else:
+        yield Finding(
+            "residuals",
+            "doubtful",
+            f"{seen}, as where exposure or light changes from frame to frame",
+            "lock exposure, gain and white balance, switch off room light, and capture again",
+        )
 
 
 def gamma(e: Evidence) -> Iterator[Finding]:

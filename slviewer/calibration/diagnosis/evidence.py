@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.diagnosis.ripple import Ripple
+from slviewer.fringe.sequence import Axis
 from slviewer.fringe.suspect import Suspect
 
 
@@ -90,6 +92,7 @@ class SolutionEvidence:
     ``focal_sigma``: relative uncertainty of the focal lengths; ``tilt_spread_deg``: the largest angle between two
     boards; ``empty_corners`` of the image, by name, that no pose reached and the projector lights; ``aspect`` fy / fx
     of the projector; ``centre_off``: how far its principal point lies from the middle, in widths and heights.
+    ``ripple``: residuals that repeat with the fringe, by axis.
     """
 
     used: tuple[str, ...]
@@ -101,6 +104,7 @@ class SolutionEvidence:
     empty_corners: tuple[str, ...]
     aspect: float
     centre_off: tuple[float, float]
+    ripple: Mapping[Axis, Ripple] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from slviewer.calibration.diagnosis.capture_rules import (
     mirrored,
     outside,
     period,
+    rippled,
     saturation,
 )
 from slviewer.calibration.diagnosis.evidence import Evidence
@@ -25,7 +26,7 @@ Rule = Callable[[Evidence], Iterator[Finding]]
 STAGES: tuple[tuple[Rule, ...], ...] = (
     (frame_faults, saturation),
     (mirrored, period, outside, board_size),
-    (single_poses, gamma, too_few, parallel, corners, uncertain),
+    (single_poses, gamma, rippled, too_few, parallel, corners, uncertain),
 )
 
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import SolutionEvidence, Strayed
+from slviewer.calibration.diagnosis.ripple import phase_ripple
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 
@@ -40,6 +41,7 @@ def solution_evidence(observations: Sequence[Observation], stereo: StereoModel) 
         empty_corners=empty_corners(used, stereo),
         aspect=float(K[1, 1] / K[0, 0]),
         centre_off=(float(K[0, 2] / (width - 1) - 0.5), float(K[1, 2] / (height - 1) - 0.5)),
+        ripple=phase_ripple(used, stereo),
     )
 
 

@@ -11,6 +11,8 @@ from slviewer.calibration.splined.normal import Data
 TUKEY = 4.685
 """Sigmas beyond which an observation says nothing: 95 % efficient on normal residuals."""
 LEAST_SIGMA_PX = 1e-4
+MOST_RATIO = 100.0
+"""Of residuals over their predicted noise, that the difference of both can tell."""
 MOST_OWN = 2.5
 """How many times the features' common noise one pose may have of its own: a tilted or blurred board is read less well.
 What exceeds that contradicts the other poses."""
@@ -28,6 +30,14 @@ class Noise:
     camera_px: float
     excess_px: tuple[float, float]
     sample_px: tuple[float, float]
+
+    @property
+    def ratio(self) -> tuple[float, float]:
+        """How many times their own predicted noise the samples scatter by, x and y: 1 where noise explains them."""
+        pairs = zip(self.sample_px, self.excess_px, strict=True)
+        predicted = [np.sqrt(max(s * s - e * e, (s / MOST_RATIO) ** 2, LEAST_SIGMA_PX**2)) for s, e in pairs]
+        x, y = (max(1.0, float(s / p)) for s, p in zip(self.sample_px, predicted, strict=True))
+        return x, y
 
     def sigmas(self, sample_sigma: np.ndarray) -> np.ndarray:
         """(m, 2) px: of samples whose predicted noise is (m, 2)."""

@@ -92,6 +92,7 @@ class Bundle:
         height = board_heights(self.points, board_frame(self.points), self.state.heights)
         return {
             "steps": self.steps,
+            "residuals_over_noise": {"x": self.noise.ratio[0], "y": self.noise.ratio[1]},
             "noise_px": {"camera": self.noise.camera_px, "x": self.noise.sample_px[0], "y": self.noise.sample_px[1]},
             "local_distortion_rms_px": fields,
             "board_height_mm": [float(height.min()), float(height.max())],
@@ -116,7 +117,8 @@ class Bundle:
         return "\n".join(
             [
                 f"splined: residuals camera {noise['camera']:.4f} px, projector x {noise['x']:.4f}, "
-                f"y {noise['y']:.4f} px (robust), after {s['steps']} steps",
+                f"y {noise['y']:.4f} px (robust; {max(self.noise.ratio):.1f} times the predicted noise), "
+                f"after {s['steps']} steps",
                 f"  local distortion {local['camera']:.3f} px RMS in the camera, "
                 f"{local['projector']:.3f} px in the projector",
                 f"  board: height {low:+.4f} ... {high:+.4f} mm, features misplaced by "

@@ -55,10 +55,14 @@ class SplinedModel:
         """Both lenses without their displacement fields, and their arrangement."""
         return StereoRig(lens_of(self.rig.camera), lens_of(self.rig.projector), self.rig.R, self.rig.t)
 
+    def residuals_over_noise(self, axis: Axis) -> float:
+        """How many times their predicted noise the target poses' phases scatter by; 1 where noise explains them."""
+        return self.bundle.noise.ratio[AXES.index(axis)]
+
     @property
     def residual_px(self) -> float:
-        """How far, in projector px, the target poses' samples scatter beyond their predicted noise (1 sigma)."""
-        return float(max(self.bundle.noise.excess_px))
+        """The same of both axes, whichever is larger: how far, in projector px, points miss their epipolar lines."""
+        return max(self.excess_px(axis) for axis in AXES)
 
     def sight(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2); NaN
@@ -115,6 +119,11 @@ class SplinedModel:
         sigma = self.depth_per_rad(phase) * phase.sigma_phase
         return np.where(np.isfinite(points[..., 2]), sigma, np.nan).astype(np.float32)
 
+    def excess_px(self, axis: Axis) -> float:
+        """Projector px that phases of the target poses scatter by beyond their predicted noise (1 sigma): what disturbs
+        the phase there disturbs it in every capture."""
+        return float(self.bundle.noise.excess_px[AXES.index(axis)])
+
     def sigma_map(self, axis: Axis) -> SigmaMap:
         """What the calibration leaves uncertain of depths through one axis, wherever points are measured."""
         if axis not in self._sigma_maps:
@@ -123,8 +132,9 @@ class SplinedModel:
 
     def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
         """(h, w) float32 mm: standard deviation of depth that the calibration leaves, rigid motion apart; NaN where the
-        organised points (h, w, 3) are. It is the same in every scan, and averages out in none."""
-        return self.sigma_map(axis).at(points)
+        organised points (h, w, 3) are. It is the same in every scan, and averages out in none. Where residuals exceed
+        their noise it is larger by that ratio, for what they consist of then is not independent."""
+        return self.sigma_map(axis).at(points) * np.float32(self.residuals_over_noise(axis))
 
     def to_dict(self) -> dict[str, Any]:
         """What is not an array, JSON-able."""
