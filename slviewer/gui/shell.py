@@ -77,8 +77,8 @@ class Shell:
         self._autopilot_says = Words(gui)
         with gui.add_folder("Session", expand_by_default=True):
             self._session_says = Words(gui)
-            self._path = gui.add_text("Folder", "")
-            opens = gui.add_button("Open or make session", icon=viser.Icon.FOLDER_OPEN, color="gray")
+            self._path = gui.add_text("Folder", "", hint="Made where it does not exist")
+            opens = gui.add_button("Open session", icon=viser.Icon.FOLDER_OPEN, color="gray")
             opens.on_click(stage.safely(lambda: ask_open(self._path.value)))
         with gui.add_folder("Messages", expand_by_default=True):
             self._busy = Words(gui)
@@ -209,7 +209,7 @@ class Shell:
         self._autopilot_says.set(boxed(snapshot.autopilot, "info") if snapshot.autopilot else "")
         latest = "".join(_notice(notice) for notice in reversed(snapshot.notices[-_KEPT:]))
         # as high as a small screen leaves, so that the panel itself does not scroll
-        style = "max-height:max(6em, calc(100vh - 625px));overflow-y:auto"
+        style = "max-height:max(6em, calc(100vh - 625px));overflow-y:auto;overflow-wrap:anywhere"
         self._latest.set(f'<div style="{style}">{latest or block(toned("Nothing yet.", "dim"))}</div>')
 
     # asking

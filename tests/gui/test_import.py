@@ -3,9 +3,12 @@
 import io
 import re
 import zipfile
+from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from playwright.sync_api import expect
 from wizard_page import PATIENCE_MS, Opened, button, choose, field
 
@@ -14,6 +17,13 @@ from slviewer.fringe.presets import gray
 from slviewer.workflow.wizard.operator import Operator
 
 PROJECTOR = (120, 90)
+
+
+@pytest.fixture
+def operator(tmp_path: Path) -> Iterator[Operator]:
+    """A new session without a rig: imported captures need none."""
+    with Operator(tmp_path / "session") as engine:
+        yield engine
 
 
 def zip_of_captures() -> bytes:

@@ -52,7 +52,7 @@ def test_what_cannot_be_done_is_said_in_words(opened: Opened, tmp_path: Path) ->
     (tmp_path / "a file").write_text("not a session")
     page = opened.page
     field(page, "Folder").fill(str(tmp_path / "a file"))
-    button(page, "Open or make session").click()
+    button(page, "Open session").click()
     expect(page.get_by_text("This failed").first).to_be_visible()
     assert opened.errors == []
 

@@ -234,7 +234,7 @@ def test_whoever_watches_sees_the_pose_and_changes_nothing(
     guest.get_by_role("checkbox", name="Hands-free").click()
     button(guest, "Delete").click()
     field(guest, "Folder").fill(str(operator.snapshot().session.folder / "other"))
-    button(guest, "Open or make session").click()
+    button(guest, "Open session").click()
     button(guest, "9. Export").click()
 
     capture_pose(page, "pose_02")  # after all that, what the operator asks for is all that happens

@@ -73,7 +73,7 @@ def _members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]
         if info.is_dir() or any(part.startswith((".", "__MACOSX")) for part in path.parts):
             continue
         if path.suffix.lower() not in _TAKEN:
-            others.append(info.filename)
+            others.append(path.name)
             continue
         if info.flag_bits & 1:
             raise InputError(f"{info.filename} in the zip is encrypted: make the zip without a password")
