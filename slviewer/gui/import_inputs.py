@@ -38,6 +38,7 @@ class ImportInputs:
                 "Channel", get_args(Channel), initial_value=DEFAULT_CHANNEL, hint="Of colour images"
             )
             self._codec = gui.add_dropdown("Codec", (_TELL, *get_args(Codec)), visible=False, hint="SLStudio's")
+            self._prefix = gui.add_text("Prefix", "", hint="Before the names, as part gives part_pose_01")
             self._folder = gui.add_text("Folder", "", hint="On the computer that runs slviewer")
             self._import = gui.add_button("Import folder", icon=viser.Icon.FOLDER_SYMLINK)
             self._import.on_click(safely(self._import_folder))
@@ -60,14 +61,18 @@ class ImportInputs:
         change(self._codec, visible=name == "slstudio")
         size = layout.projector if layout else None
         if size is not None:
-            self._size_hint.say(f"Empty: {size[0]}x{size[1]}, as this layout has it.", "dim")
+            empty = f"{size[0]}x{size[1]}, as this layout has it"
+        elif name == "frames":
+            empty = "as the TOML states it"
         else:
-            self._size_hint.say("Empty: as the TOML, the layout or the session states it.", "dim")
+            empty = "as the layout or the session states it" if layout is None else "as in the session"
+        self._size_hint.say(f"Empty: {empty}.", "dim")
 
     def _options(self) -> dict[str, Any]:
         chosen: dict[str, Any] = {"layout": self._layout.value or _DETECT, "role": self._role}
-        if self._projector.value.strip():
-            chosen["projector"] = self._projector.value.strip()
+        for name, handle in (("projector", self._projector), ("prefix", self._prefix)):
+            if handle.value.strip():
+                chosen[name] = handle.value.strip()
         if self._channel.value != DEFAULT_CHANNEL:
             chosen["channel"] = self._channel.value
         if chosen["layout"] == "slstudio" and self._codec.value != _TELL:
