@@ -139,6 +139,7 @@ def merge(
     model: ModelName | None = None,
     start: Start = "features",
     angle: float | None = None,
+    keep_background: bool = False,
     json: Path | None = None,
     accept_rejected: bool = False,
 ) -> None:
@@ -155,6 +156,7 @@ def merge(
         start: Where registration starts from: features finds by itself how the scans lie; turntable uses --angle;
             identity takes them to lie nearly right already.
         angle: Degrees that the turntable turns from each capture to the next, with --start turntable.
+        keep_background: Leave points on the surface that stand still while the object moves.
         model: Which calibration to use; by default the best one available.
         json: Write the registrations to this file too.
         accept_rejected: Use the calibration although its verdict rejects it.
@@ -167,6 +169,7 @@ def merge(
         model=model,
         start=start,
         angle=angle,
+        keep_background=keep_background,
         accept_rejected=accept_rejected,
         **ui(),
     )

@@ -14,6 +14,7 @@ _STRAY = {
     "edges": "beside depth jumps",
     "grazing": "seen at grazing angles",
     "groups": "in loose groups",
+    "far": "far from everything else",
     "unconfirmed": "that other scans see through",
 }
 

@@ -21,7 +21,7 @@ from slviewer.registration import graph
 from slviewer.registration.agreeing import agreeing
 from slviewer.registration.graph import Edge, Gap
 from slviewer.registration.pairwise import Progress, Registration, register_prepared, searched
-from slviewer.registration.prepared import Prepared, prepared
+from slviewer.registration.prepared import LEAST_POINTS, Prepared, prepared
 from slviewer.registration.refine import Uncertainty
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import Scan
@@ -113,6 +113,17 @@ def register_all(
         raise InputError(f"{len(scans)} scan(s) given: registering takes 2 to {MOST_SCANS} scans of one object.")
     work = _Work(scans, reference, starts or Starts(), progress or (lambda share: None))
     return work.done()
+
+
+def _check_trusted(name: str, scan: Scan) -> None:
+    """Raises InputError, with what becomes of its points, where too few of a scan can be used."""
+    if scan.trusted is None or np.count_nonzero(scan.trusted) >= LEAST_POINTS or len(scan.points) < LEAST_POINTS:
+        return
+    raise InputError(
+        f"{name} has {len(scan.points)} points, and all but {np.count_nonzero(scan.trusted)} lie beside holes or depth "
+        "steps: the cloud is too sparse or too noisy to be aligned; capture it with more light and longer exposure, or "
+        "with more phase steps"
+    )
 
 
 class _Work:
@@ -224,6 +235,7 @@ class _Work:
         name, scan = given
         scan = scan if isinstance(scan, Scan) else Scan.from_cloud(scan)
         chosen = slice(None) if scan.trusted is None else scan.trusted
+        _check_trusted(name, scan)
         normals = None if scan.normals is None else scan.normals[chosen]
         made = prepared(name, scan.points[chosen], normals, scan.sigma_mm)
         self.say(self._share + 0.2 / len(self.names))

@@ -105,7 +105,10 @@ def prepared(
     voxel = FINEST_MM * scale_of(size)
     fine = _cloud(points, normals, voxel)
     if len(fine.points) < LEAST_POINTS // 5:
-        raise InputError(f"Nearly all of the {name} is seen at grazing angles: turn the object towards the camera.")
+        raise InputError(
+            f"Nearly all of the {len(points)} points of the {name} are seen at grazing angles or have no normal "
+            f"({len(fine.points)} places are left): turn the object towards the camera."
+        )
     thinning = len(points) / len(fine.points)
     spacing = _spacing(cKDTree(np.asarray(fine.points)), np.asarray(fine.points)) / np.sqrt(thinning)
     return Prepared(points, fine, voxel, float(spacing), size, sigma_mm)

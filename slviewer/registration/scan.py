@@ -12,6 +12,8 @@ _RIM_PX = 2
 """So near to the edge of the measured surface, a pixel may have seen two surfaces at once."""
 _STEEPEST = 6.0
 """Rise over the pixels' pitch beyond which neighbours do not belong to one surface, or to one seen too obliquely."""
+_NOISE = 4.0
+"""Standard deviations that noise alone may add to a step."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +42,18 @@ class Scan:
             normals=grid_normals(cloud.points)[mask],
             colours=_rgb(cloud.colours()),
             sigma_mm=float(np.median(sigma)) if sigma.size else None,
-            trusted=away_from_edges(cloud.points)[mask],
+            trusted=away_from_edges(cloud.points, cloud.sigma_z)[mask],
         )
 
 
-def away_from_edges(points: np.ndarray) -> np.ndarray:
+def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np.ndarray:
     """(h, w) bool: the pixels of an organised cloud (h, w, 3) mm that lie two pixels or more inside the surface.
 
-    Edges are invalid pixels, the image's border, and steps that are steep for the pixels' pitch.
+    Edges are invalid pixels, the image's border, and steps that are steep for the pixels' pitch and exceed the noise
+    ``sigma_z`` (h, w) mm of both pixels, where it is known.
     """
     valid = np.isfinite(points[..., 2])
+    noise = np.zeros(valid.shape) if sigma_z is None else _NOISE * np.nan_to_num(sigma_z, posinf=0.0)
     inside = valid.copy()
     for axis in (0, 1):
         first, second = (
@@ -59,7 +63,10 @@ def away_from_edges(points: np.ndarray) -> np.ndarray:
         known = pitch[np.isfinite(pitch)]
         if not known.size:
             continue
-        step = np.abs(second[..., 2] - first[..., 2]) > _STEEPEST * float(np.median(known))
+        noisy = np.hypot(
+            *(noise[tuple(s if k == axis else slice(None) for k in (0, 1))] for s in (_BUT_LAST, _BUT_FIRST))
+        )
+        step = np.abs(second[..., 2] - first[..., 2]) > _STEEPEST * float(np.median(known)) + noisy
         for s in (_BUT_LAST, _BUT_FIRST):
             inside[tuple(s if k == axis else slice(None) for k in (0, 1))] &= ~step
     return np.asarray(binary_erosion(inside, np.ones((3, 3), bool), _RIM_PX))

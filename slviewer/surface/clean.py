@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from slviewer.reconstruction.cloud import Cloud
 
@@ -11,6 +13,10 @@ STEEPEST = 6.0
 """Steps between neighbours, in their own distance across the line of sight, from which they are two surfaces (80°)."""
 FLATTEST_SIGHT = 0.12
 """The cosine between a surface's normal and the line of sight below which it is not measured, but guessed (83°)."""
+FAR_SPACINGS = 20.0
+FAR_SHARE = 0.005
+"""A cluster that lies so many times the distance of neighbouring points away from all others, and has less than this
+share of them, is no part of the object."""
 LEAST_GROUP = 2e-4
 """Share of a scan's pixels below which a group without neighbours is no part of the object."""
 
@@ -18,16 +24,17 @@ LEAST_GROUP = 2e-4
 @dataclass(frozen=True)
 class Cleaned:
     """What of a scan is left out, in pixels: at its rim and at depth jumps, seen grazing or without a normal, in small
-    groups."""
+    groups, far from everything else."""
 
     edges: int
     grazing: int
     groups: int
+    far: int = 0
 
     @property
     def total(self) -> int:
         """All of them."""
-        return self.edges + self.grazing + self.groups
+        return self.edges + self.grazing + self.groups + self.far
 
 
 def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, Cleaned]:
@@ -43,7 +50,9 @@ def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, Cleaned]:
     seen = kept & (np.abs(sight(cloud.points, normals)) > FLATTEST_SIGHT)  # False where the normal is NaN
     grazing = int(kept.sum() - seen.sum())
     large = _large_groups(seen)
-    return large, Cleaned(edges, grazing, int(seen.sum() - large.sum()))
+    near = large & ~far_clusters(cloud.points, large)
+    groups, far = int(seen.sum() - large.sum()), int(large.sum() - near.sum())
+    return near, Cleaned(edges, grazing, groups, far)
 
 
 def sight(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -79,6 +88,26 @@ def at_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
         jumps[here] |= leap
         jumps[there] |= leap
     return jumps
+
+
+def far_clusters(points: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """(h, w) bool: of the points (h, w, 3) mm ``kept`` (h, w), those in small clusters far from everything else."""
+    far = np.zeros(kept.shape, bool)
+    places = points[kept].astype(np.float64)
+    if len(places) < 2:
+        return far
+    every = places[:: max(1, len(places) // 5000)]
+    spacing = float(np.median(cKDTree(places).query(every, k=2)[0][:, 1]))
+    if not spacing > 0:
+        return far
+    cells, which, counts = np.unique(
+        np.floor(places / (FAR_SPACINGS * spacing)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    joined = cKDTree(cells).sparse_distance_matrix(cKDTree(cells), 1.8).tocsr()  # all 26 neighbours
+    _, cluster = connected_components(joined, directed=False)
+    small = np.bincount(cluster, counts) < FAR_SHARE * len(places)
+    far[kept] = small[cluster][which.ravel()]
+    return far
 
 
 def _large_groups(mask: np.ndarray) -> np.ndarray:

@@ -76,7 +76,12 @@ def fuse(
     names = tuple(views)
     pairs = agreements(views, lambda share: say(0.3 + 0.1 * share))
     left_out = {
-        name: {"edges": v.cleaned.edges, "grazing": v.cleaned.grazing, "groups": v.cleaned.groups}
+        name: {
+            "edges": v.cleaned.edges,
+            "grazing": v.cleaned.grazing,
+            "groups": v.cleaned.groups,
+            "far": v.cleaned.far,
+        }
         for name, v in views.items()
     }
     for name, denied in _denied(views, pairs, lambda share: say(0.4 + 0.1 * share)).items():

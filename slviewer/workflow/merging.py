@@ -1,7 +1,7 @@
 """Registering scans of one object, and fusing them into one surface."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,9 +10,10 @@ import numpy as np
 from slviewer.errors import UsageError
 from slviewer.evaluation import letter
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.registration.multiway import Alignment, Pair, Starts, register_all
+from slviewer.registration.multiway import Alignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import picked_start
+from slviewer.registration.static_scene import Contradiction, ObjectAlignment, register_object
 from slviewer.registration.turntable import Axis
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
@@ -25,6 +26,8 @@ from slviewer.workflow.opening import SessionLike, opened
 from slviewer.workflow.scaling import scale_factor, told_scale
 from slviewer.workflow.trust import told
 
+CONTRADICTING = 0.01
+"""Share of contradicting points from which on a pair is warned about: noise alone has fewer than one in a million."""
 StartKind = Literal["features", "turntable", "identity"]
 Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 """Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
@@ -35,6 +38,7 @@ class Merge:
     """How scans lie on one of them, the one surface that they were fused to, and the file it went to.
 
     ``scale`` says, in words, what correction of scale is in it; ``kept`` names the session's result, where it is kept.
+    ``static_points``: by scan, how many points stand still while the object moves; ``contradictions`` of each pair.
     In the file ``seen_by`` counts the scans that a point is the mean of, and ``source`` numbers the one that its place
     comes from, 0 for the first of ``fused.names``.
     """
@@ -45,6 +49,8 @@ class Merge:
     out: Path
     scale: str = ""
     kept: str = ""
+    static_points: Mapping[str, int] = field(default_factory=dict)
+    contradictions: Mapping[Pair, Contradiction] = field(default_factory=dict)
 
     @property
     def reference(self) -> str:
@@ -60,6 +66,11 @@ class Merge:
         """The contract of ``merge --json``."""
         return {
             **alignment_json(self.alignment),
+            "static_points": dict(self.static_points),
+            "contradictions": [
+                {"scan": a, "onto": b, "share": found.share, "compared": found.compared, "gate_mm": found.gate_mm}
+                for (a, b), found in self.contradictions.items()
+            ],
             "letter_rms_mm": dict(letter.EXPERIMENT_3_ICP_RMS_MM),
             "points": len(self.fused.surface),
             "shared": self.fused.shared,
@@ -69,6 +80,14 @@ class Merge:
     def text(self) -> str:
         """For people."""
         lines = [alignment_text(self.alignment)]
+        if self.contradictions:
+            worst = max(self.contradictions.values(), key=lambda found: found.share)
+            lines.append(
+                f"contradicting points: {100 * worst.share:.2g} % at most of what both scans of a pair cover lies more "
+                f"than {worst.gate_mm:.2g} mm in front of the other's surface"
+            )
+        if removed := _removed_text(self.fused):
+            lines.append(removed)
         if self.scale:
             lines.append(self.scale)
         seen = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
@@ -134,6 +153,7 @@ def merge(
     axis: Axis | None = None,
     poses: Mapping[str, np.ndarray] | None = None,
     picked: Picked | None = None,
+    keep_background: bool = False,
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
@@ -143,7 +163,8 @@ def merge(
     Scans are given in the order in which they were taken. ``start``: where registration starts from; "turntable" needs
     the ``angle`` in degrees from each scan to the next and finds the ``axis`` where it is not given; "identity" takes
     scans to lie in one frame already, or as ``poses`` (4, 4) by name say. ``picked``: of a pair (scan, onto), three or
-    more points (n, 3) mm on either, in their cameras' frames; these pairs start from there. Without ``out`` the
+    more points (n, 3) mm on either, in their cameras' frames; these pairs start from there. What stands still while
+    the object moves is measured apart from it and left off the surface, unless ``keep_background``. Without ``out`` the
     session keeps the merge, as ``merge/<number>``, and its file in the exports.
     """
     given = list(dict.fromkeys(captures))
@@ -176,9 +197,11 @@ def merge(
                 warn=warn,
             )
         registering, fusing = part(progress, 0.4, 0.75), part(progress, 0.75, 0.9)
-        alignment = register_all(clouds, reference, starts, lambda done: registering(done, "registering"))
-        for why in alignment.dropped.values():
+        registered = register_object(clouds, reference, starts, lambda done: registering(done, "registering"))
+        alignment = registered.alignment
+        for why in [*alignment.dropped.values(), *_scene_warnings(clouds, registered, keep_background)]:
             warn(why)
+        clouds = clouds if keep_background else dict(registered.clouds)
         fused = fuse(clouds, alignment.T_reference_scan, lambda done: fusing(done, "fusing"))
         progress(0.9, "writing")
         surface = fused.surface
@@ -190,11 +213,42 @@ def merge(
         path = store.exports / f"merged_{number}.ply" if out is None else out
         path.parent.mkdir(parents=True, exist_ok=True)
         write_ply(path, surface.points, surface.colours, surface.normals, scalars, notes=notes)
-        found = Merge(alignment, fused, clouds, path, scale, f"merge/{number}" if number else "")
+        still = {name: int(mask.sum()) for name, mask in registered.static.items()}
+        kept = f"merge/{number}" if number else ""
+        found = Merge(alignment, fused, clouds, path, scale, kept, still, registered.contradictions)
         if found.kept:
             store.save_result(found.kept, merge_record(store, found, fitted.name), {})
     progress(1.0, "merged")
     return found
+
+
+def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool) -> list[str]:
+    """What of the scans is not the object, or contradicts, and what to do."""
+    said = []
+    still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
+    if still:
+        total = sum(int(clouds[name].mask.sum()) for name in still)
+        counts = ", ".join(f"{count} of {name}" for name, count in still.items())
+        said.append(
+            f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while the object moves: "
+            + ("they are in the merge once for each scan" if keep_background else "they are not part of the merge")
+        )
+    for (one, other), found in registered.contradictions.items():
+        if found.share > CONTRADICTING:
+            said.append(
+                f"{one} -> {other}: {100 * found.share:.2g} % of the points contradict, they lie more than "
+                f"{found.gate_mm:.2g} mm in front of what the other scan sees there: something moved on its own or "
+                "stands still; restrict the scans to the object, or scan again"
+            )
+    return said
+
+
+def _removed_text(fused: Fused) -> str:
+    """How many points were removed from the surface as far from everything else; empty where none were."""
+    far = {name: counts.get("far", 0) for name, counts in fused.left_out.items() if counts.get("far")}
+    if not far:
+        return ""
+    return "removed as far from everything else: " + ", ".join(f"{n} points of {name}" for name, n in far.items())
 
 
 def next_merge(store: Session) -> int:
