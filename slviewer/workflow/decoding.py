@@ -41,6 +41,12 @@ def check_projector(name: str, sequence: PatternSequence, phases: dict[Axis, Pha
     for axis, phase in phases.items():
         outside = np.count_nonzero(phase.reason == Reason.OUTSIDE)
         inside = np.count_nonzero(phase.mask)
+        saturated = np.count_nonzero(phase.reason == Reason.SATURATED)
+        if inside + outside == 0 and saturated > 0.5 * np.count_nonzero(phase.lit):
+            raise InputError(
+                f"{name}: no pixel carries a readable {axis} pattern: the camera saturates in "
+                f"{100 * saturated / phase.reason.size:.0f} % of the image; lower the exposure, then capture again"
+            )
         if inside + outside == 0:
             raise InputError(
                 f"{name}: no pixel carries a readable {axis} pattern: are the frames in order, "

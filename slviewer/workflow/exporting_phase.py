@@ -45,8 +45,9 @@ class DecodedFiles:
             "capture": self.capture,
             "files": dict(self.files),
             "units": {
-                "phase": "rad, absolute: 2 pi u / period_px, 0 at the centre of projector column (row) 0; NaN: masked",
-                "coordinate": "projector px, 0 at the centre of column (row) 0; NaN: masked",
+                "phase": "rad, 2 pi u / period_px, 0 at the centre of projector column (row) 0; NaN: masked",
+                "coordinate": "projector px, 0 at the centre of column (row) 0; modulo unambiguous_px where that is a "
+                "number; NaN: masked",
                 "sigma": "projector px, standard deviation of the coordinate by the camera's noise; NaN: masked",
                 "modulation": "grey levels, amplitude of the fringes; of Gray code alone half its contrast",
                 "reason": "uint8 code, see reasons",
@@ -64,7 +65,10 @@ class DecodedFiles:
             lines.append(f"{self.capture}, axis {axis}: {shares}")
             if not phase.mask.any():
                 continue
-            what = "Gray code alone, quantised" if phase.steps == 0 else f"period {phase.period_px:g} px"
+            what = "cells of Gray code" if phase.steps == 0 else "period"
+            what += f" {phase.period_px:g} px"
+            if phase.is_relative:
+                what += f", known only modulo {phase.unambiguous_px:g} px"
             lines.append(
                 f"  {what}: coordinates {figures['coordinate_px'][0]:.1f}-{figures['coordinate_px'][1]:.1f} px, "
                 f"modulation {figures['median_modulation']:.1f} and noise {figures['noise_levels']:.2f} grey levels, "
@@ -81,7 +85,12 @@ def axis_figures(phase: PhaseMap) -> dict[str, Any]:
     """
     valid = phase.mask
     shares = {REASON_LABELS[reason]: round(share, 6) for reason, share in reason_shares(phase).items()}
-    figures: dict[str, Any] = {"period_px": phase.period_px, "steps": phase.steps, "shares": shares}
+    figures: dict[str, Any] = {
+        "period_px": phase.period_px,
+        "steps": phase.steps,
+        "unambiguous_px": phase.unambiguous_px if phase.is_relative else None,
+        "shares": shares,
+    }
     names = ("coordinate_px", "median_modulation", "median_background", "noise_levels", "median_sigma_px")
     if not valid.any():
         return figures | dict.fromkeys(names)

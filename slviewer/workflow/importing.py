@@ -20,6 +20,7 @@ from slviewer.workflow.decoding import check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import available
 from slviewer.workflow.opening import SessionLike, opened, opened_or_made
+from slviewer.workflow.preflight.recorded import check_capture_exposure
 from slviewer.workflow.trust import keep_residuals
 
 Role = Literal["calibration", "scan"]
@@ -180,5 +181,9 @@ def checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
         if origins:
             sequence = replace(sequence, gray_origin_px=origins[0])
             warn(f"{capture.name}: Gray code 0 was found to begin at projector px {origins[0]:.2f}")
-    check_projector(capture.name, sequence, decode_frames(capture.name, sequence, capture.frames))
+    phases = decode_frames(capture.name, sequence, capture.frames)
+    check_projector(capture.name, sequence, phases)
+    exposure = check_capture_exposure(sequence, capture.frames, phases)
+    if exposure.verdict != "good":
+        warn(f"{capture.name}: {exposure.sentence} {exposure.remedy}")
     return replace(capture, sequence=sequence)

@@ -137,3 +137,21 @@ def test_a_projector_size_that_is_not_stated_is_said(run: Run, tmp_path: Path) -
     assert status == 0 and "projector" in err and "not stated" in err
     status, out, _ = run("inspect", session)
     assert status == 0 and "unknown size" in out
+
+
+@pytest.mark.parametrize(("gain", "word"), [(0.2, "exposure"), (1.9, "saturates"), (1.0, "")])
+def test_a_wrong_exposure_is_reported(tmp_path: Path, run: Run, gain: float, word: str) -> None:
+    steps = phase_steps("x", 4, float(PROJECTOR[0]))
+    sequence = PatternSequence(PROJECTOR, tuple(steps))
+    (folder := tmp_path / "source").mkdir()
+    for number, frame in enumerate(photographed(sequence, 0)):
+        bright = np.clip(np.rint(frame * gain), 0, 255).astype(np.uint8)
+        assert cv2.imwrite(str(folder / f"{number}.png"), bright)
+    lines = [f'[[frame]]\nfile = "{k}.png"\n' + _toml(frame.to_dict()) for k, frame in enumerate(steps)]
+    (tmp_path / "frames.toml").write_text('projector = "120x90"\n' + "\n".join(lines))
+    status, _, err = run("import", "frames", folder, tmp_path / "session", "--sequence", tmp_path / "frames.toml")
+    assert status == (gain > 1) and (word in err if word else "warning" not in err), err
+
+
+def _toml(values: dict) -> str:
+    return "\n".join(f'{k} = "{v}"' if isinstance(v, str) else f"{k} = {v}" for k, v in values.items())

@@ -51,7 +51,7 @@ def preflight_capture(capture: Capture, progress: Progress = unheard) -> Preflig
         _description(capture.name, sequence, phases),
         _order(sequence, fits),
         repeated_images(sequence, frames),
-        _exposure(sequence, frames, phases),
+        check_capture_exposure(sequence, frames, phases),
         _light(fits),
         _room_light(fits),
         _response(sequence, frames),
@@ -111,7 +111,8 @@ def _room_light(fits: Sequence[FrameResiduals]) -> Check:
     return Check("ambient", "good", "The light of the room did not change between the frames.", "", {})
 
 
-def _exposure(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
+def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
+    """Whether the frames (n, h, w) of a capture are too bright or too dark, by the pixels that see the patterns."""
     full = float(white_level(frames, list(range(len(frames)))))
     illuminated = np.logical_or.reduce([phase.lit for phase in phases.values()])
     if not illuminated.any():
