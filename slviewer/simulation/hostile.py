@@ -86,8 +86,9 @@ def render_light(
 def hostile_light(
     fault: Fault, severity: Severity, rig: SimulatedRig, scene: Scene, sequence: PatternSequence, number: int
 ) -> tuple[np.ndarray, Renderer]:
-    """As ``render_light``, with what the fault does to the rig, the scene and the patterns; the renderer is that of the
-    first frame.
+    """As ``render_light``, with what the fault does to the rig, the scene and the patterns.
+
+    Where the scene moves, the renderer is that of the middle of the phase steps of x, which depth comes from.
     """
     level = fault.level(severity)
     rig = fault.rig(rig, level, number) if fault.rig else rig
@@ -98,7 +99,9 @@ def hostile_light(
     parts = np.array_split(np.arange(len(sequence.frames)), len(places))
     rendered = [render_light(rig, place, sequence, changed) for place in places]
     light = [light[part] for (light, _), part in zip(rendered, parts, strict=True)]
-    return np.concatenate(light), rendered[0][1]
+    steps = [i for i, frame in enumerate(sequence.frames) if (frame.kind, frame.axis) == ("phase", "x")]
+    middle = next(k for k, part in enumerate(parts) if steps[len(steps) // 2] in part)
+    return np.concatenate(light), rendered[middle][1]
 
 
 def expose_frames(

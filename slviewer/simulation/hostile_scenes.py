@@ -219,9 +219,9 @@ def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
 
 
 def moving_scenes(scene: Scene, by_mm: float) -> list[Scene]:
-    """A hand that trembles and sinks: four places, ``by_mm`` from the first to the last."""
+    """A hand that sinks: eleven places, `by_mm` from the first to the last."""
     way, turn = np.array([0.7, 0.5, 0.5]), np.array([0.3, -0.5, 0.2]) / 100
-    return [moved_scene(scene, share * by_mm * way, share * by_mm * turn) for share in (0.0, 1 / 3, 2 / 3, 1.0)]
+    return [moved_scene(scene, share * by_mm * way, share * by_mm * turn) for share in np.linspace(0, 1, 11)]
 
 
 def dirty_scene(scene: Scene, share: float, number: int) -> Scene:

@@ -1,7 +1,7 @@
 """Captures of a hostile rig, put through the program's own path: files, import, calibration, clouds, fitted shapes."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +27,7 @@ from slviewer.workflow.calibrating import calibrate
 from slviewer.workflow.diagnosing import last_verdict
 from slviewer.workflow.importing import import_frames
 from slviewer.workflow.reconstructing import reconstruct
+from slviewer.workflow.trust import residuals
 from slviewer.workflow.verifying import verify
 
 BOARD = Board.parse("circles:21x16:9")
@@ -126,10 +127,12 @@ class HostileBench:
                 write_images(source / name, captures[name])
             toml = source / "sequence.toml"
             toml.write_text(describe_sequence(self.sequence))
-            import_frames(source, session, toml, role=role, force=True, warn=report.warnings.append)  # type: ignore[arg-type]
-        with Session.open(session) as store:
-            for name in captures:
-                report.named += suspected_causes(store, name, report.warnings)
+            try:
+                import_frames(source, session, toml, role=role, force=True, warn=report.warnings.append)  # type: ignore[arg-type]
+            except SlviewerError as error:
+                report.named += named_causes(self.sequence, captures, [*report.warnings, str(error)])
+                raise
+        report.named += named_causes(self.sequence, captures, report.warnings)
 
     def calibrate(self, session: Path, report: Report) -> None:
         """Calibrate the session's target poses; the report gets the verdict's causes."""
@@ -204,14 +207,21 @@ _SUSPECTED: dict[str, frozenset[str]] = {
 """What a frame's suspected fault says, in the words of causes; several where it leaves that open."""
 
 
-def suspected_causes(store: Session, name: str, warnings: Sequence[str]) -> list[frozenset[str]]:
-    """The causes of the suspects of an imported capture whose sentence was among the warnings."""
-    if not store.has_result(f"trust/{name}"):
-        return []
-    axes = store.load_result(f"trust/{name}")[0]["axes"]
-    suspects = [suspect for axis in axes for suspect in axis["suspects"]]
-    given = [s for s in suspects if any(s["sentence"] in warning for warning in warnings)]
-    return list({_SUSPECTED.get(s["fault"], frozenset({s["fault"]})) for s in given})
+def named_causes(
+    sequence: PatternSequence, captures: Mapping[str, np.ndarray], messages: Sequence[str]
+) -> list[frozenset[str]]:
+    """The causes that messages about captures name: those of the program's own suspects and contradictions whose
+    sentence is part of a message.
+    """
+    named: dict[frozenset[str], None] = {}
+    for name, frames in captures.items():
+        about = [message for message in messages if name in message]
+        if not about:
+            continue
+        suspects = [suspect for axis in residuals(sequence, frames) for suspect in axis.suspects]
+        known = [(s.sentence, _SUSPECTED.get(s.fault, frozenset({s.fault}))) for s in suspects]
+        named |= {causes: None for sentence, causes in known if any(sentence in message for message in about)}
+    return list(named)
 
 
 def run_case(work: Callable[[Report], Sequence[Measured]]) -> tuple[Report, Sequence[Measured]]:

@@ -40,12 +40,17 @@ Outcome = Literal[
 ]  # fmt: skip
 PASSED: tuple[Outcome, ...] = ("measured", "degraded, warned", "noisier as predicted", "refused")
 
-_WORDS: tuple[tuple[str, str], ...] = (
-    (r"outside the projector", "projector-size"),
-    (r"no pixel carries a readable", "unreadable"),
-    (r"circles|board's columns", "board"),
+_WORDS: tuple[tuple[str, frozenset[str]], ...] = (
+    (r"outside the projector", frozenset({"projector-size"})),
+    (r"no pixel carries a readable", frozenset({"unreadable"})),
+    (r"[Cc]ircles were|[Cc]ircles detected|board's columns", frozenset({"board"})),
+    (r"axes are exchanged", frozenset({"axes-swapped"})),
+    (r"axis is reversed|turned by 180", frozenset({"axis-reversed"})),
+    (r"calibration is of another rig", frozenset({"other-rig", "moved"})),
 )
 """What messages without a structured cause name, by their facts."""
+_OPEN: tuple[tuple[str, frozenset[str]], ...] = ((r"sigma was raised", frozenset({"other-rig", "moved", "motion"})),)
+"""What messages name that leave the cause open: right where it is among them, and never wrong."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +247,9 @@ def judge(
     """The outcome of a case, and the causes that the program named."""
     named = list(report.named)
     texts = [*report.warnings, *([str(report.error)] if report.error and not named else [])]
-    named += [frozenset({cause}) for pattern, cause in _WORDS if any(re.search(pattern, text) for text in texts)]
+    named += [causes for pattern, causes in _WORDS if any(re.search(pattern, text) for text in texts)]
+    maybe = [causes for pattern, causes in _OPEN if any(re.search(pattern, text) for text in texts)]
+    named += [causes for causes in maybe if causes & fault.causes]
     words = tuple(dict.fromkeys("|".join(sorted(each)) for each in named))
     right = any(each & fault.causes for each in named)
     must = fault.must_measure and severity == "mild"
