@@ -1,6 +1,6 @@
 """From a stored capture to phase maps and a texture."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -9,7 +9,9 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, texture
 from slviewer.fringe.hdr import radiance, toned
+from slviewer.fringe.layout import layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
@@ -17,6 +19,10 @@ from slviewer.session.store import Session
 MAX_OUTSIDE = 0.01
 """Share of readable pixels whose code may lie outside the projector before its size is doubted: of the right size there
 are a few along its border, and a corner of a wall beside the board may be all that tells a wrong one."""
+MANY_SATURATED = 0.05
+"""Share of the illuminated pixels: highlights saturate fewer, an exposure that is too long more."""
+NEAR_DARK = 2.0
+"""A median modulation within this factor of the least that is decoded: much of the scene lies below it."""
 
 
 def decode_capture(capture: Capture, frames: np.ndarray | None = None) -> dict[Axis, PhaseMap]:
@@ -60,6 +66,35 @@ def check_projector(name: str, sequence: PatternSequence, phases: dict[Axis, Pha
                 f"{name}: {100 * outside / (inside + outside):.1f} % of the {axis} codes lie outside the projector's "
                 f"{extent} {what}: give the size of the projector that was used, instead of {width}x{height}"
             )
+
+
+def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> list[str]:
+    """Why many pixels of a decoded capture (n, h, w) are masked, where saturation or weak fringes are the reason."""
+    messages = []
+    saturated = max((_saturated_share(phase) for phase in phases.values()), default=0.0)
+    if saturated > MANY_SATURATED:
+        messages.append(
+            f"{100 * saturated:.0f} % of the illuminated pixels are saturated and masked: lower the exposure or the "
+            "gain until white stays below the camera's full scale"
+        )
+    for axis, phase in phases.items():
+        if not (phase.steps and phase.mask.any()):
+            continue
+        modulation, background = (float(np.median(m[phase.mask])) for m in (phase.modulation, phase.background))
+        white = white_level(frames, sequence.select(axis))
+        least = dark_limit(np.array([background], np.float32), phase.noise, white, dark_sigmas(layout(sequence, axis)))
+        if modulation < NEAR_DARK * float(least[0]):
+            messages.append(
+                f"the {axis} fringes are weak, {modulation:.0f} grey levels in the median, and pixels below "
+                f"{float(least[0]):.1f} are masked: make the patterns brighter (longer exposure, wider aperture, "
+                "nearer projector, darker room)"
+            )
+            break
+    return messages
+
+
+def _saturated_share(phase: PhaseMap) -> float:
+    return np.count_nonzero(phase.reason == Reason.SATURATED) / max(1, np.count_nonzero(phase.lit))
 
 
 def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:

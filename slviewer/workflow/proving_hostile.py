@@ -44,6 +44,8 @@ _WORDS: tuple[tuple[str, frozenset[str]], ...] = (
     (r"outside the projector", frozenset({"projector-size"})),
     (r"no pixel carries a readable", frozenset({"unreadable"})),
     (r"[Cc]ircles were|[Cc]ircles detected|board's columns", frozenset({"board"})),
+    (r"are saturated and masked", frozenset({"saturation"})),
+    (r"fringes are weak", frozenset({"dark"})),
     (r"axes are exchanged", frozenset({"axes-swapped"})),
     (r"axis is reversed|turned by 180", frozenset({"axis-reversed"})),
     (r"calibration is of another rig", frozenset({"other-rig", "moved"})),

@@ -20,7 +20,7 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
 from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
-from slviewer.workflow.decoding import capture_texture, decode_capture
+from slviewer.workflow.decoding import capture_texture, decode_capture, loss_warnings
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, check_accepted, frame_of, load_models, load_stereo, preferred, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
@@ -110,6 +110,8 @@ def reconstruct(
             warn(f"{capture}: {sentence}")
         progress(0.3, "decoding")
         phases = decode_capture(shot, frames)
+        for message in loss_warnings(shot.sequence, frames, phases):
+            warn(f"{capture}: {message}")
         texture = capture_texture(shot, frames)
         is_pose = shot.role == "calibration"
         chosen = load_models(store, () if is_pose and model is None else (name,))

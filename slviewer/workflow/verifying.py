@@ -14,7 +14,7 @@ from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
 from slviewer.workflow.capture_clouds import check_capture_sizes
-from slviewer.workflow.decoding import capture_texture, decoded
+from slviewer.workflow.decoding import capture_texture, decoded, loss_warnings
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
@@ -112,6 +112,8 @@ def verify(
         for i, (shot, frames, phases) in enumerate(decoded(store, captures)):
             for sentence in told(store, shot.name, frames):
                 warn(f"{shot.name}: {sentence}")
+            for message in loss_warnings(shot.sequence, frames, phases):
+                warn(f"{shot.name}: {message}")
             progress(i / len(captures), f"measuring {shot.name}")
             clouds = reconstruct_models(store, chosen, shot, phases, axis, accept_rejected=accept_rejected, warn=warn)
             region: np.ndarray | None = None

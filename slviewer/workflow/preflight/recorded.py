@@ -16,7 +16,7 @@ from slviewer.fringe.residual_sample import spread_rows
 from slviewer.fringe.response import harmonic_error_rad, nonlinearity
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.capture import Capture
-from slviewer.workflow.decoding import check_projector, decode_frames
+from slviewer.workflow.decoding import NEAR_DARK, check_projector, decode_frames
 from slviewer.workflow.feedback import Progress, unheard
 from slviewer.workflow.preflight.checks import Check, Preflight, Verdict
 from slviewer.workflow.preflight.exposure import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
@@ -30,8 +30,6 @@ _FEW, _TOO_FEW = 0.75, 0.25
 """Shares of the illuminated pixels that must decode: below the first a warning, below the other most is lost."""
 _LEAST_ILLUMINATED = 0.005
 """Share of the image that must carry a pattern: half a percent is a board in a corner of the image."""
-_NEAR_DARK = 2.0
-"""A median modulation within this factor of the least that is decoded: much of the scene lies below it."""
 
 
 def preflight_capture(capture: Capture, progress: Progress = unheard) -> Preflight:
@@ -167,7 +165,7 @@ def _noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, 
         sigma = float(np.median(phase.sigma_phase[valid])) * phase.period_px / (2 * np.pi)
         white = white_level(frames, sequence.select(axis))
         least = dark_limit(np.array([background], np.float32), phase.noise, white, dark_sigmas(layout(sequence, axis)))
-        weak |= modulation < _NEAR_DARK * float(least[0])
+        weak |= modulation < NEAR_DARK * float(least[0])
         figures[axis] = {
             "noise_levels": round(noise, 3),
             "median_modulation_levels": round(modulation, 2),

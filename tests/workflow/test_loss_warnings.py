@@ -1,0 +1,33 @@
+"""A capture of which much is masked says why: saturation, or fringes near the least that is decoded."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from slviewer.fringe.presets import complementary
+from slviewer.simulation.boards import Pose, blank_board
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.workflow.decoding import decode_frames, loss_warnings
+
+PLANE = blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0])))
+
+
+def said(peak_level: float) -> str:
+    rig = letter(0.15)
+    rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, peak_level=peak_level))
+    sequence = complementary(rig.projector.size)
+    frames = Renderer(rig, PLANE).capture(sequence)
+    phases = decode_frames("plane", sequence, frames)
+    return " ".join(loss_warnings(sequence, frames, phases))
+
+
+@pytest.mark.parametrize(("peak_level", "word"), [(400.0, "saturated"), (16.0, "weak")])
+def test_the_reason_of_many_masked_pixels_is_named(peak_level, word):
+    assert word in said(peak_level)
+
+
+@pytest.mark.parametrize("peak_level", [212.0, 60.0])
+def test_a_sound_capture_says_nothing(peak_level):
+    assert said(peak_level) == ""
