@@ -94,7 +94,8 @@ def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping
 
 
 def _saturated_share(phase: PhaseMap) -> float:
-    return np.count_nonzero(phase.reason == Reason.SATURATED) / max(1, np.count_nonzero(phase.lit))
+    illuminated = phase.reason[phase.lit]
+    return float(np.mean(illuminated == Reason.SATURATED)) if illuminated.size else 0.0
 
 
 def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
