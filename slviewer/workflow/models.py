@@ -94,6 +94,15 @@ def load_stereo(store: Session) -> StereoModel:
     return StereoModel.made_elsewhere(rig)
 
 
+def load_stereo_if_complete(store: Session) -> StereoModel | None:
+    """The session's stereo calibration; None where there is none, or an imported one whose sizes nothing tells yet."""
+    if "stereo" not in available(store):
+        return None
+    meta = store.load_result("calibration/stereo", only=())[0]
+    sized = "model" in meta or (meta["camera"] and meta["projector"]) or store.capture_names()
+    return load_stereo(store) if sized else None
+
+
 def load_residuals(store: Session) -> dict[str, np.ndarray]:
     """{pose: (n, 4) px} camera and projector residuals of the stereo calibration; empty for one made elsewhere."""
     arrays = store.load_result("calibration/stereo")[1]

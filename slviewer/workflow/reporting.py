@@ -42,6 +42,7 @@ from slviewer.workflow.models import (
     load_model,
     load_residuals,
     load_stereo,
+    load_stereo_if_complete,
     preferred,
     recommended,
     validation,
@@ -70,7 +71,7 @@ def report(session: SessionLike, out: Path | str, *, progress: Progress = unhear
 
 
 def _data(store: Session) -> SessionData:
-    stereo = load_stereo(store) if "stereo" in available(store) else None
+    stereo = load_stereo_if_complete(store)
     observations = {o.name: o for o in load_observations(store, list(stereo.poses))} if stereo and stereo.poses else {}
     stale = [
         f"The {name} calibration was made from target poses that have since changed: run calibrate again."

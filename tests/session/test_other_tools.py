@@ -79,6 +79,10 @@ def test_slstudio_frames_that_fit_several_codecs_need_its_name(tmp_path):
         slstudio.read(tmp_path, projector=SIZE)
     with pytest.raises(InputError, match="--projector"):
         slstudio.read(tmp_path, codec="2x3")
+    for number in range(3):
+        write(tmp_path / "three" / f"frameSeq_{number}.bmp", cosines(3, COLUMNS, U)[number])
+    with pytest.raises(InputError, match=r"3 frames may also be those of .*2p1.*--codec"):
+        slstudio.read(tmp_path / "three", projector=SIZE)
     (tmp_path / "frameSeq_07.bmp").unlink()
     with pytest.raises(InputError, match="lacks frameSeq_07"):
         slstudio.read(tmp_path, projector=SIZE)
@@ -110,6 +114,9 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
         opencv_graycode.read(tmp_path, projector=SIZE)
     found = opencv_graycode.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
     assert len(found) == 1 and "pattern_cam2_im1.png" in found.warnings[0]
+    other = (2000, ROWS) if shadow else (COLUMNS, 60)  # as many images as another projector without, or with them
+    with pytest.raises(InputError, match=r"the last two images show (white and black|stripes), and"):
+        opencv_graycode.read(tmp_path, projector=other, files="pattern_cam1_*")
     with pytest.raises(InputError, match=f"holds {len(patterns)} images.*4000x120 projector takes 40"):
         opencv_graycode.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
 

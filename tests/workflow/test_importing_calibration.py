@@ -124,6 +124,15 @@ def test_a_capture_contradicts_a_calibration(
         assert store.deleted_results() == []
 
 
+def test_a_capture_that_arrives_later_contradicts_a_calibration(run: Run, tmp_path: Path) -> None:
+    session, path = tmp_path / "s", file(tmp_path, entries(**INVERSE))
+    sizes = ("--projector", "456x570", "--camera", "160x120")
+    assert run("import", "opencv-calibration", path, session, *sizes)[0] == 0
+    save_wall(session)
+    status, _, err = run("reconstruct", session, "wall")
+    assert status == 1 and "R and T are inverted" in err
+
+
 def test_sizes_that_contradict_each_other_are_refused(session: Path, run: Run, tmp_path: Path) -> None:
     path = file(tmp_path, entries(), cam_size=np.array([320, 240]), pro_size=np.array(PROJECTOR))
     status, _, err = run("import", "opencv-calibration", path, session)

@@ -8,12 +8,18 @@ modules/structured_light, src/graycodepattern.cpp and samples/cap_pattern.cpp (`
 import re
 from pathlib import Path
 
+import numpy as np
+
 from slviewer.errors import InputError
 from slviewer.fringe.presets import gray
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.importers.frame_groups import images_by_name, match_files
+from slviewer.session.importers.images import read_frames
 from slviewer.session.importers.imported import Imports, Recording, collect_captures, listed, strangers_warning
 
+_LIT, _MOSTLY = 0.25, 0.9
+"""Share of the largest difference from which on a pixel counts; share of these in which white is brighter than black:
+all of them but for a few that something disturbs, and half of them between two stripes."""
 _SAMPLE = re.compile(r"pattern_(cam\d+_)?(im)?\d+", re.IGNORECASE)
 
 
@@ -42,6 +48,7 @@ def read(
             shown = listed([f"{kind}N" for kind in sorted(kinds)])
             raise InputError(f'it holds images named {shown}: choose one with --files "{min(kinds)}*"')
         shown_sequence = _shown(sequence, len(found))
+        _check_shadow_images(found, shown_sequence)
         recording = Recording(name, shown_sequence, tuple(found), folder)
         return recording, strangers_warning(folder, [file for file in images_by_name(folder) if file not in found])
 
@@ -56,6 +63,26 @@ def read(
 def is_capture(folder: Path) -> bool:
     """Whether a folder holds images with the names of OpenCV's own program."""
     return any(_SAMPLE.fullmatch(file.stem) for file in images_by_name(folder))
+
+
+def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
+    """Raise InputError where white and black stand where stripes are expected, or the other way round.
+
+    A projector of another size may take two images more or less, as many as white and black are. In a pair of the
+    finest stripes the first image is the brighter in half of the places, in white and black everywhere.
+    """
+    first, second = read_frames(files[-2:]).stack.astype(np.int32)
+    difference = first - second
+    lit = np.abs(difference) > _LIT * np.abs(difference).max()
+    brighter = float((difference[lit] > 0).mean()) if lit.any() else 0.5
+    ends_in_white = sequence.frames[-1].kind == "black"
+    if ends_in_white != (brighter > _MOSTLY):
+        there, expected = ("stripes", "white and black") if ends_in_white else ("white and black", "stripes")
+        width, height = sequence.projector
+        raise InputError(
+            f"the last two images show {there}, and {expected} are expected of a {width}x{height} projector: it has "
+            "another size, or images are missing or too many"
+        )
 
 
 def _shown(sequence: PatternSequence, images: int) -> PatternSequence:

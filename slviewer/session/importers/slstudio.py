@@ -32,6 +32,8 @@ _STEPS: dict[Codec, tuple[tuple[int, int], ...]] = {
     "4": ((4, 1),),
 }
 """Steps, and periods over the projector."""
+_OTHERS = {3: "SLStudio's codecs 2p1 or 3Unwrap"}
+"""Numbers of frames that codecs which are not described here have too."""
 _SHOWN_BITS: dict[Axis, int] = {"x": 10, "y": 6}
 _SINGLE_AXIS: tuple[Codec, ...] = ("3", "4")
 
@@ -70,6 +72,11 @@ def is_capture(folder: Path) -> bool:
 
 
 def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis: Axis) -> PatternSequence:
+    if codec is None and images in _OTHERS:
+        raise InputError(
+            f"{images} frames may also be those of {_OTHERS[images]}, which cannot be imported: say with --codec what "
+            "was shown"
+        )
     candidates = [
         (each, axes)
         for each in get_args(Codec)

@@ -26,7 +26,7 @@ from slviewer.workflow.models import (
     available,
     insisted,
     load_model,
-    load_stereo,
+    load_stereo_if_complete,
     preferred,
     recommended,
     rejection,
@@ -83,8 +83,9 @@ class Reader:
         decided = self.session.decision("target")
         if decided:
             return str(decided)
-        if "stereo" in available(self.session) and (board := load_stereo(self.session).board):
-            return board
+        stereo = load_stereo_if_complete(self.session)
+        if stereo is not None and stereo.board:
+            return stereo.board
         return next((str(c.meta["board"]) for c in self.session.captures("calibration") if c.meta.get("board")), "")
 
     def patterns(self) -> str:
@@ -300,7 +301,10 @@ class Reader:
         if "stereo" not in models:
             return None, None
         meta = self._meta("calibration/stereo")
-        stereo: StereoModel = self._keep(("stereo", meta["hash"], tuple(captures)[:1]), lambda: load_stereo(session))
+        made_of = ("stereo", meta["hash"], tuple(captures)[:1])
+        stereo: StereoModel | None = self._keep(made_of, lambda: load_stereo_if_complete(session))
+        if stereo is None:
+            return None, None
         fit_rms: dict[str, Mapping[str, float]] = {}
         if "pixelwise" in models:
             key = ("pixelwise", self._meta("calibration/pixelwise")["hash"])

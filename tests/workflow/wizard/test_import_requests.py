@@ -11,6 +11,8 @@ import pytest
 
 from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import gray
+from slviewer.session.exporters import write_calibration
+from slviewer.workflow.importing_calibration import import_opencv_calibration
 from slviewer.workflow.wizard.operator import Operator
 
 PROJECTOR = (120, 90)
@@ -91,3 +93,16 @@ def test_a_cancelled_import_saves_nothing(operator: Operator, source: Path) -> N
     operator.cancel()
     operator.settle(60)
     assert operator.session is not None and operator.session.capture_names() == []
+
+
+def test_an_imported_calibration_without_sizes_waits_for_captures(source: Path, tmp_path: Path) -> None:
+    K, R = np.array([[400.0, 0, 60], [0, 400.0, 45], [0, 0, 1]]), np.eye(3)
+    matrices = {"K_camera": K, "D_camera": np.zeros(5), "K_projector": K, "D_projector": np.zeros(5)}
+    write_calibration(tmp_path / "rig.yml", {**matrices, "R": R, "T": np.array([100.0, 0, 0])})
+    import_opencv_calibration(tmp_path / "rig.yml", tmp_path / "session")
+    with Operator(tmp_path / "session") as operator:
+        view = operator.settle(60).session
+        assert view is not None and view.calibration is None
+        assert operator.import_folder(source, projector="120x90")
+        view = operator.settle(60).session
+        assert view is not None and view.calibration is not None and view.calibration.baseline_mm == 100
