@@ -149,6 +149,8 @@ def calibrate(
             keep_rejected(store, stereo, settings, found.verdict)
             save_verdict(store, found.verdict, names)
             raise rejected(found.verdict, kept=True)
+        if found.warning:
+            warn(found.warning)
         for name, why in stereo.left_out.items():
             if name not in excluded:
                 warn(f"{name} is left out: {why}")

@@ -1,5 +1,8 @@
 """An object on a turntable before a wall that stands still: its motion is measured, and the wall is kept out of it."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -110,3 +113,36 @@ def test_contradictions_are_counted_where_one_scan_sees_through_the_others_point
     assert 0.2 * share < moved < 0.8 * share  # half of the turned wall lies before itself, the other half behind
     still = contradiction(views["b"], views["a"], np.eye(4), 1.0).share
     assert 0.001 < still < 0.5 * (1 - share)
+
+
+def test_real_shells_turn_while_their_background_stands_still(real_data: Path) -> None:
+    clouds = {}
+    calibration = real_data / "sltk_shells" / "procam_2016_12_09.yaml"
+    for name in ("scan_0020", "scan_0021"):
+        file = calibration.with_name(f"{name}_cloud.ply")
+        if not file.exists():
+            pytest.skip(f"{file} is not among the real captures")
+        clouds[name] = organised_ply(file, calibration)
+    found = register_object(clouds, "scan_0020")
+    turn = np.degrees(Rotation.from_matrix(found.alignment.T_reference_scan["scan_0021"][:3, :3]).magnitude())
+    assert turn == pytest.approx(1.37, abs=0.03)
+    for name, cloud in clouds.items():
+        share = found.static[name].sum() / cloud.mask.sum()
+        assert 0.02 < share < 0.1, "the wall and the rim beside the shells"
+        shell = cloud.mask & (cloud.points[..., 0] > -200) & (cloud.points[..., 2] > 640)
+        assert (found.static[name] & shell).sum() < 0.005 * shell.sum()
+    assert found.contradictions["scan_0021", "scan_0020"].share < 0.01
+
+
+def organised_ply(file: Path, calibration: Path, step: int = 3) -> Cloud:
+    """The authors' cloud on the grid of every third pixel of their camera."""
+    data = file.read_bytes()
+    vertices = np.frombuffer(data[data.index(b"end_header\n") + 11 :], dtype=[("p", "<f4", 3), ("c", "u1", 3)])
+    points = vertices["p"].astype(np.float64) * (1, -1, -1)
+    storage = cv2.FileStorage(str(calibration), cv2.FILE_STORAGE_READ)
+    K, distortion = storage.getNode("cam_K").mat(), storage.getNode("cam_kc").mat()
+    pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
+    u, v = np.rint(pixels / step).astype(int).T
+    grid = np.full((1944 // step + 1, 2592 // step + 1, 3), np.nan, np.float32)
+    grid[v, u] = points
+    return Cloud(grid, "x", "stereo", np.full(grid.shape[:2], 0.15, np.float32))

@@ -8,7 +8,7 @@ import numpy as np
 
 from slviewer.calibration.centres import calibrate_centred
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
-from slviewer.calibration.diagnosis.numbering import misnumbered
+from slviewer.calibration.diagnosis.numbering import consistent_marks, misnumbered
 from slviewer.calibration.diagnosis.poses import most_moved_px, unfit
 from slviewer.calibration.diagnosis.rules import judged
 from slviewer.calibration.diagnosis.solution import solution_evidence
@@ -24,6 +24,7 @@ from slviewer.target.board import Board
 class Attempt:
     """What came of it. ``stereo``: the calibration; of a rejected one what there is to look into, None for nothing.
     ``observations``: the poses that it used, circles at their centres. ``left_out``: the others, and why.
+    ``warning``: what else the operator should know.
     """
 
     verdict: Verdict
@@ -31,6 +32,7 @@ class Attempt:
     stereo: StereoModel | None
     observations: tuple[Observation, ...]
     left_out: Mapping[str, str]
+    warning: str = ""
 
 
 def attempt_stereo(
@@ -44,6 +46,7 @@ def attempt_stereo(
 
     ``left_out``: poses kept out beforehand, and why.
     """
+    observations, warning = consistent_marks(board, observations)
     poses = [_numbered(pose, board, observations) for pose in poses]
     set_aside = _set_aside(poses, observations)
     kept = [o for o in observations if o.name not in set_aside]
@@ -69,7 +72,7 @@ def attempt_stereo(
     for finding in verdict.findings:  # which knows more of a pose than the fit that found it out
         if finding.cause in ("moved", "outlier", "board-numbering") and len(finding.poses) == 1:
             left_out |= {name: finding.text() for name in finding.poses if name in left_out and name not in out}
-    return Attempt(verdict, evidence, stereo, tuple(used), left_out)
+    return Attempt(verdict, evidence, stereo, tuple(used), left_out, warning)
 
 
 def _whatever_there_is(

@@ -1,12 +1,18 @@
 """Whether the features of a pose are numbered as the board's are, and how many circles the board really has."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
+from slviewer.calibration.observe import Observation
+from slviewer.calibration.splined.half_turns import opposite
 from slviewer.target.blobs import find_blobs
 from slviewer.target.board import Board
 from slviewer.target.images import SEARCH_PX, BoardImage, resized
 from slviewer.target.lattice import grow_lattices
+from slviewer.target.numbering import upright
 from slviewer.target.planar import to_image
 
 MISPLACED = 0.8
@@ -44,6 +50,36 @@ def misnumbered(board: Board, points: np.ndarray, pixels: np.ndarray) -> str:
             if left < least:
                 best, least = story, left
     return best
+
+
+def consistent_marks(board: Board, observations: Sequence[Observation]) -> tuple[list[Observation], str]:
+    """The observations of a board of circles numbered alike, and a warning; empty where the poses agree on the mark.
+
+    A board has a mark in all poses or in none. What a minority of them takes for one is something else: these poses are
+    numbered by the rule for boards without a mark (``slviewer.target.numbering``), as the others are.
+    """
+    doubtful = [o.name for o in observations if o.marked]
+    if not doubtful or 2 * len(doubtful) >= len(observations):
+        return list(observations), ""
+    numbered = [_by_rule(board, o) if o.marked else o for o in observations]
+    return numbered, (
+        f"a mark was detected in {len(doubtful)} of {len(observations)} poses ({', '.join(doubtful)}) only: taken for "
+        "clutter beside the board, these poses are numbered like the others; if the board has a mark, keep it in view "
+        "and uncovered"
+    )
+
+
+def _by_rule(board: Board, observation: Observation) -> Observation:
+    """The observation, numbered as if no mark had been seen."""
+    partner = opposite(board.points)
+    plain = replace(observation, marked=False)
+    if partner is None or len(observation.points) != len(board.points):
+        return plain
+    same = np.arange(len(board.points))
+    if np.array_equal(upright(board, observation.camera, [same, partner]), same):
+        return plain
+    slopes = None if observation.slopes is None else observation.slopes[partner]
+    return replace(plain, camera=observation.camera[partner], projector=observation.projector[partner], slopes=slopes)
 
 
 def seen_grid(board: Board, image: np.ndarray) -> tuple[int, int] | None:
