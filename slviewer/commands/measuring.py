@@ -14,6 +14,8 @@ def calibrate(
     session: Positional[Path],
     target: str,
     models: tuple[ModelName, ...] = (),
+    poses: tuple[str, ...] = (),
+    exclude: tuple[str, ...] = (),
     smoothing: Literal["spline", "polynomial"] = "spline",
     degree: int = 5,
     validate: bool = False,
@@ -28,12 +30,16 @@ def calibrate(
         target: circles:21x16:9 (columns x rows : pitch mm), acircles:…, chessboard:9x7:75 (inner corners : square mm),
             charuco:….
         models: Which models to fit; by default stereo, which is always made, the Letter's pixelwise, and splined.
+        poses: Calibrate from these target poses alone: names, or patterns such as 'pose_0*'.
+        exclude: Leave these target poses out, this time; the wizard excludes poses for good.
         smoothing: How the Letter's step 2 smooths a board's phase; the spline keeps the local distortion.
         degree: Degree of the polynomial, with --smoothing polynomial.
         validate: Also compare the models on poses that they were not made from, as `slviewer validate` does.
         json: Write the result to this file too.
     """
-    result = workflow.calibrate(session, target, models=models, smoothing=smoothing, degree=degree, **ui())
+    result = workflow.calibrate(
+        session, target, models=models, poses=poses, exclude=exclude, smoothing=smoothing, degree=degree, **ui()
+    )
     data = result.to_json()
     print(result.text())
     if validate:

@@ -24,6 +24,12 @@ from slviewer.reconstruction.cloud import Cloud
 
 Shape = Literal["plane", "sphere"]
 
+LEAST_SHARE = 0.5
+"""Of the scene's measured pixels, that a plane must hold to be what was captured."""
+MOST_OVER_FLOOR = 4.0
+"""Times the noise floor, up to which the best model's RMS may be the calibration's own error; beyond, the shape is
+doubtful too."""
+
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
@@ -32,6 +38,8 @@ class Comparison:
     ``results`` by model name, each over the pixels of ``common`` ``(h, w)`` bool: those of ``region`` ``(h, w)`` bool
     that every model measures. ``coverage`` by model: measured over lit pixels of the region, NaN if it is not known
     what is lit. ``incidence``: percent of the measured region in R1, R2, R3, or None without a depth range.
+    ``share``: of the pixels that all models measure, those in the region; ``is_searched``: the region was not given,
+    it is the largest patch of the shape.
     """
 
     shape: Shape
@@ -40,11 +48,35 @@ class Comparison:
     common: np.ndarray
     coverage: dict[str, float]
     incidence: dict[str, float] | None
+    share: float = 1.0
+    is_searched: bool = False
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences that name the model: where more than 2 % was set aside."""
-        return [f"{model}: {result.warning}" for model, result in self.results.items() if result.warning]
+        """Where more than 2 % was set aside, where a plane is a minor part of the scene, and where the RMS is far above
+        the noise floor by every model."""
+        found = [f"{model}: {result.warning}" for model, result in self.results.items() if result.warning]
+        if self.is_searched and self.shape == "plane" and self.share < LEAST_SHARE:
+            found.append(
+                f"the largest plane holds {100 * self.share:.0f} % of the measured pixels ({self.region_text()}), and "
+                "the figures are of it alone: is this a capture of a plane?"
+            )
+        ratios = {model: result.rms_mm / result.noise_floor_mm for model, result in self.results.items()}
+        known = {model: ratio for model, ratio in ratios.items() if np.isfinite(ratio)}
+        best = min(known, key=lambda model: known[model], default="")
+        if best and known[best] > MOST_OVER_FLOOR:
+            found.append(
+                f"the RMS is {known[best]:.1f} times the noise floor at best ({best}): this is no {self.shape}, the "
+                "frames are disturbed, or the calibration is off by that much"
+            )
+        return found
+
+    def region_text(self) -> str:
+        """Where the measured region lies in the image, in words; empty where its map is not at hand."""
+        rows, columns = np.flatnonzero(self.region.any(axis=1)), np.flatnonzero(self.region.any(axis=0))
+        if not len(rows):
+            return ""
+        return f"columns {columns[0]}-{columns[-1]}, rows {rows[0]}-{rows[-1]}"
 
     def text(self) -> str:
         """For people: a line a model, with the shares in R1, R2, R3 above."""
@@ -60,7 +92,10 @@ class Comparison:
         shares = (
             "" if self.incidence is None else ", ".join(f"{r} {share:.1f} %" for r, share in self.incidence.items())
         )
-        return "\n".join([*([shares] if shares else []), render(table)])
+        where = self.region_text()
+        if where:
+            where = f"region: {where}, {100 * self.share:.0f} % of the measured pixels; coverage is of this region"
+        return "\n".join([*(line for line in (shares, where) if line), render(table)])
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the figures without the maps; what is not known is None."""
@@ -75,7 +110,7 @@ class Comparison:
             }
             for model, result in self.results.items()
         }
-        return {"shape": self.shape, "incidence": self.incidence, "models": models}
+        return {"shape": self.shape, "incidence": self.incidence, "share": _known(self.share), "models": models}
 
 
 def compare(
@@ -111,6 +146,7 @@ def compare(
         )
     # A wall behind the shape may hold more pixels, in a model that measures everywhere.
     searched = region if region is not None else shared
+    is_searched = region is None
     start: Plane | Sphere
     if shape == "plane":
         start = start_plane(every, searched, sigma_z)
@@ -139,6 +175,8 @@ def compare(
         common=common,
         coverage={model: _coverage(cloud, region, lit) for model, cloud in clouds.items()},
         incidence=None if depth_range is None else incidence(every, region, depth_range),
+        share=np.count_nonzero(common) / max(1, np.count_nonzero(shared)),
+        is_searched=is_searched,
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import CalibrationRejected, InputError
+from slviewer.errors import CalibrationRejected, InputError, UsageError
 from slviewer.target.board import Board
 from slviewer.workflow.diagnosing import attempt, keep_rejected, rejected, save_verdict
 from slviewer.workflow.feedback import Progress, Warn, part, unheard, unwarned
@@ -111,6 +112,8 @@ def calibrate(
     target: str,
     *,
     models: Sequence[str] = (),
+    poses: Sequence[str] = (),
+    exclude: Sequence[str] = (),
     smoothing: str = "spline",
     degree: int = 5,
     progress: Progress = unheard,
@@ -119,10 +122,11 @@ def calibrate(
     """Calibrate from the session's captures of role calibration, and save the models in the session.
 
     ``models``: by default stereo, pixelwise and splined. ``stereo`` is always made; ``pixelwise`` and ``anchored`` are
-    fitted on top of it, and ``splined`` starts from it. A pose that cannot be used is left out with the reason. The
-    verdict is saved beside the models. Raises CalibrationRejected with its reason where it rejects them: then stereo
-    alone is kept to look into, and used only where that is insisted on; where none could be made at all, what the
-    session held stays.
+    fitted on top of it, and ``splined`` starts from it. ``poses``: the only ones to calibrate from, ``exclude``: those
+    to leave out; names or patterns such as ``pose_0*``, for this calibration alone. A pose that cannot be used is left
+    out with the reason. The verdict is saved beside the models. Raises CalibrationRejected with its reason where it
+    rejects them: then stereo alone is kept to look into, and used only where that is insisted on; where none could be
+    made at all, what the session held stays.
     """
     board = Board.parse(target)
     models = models or DEFAULT_MODELS
@@ -136,6 +140,7 @@ def calibrate(
                 f"{store.folder} holds no target poses: import some with --role calibration, or capture them first"
             )
         left_out = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
+        left_out |= _unselected(names, poses, exclude)
         names = [name for name in names if name not in left_out]
         if not names:
             raise InputError("every target pose is excluded: include some again")
@@ -152,7 +157,7 @@ def calibrate(
         if found.warning:
             warn(found.warning)
         for name, why in stereo.left_out.items():
-            if name not in excluded:
+            if name not in left_out:
                 warn(f"{name} is left out: {why}")
         for finding in found.verdict.findings:
             if finding.severity == "doubtful":
@@ -176,6 +181,19 @@ def calibrate(
         warn_if_frame_changed(store, before, warn)
         progress(1.0, "calibrated")
     return replace(made, verdict=verdict)
+
+
+def _unselected(names: Sequence[str], poses: Sequence[str], exclude: Sequence[str]) -> dict[str, str]:
+    """{pose: why} of the target poses that are not among ``poses``, where any are named, or that ``exclude`` names.
+
+    Raises UsageError for a name or pattern that fits no target pose.
+    """
+    for pattern in (*poses, *exclude):
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise UsageError(f"no target pose is called {pattern!r}: there are {', '.join(names)}")
+    chosen = {name for name in names if not poses or any(fnmatchcase(name, pattern) for pattern in poses)}
+    out = {name: "not among the poses that were named" for name in names if name not in chosen}
+    return out | {name: "excluded for this calibration" for name in names for p in exclude if fnmatchcase(name, p)}
 
 
 def _made(

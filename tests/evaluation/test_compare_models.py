@@ -189,3 +189,28 @@ def test_a_plane_far_off_the_depths_is_all_in_one_range() -> None:
     points = cloud(plane_depth(440.0), 0.02)
     result = compare("plane", {"stereo": seen(points, "stereo")}, depth_range=letter.DEPTH_RANGE_MM)
     assert result.incidence == {"R1": 100.0, "R2": 0.0, "R3": 0.0}
+
+
+def test_a_plane_that_is_a_minor_part_of_the_scene_is_told_with_its_place() -> None:
+    board = rectangle((60, 140), (50, 110))
+    u = np.arange(board.shape[1])[None, :]
+    rough = plane_depth(900.0) + 40.0 * np.sin(u / 6.0)
+    points = cloud(np.where(board, plane_depth(), rough), 0.05)
+    result = compare("plane", {"stereo": seen(points, "stereo")}, np.ones(board.shape, bool))
+    assert 0.0 < result.share < 0.5 and result.to_dict()["share"] == result.share
+    (warning,) = [w for w in result.warnings if "measured pixels" in w]
+    assert f"{100 * result.share:.0f} %" in warning and result.region_text() in warning
+    assert "columns" in result.region_text() and "coverage is of this region" in result.text()
+    given = compare("plane", {"stereo": seen(points, "stereo")}, region=board)
+    assert not any("largest plane" in w for w in given.warnings)  # it was not searched for
+
+
+def test_an_rms_far_above_the_floor_by_every_model_is_told() -> None:
+    v = np.arange(plane_depth().shape[0])[:, None]
+    bent = cloud(plane_depth() + 0.6 * np.sin(v / 10.0), 0.05)
+    result = compare("plane", {"stereo": seen(bent, "stereo"), "splined": seen(bent, "splined")})
+    (warning,) = [w for w in result.warnings if "noise floor" in w]
+    assert (
+        "no plane" in warning
+        and f"{result.results['stereo'].rms_mm / result.results['stereo'].noise_floor_mm:.1f}" in warning
+    )

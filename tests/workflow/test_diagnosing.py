@@ -135,3 +135,12 @@ def test_gamma_below_five_steps_is_named_and_not_taken_for_another_period() -> N
     assert "gamma" not in sound.verdict.causes
     assert bent.verdict.level == "doubtful" and "gamma" in bent.verdict.causes
     assert "fringe-period" not in bent.verdict.causes
+
+
+def test_calibrate_from_some_poses(session: Path, run: Run) -> None:
+    chosen = ("--models", "stereo", "--poses", "pose_0[0-5]", "--exclude", "pose_05")
+    status, text, error = run("calibrate", session, "--target", BOARD, *chosen)
+    assert status == 0 and "poses: 5 of 7 used" in text and error.count("left out") == 0
+    assert "pose_05: excluded for this calibration" in text and "pose_06: not among the poses" in text
+    status, _, error = run("calibrate", session, "--target", BOARD, "--exclude", "pose_9")
+    assert status == 2 and "'pose_9'" in error and "pose_06" in error
