@@ -7,6 +7,7 @@ from tyro.conf import Positional
 
 from slviewer import workflow
 from slviewer.commands.parsing import Axis, ModelName, Start, deferred, ui, write_json
+from slviewer.errors import UsageError
 
 
 @deferred
@@ -19,6 +20,8 @@ def calibrate(
     smoothing: Literal["spline", "polynomial"] = "spline",
     degree: int = 5,
     validate: bool = False,
+    camera_only: bool = False,
+    out: Path | None = None,
     json: Path | None = None,
 ) -> None:
     """Calibrate from the session's target poses, and say whether the calibration is good, and if not, why.
@@ -26,7 +29,7 @@ def calibrate(
     One that is rejected ends with status 3; it is kept to look into, and not used.
 
     Args:
-        session: Session folder.
+        session: Session folder; with --camera-only also a folder of pictures of the board.
         target: circles:21x16:9 (columns x rows : pitch mm), acircles:…, chessboard:9x7:75 (inner corners : square mm),
             charuco:….
         models: Which models to fit; by default stereo, which is always made, the Letter's pixelwise, and splined.
@@ -35,8 +38,17 @@ def calibrate(
         smoothing: How the Letter's step 2 smooths a board's phase; the spline keeps the local distortion.
         degree: Degree of the polynomial, with --smoothing polynomial.
         validate: Also compare the models on poses that they were not made from, as `slviewer validate` does.
+        camera_only: Calibrate the camera's lens alone, from pictures of the board; the session stays as it is.
+        out: With --camera-only: write the lens to this .yml, .xml or .json, for OpenCV.
         json: Write the result to this file too.
     """
+    if camera_only:
+        camera = workflow.calibrate_camera_alone(session, target, poses=poses, exclude=exclude, out=out, **ui())
+        write_json(json, camera.to_json())
+        print(camera.text())
+        return
+    if out is not None:
+        raise UsageError("--out belongs to --camera-only: `slviewer export calibration` writes the rig's calibration")
     result = workflow.calibrate(
         session, target, models=models, poses=poses, exclude=exclude, smoothing=smoothing, degree=degree, **ui()
     )
@@ -145,7 +157,6 @@ def merge(
     model: ModelName | None = None,
     start: Start = "features",
     angle: float | None = None,
-    keep_background: bool = False,
     json: Path | None = None,
     accept_rejected: bool = False,
 ) -> None:
@@ -162,7 +173,6 @@ def merge(
         start: Where registration starts from: features finds by itself how the scans lie; turntable uses --angle;
             identity takes them to lie nearly right already.
         angle: Degrees that the turntable turns from each capture to the next, with --start turntable.
-        keep_background: Leave points on the surface that stand still while the object moves.
         model: Which calibration to use; by default the best one available.
         json: Write the registrations to this file too.
         accept_rejected: Use the calibration although its verdict rejects it.
@@ -175,7 +185,6 @@ def merge(
         model=model,
         start=start,
         angle=angle,
-        keep_background=keep_background,
         accept_rejected=accept_rejected,
         **ui(),
     )

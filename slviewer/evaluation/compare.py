@@ -175,7 +175,7 @@ def compare(
         common=common,
         coverage={model: _coverage(cloud, region, lit) for model, cloud in clouds.items()},
         incidence=None if depth_range is None else incidence(every, region, depth_range),
-        share=np.count_nonzero(common) / max(1, np.count_nonzero(shared)),
+        share=int(np.count_nonzero(common)) / max(1, int(np.count_nonzero(shared))),
         is_searched=is_searched,
     )
 

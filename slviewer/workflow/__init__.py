@@ -22,6 +22,7 @@ _HOMES = {
     "in_words": "checking",
     "summary": "inspecting",
     "calibrate": "calibrating",
+    "calibrate_camera_alone": "calibrating_camera",
     "validate": "validating",
     "reconstruct": "reconstructing",
     "verify": "verifying",

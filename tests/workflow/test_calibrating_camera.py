@@ -1,0 +1,55 @@
+"""The camera alone: from pictures of the board in a folder."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.fringe.patterns import profile
+from slviewer.fringe.presets import p18
+from slviewer.simulation.boards import FLAT, printed_board
+from slviewer.simulation.plans import target_poses
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.truth import rig_record
+from slviewer.target.board import Board
+
+Run = Callable[..., tuple[int, str, str]]
+BOARD = Board.parse("circles:21x16:9")
+RIG = letter(0.25, 4, local_distortion_px=0.0)
+WHITE = p18(RIG.projector.size)  # whose frame 25 is
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pictures")
+    width, height = RIG.camera.size
+    for i, pose in enumerate(target_poses(RIG, BOARD, 8)):
+        image = np.empty((height, width), np.uint8)
+        renderer = Renderer(RIG, printed_board(BOARD, pose, FLAT, RIG.seed))
+        renderer.frame(profile(WHITE, 25), np.array([i, 7], np.uint32), image)
+        cv2.imwrite(str(folder / f"board_{i}.png"), image)
+    cv2.imwrite(str(folder / "wall.png"), np.full((height, width), 90, np.uint8))
+    return folder
+
+
+def test_a_camera_is_calibrated_from_pictures(pictures: Path, run: Run, tmp_path: Path) -> None:
+    out, found = tmp_path / "camera.yml", tmp_path / "camera.json"
+    status, text, error = run("calibrate", pictures, "--target", BOARD, "--camera-only", "--out", out, "--json", found)
+    assert status == 0 and "verdict: good" in text and "wall.png" in text and "wall.png is excluded" in error
+    data = json.loads(found.read_text())
+    K, true = np.array(data["K_camera"]), np.array(rig_record(RIG)["camera"]["K"])
+    assert 0.005 < data["reprojection_rms_px"] < 0.05
+    assert np.all(np.abs(np.diag(K - true)[:2]) < 5 * np.array(data["focal_sigma_px"]) + 0.1)
+    storage = cv2.FileStorage(str(out), cv2.FILE_STORAGE_READ)
+    np.testing.assert_allclose(storage.getNode("K_camera").mat(), K)
+    storage.release()
+
+
+def test_pictures_are_chosen_and_too_few_are_refused(pictures: Path, run: Run) -> None:
+    status, _, error = run("calibrate", pictures, "--target", BOARD, "--camera-only", "--poses", "board_[01].png")
+    assert status == 3 and "detected in 2 pictures" in error
+    assert run("calibrate", pictures, "--target", BOARD, "--camera-only", "--exclude", "none*")[0] == 2
