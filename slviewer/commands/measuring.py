@@ -84,6 +84,7 @@ def reconstruct(
     capture: Positional[str],
     model: ModelName | None = None,
     axis: Axis | None = None,
+    depth_range: tuple[float, float] | None = None,
     out: Path | None = None,
     grid: Path | None = None,
     mesh: bool = False,
@@ -96,6 +97,8 @@ def reconstruct(
         capture: Name of the capture.
         model: Which calibration to use; by default the best one available.
         axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
+        depth_range: For patterns that do not cover the projector: near and far end, mm, of the depths between which
+            all surfaces lie; by default the calibrated depths.
         out: PLY file; by default in the session's exports. That of a board pose holds the points inside the board's
             outline.
         grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as .npy.
@@ -103,7 +106,16 @@ def reconstruct(
         accept_rejected: Use the calibration although its verdict rejects it.
     """
     result = workflow.reconstruct(
-        session, capture, model=model, axis=axis, out=out, grid=grid, mesh=mesh, accept_rejected=accept_rejected, **ui()
+        session,
+        capture,
+        model=model,
+        axis=axis,
+        depth_range=depth_range,
+        out=out,
+        grid=grid,
+        mesh=mesh,
+        accept_rejected=accept_rejected,
+        **ui(),
     )
     print(result.text())
 

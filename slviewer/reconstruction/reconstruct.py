@@ -110,6 +110,10 @@ def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
 def _measure(model: Model, phase: PhaseMap) -> tuple[np.ndarray, np.ndarray]:
     """Points (h, w, 3) mm and the standard deviation (h, w) mm of their depth: from the phase noise, and from what the
     calibration's own phases scatter by beyond theirs."""
+    if phase.is_relative:
+        raise InputError(
+            f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px: resolve it by a depth range."
+        )
     points = model.points(phase)
     sigma = model.sigma_z(phase, points)
     excess = model.excess_px(phase.axis) if isinstance(model, Scattered) else 0.0

@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.reconstruction.axis_agreement import CaptureCheck, check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.reconstruction.relative_phase import resolve_phase
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.workflow.feedback import Warn, unwarned
@@ -62,6 +64,54 @@ def check_capture(
     check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
     calibration = model if isinstance(model, SplinedModel) else stereo
     return check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
+
+
+def absolute_phases(
+    store: Session,
+    name: str,
+    phases: Mapping[Axis, PhaseMap],
+    depth_range: tuple[float, float] | None = None,
+    warn: Warn = unwarned,
+) -> dict[Axis, PhaseMap]:
+    """A capture's phases, those that repeat made absolute by the depths (near, far) mm between which the scene lies; by
+    default the calibrated ones. An axis that more than one depth fits is left to the other axis, with a warning.
+
+    Raises InputError where no axis is unique in the range, and where no range is known.
+    """
+    if not any(phase.is_relative for phase in phases.values()):
+        if depth_range is not None:
+            warn(f"{name}: its phase is absolute, and the depth range is not needed: it was not used")
+        return dict(phases)
+    stereo = load_stereo(store)
+    near_far, whose = depth_range or stereo.depth_range_mm, "" if depth_range else ", the calibrated depths"
+    if near_far is None:
+        raise InputError(
+            f"{name}: its phase is not absolute, and the calibration knows no depths: state those of the scene with "
+            "--depth-range NEAR FAR, mm"
+        )
+    absolute, refusals = {axis: phase for axis, phase in phases.items() if not phase.is_relative}, []
+    for axis, phase in phases.items():
+        if not phase.is_relative:
+            continue
+        try:
+            resolved = resolve_phase(stereo.rig, phase, near_far)
+        except InputError as error:
+            refusals.append(str(error))
+            continue
+        absolute[axis] = resolved.phase
+        warn(
+            f"{name}: the phase of axis {axis} repeats every {phase.unambiguous_px:g} px, and each pixel was given its "
+            f"one depth between {near_far[0]:.0f} and {near_far[1]:.0f} mm{whose}; {100 * resolved.outside:.1f} % of "
+            "the decoded pixels have none and are masked. A surface outside of this range would be measured about "
+            f"{resolved.spacing_mm:.0f} mm from its place: change it with --depth-range"
+        )
+    if not absolute:
+        raise InputError(
+            f"{name}: {'; '.join(refusals)} (--depth-range NEAR FAR{whose and '; by default' + whose[1:]})"
+        )
+    for refusal in refusals:
+        warn(f"{name}: {refusal}; this axis was not used")
+    return absolute
 
 
 def raised(cloud: Cloud, factor: float) -> Cloud:

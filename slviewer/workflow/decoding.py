@@ -25,14 +25,28 @@ NEAR_DARK = 2.0
 """A median modulation within this factor of the least that is decoded: much of the scene lies below it."""
 
 
-def decode_capture(capture: Capture, frames: np.ndarray | None = None) -> dict[Axis, PhaseMap]:
-    """The absolute phase of every axis that a capture holds."""
+def decode_capture(
+    capture: Capture, frames: np.ndarray | None = None, *, relative: bool = False
+) -> dict[Axis, PhaseMap]:
+    """The absolute phase of every axis that a capture holds.
+
+    Raises InputError for a phase that is not absolute, unless a ``relative`` one will do.
+    """
     frames = capture.frames if frames is None else frames
-    return decode_frames(capture.name, capture.sequence, frames)
+    phases = decode_frames(capture.name, capture.sequence, frames)
+    for axis, phase in phases.items():
+        if phase.is_relative and not relative:
+            raise InputError(
+                f"{capture.name}: the phase of axis {axis} repeats every {phase.unambiguous_px:g} px of the projector, "
+                "so that it gives no projector coordinate: `slviewer reconstruct --depth-range NEAR FAR` measures a "
+                "scan whose depths are known, `slviewer decode` writes the phase as it is; calibrate with patterns "
+                "that cover the projector"
+            )
+    return phases
 
 
 def decode_frames(name: str, sequence: PatternSequence, frames: np.ndarray) -> dict[Axis, PhaseMap]:
-    """The absolute phase of every axis; errors name the capture."""
+    """The phase of every axis, absolute or not; errors name the capture."""
     phases = {}
     for axis in sequence.axes:
         try:

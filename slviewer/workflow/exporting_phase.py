@@ -137,7 +137,7 @@ def decode(
         for sentence in told(store, capture, frames):
             warn(f"{capture}: {sentence}")
     progress(0.4, "decoding")
-    phases = decode_capture(shot, frames)
+    phases = decode_capture(shot, frames, relative=True)
     progress(0.6, "writing")
     folder.mkdir(parents=True, exist_ok=True)
     files: dict[str, str] = {}

@@ -19,7 +19,7 @@ from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
-from slviewer.workflow.capture_clouds import capture_cloud, check_capture_sizes
+from slviewer.workflow.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
 from slviewer.workflow.decoding import capture_texture, decode_capture, loss_warnings
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import Model, check_accepted, frame_of, load_models, load_stereo, preferred, warn_if_stale
@@ -86,6 +86,7 @@ def reconstruct(
     *,
     model: str | None = None,
     axis: Axis | None = None,
+    depth_range: tuple[float, float] | None = None,
     out: Path | str | None = None,
     grid: Path | str | None = None,
     mesh: bool = False,
@@ -96,7 +97,8 @@ def reconstruct(
     """Reconstruct a capture, write it as PLY, and ``grid`` as an organised (h, w, 3) float32 .npy.
 
     The PLY of a board pose holds the points inside the board's outline; a scan's holds every point. That of a ``mesh``
-    also holds the triangles between neighbouring pixels.
+    also holds the triangles between neighbouring pixels. ``depth_range`` (near, far) mm: the depths between which a
+    capture whose phase repeats has its surfaces; by default the calibrated ones.
     """
     with opened(session) as store:
         check_accepted(store, accept_rejected)
@@ -109,9 +111,10 @@ def reconstruct(
         for sentence in told(store, capture, frames):
             warn(f"{capture}: {sentence}")
         progress(0.3, "decoding")
-        phases = decode_capture(shot, frames)
-        for message in loss_warnings(shot.sequence, frames, phases):
+        decoded = decode_capture(shot, frames, relative=True)
+        for message in loss_warnings(shot.sequence, frames, decoded):
             warn(f"{capture}: {message}")
+        phases = absolute_phases(store, capture, decoded, depth_range, warn)
         texture = capture_texture(shot, frames)
         is_pose = shot.role == "calibration"
         chosen = load_models(store, () if is_pose and model is None else (name,))
