@@ -63,23 +63,25 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
         inside = phase.mask & (coordinate + order * reach <= high)
         absolute = phase.phase + np.float32(2 * np.pi / phase.period_px) * (order * reach).astype(np.float32)
     reason = np.where(phase.mask & ~inside, np.uint8(Reason.OUTSIDE), phase.reason)
-    outside = np.count_nonzero(phase.mask & ~inside) / max(1, np.count_nonzero(phase.mask))
-    spacing = float(np.nanmedian(np.where(phase.mask, high - low, np.nan))) if phase.mask.any() else np.nan
+    outside = float(np.mean(~inside[phase.mask])) if phase.mask.any() else 0.0
+    stretch = float(np.nanmedian((high - low)[phase.mask])) if phase.mask.any() else np.nan
     return Resolved(
         replace(
             phase, phase=np.where(inside, absolute, np.float32(np.nan)), reason=reason, unambiguous_px=float(np.inf)
         ),
         depth_range_mm,
-        float(outside),
-        (far - near) * reach / spacing if spacing > 0 else np.inf,
+        outside,
+        (far - near) * reach / stretch if stretch > 0 else np.inf,
     )
 
 
 def _stretch(rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str) -> tuple[np.ndarray, np.ndarray]:
     """The lowest and the highest projector coordinate (...,) px that rays (..., 2) pass between two depths."""
     row = 0 if axis == "x" else 1
-    ends = [rig.project(points_from_depth(rays, np.full(rays.shape[:-1], depth)))[..., row] for depth in (near, far)]
-    return np.minimum(*ends), np.maximum(*ends)
+    at_near, at_far = (
+        rig.project(points_from_depth(rays, np.full(rays.shape[:-1], depth)))[..., row] for depth in (near, far)
+    )
+    return np.minimum(at_near, at_far), np.maximum(at_near, at_far)
 
 
 def _unique_far(rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str, reach: float) -> float:

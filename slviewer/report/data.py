@@ -151,7 +151,7 @@ class CaptureRow:
     role: str
     state: Literal["used", "left out", "excluded", "scan", "waiting"]
     camera: tuple[int, int]
-    projector: tuple[int, int]
+    projector: tuple[int, int] | None
     frames: int
     periods_px: Mapping[str, float]
     why: str = ""

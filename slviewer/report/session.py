@@ -136,7 +136,7 @@ def _captures(data: SessionData) -> Section:
             row.role,
             Cell(row.state, marks.get(row.state, "")),
             f"{row.camera[0]}x{row.camera[1]}",
-            f"{row.projector[0]}x{row.projector[1]}",
+            f"{row.projector[0]}x{row.projector[1]}" if row.projector else "unknown",
             str(row.frames),
             ", ".join(f"{axis} {period:g}" for axis, period in row.periods_px.items()),
             row.made,

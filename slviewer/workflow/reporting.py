@@ -201,7 +201,7 @@ def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping
         role=capture.role,
         state=state,  # type: ignore[arg-type]
         camera=capture.size,
-        projector=sequence.projector,
+        projector=sequence.projector_size,
         frames=len(sequence.frames),
         periods_px={axis: sequence.period_px(axis) for axis in sequence.axes},
         why=why,

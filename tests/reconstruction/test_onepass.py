@@ -1,5 +1,7 @@
 """One pass over the frames against the definitions: NumPy's decoding, and each model's own points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -20,6 +22,7 @@ SEQUENCES = {
     "3 steps and complementary code": complementary(PROJECTOR, 3, 18.0),
     "three frequencies of 4 steps": multifrequency(PROJECTOR, 4),
     "heterodyne, 7 steps": multifrequency((400, 400), 7, (18.0, 21.0, 25.0)),
+    "offset and falling phase": replace(complementary(PROJECTOR, 4, 18.0), phase_offset_rad=1.9, phase_sign=-1),
 }
 
 
@@ -136,6 +139,10 @@ def test_a_camera_of_more_bits_than_the_last_light_says_is_judged_anew():
 def test_it_refuses_what_it_cannot_do():
     with pytest.raises(InputError, match="without phase steps"):
         OnePass(gray(PROJECTOR), pixelwise(), "x")
+    with pytest.raises(InputError, match="not the periods of one phase shift"):
+        OnePass(replace(SEQUENCES["18 steps and Gray code"], gray_cell_px=9.0), pixelwise(), "x")
+    with pytest.raises(InputError, match="relative phase"):
+        OnePass(replace(multifrequency(PROJECTOR, 4, (16.0,)), relative=True), pixelwise(), "x")
     with pytest.raises(InputError, match="no axis y"):
         OnePass(SEQUENCES["18 steps and Gray code"], pixelwise(), "y")
     one = OnePass(SEQUENCES["18 steps and Gray code"], pixelwise(), "x")

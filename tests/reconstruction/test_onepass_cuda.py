@@ -34,7 +34,7 @@ PROJECTOR = (912, 1140)
 HEIGHT, WIDTH = 14, 20  # the simulator runs each pixel as a Python thread
 V, U = np.mgrid[:HEIGHT, :WIDTH].astype(float)
 SEQUENCES = {
-    "p18": p18(PROJECTOR),
+    "p18": replace(p18(PROJECTOR), phase_offset_rad=1.9),
     "complementary": complementary(PROJECTOR, 3, 18.0),
     "short": short(PROJECTOR, "x"),
     "heterodyne": multifrequency((400, 400), 5, (18.0, 21.0, 25.0)),

@@ -202,7 +202,7 @@ class Reader:
         if not target:
             return self._views(captures, states, {}, None, calibration, ""), None, False
         first = next((c for c in captures.values() if c.role == "calibration"), None)
-        camera, projector = (first.size, first.sequence.projector) if first else (rig.camera, rig.projector)
+        camera, projector = (first.size, first.sequence.projector_size) if first else (rig.camera, rig.projector)
         planned, planning = None, False
         if camera is not None and projector is not None:
             counted = {name: f for name, f in features.items() if states[name][0] not in ("excluded", "refused")}
