@@ -26,6 +26,7 @@ from slviewer.workflow.trust import residuals
 
 _LIGHT_FAULTS = ("light", "flicker", "exposure-drift")
 _ROOM_FAULTS = ("room-light",)
+_RESPONSE_FAULTS = ("gamma",)
 _FEW, _TOO_FEW = 0.75, 0.25
 """Shares of the illuminated pixels that must decode: below the first a warning, below the other most is lost."""
 _LEAST_ILLUMINATED = 0.005
@@ -52,7 +53,7 @@ def preflight_capture(capture: Capture, progress: Progress = unheard) -> Preflig
         check_capture_exposure(sequence, frames, phases),
         _light(fits),
         _room_light(fits),
-        _response(sequence, frames),
+        _response(sequence, frames, fits),
         _noise(sequence, frames, phases),
         _decoded(phases),
     )
@@ -70,7 +71,8 @@ def _description(name: str, sequence: PatternSequence, phases: Mapping[Axis, Pha
 
 
 def _order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> Check:
-    suspects = [s for fit in fits for s in fit.suspects if s.fault not in _LIGHT_FAULTS + _ROOM_FAULTS]
+    others = _LIGHT_FAULTS + _ROOM_FAULTS + _RESPONSE_FAULTS
+    suspects = [s for fit in fits for s in fit.suspects if s.fault not in others]
     n = len(sequence.frames)
     figures = {"frames": n, "misplaced_frames": sorted({s.frame + 1 for s in suspects})}
     if suspects:
@@ -134,9 +136,14 @@ def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases
     return Check("exposure", "good", f"{said}; {100 * clipped:.1f} % of the pixels are saturated.", "", figures)
 
 
-def _response(sequence: PatternSequence, frames: np.ndarray) -> Check:
+def _response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]) -> Check:
+    remedy = "Straighten the projector's response, or use more steps."
+    suspects = [s.sentence for fit in fits for s in fit.suspects if s.fault in _RESPONSE_FAULTS]
     harmonics = {axis: second_harmonic(sequence, frames, axis) for axis in sequence.axes}
     known = {axis: value for axis, value in harmonics.items() if np.isfinite(value)}
+    if suspects:
+        said = "; ".join(dict.fromkeys(suspects))
+        return Check("gamma", "warning", f"{said[0].upper()}{said[1:]}.", remedy, {})
     if not known:
         why = "fewer than five phase steps, or too few pixels that see fringes"
         return Check("gamma", "unknown", f"The response cannot be measured: {why}.", "", {})
@@ -150,7 +157,7 @@ def _response(sequence: PatternSequence, frames: np.ndarray) -> Check:
     if curved <= CURVED:
         return Check("gamma", "good", f"The response is straight: {said}.", "", figures)
     sentence = f"The response is curved: {said}; an error of {error:.4f} rad with {steps} steps."
-    return Check("gamma", "warning", sentence, "Straighten the projector's response, or use more steps.", figures)
+    return Check("gamma", "warning", sentence, remedy, figures)
 
 
 def _noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
