@@ -10,6 +10,7 @@ import numpy as np
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.calibration.splined.bundle import Bundle, adjust
 from slviewer.calibration.splined.compiled import Compiled, compile_axis, pixel_rays
+from slviewer.calibration.splined.evidence import LEAST_SIGMA_PX
 from slviewer.calibration.splined.fields import undistort
 from slviewer.calibration.splined.uncertainty import SigmaMap, sigma_map
 from slviewer.calibration.splined.unknowns import Arrangement, lens_of
@@ -122,7 +123,8 @@ class SplinedModel:
     def excess_px(self, axis: Axis) -> float:
         """Projector px that phases of the target poses scatter by beyond their predicted noise (1 sigma): what disturbs
         the phase there disturbs it in every capture."""
-        return float(self.bundle.noise.excess_px[AXES.index(axis)])
+        excess = float(self.bundle.noise.excess_px[AXES.index(axis)])
+        return excess if excess > 2 * LEAST_SIGMA_PX else 0.0  # the least that an estimate can be means none
 
     def sigma_map(self, axis: Axis) -> SigmaMap:
         """What the calibration leaves uncertain of depths through one axis, wherever points are measured."""
