@@ -246,6 +246,8 @@ def _words(story: _Story, indices: tuple[int, ...]) -> str:
 def _repeated(sampled: Fringe, products: _Products) -> list[int]:
     """Steps that are the frame before once more, where any two that follow each other should differ alike."""
     n, seen = sampled.steps, sampled.seen
+    if n == 3 and not sampled.turns:  # two steps look alike where the pixels see one side of the fringe alone
+        return []
     differences = np.array([float(np.mean((seen[k] - seen[k - 1]) ** 2)) for k in range(1, n)])
     noise = 2 * sampled.roughness**2
     usual = float(np.max(differences) if n == 3 else np.median(differences))

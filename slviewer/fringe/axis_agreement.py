@@ -1,0 +1,420 @@
+"""How well the frames of one axis agree with each other under a hypothesis of what each of them shows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.levels import plan_levels
+from slviewer.fringe.limits import OUTSIDE_PX
+from slviewer.fringe.line_sample import LineSample
+from slviewer.fringe.reference import lowest_coordinate
+from slviewer.fringe.residual_sample import columns
+from slviewer.fringe.sequence import Axis, Kind, PatternSequence
+
+TWO_PI = 2 * np.pi
+DECIDED = 0.2
+"""Of the swing, that a bit must lie away from the middle to be read."""
+DECIDED_SIGMAS = 3.0
+"""And so many standard deviations of the noise."""
+REACH = 4
+"""px between two read pixels that count as neighbours: an edge blurred over so many is still one edge."""
+READABLE_STRIPE = 6.0
+"""px: mean width of stripes that most pixels are inside of."""
+READABLE_SHARE = 0.5
+FEWEST_EDGES = 50
+"""With fewer code edges a share is known to no better than 7 %, and nothing is judged by it."""
+FEWEST_OF_BIT = 10
+"""Edges of one bit that contradict the others before it is doubted: most of so many are no chance."""
+MIN_KEPT = 0.15
+"""Share of the pixels at which all readable bits are decided; stripes of 6 px and wider leave more than a third."""
+FEWEST_PIXELS = 500
+MIDDLE_OF_CELL = 0.2
+"""Part of a period next to a code edge where blur may have moved the code."""
+
+
+@dataclass(frozen=True)
+class AxisFrames:
+    """Which image shows what, of one axis: image indices, None where the image is not there.
+
+    ``extent`` None where the projector's size is not known. ``shifts``: (period, images by step), longest period first.
+    ``bits`` most significant first, the complementary bit last; ``inverse`` like ``bits``, or empty. ``inverted``: bits
+    and their inverses are exchanged. ``gamma``: the exponent by which the light was curved.
+    """
+
+    extent: int | None
+    sign: int
+    offset_rad: float
+    origin_px: float
+    cell_px: float
+    shifts: tuple[tuple[float, tuple[int | None, ...]], ...]
+    bits: tuple[int | None, ...]
+    inverse: tuple[int | None, ...]
+    complementary: bool
+    inverted: bool = False
+    gamma: float = 1.0
+
+    @property
+    def fringe(self) -> tuple[float, tuple[int | None, ...]] | None:
+        """The period that is compared with the Gray code, the one most like its cells; None for Gray code alone."""
+        return min(self.shifts, key=lambda shift: abs(np.log(shift[0] / self.cell_px)), default=None)
+
+    def cell_of(self, count: int) -> float:
+        """px: width of the cells that the first ``count`` bits number."""
+        return self.cell_px * 2.0 ** (len(self.bits) - self.complementary - count)
+
+
+def described_frames(
+    sequence: PatternSequence, axis: Axis, images: Sequence[int | None] | None = None
+) -> AxisFrames:  # fmt: skip
+    """The frames of an axis as a sequence has them, frame i shown in image ``images[i]``."""
+
+    def shown(kind: Kind, period: float | None = None) -> tuple[int | None, ...]:
+        chosen = [i for i in sequence.find(kind, axis) if period in (None, sequence.frames[i].period_px)]
+        chosen.sort(key=lambda i: (sequence.frames[i].step, sequence.frames[i].bit))
+        return tuple(i if images is None else images[i] for i in chosen)
+
+    complementary = shown("complementary")
+    return AxisFrames(
+        extent=sequence.extent(axis) if sequence.projector_size else None,
+        sign=sequence.sign(axis),
+        offset_rad=sequence.offset_rad(axis),
+        origin_px=sequence.origin_px(axis),
+        cell_px=sequence.gray_cell(axis),
+        shifts=tuple((period, shown("phase", period)) for period in sequence.periods_px(axis)),
+        bits=shown("gray") + complementary,
+        inverse=shown("inverse"),
+        complementary=bool(complementary),
+    )
+
+
+def reversed_bits(frames: AxisFrames) -> AxisFrames:
+    """The same with the Gray bits from the least significant to the most; the complementary bit stays."""
+    last = frames.bits[len(frames.bits) - frames.complementary :]
+    gray = frames.bits[: len(frames.bits) - frames.complementary]
+    return replace(frames, bits=(*gray[::-1], *last), inverse=frames.inverse[::-1])
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Shares weighed by modulation; NaN where the frames do not tell.
+
+    ``edges``: code edges that were read. ``rule``: share of the edges that obey the Gray code, of the bit with the
+    least. ``common``: length of the mean unit vector of the wrapped phases at code edges; ``rising``: share of them at
+    which the phase rises with the code; ``begin_turns``: where in a period (-0.5 ... 0.5) the code's cells begin;
+    ``turns_per_cell`` fringes in a cell of the Gray code.
+    ``level_common``, ``level_turns``: the same for the step from each period to the next finer, in periods.
+    ``outside``: share of the coordinates beyond the projector, ``reach_px`` their largest. ``unreadable``: the first
+    bit, from 0, that cannot be read though its stripes are wide. ``borders``: phase (rad), number and weight of the
+    cells' borders that were seen.
+    """
+
+    edges: int
+    rule: float
+    common: float
+    rising: float
+    begin_turns: float
+    turns_per_cell: float
+    level_common: tuple[float, ...]
+    level_turns: tuple[float, ...]
+    outside: float
+    reach_px: float
+    unreadable: int | None
+    borders: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+
+
+class AxisReader:
+    """Reads bits and phases of a sample, each once for all hypotheses."""
+
+    def __init__(self, sample: LineSample, indices: list[int]) -> None:
+        swing = sample.swing(indices)
+        self.illuminated = swing > sample.least_swing
+        seen = np.flatnonzero(self.illuminated)
+        self.seen = seen
+        self.frames = sample.frames[:, seen]
+        self.swing = swing[seen]
+        chosen = self.frames[indices] if len(seen) else np.zeros((1, 0), np.float32)
+        self.middle = (chosen.max(axis=0) + chosen.min(axis=0)) / 2
+        self.line, self.place = sample.line[seen], sample.place[seen]
+        self.across = self.line >= sample.rows
+        self._noise = sample.noise
+        self._bits: dict[tuple[int | None, int | None], tuple[np.ndarray, np.ndarray, float, float]] = {}
+
+    def bit(self, image: int | None, inverse: int | None) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """(p,) bool value, (p,) bool decided, share decided, mean stripe width in px."""
+        key = (image, inverse)
+        if key not in self._bits:
+            high = self.middle if image is None else self.frames[image]
+            low = self.middle if inverse is None else self.frames[inverse]
+            both = image is not None and inverse is not None
+            height = (high - low) * np.float32(0.5 if both else 1.0)
+            noise = self._noise * (0.71 if both else 1.0)
+            decided = np.abs(height) > np.maximum(DECIDED * self.swing, DECIDED_SIGMAS * noise)
+            value = height > 0
+            self._bits[key] = value, decided, float(decided.mean()) if decided.size else 0.0, self._stripe(value)
+        return self._bits[key]
+
+    def _stripe(self, value: np.ndarray) -> float:
+        """Mean width in px of stripes, along the rows or the columns, whichever is less."""
+        near = (np.diff(self.place) == 1) & (np.diff(self.line) == 0)
+        edges = (value[1:] != value[:-1]) & near
+        parts = [part for part in (self.across[1:], ~self.across[1:]) if part.any()]
+        return min((np.count_nonzero(part) / (1 + np.count_nonzero(edges & part)) for part in parts), default=0.0)
+
+    def phasor(self, images: tuple[int | None, ...], frames: AxisFrames) -> np.ndarray | None:
+        """(p,) complex64 modulation e^(i phase); None with fewer than three of the steps."""
+        n = len(images)
+        steps = [k for k, image in enumerate(images) if image is not None]
+        there = [image for image in images if image is not None]
+        if len(steps) < 3:
+            return None
+        weights = np.linalg.pinv(columns(np.array(steps), n, 1))[1:].astype(np.float32)
+        levels = self.frames[there]
+        if frames.gamma != 1.0:
+            dark = self.middle - self.swing / 2
+            levels = np.maximum((levels - dark) / np.maximum(self.swing, 1e-6), 0) ** np.float32(1 / frames.gamma)
+            levels = levels * self.swing
+        cosine, sine = weights @ levels
+        turned = np.exp(-1j * frames.offset_rad).astype(np.complex64)
+        return (cosine - 1j * frames.sign * sine) * turned
+
+
+def agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
+    """How well the frames agree under this hypothesis."""
+    result = Agreement(0, np.nan, np.nan, np.nan, np.nan, np.nan, (), (), np.nan, np.nan, None, None)
+    if len(reader.swing) < FEWEST_PIXELS:
+        return result
+    if not frames.bits:
+        return _of_levels(reader, frames, result)
+    code = _read_code(reader, frames)
+    rule, edges = _rule(reader, code)
+    result = replace(result, rule=rule, edges=len(edges.first), unreadable=code.unreadable)
+    if code.known != (1 << code.count) - 1:  # only the bits above the missing one number anything
+        missing = code.count - 1 - ((1 << code.count) - 1 - code.known).bit_length() + 1
+        bits = tuple(image if b < missing else None for b, image in enumerate(frames.bits))
+        inverse = tuple(image if b < missing else None for b, image in enumerate(frames.inverse))
+        code = _read_code(reader, replace(frames, bits=bits, inverse=inverse))
+        _, edges = _rule(reader, code)
+    phasor = None if frames.fringe is None else reader.phasor(frames.fringe[1], frames)
+    if phasor is not None and len(edges.first) >= FEWEST_EDGES:
+        result = _with_phase(reader, frames, code, edges, phasor, result)
+    return _with_reach(reader, frames, code, result)
+
+
+@dataclass(frozen=True, eq=False)
+class _Code:
+    """Of the pixels in ``kept`` (indices): the first ``count`` bits as a Gray number; ``known`` masks its bits."""
+
+    kept: np.ndarray
+    gray: np.ndarray
+    binary: np.ndarray
+    count: int
+    known: int
+    unreadable: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Pairs of kept pixels between which the code changes by one, from ``first`` up to ``second``."""
+
+    first: np.ndarray
+    second: np.ndarray
+
+
+def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
+    bits: list[tuple[np.ndarray, np.ndarray, float, float] | None] = []
+    for b, image in enumerate(frames.bits):
+        inverse = frames.inverse[b] if b < len(frames.inverse) else None
+        bits.append(None if image is None and inverse is None else reader.bit(image, inverse))
+    readable = [bit is None or (bit[2] > READABLE_SHARE and bit[3] >= READABLE_STRIPE) for bit in bits]
+    count = readable.index(False) if False in readable else len(bits)
+    while count and bits[count - 1] is None:
+        count -= 1
+    chosen = [(b, bit) for b, bit in enumerate(bits[:count]) if bit is not None]
+    unreadable = _first_unreadable(reader, bits, count)
+    if not chosen:
+        return _Code(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0, np.int32), 0, 0, unreadable)
+    decided = np.logical_and.reduce([bit[1] for _, bit in chosen])
+    kept = np.flatnonzero(decided)
+    if unreadable is None and len(kept) < MIN_KEPT * len(decided):
+        unreadable = chosen[int(np.argmin([bit[2] for _, bit in chosen]))][0]
+    gray, known = np.zeros(len(kept), np.int32), 0
+    for b, bit in chosen:
+        gray |= (bit[0][kept] ^ frames.inverted).astype(np.int32) << (count - 1 - b)
+        known |= 1 << (count - 1 - b)
+    binary = gray.copy()
+    shift = 1
+    while shift < count:
+        binary ^= binary >> shift
+        shift *= 2
+    return _Code(kept, gray, binary, count, known, unreadable)
+
+
+def _first_unreadable(
+    reader: AxisReader, bits: list[tuple[np.ndarray, np.ndarray, float, float] | None], count: int
+) -> int | None:
+    """The first bit that cannot be read although its stripes should be wide; None where blur explains all."""
+    if count == len(bits) or len(reader.swing) < FEWEST_PIXELS:
+        return None
+    widths = [bit[3] for bit in bits[:count] if bit is not None]
+    later = [bit for bit in bits[count + 1 :] if bit is not None]
+    expected = widths[-1] / 2 if widths else np.inf
+    wider = any(bit[2] > READABLE_SHARE and bit[3] > 2 * READABLE_STRIPE for bit in later)
+    # Few edges in view make a stripe seem wider than it is, by a factor that its neighbours in order share.
+    wide = expected > 2 * READABLE_STRIPE and len(widths) >= 2 and widths[-2] < 3 * widths[-1]
+    return count if wider or wide or not widths else None
+
+
+def _rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
+    """Share of each bit's edges that obey the Gray code, the least of all bits; and the edges that obey."""
+    kept = code.kept
+    near = (np.diff(reader.place[kept]) <= REACH) & (np.diff(reader.line[kept]) == 0)
+    change = (code.gray[1:] ^ code.gray[:-1]) * near
+    at = np.flatnonzero(change)
+    change = change[at]
+    single = (change & (change - 1)) == 0
+    below = change - 1  # the bits below the one that changes: 1, 0, 0 ...
+    wanted = (change >> 1) & code.known
+    obeys = single & ((code.gray[at] & below & code.known) == wanted)
+    weight = np.minimum(reader.swing[kept[at]], reader.swing[kept[at + 1]])
+    shares = []
+    if len(change) >= FEWEST_EDGES:
+        shares.append(float(weight[obeys].sum() / weight.sum()))
+        for b in range(code.count):
+            of_bit = single & (change == 1 << b)
+            if np.count_nonzero(of_bit & ~obeys) >= FEWEST_OF_BIT:
+                shares.append(float(weight[of_bit & obeys].sum() / weight[of_bit].sum()))
+    at = at[obeys]
+    up = code.binary[at + 1] > code.binary[at]
+    return min(shares, default=np.nan), _Edges(np.where(up, at, at + 1), np.where(up, at + 1, at))
+
+
+def _with_phase(
+    reader: AxisReader, frames: AxisFrames, code: _Code, edges: _Edges, phasor: np.ndarray, result: Agreement
+) -> Agreement:  # fmt: skip
+    assert frames.fringe is not None
+    below, above = phasor[code.kept[edges.first]], phasor[code.kept[edges.second]]
+    weight = np.minimum(np.abs(below), np.abs(above))
+    step = np.angle(above * np.conj(below))
+    angle = np.angle(below) + step / 2
+    border = code.binary[edges.second].astype(np.float64)
+    per_cell = _turns_per_cell(reader, code, edges, phasor)
+    cell = frames.cell_of(code.count)
+    common, begin = common_phase(angle, border * cell / frames.fringe[0], weight)
+    return replace(
+        result,
+        common=common,
+        begin_turns=begin,
+        rising=float(weight[step > 0].sum() / max(float(weight.sum()), 1e-9)),
+        turns_per_cell=per_cell * frames.cell_px / cell,
+        borders=(angle, border * cell / frames.cell_px, weight),
+    )
+
+
+def common_phase(angle: np.ndarray, border_turns: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    """(length, turns -0.5 ... 0.5) of the mean unit vector of the phases (rad) at the borders of cells, less what the
+    cells before them hold. The turns are the mean of those near the common phase alone: the rest are depth steps.
+    """
+    unit = np.exp(1j * (angle - TWO_PI * border_turns))
+    mean = complex((weight * unit).sum()) / max(float(weight.sum()), 1e-9)
+    centre = np.angle(mean)
+    for _ in range(3):
+        apart = np.angle(unit * np.exp(-1j * centre))
+        near = np.abs(apart) < np.pi / 4
+        if near.any():
+            centre += float(np.average(apart[near], weights=weight[near] + 1e-9))
+    return abs(mean), float((centre / TWO_PI + 0.5) % 1 - 0.5)
+
+
+def _turns_per_cell(reader: AxisReader, code: _Code, edges: _Edges, phasor: np.ndarray) -> float:
+    """Fringes between two successive edges of the code along a line, the median."""
+    adjacent = (np.diff(reader.place) == 1) & (np.diff(reader.line) == 0)
+    steps = np.angle(phasor[1:] * np.conj(phasor[:-1]))
+    angle = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+    gaps = np.concatenate([[0], np.cumsum(~adjacent)])
+    here, there = code.kept[edges.first], code.kept[edges.second]
+    order = np.argsort(np.minimum(here, there))
+    left, middle = np.minimum(here, there)[order], ((angle[here] + angle[there]) / 2)[order]
+    rising, cell = (there > here)[order], code.binary[edges.second][order]
+    consecutive = (rising[1:] == rising[:-1]) & (np.abs(np.diff(cell)) == 1) & (gaps[left[1:]] == gaps[left[:-1]])
+    if np.count_nonzero(consecutive) < FEWEST_EDGES // 2:
+        return np.nan
+    return float(np.median(np.abs(np.diff(middle))[consecutive])) / TWO_PI
+
+
+def _with_reach(reader: AxisReader, frames: AxisFrames, code: _Code, result: Agreement) -> Agreement:
+    """Where the coordinates lie that the code tells, to within the cells that were read."""
+    if code.known != (1 << code.count) - 1 or len(code.kept) < FEWEST_PIXELS:
+        return result
+    cell = frames.cell_of(code.count)
+    return _reach(code.binary * cell + frames.origin_px, reader.swing[code.kept], cell, frames.extent, result)
+
+
+def _reach(
+    coordinate: np.ndarray, weight: np.ndarray, cell: float, extent: int | None, result: Agreement
+) -> Agreement:  # fmt: skip
+    """``coordinate``: where cells of so many px begin."""
+    result = replace(result, reach_px=float(np.quantile(coordinate + cell, 0.995)) if len(coordinate) else np.nan)
+    if extent is None:
+        return result
+    beyond = (coordinate > extent - 0.5 + OUTSIDE_PX) | (coordinate + cell < -0.5 - OUTSIDE_PX)
+    return replace(result, outside=float(weight[beyond].sum() / max(float(weight.sum()), 1e-9)))
+
+
+def coordinates(reader: AxisReader, frames: AxisFrames) -> np.ndarray:
+    """(p,) float64 projector px of all pixels of the sample, to within a cell of the bits that can be read; NaN where
+    they are not read.
+    """
+    out = np.full(len(reader.illuminated), np.nan)
+    if len(reader.swing) == 0:
+        return out
+    if frames.bits:
+        code = _read_code(reader, frames)
+        out[reader.seen[code.kept]] = code.binary * frames.cell_of(code.count) + frames.origin_px
+    else:
+        found = _levels(reader, frames)
+        if found is not None:
+            out[reader.seen] = found[2]
+    return out
+
+
+def _of_levels(reader: AxisReader, frames: AxisFrames, result: Agreement) -> Agreement:
+    """Of several periods without a Gray code."""
+    found = _levels(reader, frames)
+    if found is None:
+        return result
+    common, turns, coordinate, weight = found
+    result = replace(result, level_common=common, level_turns=turns)
+    return _reach(coordinate, weight, 0.0, frames.extent, result)
+
+
+def _levels(
+    reader: AxisReader, frames: AxisFrames
+) -> tuple[tuple[float, ...], tuple[float, ...], np.ndarray, np.ndarray] | None:
+    """Concentration and mean of the step to each finer level, coordinates (p,) in px, and the weight of each pixel."""
+    phasors = [reader.phasor(images, frames) for _, images in frames.shifts]
+    if any(p is None for p in phasors) or not len(reader.swing):
+        return None
+    wrapped = [np.angle(p) for p in phasors if p is not None]
+    weight = np.minimum.reduce([np.abs(p) for p in phasors if p is not None])
+    periods = tuple(period for period, _ in frames.shifts)
+    try:
+        levels = plan_levels(periods, frames.extent or 1)
+    except InputError:  # periods that cover the projector not at all leave the phase relative
+        return None
+    common, turns_all = [], []
+    coordinate = np.zeros(len(weight))
+    for number, level in enumerate(levels):
+        angle = sum(w * psi.astype(np.float64) for w, psi in zip(level.weights, wrapped, strict=True) if w)
+        own = angle * (level.period_px / TWO_PI)
+        if number == 0:
+            low = lowest_coordinate(level.period_px, frames.extent or int(level.period_px))
+            coordinate = own - np.floor((own - low) / level.period_px) * level.period_px
+            continue
+        turns = (coordinate - own) / level.period_px
+        mean = complex((weight * np.exp(1j * TWO_PI * turns)).sum()) / max(float(weight.sum()), 1e-9)
+        common.append(abs(mean))
+        turns_all.append(float(np.angle(mean)) / TWO_PI)
+        coordinate = own + np.rint(turns) * level.period_px
+    return tuple(common), tuple(turns_all), coordinate, weight

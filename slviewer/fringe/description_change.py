@@ -1,0 +1,226 @@
+"""Changes of one axis' description with which its frames agree: bits, signs, offsets, cells, periods and sizes."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from slviewer.fringe.agreement_tests import (
+    MAX_BEGIN_TURNS,
+    MAX_LEVEL_TURNS,
+    MAX_OUTSIDE,
+    SURE,
+    Answer,
+    failed_tests,
+    is_certain,
+    is_sure,
+    score_of,
+    wrap,
+)
+from slviewer.fringe.axis_agreement import (
+    FEWEST_EDGES,
+    Agreement,
+    AxisFrames,
+    AxisReader,
+    agreement,
+    common_phase,
+    described_frames,
+    reversed_bits,
+)
+from slviewer.fringe.contradiction import Contradiction
+from slviewer.fringe.sequence import Axis, PatternSequence
+
+CLEARLY = 0.1
+"""By which the shares of one hypothesis must exceed those of a simpler one."""
+GAMMAS = (1.6, 1.9, 2.2, 2.5)
+LINES = {"x": "columns", "y": "rows"}
+
+
+def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> list[Answer]:
+    """The fewest changes of one axis' description with which its frames agree; several where they do so equally."""
+    answers: list[Answer] = []
+    for variant, changes in _variants(described_frames(sequence, axis), axis):
+        explain = _with_values if variant.bits else _with_offset
+        answer = explain(reader, variant, axis, changes)
+        if answer is not None:
+            answers.append(answer)
+    if not answers:
+        return []
+    fewest = min(_count(answer) for answer in answers)
+    answers = sorted((a for a in answers if _count(a) == fewest), key=lambda a: -a.score)
+    # Several gammas fit more or less: the best of them stands for all.
+    first = answers[0].contradictions[0].cause
+    return [
+        answers[0],
+        *(a for a in answers[1:] if a.contradictions[0].cause != first and a.score > answers[0].score - CLEARLY),
+    ]
+
+
+def _count(answer: Answer) -> int:
+    return len(answer.contradictions)
+
+
+def _variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list[Contradiction]]]:
+    """The description with bits, phase sign or both changed; and what each change means."""
+    bits: list[tuple[AxisFrames, list[Contradiction]]] = [(frames, [])]
+    if len(frames.bits) - frames.complementary > 1:
+        text = f"the Gray bits of axis {axis} are in reverse order, the least significant first: number them backwards"
+        bits.append((reversed_bits(frames), [Contradiction("bit-order", text, axis, None)]))
+        text = f"the Gray bits of axis {axis} are inverted: exchange each bit with its inverse"
+        inverted = replace(frames, inverted=True)
+        bits.append((inverted, [Contradiction("bit-order", text, axis, None)]))
+    for variant, changes in bits:
+        yield variant, changes
+        if frames.shifts:
+            flipped = replace(variant, sign=-variant.sign)
+            text = (
+                f"the phase of axis {axis} falls where the coordinate rises: set phase_sign = {flipped.sign} for axis "
+                f"{axis}"
+            )
+            yield flipped, [*changes, Contradiction("step-order", text, axis, float(flipped.sign))]
+    if frames.shifts and not frames.bits:
+        for gamma in GAMMAS:
+            text = (
+                f"the light of the projector or the camera follows the grey level by a gamma of about {gamma:g}, and "
+                f"{len(frames.shifts[-1][1])} phase steps cannot average that out: set the projector's gamma to 1, or "
+                "take more steps"
+            )
+            yield replace(frames, gamma=gamma), [Contradiction("gamma", text, axis, gamma)]
+
+
+def _with_values(
+    reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
+) -> Answer | None:  # fmt: skip
+    """The changes, and the values besides them with which all tests are passed; None if there are none."""
+    a = agreement(reader, frames)
+    failed = failed_tests(frames, a)
+    out = list(changes)
+    if failed & {"bits", "rule", "rising"} or not a.rule > SURE or a.edges < FEWEST_EDGES:
+        return None
+    if frames.fringe is not None:
+        period = frames.fringe[0]
+        if failed & {"common", "cell"}:
+            cell, common, begin = _best_cell(frames, a)
+            if common < SURE or not a.rising > SURE:
+                return None
+            a = replace(a, common=common, begin_turns=begin)
+            fitting = period * frames.cell_px / cell
+            out.append(
+                Contradiction(
+                    "gray-cell",
+                    f"a cell of the Gray code of axis {axis} holds {cell / period:.3g} fringes, and "
+                    f"{frames.cell_px / period:.3g} were described: set gray_cell_px = {cell:.4g}, or "
+                    f"period_px = {fitting:.4g} if the cells are right",
+                    axis,
+                    cell,
+                )
+            )
+        elif a.common < SURE or a.rising < SURE:
+            return None
+        late = wrap(a.begin_turns - frames.origin_px / period)
+        if out and out[-1].cause == "step-order" and abs(wrap(late + 1 / len(frames.fringe[1]))) < abs(late):
+            n = len(frames.fringe[1])
+            text = (
+                f"the {n} phase steps of axis {axis} are in reverse order: number them backwards, or set "
+                f"phase_sign = {frames.sign} and phase_offset = {-2 * np.pi / n:.3f}"
+            )
+            out[-1] = Contradiction("step-order", text, axis, float(frames.sign))
+            late = wrap(late + 1 / n)
+        if abs(late) > MAX_BEGIN_TURNS:
+            out += _phase_shifted(frames, a, late, axis)
+    if a.outside > MAX_OUTSIDE:
+        out += too_small(frames, a, axis)
+    return Answer(tuple(out), score_of(a), is_certain(a)) if out else None
+
+
+def _best_cell(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
+    """(px, concentration, turns): the width of the Gray cells for which all edges fall at one phase."""
+    assert frames.fringe is not None and a.borders is not None
+    angle, border, weight = a.borders
+    turns = a.turns_per_cell if np.isfinite(a.turns_per_cell) else frames.cell_px / frames.fringe[0]
+    best = (frames.cell_px, 0.0, 0.0)
+    for ratio in np.arange(0.88, 1.121, 0.0005) * turns:
+        common, begin = common_phase(angle, border * ratio, weight)
+        if common > best[1]:
+            best = (float(ratio * frames.fringe[0]), common, begin)
+    return best
+
+
+def _phase_shifted(frames: AxisFrames, a: Agreement, late: float, axis: Axis) -> list[Contradiction]:
+    """Fringes and Gray code apart by ``late`` periods: either of them may begin elsewhere than described."""
+    assert frames.fringe is not None
+    period, steps = frames.fringe[0], len(frames.fringe[1])
+    offset = wrap((frames.offset_rad + 2 * np.pi * late) / (2 * np.pi)) * 2 * np.pi
+    share = share_of_period(2 * np.pi * late)
+    shifted = Contradiction(
+        "phase-offset",
+        f"the phase steps of axis {axis} begin {share} than described: set phase_offset = {offset:.3f}",
+        axis,
+        offset,
+    )
+    origin = a.begin_turns - np.ceil(a.begin_turns - 0.25)
+    moved = Contradiction(
+        "gray-origin",
+        f"the Gray code of axis {axis} begins {share.rsplit(' ', 1)[0]} of the fringes from where it was described: "
+        f"set gray_origin = {origin * period:.2f}",
+        axis,
+        float(origin * period),
+    )
+    by_step = min(abs(wrap(late - k / steps)) for k in range(1, steps)) < 0.03 and abs(abs(late) - 0.5) > 0.05
+    by_quarter = abs(abs(late) - 0.25) < 0.05
+    return [shifted, moved] if by_quarter or by_step else [moved, shifted]
+
+
+def too_small(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradiction]:
+    """Coordinates beyond the projector."""
+    assert frames.extent is not None
+    seen = (
+        f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector's {frames.extent} {LINES[axis]} and "
+        f"reach {a.reach_px:.0f}"
+    )
+    size = f"{seen}: give the size of the projector that was used"
+    out = [Contradiction("projector-size", size, axis, a.reach_px)]
+    if frames.shifts:
+        period = frames.shifts[-1][0] * frames.extent / a.reach_px
+        text = f"{seen}: or the fringe period is {period:.3g} px or less: correct period_px"
+        out.append(Contradiction("fringe-period", text, axis, period))
+    return out
+
+
+def _with_offset(
+    reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
+) -> Answer | None:  # fmt: skip
+    """The same where several periods number the fringes."""
+    a = agreement(reader, frames)
+    failed = failed_tests(frames, a)
+    if "levels" in failed or not is_sure(frames, a):
+        return None
+    if not failed:
+        return Answer(tuple(changes), score_of(a), is_certain(a)) if changes else None
+    if failed == {"outside"}:
+        return Answer((*changes, *too_small(frames, a, axis)), score_of(a), is_certain(a))
+    steps = len(frames.shifts[-1][1])
+    best: tuple[float, AxisFrames, Agreement] | None = None
+    for turns in (0.25, -0.25, 0.5, *(wrap(k / steps) for k in range(1, steps))):
+        turned = replace(frames, offset_rad=frames.offset_rad + 2 * np.pi * turns)
+        b = agreement(reader, turned)
+        apart = max(map(abs, b.level_turns))
+        if not failed_tests(turned, b) and apart < MAX_LEVEL_TURNS / 4 and (best is None or apart < best[0]):
+            best = apart, turned, b
+    if best is None:
+        return None
+    offset = wrap(best[1].offset_rad / (2 * np.pi)) * 2 * np.pi
+    text = f"the phase steps of axis {axis} begin {share_of_period(offset - frames.offset_rad)} than described"
+    if changes:  # a sign and an offset: the steps in reverse order
+        text = f"the {steps} phase steps of axis {axis} are in reverse order, or"
+        cure = f"set phase_sign = {frames.sign} and phase_offset = {offset:.3f} for axis {axis}"
+        out = Contradiction("step-order", f"{text} begin elsewhere: {cure}", axis, float(frames.sign))
+        return Answer((out,), score_of(best[2]), is_certain(best[2]))
+    out = Contradiction("phase-offset", f"{text}: set phase_offset = {offset:.3f}", axis, offset)
+    return Answer((out,), score_of(best[2]), is_certain(best[2]))
+
+
+def share_of_period(angle: float) -> str:
+    turns = wrap(angle / (2 * np.pi))
+    share = {0.25: "a quarter period", 0.5: "half a period"}.get(round(abs(turns) * 20) / 20)
+    return f"{share or f'{abs(turns):.2f} periods'} {'later' if turns > 0 else 'earlier'}"

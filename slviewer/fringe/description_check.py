@@ -1,0 +1,170 @@
+"""Whether the description of a capture fits its frames, and which other description or order of the frames would.
+
+A hypothesis is believed when the description fails a test that it passes: code edges obey the Gray code, fall at one
+phase of the fringes, and the phase rises with the code; each fringe period leads to the next finer one; coordinates lie
+inside the projector and are no mirror image of the scene.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from slviewer.fringe.agreement_tests import failed_tests, is_sure, score_of
+from slviewer.fringe.axis_agreement import Agreement, AxisReader, agreement, coordinates, described_frames
+from slviewer.fringe.contradiction import Contradiction
+from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
+from slviewer.fringe.frame_order import fitting_order, misplaced_steps, unexplained_steps
+from slviewer.fringe.layout import check_stack
+from slviewer.fringe.line_sample import LineSample, coded_frames, grid_sample, sample_lines
+from slviewer.fringe.sequence import Axis, PatternSequence
+
+LEAST_ILLUMINATED = 0.005
+"""Share of the pixels that must carry a pattern."""
+MOSTLY = 0.5
+APART = 6
+"""Pixels of the grid over which coordinates are compared: several cells of the code."""
+FEWEST_TURNS = 100
+MIRRORED = 0.8
+"""Share of the pixels that see a mirror image where an axis is reversed; elsewhere they are noise and depth steps."""
+
+
+def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
+    """What in the description of an (n, h, w) stack contradicts its frames, the most probable first; empty where the
+    description holds. Some rows and columns are read, weighed by modulation. Raises InputError for a stack that is none
+    of this sequence.
+    """
+    check_stack(sequence, stack)
+    if not sequence.axes:
+        return ()
+    sample = sample_lines(sequence, stack)
+    readers = {axis: AxisReader(sample, coded_frames(sequence, axis)) for axis in sequence.axes}
+    if dark := _without_pattern(sequence, sample):
+        return dark
+    stated = {axis: agreement(readers[axis], described_frames(sequence, axis)) for axis in sequence.axes}
+    failed = {axis: failed_tests(described_frames(sequence, axis), stated[axis]) for axis in sequence.axes}
+    disordered = [c for axis in sequence.axes for c in misplaced_steps(sequence, axis, sample)]
+    strange = set() if disordered else unexplained_steps(sequence, sample)
+    if not any(failed.values()) and not disordered and not strange:
+        return _mirrored(sequence, sample)
+    if disordered and all(contradiction.cause in ("duplicate-frame", "frame-order") for contradiction in disordered):
+        return tuple(disordered)  # steps of one period, which says all about them
+    if exchanged := _axes_exchanged(sequence, readers, failed):
+        return exchanged
+    answers = {axis: explain_axis(readers[axis], sequence, axis) for axis in sequence.axes if failed[axis]}
+    explained = [answers[axis][0].score if answers.get(axis) else score_of(stated[axis]) for axis in sequence.axes]
+    complete = all(answers.values()) and not disordered and not strange
+    if not (complete and all(answers[axis][0].is_certain for axis in answers)):
+        order = fitting_order(sequence, sample, readers, disordered, strange)
+        if order is not None and not (complete and sum(explained) > order.score - CLEARLY):
+            return order.contradictions
+    out = list(disordered)
+    for axis in sequence.axes:
+        if answers.get(axis):
+            out += [contradiction for answer in answers[axis] for contradiction in answer.contradictions]
+        elif failed[axis] and not disordered:
+            out.append(_unexplained(axis, stated[axis], failed[axis]))
+    return tuple(dict.fromkeys(out))
+
+
+def _without_pattern(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
+    """Captures that are dark, saturated, or show no pattern."""
+    seen = sample.grid[coded_frames(sequence)].astype(np.float32)
+    high, low = seen.max(axis=0), seen.min(axis=0)
+    share = float(np.mean(high - low > sample.least_swing))
+    if share >= LEAST_ILLUMINATED:
+        return ()
+    clipped, modulation = float(np.mean(low >= sample.white)), float(np.quantile(high - low, 0.99)) / 2
+    seen_text = f"{100 * share:.1f} % of the pixels carry a readable pattern"
+    if clipped > MOSTLY:
+        return (
+            Contradiction(
+                "saturation",
+                f"{seen_text}, and {100 * clipped:.0f} % are saturated in all frames: lower the exposure or the gain, "
+                "and capture again",
+                None,
+                clipped,
+            ),
+        )
+    return (
+        Contradiction(
+            "dark",
+            f"{seen_text}; the modulation is {modulation:.1f} of {sample.white:.0f} grey levels: raise the exposure or "
+            "the projector's brightness, and check that the projector showed the patterns",
+            None,
+            modulation,
+        ),
+    )
+
+
+def _axes_exchanged(
+    sequence: PatternSequence, readers: dict[Axis, AxisReader], failed: dict[Axis, set[str]]
+) -> tuple[Contradiction, ...]:
+    """Both axes fit, each described as the other."""
+    if len(sequence.axes) < 2 or not any(failed.values()):
+        return ()
+    other: dict[Axis, Axis] = {"x": "y", "y": "x"}
+    for axis in sequence.axes:
+        frames = described_frames(sequence, other[axis])
+        frames = replace(frames, extent=described_frames(sequence, axis).extent)
+        a = agreement(readers[other[axis]], frames)
+        if failed_tests(frames, a) or not is_sure(frames, a):
+            return ()
+    return (_exchanged_axes("the codes along x fit the projector's rows, and those along y its columns"),)
+
+
+def _exchanged_axes(seen: str) -> Contradiction:
+    text = f"{seen}: x and y are exchanged; exchange the x and y (V and H) frames in the description"
+    return Contradiction("axes-swapped", text, None, None)
+
+
+def _mirrored(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
+    """Axes exchanged or reversed: of what camera and projector both see from the front, neither sees a mirror image."""
+    if len(sequence.axes) < 2:
+        return ()
+    grid = grid_sample(sample)
+    shape = sample.grid.shape[1:]
+    u, v = (
+        coordinates(AxisReader(grid, coded_frames(sequence, axis)), described_frames(sequence, axis)).reshape(shape)
+        for axis in sequence.axes
+    )
+    here, right, below = np.s_[:-APART, :-APART], np.s_[:-APART, APART:], np.s_[APART:, :-APART]
+    ux, uy, vx, vy = u[right] - u[here], u[below] - u[here], v[right] - v[here], v[below] - v[here]
+    turn = ux * vy - uy * vx
+    known = np.isfinite(turn) & (turn != 0)
+    if np.count_nonzero(known) < FEWEST_TURNS:
+        return ()
+    share = float(np.mean(turn[known] < 0))
+    if share < MIRRORED:
+        return ()
+    seen = f"the projector's coordinates are a mirror image of what the camera sees ({100 * share:.0f} % of the pixels)"
+    along, across = (float(np.median(np.abs(a[known]))) for a in (ux, uy))
+    if across > along:  # devices that stand upright
+        return (_exchanged_axes(seen),)
+    reversed_x = float(np.median(ux[known])) < 0
+    axis: Axis = "x" if reversed_x else "y"
+    cure = f"number the projector's {LINES[axis]} from the other end, or switch off its mirror or rear mode"
+    out = [Contradiction("axis-reversed", f"{seen}, as if axis {axis} were reversed: {cure}", axis, None)]
+    if not sequence.find("gray", axis):
+        sign = -sequence.sign(axis)
+        text = f"{seen}, as if the phase of axis {axis} ran backwards: set phase_sign = {sign} for axis {axis}"
+        out.insert(0, Contradiction("step-order", text, axis, float(sign)))
+    return tuple(out)
+
+
+def _unexplained(axis: Axis, a: Agreement, failed: set[str]) -> Contradiction:
+    """What was seen, where no hypothesis explains it."""
+    if "bits" in failed:
+        seen = f"Gray bit {a.unreadable} of axis {axis} cannot be read though its stripes should be wide"
+    elif "rule" in failed:
+        seen = f"{100 * (1 - a.rule):.0f} % of the edges of a Gray bit of axis {axis} contradict the other bits"
+    elif failed & {"common", "rising", "cell"}:
+        seen = f"the edges of the Gray code of axis {axis} fall at no common phase of the fringes"
+    elif failed & {"levels", "level offset"}:
+        seen = f"the fringe periods of axis {axis} contradict each other"
+    else:
+        seen = f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector"
+    text = (
+        f"{seen}, and no other order, numbering or size explains it: check that all frames belong to one capture, that "
+        "nothing moved, and the periods, steps and bits of the description"
+    )
+    return Contradiction("unreadable", text, axis, None)

@@ -1,0 +1,132 @@
+"""An order of the frames in which a capture fits its description: late, missing, repeated and exchanged images."""
+
+from collections.abc import Iterator
+
+from slviewer.fringe.agreement_tests import Answer, failed_tests, is_sure, score_of
+from slviewer.fringe.axis_agreement import AxisFrames, AxisReader, agreement, described_frames
+from slviewer.fringe.contradiction import Contradiction
+from slviewer.fringe.layout import Shift
+from slviewer.fringe.line_sample import LineSample
+from slviewer.fringe.residual_order import order_suspects, strange_suspects
+from slviewer.fringe.residual_sample import Fringe, fringe
+from slviewer.fringe.sequence import Axis, PatternSequence
+
+SAID = 0.5
+"""What a hypothesis gains that the phase steps name by themselves."""
+
+Images = tuple[int | None, ...]
+
+
+def misplaced_steps(
+    sequence: PatternSequence, axis: Axis, sample: LineSample, images: Images | None = None
+) -> list[Contradiction]:
+    """Phase steps out of order, by what a cosine through all of them leaves."""
+    out = []
+    causes = {"late": "duplicate-frame", "dropped": "missing-frame", "lag": "frame-lag"}
+    for sampled in _sampled_steps(sequence, axis, sample, images):
+        for suspect in order_suspects(sampled):
+            cause = causes.get(suspect.fault, "frame-order")
+            text = f"{suspect.sentence}: put the frames in order, or capture again"
+            out.append(Contradiction(cause, text, axis, float(suspect.frame)))
+    return out
+
+
+def unexplained_steps(sequence: PatternSequence, sample: LineSample, images: Images | None = None) -> set[int]:
+    """Frames that no step of their period explains."""
+    return {
+        suspect.frame
+        for axis in sequence.axes
+        for sampled in _sampled_steps(sequence, axis, sample, images)
+        if sampled.steps > 3
+        for suspect in strange_suspects(sampled)
+    }
+
+
+def fitting_order(
+    sequence: PatternSequence,
+    sample: LineSample,
+    readers: dict[Axis, AxisReader],
+    disordered: list[Contradiction],
+    strange: set[int],
+) -> Answer | None:
+    """The order of the frames in which all tests are passed best; None if there is none. ``disordered``: what the phase
+    steps alone say; ``strange``: those that no step explains.
+    """
+    said = {(contradiction.cause, contradiction.value) for contradiction in disordered}
+    passed: list[Answer] = []
+    orders: dict[int, Images] = {}
+    for images, contradiction, penalty in _orders(sequence):
+        score, sure = -penalty, False
+        for axis in sequence.axes:
+            frames = described_frames(sequence, axis, images)
+            a = agreement(readers[axis], frames)
+            if failed_tests(frames, a) or not (is_sure(frames, a) or _lacks_steps(frames)):
+                break
+            sure |= is_sure(frames, a)
+            score += score_of(a)
+        else:
+            if sure:
+                score += SAID * ((contradiction.cause, contradiction.value) in said)
+                orders[len(passed)] = images
+                passed.append(Answer((contradiction,), score))
+    for i in sorted(range(len(passed)), key=lambda i: -round(passed[i].score / 0.02)):
+        images = orders[i]
+        ordered = not any(misplaced_steps(sequence, axis, sample, images) for axis in sequence.axes)
+        if ordered and not unexplained_steps(sequence, sample, images):
+            return passed[i]
+    return None
+
+
+def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, float]]:
+    """Images by frame, how that came about, and a penalty for frames that are nowhere; the simplest first."""
+    n = len(sequence.frames)
+    for lag in (1, 2, -1):
+        images = tuple(i + lag if 0 <= i + lag < n else None for i in range(n))
+        count = "one image" if abs(lag) == 1 else f"{abs(lag)} images"
+        way = (
+            "behind the projector: let the camera wait longer after each pattern"
+            if lag > 0
+            else ("ahead of the projector: the first frame is missing")
+        )
+        text = f"all frames are {count} {way}, and capture again, or move the files by {count}"
+        yield images, Contradiction("frame-lag", text, None, float(lag)), 0.0
+    for k in range(n - 1):
+        images = (*range(k), k + 1, k, *range(k + 2, n))
+        text = f"frames {k + 1} and {k + 2} have changed places: exchange these two files, or capture again"
+        yield images, Contradiction("frame-order", text, sequence.frames[k].axis, float(k)), 0.0
+    for k in range(1, n):
+        images = (*range(k), *(i + 1 if i + 1 < n else None for i in range(k, n)))
+        text = (
+            f"from frame {k + 1} on the camera is one image behind the projector, and image {k + 1} repeats the one "
+            "before: capture again"
+        )
+        yield images, Contradiction("frame-lag", text, sequence.frames[k].axis, float(k)), 0.05
+        images = (*range(k), None, *range(k, n - 1))
+        text = f"frame {k + 1} is missing, and those that follow come one place too early: add it, or capture again"
+        yield images, Contradiction("missing-frame", text, sequence.frames[k].axis, float(k)), 0.1
+    for k in range(n):
+        images = (*range(k), None, *range(k + 1, n))
+        text = f"frame {k + 1} shows something else than described, or another frame's pattern: capture again"
+        yield images, Contradiction("duplicate-frame", text, sequence.frames[k].axis, float(k)), 0.2
+
+
+def _sampled_steps(
+    sequence: PatternSequence, axis: Axis, sample: LineSample, images: Images | None
+) -> Iterator[Fringe]:  # fmt: skip
+    """The fringes of each period all of whose steps are there."""
+    lines = sample.lines
+    if images is not None:
+        lines = lines[[i if image is None else image for i, image in enumerate(images)]]
+    for period, there in described_frames(sequence, axis, images).shifts:
+        if None in there:
+            continue
+        described = [i for i in sequence.find("phase", axis) if sequence.frames[i].period_px == period]
+        described.sort(key=lambda i: sequence.frames[i].step)
+        sampled = fringe(lines, Shift(period, tuple(described)), (0.0, 0.0), sample.white)
+        if sampled is not None:
+            yield sampled
+
+
+def _lacks_steps(frames: AxisFrames) -> bool:
+    """Whether too many steps are missing to compare its periods."""
+    return not frames.bits and any(sum(image is not None for image in images) < 3 for _, images in frames.shifts)
