@@ -18,8 +18,9 @@ DECIDED = 0.2
 """Of the swing, that a bit must lie away from the middle to be read."""
 DECIDED_SIGMAS = 3.0
 """And so many standard deviations of the noise."""
-REACH = 4
-"""px between two read pixels that count as neighbours: an edge blurred over so many is still one edge."""
+REACH = (4, 16)
+"""px between two read pixels that count as neighbours, at least and at most: an edge blurred over so many is still one
+edge. In between it is a third of the finest stripe's width, which leaves the next edge out of reach."""
 READABLE_STRIPE = 6.0
 """px: mean width of stripes that most pixels are inside of."""
 READABLE_SHARE = 0.5
@@ -204,7 +205,8 @@ def agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
 
 @dataclass(frozen=True, eq=False)
 class _Code:
-    """Of the pixels in ``kept`` (indices): the first ``count`` bits as a Gray number; ``known`` masks its bits."""
+    """Of the pixels in ``kept`` (indices): the first ``count`` bits as a Gray number; ``known`` masks its bits;
+    ``reach`` px between neighbours."""
 
     kept: np.ndarray
     gray: np.ndarray
@@ -212,6 +214,7 @@ class _Code:
     count: int
     known: int
     unreadable: int | None
+    reach: float = REACH[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +251,8 @@ def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
     while shift < count:
         binary ^= binary >> shift
         shift *= 2
-    return _Code(kept, gray, binary, count, known, unreadable)
+    reach = float(np.clip(chosen[-1][1][3] / 3, *REACH))
+    return _Code(kept, gray, binary, count, known, unreadable, reach)
 
 
 def _first_unreadable(
@@ -269,7 +273,7 @@ def _first_unreadable(
 def _rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
     """Share of each bit's edges that obey the Gray code, the least of all bits; and the edges that obey."""
     kept = code.kept
-    near = (np.diff(reader.place[kept]) <= REACH) & (np.diff(reader.line[kept]) == 0)
+    near = (np.diff(reader.place[kept]) <= code.reach) & (np.diff(reader.line[kept]) == 0)
     change = (code.gray[1:] ^ code.gray[:-1]) * near
     at = np.flatnonzero(change)
     change = change[at]
@@ -294,9 +298,12 @@ def _with_phase(
     reader: AxisReader, frames: AxisFrames, code: _Code, edges: _Edges, phasor: np.ndarray, result: Agreement
 ) -> Agreement:  # fmt: skip
     assert frames.fringe is not None
-    below, above = phasor[code.kept[edges.first]], phasor[code.kept[edges.second]]
-    weight = np.minimum(np.abs(below), np.abs(above))
-    step = np.angle(above * np.conj(below))
+    turned, gaps = _unwrapped(reader, phasor)
+    first, second = code.kept[edges.first], code.kept[edges.second]
+    below, above = phasor[first], phasor[second]
+    # Between an edge's pixels, several px apart, a fine fringe turns by more than half a period.
+    weight = np.minimum(np.abs(below), np.abs(above)) * (gaps[first] == gaps[second])
+    step = turned[second] - turned[first]
     angle = np.angle(below) + step / 2
     border = code.binary[edges.second].astype(np.float64)
     per_cell = _turns_per_cell(reader, code, edges, phasor)
@@ -327,12 +334,17 @@ def common_phase(angle: np.ndarray, border_turns: np.ndarray, weight: np.ndarray
     return abs(mean), float((centre / TWO_PI + 0.5) % 1 - 0.5)
 
 
-def _turns_per_cell(reader: AxisReader, code: _Code, edges: _Edges, phasor: np.ndarray) -> float:
-    """Fringes between two successive edges of the code along a line, the median."""
+def _unwrapped(reader: AxisReader, phasor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(p,) phase in rad, unwrapped from pixel to pixel along each line; and how many gaps come before each pixel."""
     adjacent = (np.diff(reader.place) == 1) & (np.diff(reader.line) == 0)
     steps = np.angle(phasor[1:] * np.conj(phasor[:-1]))
     angle = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
-    gaps = np.concatenate([[0], np.cumsum(~adjacent)])
+    return angle, np.concatenate([[0], np.cumsum(~adjacent)])
+
+
+def _turns_per_cell(reader: AxisReader, code: _Code, edges: _Edges, phasor: np.ndarray) -> float:
+    """Fringes between two successive edges of the code along a line, the median."""
+    angle, gaps = _unwrapped(reader, phasor)
     here, there = code.kept[edges.first], code.kept[edges.second]
     order = np.argsort(np.minimum(here, there))
     left, middle = np.minimum(here, there)[order], ((angle[here] + angle[there]) / 2)[order]

@@ -8,6 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, texture
+from slviewer.fringe.description_check import check_description
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
@@ -16,13 +17,21 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
-MAX_OUTSIDE = 0.01
-"""Share of readable pixels whose code may lie outside the projector before its size is doubted: of the right size there
-are a few along its border, and a corner of a wall beside the board may be all that tells a wrong one."""
 MANY_SATURATED = 0.05
 """Share of the illuminated pixels: highlights saturate fewer, an exposure that is too long more."""
 NEAR_DARK = 2.0
 """A median modulation within this factor of the least that is decoded: much of the scene lies below it."""
+MIN_DECODED = 0.05
+"""Share of the illuminated pixels that must decode: of sound captures, also cluttered ones, half and more do."""
+_REASONS = {
+    Reason.SATURATED: ("lie where the camera saturates", "lower the exposure or the gain, and capture again"),
+    Reason.INCONSISTENT: (
+        "contradict themselves or their neighbours",
+        "keep the scene and the light still, raise the exposure, and check the description of the frames",
+    ),
+    Reason.OUTSIDE: ("lie outside the projector", "check the size of the projector and the periods"),
+}
+"""Why illuminated pixels do not decode, and what to do."""
 
 
 def decode_capture(
@@ -56,30 +65,28 @@ def decode_frames(name: str, sequence: PatternSequence, frames: np.ndarray) -> d
     return phases
 
 
-def check_projector(name: str, sequence: PatternSequence, phases: dict[Axis, PhaseMap]) -> None:
-    """Raise InputError where the codes that were seen contradict the projector's size."""
+def check_capture(
+    name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
+) -> None:  # fmt: skip
+    """Raise InputError where the frames (n, h, w) contradict their description, or next to nothing of them decodes."""
+    if found := check_description(sequence, frames):
+        others = "".join(f"; or {c.message}" for c in found[1:] if c.axis == found[0].axis)
+        raise InputError(f"{name}: {found[0].message}{others}")
     for axis, phase in phases.items():
-        outside = np.count_nonzero(phase.reason == Reason.OUTSIDE)
-        inside = np.count_nonzero(phase.mask)
-        saturated = np.count_nonzero(phase.reason == Reason.SATURATED)
-        if inside + outside == 0 and saturated > 0.5 * np.count_nonzero(phase.lit):
-            raise InputError(
-                f"{name}: no pixel carries a readable {axis} pattern: the camera saturates in "
-                f"{100 * saturated / phase.reason.size:.0f} % of the image; lower the exposure, then capture again"
-            )
-        if inside + outside == 0:
-            raise InputError(
-                f"{name}: no pixel carries a readable {axis} pattern: are the frames in order, "
-                "and was the projector bright enough?"
-            )
-        if outside > MAX_OUTSIDE * (inside + outside):
-            width, height = sequence.projector
-            extent = width if axis == "x" else height
-            what = "columns" if axis == "x" else "rows"
-            raise InputError(
-                f"{name}: {100 * outside / (inside + outside):.1f} % of the {axis} codes lie outside the projector's "
-                f"{extent} {what}: give the size of the projector that was used, instead of {width}x{height}"
-            )
+        illuminated, decoded = np.count_nonzero(phase.lit), np.count_nonzero(phase.mask)
+        if decoded and decoded >= MIN_DECODED * illuminated:
+            continue
+        if illuminated:
+            share = f"{decoded} of {illuminated} illuminated pixels ({100 * decoded / illuminated:.1f} %) decode"
+            shares = [np.mean(phase.reason[phase.lit] == reason) for reason in _REASONS]
+            worst = int(np.argmax(shares))
+            seen, cure = list(_REASONS.values())[worst]
+            raise InputError(f"{name}: {share} along {axis}, {100 * shares[worst]:.0f} % {seen}: {cure}")
+        middle = float(np.median(phase.modulation))
+        raise InputError(
+            f"{name}: no pixel carries a readable {axis} pattern (median modulation {middle:.1f} grey levels): raise "
+            "the exposure or the projector's brightness"
+        )
 
 
 def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> list[str]:

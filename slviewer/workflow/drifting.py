@@ -14,7 +14,7 @@ from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
-from slviewer.workflow.decoding import capture_texture, check_projector, decode_capture
+from slviewer.workflow.decoding import capture_texture, check_capture, decode_capture
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import load_stereo, warn_if_stale
 from slviewer.workflow.opening import SessionLike, opened
@@ -88,7 +88,7 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
         progress(0.0, f"reading {capture}")
         frames = shot.stack()
         phases = decode_capture(shot, frames)
-        check_projector(capture, shot.sequence, phases)
+        check_capture(capture, shot.sequence, frames, phases)
         check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
         board = Board.parse(stereo.board)
         observation = observe(capture, board, detect(board, capture_texture(shot, frames)), phases, _smoothing(store))

@@ -8,6 +8,7 @@ from slviewer.calibration.diagnosis.evidence import PoseEvidence
 from slviewer.calibration.diagnosis.frames import axis_evidence, mean_turn, moved_px, white_displaced
 from slviewer.calibration.diagnosis.numbering import seen_grid
 from slviewer.calibration.observe import Observation, pitch_px
+from slviewer.fringe.description_check import check_description
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.capture import Capture
@@ -16,7 +17,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 from slviewer.workflow.trust import residuals
 
-LOOK = 2
+LOOK = 3
 """How poses are examined; what a session keeps of another look is looked at anew."""
 
 
@@ -47,6 +48,7 @@ def examine(
         if found is None
         else moved_px(sequence, frames, found.pixels, float(np.median(pitch_px(board, found)))),
         turn=None if seen is None else mean_turn(seen.camera, seen.projector),
+        contradictions=check_description(sequence, frames) if refused else (),
     )
 
 

@@ -27,7 +27,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
-from slviewer.workflow.decoding import check_projector, decode_frames
+from slviewer.workflow.decoding import check_capture, decode_frames
 from slviewer.workflow.evidence import examine
 
 BOARD = Board.parse("circles:21x16:9")
@@ -118,7 +118,7 @@ class Bench:
         try:
             found = detect(board, image)
             seen = observe(name, board, found, phases)
-            check_projector(name, sequence, phases)
+            check_capture(name, sequence, frames, phases)
         except InputError as error:
             refused = str(error)
         evidence = examine(name, sequence, frames, phases, board, image, found, seen, refused)

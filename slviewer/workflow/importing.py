@@ -11,12 +11,12 @@ from typing import Any, Literal, get_args
 
 from slviewer.errors import InputError
 from slviewer.fringe.origin import estimate_gray_origin
-from slviewer.fringe.sequence import parse_size
+from slviewer.fringe.sequence import PerAxis, parse_size
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportedCapture, Imports, Recording, Skipped, none_usable
 from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
 from slviewer.session.store import Session, is_session
-from slviewer.workflow.decoding import check_projector, decode_frames
+from slviewer.workflow.decoding import check_capture, decode_frames
 from slviewer.workflow.feedback import Progress, Warn, unheard, unwarned
 from slviewer.workflow.models import available
 from slviewer.workflow.opening import SessionLike, opened, opened_or_made
@@ -172,17 +172,23 @@ def _assumptions(recording: Recording, capture: ImportedCapture) -> Iterator[str
 
 
 def checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
-    """The capture, with its Gray origin found if it was not given; InputError where codes contradict the projector."""
+    """The capture, with its Gray origin estimated if it was not given; InputError where its frames contradict its
+    description.
+    """
     sequence = capture.sequence
     if not capture.settings.get("gray_origin_given", True) and any(f.kind == "gray" for f in sequence.frames):
-        origins = [
-            estimate_gray_origin(sequence, capture.frames, axis) for axis in sequence.axes if sequence.periods_px(axis)
-        ]
+        origins = {
+            axis: estimate_gray_origin(sequence, capture.frames, axis)
+            for axis in sequence.axes
+            if sequence.periods_px(axis) and sequence.find("gray", axis)
+        }
         if origins:
-            sequence = replace(sequence, gray_origin_px=origins[0])
-            warn(f"{capture.name}: Gray code 0 was found to begin at projector px {origins[0]:.2f}")
+            first = next(iter(origins.values()))
+            sequence = replace(sequence, gray_origin_px=PerAxis(origins.get("x", first), origins.get("y", first)))
+            listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
+            warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
     phases = decode_frames(capture.name, sequence, capture.frames)
-    check_projector(capture.name, sequence, phases)
+    check_capture(capture.name, sequence, capture.frames, phases)
     exposure = check_capture_exposure(sequence, capture.frames, phases)
     if exposure.verdict != "good":
         warn(f"{capture.name}: {exposure.sentence} {exposure.remedy}")

@@ -14,7 +14,7 @@ from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
-from slviewer.workflow.decoding import capture_texture, check_projector, decoded
+from slviewer.workflow.decoding import capture_texture, check_capture, decoded
 from slviewer.workflow.evidence import examine as examine_frames
 from slviewer.workflow.evidence import keep_evidence, known_evidence
 
@@ -49,7 +49,7 @@ def judge(
     try:
         found = detect(board, texture)
         seen = observe(capture.name, board, found, phases, smoothing)
-        check_projector(capture.name, capture.sequence, phases)
+        check_capture(capture.name, capture.sequence, frames, phases)
     except InputError as error:
         refused = str(error).removeprefix(f"{capture.name}: ")
     evidence = None

@@ -1,10 +1,14 @@
 """What a capture says about itself: frames that were late, lost, out of order or lit otherwise."""
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.contradiction import Contradiction
+from slviewer.fringe.description_check import check_description
 from slviewer.fringe.residual import FrameResiduals, frame_residuals
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.store import Session
@@ -26,9 +30,15 @@ def residuals(sequence: PatternSequence, stack: np.ndarray) -> list[FrameResidua
 def keep_residuals(session: Session, name: str) -> list[str]:
     """Look at a capture's frames, keep what is found as the result `trust/<name>`, and return what must be told."""
     capture = session.load_capture(name)
-    found = residuals(capture.sequence, capture.frames)
-    session.save_result(f"trust/{name}", {"inputs": session.input_hashes(name), "axes": described(found)}, {})
-    return warnings_of(found)
+    frames = capture.frames
+    found, contradictions = residuals(capture.sequence, frames), check_description(capture.sequence, frames)
+    meta = {
+        "inputs": session.input_hashes(name),
+        "axes": described(found),
+        "contradictions": [asdict(contradiction) for contradiction in contradictions],
+    }
+    session.save_result(f"trust/{name}", meta, {})
+    return warnings_of(found, contradictions)
 
 
 def told(session: Session, name: str, frames: np.ndarray) -> list[str]:
@@ -36,18 +46,27 @@ def told(session: Session, name: str, frames: np.ndarray) -> list[str]:
     result = f"trust/{name}"
     if session.state_of(result) != "fresh":
         return capture_warnings(session.load_capture(name).sequence, frames)
-    axes = session.load_result(result)[0]["axes"]
-    return _shortened([suspect["sentence"] for axis in axes for suspect in axis["suspects"]])
+    meta = session.load_result(result)[0]
+    messages = [contradiction["message"] for contradiction in meta.get("contradictions", ())]
+    return _joined(messages, [suspect["sentence"] for axis in meta["axes"] for suspect in axis["suspects"]])
 
 
 def capture_warnings(sequence: PatternSequence, stack: np.ndarray) -> list[str]:
-    """One sentence for each frame of a capture (n, h, w) that contradicts the others; none for a sound one."""
-    return warnings_of(residuals(sequence, stack))
+    """What contradicts the description of a capture (n, h, w), and each frame that contradicts the others; nothing for
+    a sound one.
+    """
+    return warnings_of(residuals(sequence, stack), check_description(sequence, stack))
 
 
-def warnings_of(found: list[FrameResiduals]) -> list[str]:
-    """The same, from what `residuals` found."""
-    return _shortened([s.sentence for axis in found for s in axis.suspects])
+def warnings_of(found: list[FrameResiduals], contradictions: Sequence[Contradiction] = ()) -> list[str]:
+    """The same, from what `residuals` and `check_description` returned."""
+    messages = [contradiction.message for contradiction in contradictions]
+    return _joined(messages, [s.sentence for axis in found for s in axis.suspects])
+
+
+def _joined(messages: list[str], sentences: list[str]) -> list[str]:
+    """Contradictions of the description, then the frames that these do not speak of already."""
+    return _shortened(messages + [s for s in sentences if not any(s in message for message in messages)])
 
 
 def _shortened(sentences: list[str]) -> list[str]:

@@ -15,6 +15,7 @@ from slviewer.calibration.diagnosis.numbering import misnumbered
 from slviewer.calibration.diagnosis.rules import judged
 from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
 from slviewer.calibration.observe import Observation
+from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.suspect import Suspect
 from slviewer.geometry.triangulation import triangulate_pixels
 
@@ -23,7 +24,7 @@ UPRIGHT = ((1.5, 0.1), (-0.1, 3.0))
 
 
 def axis(**change: float) -> AxisEvidence:
-    sound = AxisEvidence(18.0, 18, 1.0, 0.0, 0.0, 0.0, 18.0)
+    sound = AxisEvidence(18.0, 18, 1.0, 0.0, 0.0, 18.0)
     return dataclasses.replace(sound, **change)
 
 
@@ -130,11 +131,12 @@ def test_a_projector_upside_down_is_sound() -> None:
 
 def test_the_root_cause_hides_its_consequences() -> None:
     late = Suspect(0, "lag", "from frame 1 on the camera is one image behind the projector")
-    spoilt = {"refused": "no board", "suspects": (late,), "axes": {"x": axis(outside=0.3, period_seen_px=7.0)}}
+    spoilt = {"refused": "no board", "suspects": (late,), "axes": {"x": axis(period_seen_px=7.0)}}
     assert causes(*(pose(k, **spoilt) for k in range(6)), refusal="0 usable poses") == ("frame-lag",)
     # codes beyond the projector: of another size, or of other fringes
-    assert causes(*(pose(k, axes={"x": axis(outside=0.1)}, refused="codes") for k in range(6))) == ("projector-size",)
-    wrong = {"axes": {"x": axis(outside=0.1, period_px=20.0)}, "refused": "codes"}
+    beyond = (Contradiction("projector-size", "10 % of the x codes lie outside: give the size", "x", 1000.0),)
+    assert causes(*(pose(k, contradictions=beyond, refused="codes") for k in range(6))) == ("projector-size",)
+    wrong = {"axes": {"x": axis(period_px=20.0)}, "refused": "codes", "contradictions": beyond}
     assert causes(*(pose(k, **wrong) for k in range(6))) == ("fringe-period",)
     # a board that is never found says why before it says that too few are left
     assert causes(*(pose(k, refused="336 of 352", grid=(20, 16)) for k in range(6))) == ("board-size",)

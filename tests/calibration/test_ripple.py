@@ -47,7 +47,7 @@ def test_a_ripple_is_measured_beside_what_lenses_leave(seen, stereo, waves: int)
 
 def evidence(seen, stereo, ripple: dict, steps: int, period_seen: float = PERIOD) -> Evidence:
     solution = replace(solution_evidence(seen, stereo), ripple=ripple)
-    axes = {axis: AxisEvidence(PERIOD, steps, 1.0, 0.0, 0.0, np.nan, period_seen) for axis in "xy"}
+    axes = {axis: AxisEvidence(PERIOD, steps, 1.0, 0.0, np.nan, period_seen) for axis in "xy"}
     turn = ((1.0, 0.0), (0.0, 1.0))
     return Evidence(
         str(BOARD), (912, 1140), tuple(PoseEvidence(o.name, axes=axes, turn=turn) for o in seen), solution=solution

@@ -8,6 +8,7 @@ from slviewer.devices.capture import capture
 from slviewer.devices.imperfect import Imperfections, imperfect
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
+from slviewer.fringe.description_check import check_description
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
@@ -53,7 +54,7 @@ def test_residuals_are_kept_as_plain_values():
     assert [axis["axis"] for axis in plain] == ["x", "y"]
     assert len(plain[0]["frames"]) == 18 and plain[0]["suspects"][0]["frame"] == 6
     assert all(0.8 < frame["sigmas"] < 1.3 for frame in plain[1]["frames"])
-    assert warnings_of(found) == capture_warnings(sequence, stack)
+    assert warnings_of(found, check_description(sequence, stack)) == capture_warnings(sequence, stack)
 
 
 def test_what_was_kept_is_told_again(tmp_path):

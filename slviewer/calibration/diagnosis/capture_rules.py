@@ -8,9 +8,8 @@ import numpy as np
 from slviewer.calibration.diagnosis.evidence import Evidence
 from slviewer.calibration.diagnosis.frames import gamma_of
 from slviewer.calibration.diagnosis.poses import MOST, ORDER, frame_order, severity, was_refused, where
-from slviewer.calibration.diagnosis.verdict import Cause, Finding, Severity
+from slviewer.calibration.diagnosis.verdict import CAUSES, Cause, Finding, Severity
 
-MAX_OUTSIDE = 0.01
 MAX_SATURATED = 0.12
 SPOILT_BY_SATURATION = 0.3
 MAX_GAMMA = 1.5
@@ -19,6 +18,8 @@ PERIOD_SIGMAS = 4.0
 ASPECTS = (0.5, 1.0, 2.0)
 """Of square pixels, and of the diamond pixels of some DMDs."""
 ASPECT_OFF = 0.05
+_SEEN_IN_POSES = ("axes-swapped", "axis-reversed", "saturation")
+_EXPLAINED = ("projector-size", "fringe-period", "unreadable")
 
 CODE_BEGINS_PX = 0.5
 """Beside column 0: where most Gray codes begin, and by where that is seen in the fringe its period is judged."""
@@ -148,34 +149,18 @@ def period(e: Evidence) -> Iterator[Finding]:
             )
 
 
-def outside(e: Evidence) -> Iterator[Finding]:
-    """Codes beyond the projector that neither another axis nor another period explains."""
-    names: list[str] = []
-    worst: dict[str, float] = {}
-    for pose in e.poses:
-        axes = {axis: a.outside for axis, a in pose.axes.items() if a.outside > MAX_OUTSIDE}
-        if axes and not frame_order(pose):
-            names.append(pose.name)
-            worst = {axis: max(share, worst.get(axis, 0.0)) for axis, share in axes.items()} | {
-                axis: share for axis, share in worst.items() if axis not in axes
-            }
-    if not names:
-        return
-    if any(mirrored(e)) or any(f.severity == "rejected" for f in period(e)):
-        return
-    width, height = e.projector
-    shares = ", ".join(
-        f"{100 * share:.0f} % of the {axis} codes lie beyond its {width if axis == 'x' else height} "
-        f"{'columns' if axis == 'x' else 'rows'}"
-        for axis, share in sorted(worst.items())
-    )
-    yield Finding(
-        "projector-size",
-        "rejected",
-        f"{where(e, tuple(names))} codes lie outside the projector ({shares})",
-        f"give the size of the projector that was used, instead of {width}x{height}, and check the fringe period",
-        tuple(names),
-    )
+def description(e: Evidence) -> Iterator[Finding]:
+    """Frames that contradict their description in what no other rule sees in the poses together."""
+    first = {pose.name: pose.contradictions[0] for pose in e.poses if pose.contradictions and not frame_order(pose)}
+    for cause in dict.fromkeys(contradiction.cause for contradiction in first.values()):
+        if cause not in CAUSES or cause in _SEEN_IN_POSES:
+            continue
+        # Codes beyond the projector may be those of another axis or of another period.
+        if cause in _EXPLAINED and (any(mirrored(e)) or any(f.severity == "rejected" for f in period(e))):
+            continue
+        names = tuple(name for name, contradiction in first.items() if contradiction.cause == cause)
+        sentence, _, remedy = first[names[0]].message.rpartition(": ")
+        yield Finding(cause, severity(e, names, mended=True), f"{where(e, names)} {sentence}", remedy, names)
 
 
 def board_size(e: Evidence) -> Iterator[Finding]:

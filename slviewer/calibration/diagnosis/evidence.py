@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.diagnosis.ripple import Ripple
+from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis
 from slviewer.fringe.suspect import Suspect
 
@@ -15,16 +16,14 @@ from slviewer.fringe.suspect import Suspect
 class AxisEvidence:
     """What the frames of one axis say. NaN where they do not.
 
-    ``period_px`` as described; ``period_seen_px`` by where the Gray code's edges fall in the phase. ``outside``: share
-    of the readable pixels whose code lies beyond the projector. ``saturated``: share of the board's lit pixels (of all,
-    where no board was found) that clip. ``harmonic``: second harmonic over the fringe; ``steps`` of the finest phase
-    shift, 0 for Gray code alone.
+    ``period_px`` as described; ``period_seen_px`` by where the Gray code's edges fall in the phase. ``saturated``:
+    share of the board's illuminated pixels (of all, where no board was detected) that clip. ``harmonic``: second
+    harmonic over the fringe; ``steps`` of the finest phase shift, 0 for Gray code alone.
     """
 
     period_px: float
     steps: int
     readable: float
-    outside: float
     saturated: float
     harmonic: float
     period_seen_px: float
@@ -39,6 +38,7 @@ class PoseEvidence:
     late (positive) or early the white frame came. ``moved_px``: by how much the features moved in the camera from the
     frames of one axis to those of the other. ``numbering``: how the features are misnumbered, in words.
     ``turn`` (2, 2): how the projector's coordinates change a camera pixel, in the mean over the board.
+    ``contradictions``: between a refused capture and its description.
     """
 
     name: str
@@ -50,6 +50,7 @@ class PoseEvidence:
     moved_px: float = np.nan
     numbering: str = ""
     turn: tuple[tuple[float, float], tuple[float, float]] | None = None
+    contradictions: tuple[Contradiction, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; NaN as None."""
@@ -74,6 +75,7 @@ class PoseEvidence:
             moved_px=np.nan if data["moved_px"] is None else data["moved_px"],
             numbering=data["numbering"],
             turn=None if data["turn"] is None else (tuple(data["turn"][0]), tuple(data["turn"][1])),
+            contradictions=tuple(Contradiction(**contradiction) for contradiction in data["contradictions"]),
         )
 
 

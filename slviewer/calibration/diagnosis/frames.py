@@ -27,16 +27,15 @@ def axis_evidence(
     sequence: PatternSequence, stack: np.ndarray, phase: PhaseMap, board: np.ndarray | None
 ) -> AxisEvidence:
     """What the frames of one axis say. ``board`` (h, w) bool: the pixels of the board, where it was found."""
-    valid, outside = phase.reason == Reason.VALID, phase.reason == Reason.OUTSIDE
+    valid = phase.reason == Reason.VALID
     where = np.ones(phase.reason.shape, bool) if board is None else board
     lit = (phase.reason != Reason.DARK) & where
     saturated = (phase.reason == Reason.SATURATED) & where
-    readable, seen = float(np.count_nonzero(valid | outside)), float(np.count_nonzero(lit))
+    seen = float(np.count_nonzero(lit))
     return AxisEvidence(
         period_px=phase.period_px,
         steps=phase.steps,
         readable=np.count_nonzero(valid & where) / max(1.0, seen),
-        outside=np.count_nonzero(outside) / max(1.0, readable),
         saturated=np.count_nonzero(saturated) / max(1.0, seen),
         harmonic=second_harmonic(sequence, stack, phase.axis),
         period_seen_px=period_seen(sequence, stack, phase.axis),

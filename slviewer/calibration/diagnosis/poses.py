@@ -49,6 +49,10 @@ def most_moved_px(poses: Sequence[PoseEvidence]) -> float:
 
 def frame_order(pose: PoseEvidence) -> Cause | None:
     """How the frames of a pose are out of order, if they are."""
+    orders: dict[str, Cause] = {cause: cause for cause in ORDER} | {"duplicate-frame": "frame-order"}
+    for contradiction in pose.contradictions[:1]:
+        if contradiction.cause in orders:
+            return orders[contradiction.cause]
     faults = Counter(s.fault for s in pose.suspects)
     if pose.displaced > 0 or (faults["lag"] and pose.displaced >= 0):
         return "frame-lag"

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 
 from slviewer.calibration.diagnosis.capture_rules import (
     board_size,
+    description,
     frame_faults,
     gamma,
     mirrored,
-    outside,
     period,
     rippled,
     saturation,
@@ -25,7 +25,7 @@ Rule = Callable[[Evidence], Iterator[Finding]]
 
 STAGES: tuple[tuple[Rule, ...], ...] = (
     (frame_faults, saturation),
-    (mirrored, period, outside, board_size),
+    (mirrored, period, description, board_size),
     (single_poses, gamma, rippled, too_few, parallel, corners, uncertain),
 )
 

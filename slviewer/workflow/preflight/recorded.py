@@ -16,7 +16,7 @@ from slviewer.fringe.residual_sample import spread_rows
 from slviewer.fringe.response import harmonic_error_rad, nonlinearity
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.capture import Capture
-from slviewer.workflow.decoding import NEAR_DARK, check_projector, decode_frames
+from slviewer.workflow.decoding import NEAR_DARK, check_capture, decode_frames
 from slviewer.workflow.feedback import Progress, unheard
 from slviewer.workflow.preflight.checks import Check, Preflight, Verdict
 from slviewer.workflow.preflight.exposure import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
@@ -47,7 +47,7 @@ def preflight_capture(capture: Capture, progress: Progress = unheard) -> Preflig
     progress(0.5, "comparing the frames")
     fits = residuals(sequence, frames)
     checks = (
-        _description(capture.name, sequence, phases),
+        _description(capture.name, sequence, frames, phases),
         _order(sequence, fits),
         repeated_images(sequence, frames),
         check_capture_exposure(sequence, frames, phases),
@@ -61,9 +61,11 @@ def preflight_capture(capture: Capture, progress: Progress = unheard) -> Preflig
     return Preflight(checks, None, None, None, time.monotonic() - began)
 
 
-def _description(name: str, sequence: PatternSequence, phases: Mapping[Axis, PhaseMap]) -> Check:
+def _description(
+    name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
+) -> Check:  # fmt: skip
     try:
-        check_projector(name, sequence, dict(phases))
+        check_capture(name, sequence, frames, phases)
     except InputError as error:
         text = str(error).removeprefix(f"{name}: ")
         return Check("description", "bad", f"{text}.", "Correct the description of the capture, then import again.", {})
