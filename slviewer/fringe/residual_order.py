@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from slviewer.fringe.ghost import ghost_suspects
 from slviewer.fringe.residual_sample import Fringe, columns
 from slviewer.fringe.suspect import Fault, Suspect
 
@@ -62,6 +63,8 @@ def order_suspects(sampled: Fringe) -> list[Suspect]:
 
 def strange_suspects(sampled: Fringe) -> list[Suspect]:
     """Frames that no step explains: what is left when order and light have been looked at."""
+    if ghosts := ghost_suspects(sampled):
+        return ghosts
     n = sampled.steps
     products = _undisturbed(sampled, _Products(sampled, sampled.frames))
     steps = {k: k for k in range(n)}

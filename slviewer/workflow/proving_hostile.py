@@ -44,6 +44,7 @@ _WORDS: tuple[tuple[str, frozenset[str]], ...] = (
     (r"outside the projector", frozenset({"projector-size"})),
     (r"no pixel carries a readable", frozenset({"unreadable"})),
     (r"[Cc]ircles were|[Cc]ircles detected|board's columns", frozenset({"board"})),
+    (r"% of the image before", frozenset({"crosstalk"})),
     (r"are saturated and masked", frozenset({"saturation"})),
     (r"fringes are weak", frozenset({"dark"})),
     (r"axes are exchanged", frozenset({"axes-swapped"})),

@@ -1,0 +1,46 @@
+"""A share of the image before in each image is measured where a series of steps begins; nothing else is taken for it."""
+
+import numpy as np
+import pytest
+
+from slviewer.fringe.ghost import ghost_share, ghost_suspects
+from slviewer.fringe.layout import layout, white_level
+from slviewer.fringe.noise import measure_noise
+from slviewer.fringe.presets import p18
+from slviewer.fringe.residual_sample import fringe
+from slviewer.simulation.boards import Pose, blank_board
+from slviewer.simulation.hostile import FAULTS, expose_frames, render_light
+from slviewer.simulation.rig import letter
+
+RIG = letter(0.15)
+SEQUENCE = p18(RIG.projector.size)
+LIGHT, RENDERER = render_light(RIG, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0]))), SEQUENCE)
+
+
+def sampled(fault=None, severity="mild", axis="y"):
+    frames = expose_frames(RIG, LIGHT, SEQUENCE, RENDERER.room_light(), 0, FAULTS[fault] if fault else None, severity)
+    found, white = layout(SEQUENCE, axis), white_level(frames, SEQUENCE.select(axis))
+    return fringe(frames, found.shifts[-1], measure_noise(found, frames, white), white)
+
+
+@pytest.mark.parametrize(("severity", "share"), [("mild", 0.02), ("medium", 0.06), ("severe", 0.15)])
+def test_the_share_of_the_image_before_is_measured(severity, share):
+    measured, error = ghost_share(sampled("crosstalk", severity))
+    assert measured == pytest.approx(share, rel=0.2) and error < 0.002
+    (suspect,) = ghost_suspects(sampled("crosstalk", severity))
+    first = next(i for i, frame in enumerate(SEQUENCE.frames) if frame.axis == "y")
+    assert suspect.fault == "strange" and suspect.frame == first
+    assert f" {first + 1} " in suspect.sentence and f" {100 * measured:.0f} %" in suspect.sentence
+
+
+@pytest.mark.parametrize(
+    ("fault", "severity"),
+    [(None, "mild"), ("vignetting", "severe"), ("gamma", "mild"), ("defocus", "severe"), ("auto-exposure", "mild"),
+     ("room-light", "medium"), ("jpeg", "severe"), ("hot-pixels", "severe"), ("dim-projector", "severe")],
+)  # fmt: skip
+def test_nothing_else_is_taken_for_it(fault, severity):
+    assert ghost_suspects(sampled(fault, severity)) == []
+
+
+def test_without_a_frame_before_nothing_is_said():
+    assert np.isnan(ghost_share(sampled("crosstalk", "severe", "x"))[0])
