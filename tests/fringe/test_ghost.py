@@ -1,4 +1,4 @@
-"""A share of the image before in each image is measured where a series of steps begins; nothing else is taken for it."""
+"""A share of the image before in each image: measured where a series of steps begins; nothing else is taken for it."""
 
 import numpy as np
 import pytest
