@@ -13,6 +13,8 @@ LEAST_SHARE = 0.01
 """Of the image before: less shifts the phase of eight steps by under 0.01 rad."""
 MOST_SHARE = 0.5
 """More is a frame that is late."""
+MOSTLY = 0.5
+"""Part of what light and ghost explain together, that the ghost alone must add."""
 SIGMAS = 10.0
 """Of its standard error, which tens of thousands of pixels make small: what blur and noise pretend lies below."""
 
@@ -20,23 +22,29 @@ SIGMAS = 10.0
 def ghost_share(sampled: Fringe) -> tuple[float, float]:
     """The share of the image before in each image, and its standard error, from the first step of a period.
 
-    NaN where no frame was captured right before the first step, or three steps fit anything.
+    NaN where no frame was captured right before the first step, where three steps fit anything, or where frames of
+    other light explain the residuals as well.
     """
     before = sampled.beside.get(sampled.shift.indices[0] - 1)
     if before is None or sampled.steps < 4:
         return np.nan, np.nan
     keep = sampled.keep
-    # A frame that is off by e leaves keep[:, 0] e, so that e is the residual of the first step over keep[0, 0].
-    off = (keep[0].astype(np.float32) @ sampled.frames) / np.float32(keep[0, 0])
-    first, last = sampled.fitted[0], sampled.fitted[-1]
-    # Its light may also differ from that of the other frames: gain and offset are not taken for a ghost.
-    design = np.stack([before - last, first, np.ones_like(first)]).astype(float)
-    normal = design @ design.T
-    inverse = np.linalg.pinv(normal, rcond=1e-9)
-    weights = inverse @ (design @ off)
-    left = off - weights @ design
-    variance = float(np.mean(left**2)) * float(inverse[0, 0])
-    return float(weights[0]), float(np.sqrt(max(variance, 0.0)))
+    left = keep.astype(np.float32) @ sampled.frames
+    # The first step is off by the share of what the image before differs from the last step; and frames of other light
+    # are not taken for a ghost: their gains are fitted together with it.
+    regressors = np.concatenate([sampled.fitted, (before - sampled.fitted[-1])[None]])
+    steps = [*range(sampled.steps), 0]
+    normal = keep[np.ix_(steps, steps)] * (regressors @ regressors.T)
+    moment = np.einsum("kp,kp->k", regressors, left[steps]).astype(float)
+    gains = slice(0, sampled.steps)
+    by_light = float(moment[gains] @ np.linalg.pinv(normal[gains, gains], rcond=1e-6) @ moment[gains])
+    inverse = np.linalg.pinv(normal, rcond=1e-6)
+    explained = float(moment @ inverse @ moment)
+    if explained - by_light < MOSTLY * explained:
+        return np.nan, np.nan
+    freedom = left.shape[1] * np.trace(keep)
+    variance = (float(np.sum(left.astype(float) ** 2)) - explained) / freedom * float(inverse[-1, -1])
+    return float(inverse[-1] @ moment), float(np.sqrt(max(variance, 0.0)))
 
 
 def ghost_suspects(sampled: Fringe) -> list[Suspect]:
