@@ -11,6 +11,7 @@ import numpy as np
 
 from slviewer.errors import SlviewerError
 from slviewer.evaluation.letter import SPHERE_RADIUS_MM
+from slviewer.fringe.description_check import check_description
 from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.reconstruction.cloud import Cloud
@@ -220,6 +221,7 @@ def named_causes(
             continue
         suspects = [suspect for axis in residuals(sequence, frames) for suspect in axis.suspects]
         known = [(s.sentence, _SUSPECTED.get(s.fault, frozenset({s.fault}))) for s in suspects]
+        known += [(c.message, frozenset({c.cause})) for c in check_description(sequence, frames)]
         named |= {causes: None for sentence, causes in known if any(sentence in message for message in about)}
     return list(named)
 
