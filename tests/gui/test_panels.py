@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import TimeoutError as NotShownError
 from wizard_page import SIZE, Opened, button, field
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
@@ -301,11 +302,12 @@ def tool(page: Page, name: str, says: str) -> None:
 
 def click_until(page: Page, place: tuple[int, int], answer: str | re.Pattern[str]) -> None:
     """Click on the surface, which comes before the eyes by itself, until it answers."""
-    for _ in range(60):  # as long as anything may take
+    for _ in range(20):
         page.mouse.click(*place)
-        page.wait_for_timeout(700)
-        if page.get_by_text(answer).is_visible():
-            return
+        try:
+            return page.get_by_text(answer).first.wait_for(timeout=3000)  # a second click too early is a second point
+        except NotShownError:
+            continue
     raise AssertionError(f"no click brought {answer!r}")
 
 
