@@ -1,5 +1,6 @@
 """What is wrong with a rig is named, and a sound rig is left in peace."""
 
+import time
 from dataclasses import replace
 from functools import partial
 
@@ -42,9 +43,11 @@ def lying(**wrong) -> Rig:
 def test_a_sound_rig_is_left_in_peace(seed):
     said: list[str] = []
     done: list[float] = []
+    before = time.process_time()
     found = looked(simulated_rig(world(seed=seed)), say=said.append, progress=lambda share, doing: done.append(share))
     assert wrong_with(found) == set() and found.verdict == "good"
-    assert found.settle_ms == 0 and found.exposure_ms is None and found.seconds < 10
+    assert found.settle_ms == 0 and found.exposure_ms is None
+    assert found.seconds > 0 and time.process_time() - before < 10  # of the processor, whatever else it does
     assert len(said) == len(found.checks) == 10 and done == sorted(done) and done[-1] == 1.0
     assert all(check.sentence.endswith(".") for check in found.checks)
     assert found.to_dict()["checks"][0]["name"] == "screen"
