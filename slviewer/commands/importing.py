@@ -9,6 +9,7 @@ from tyro.conf import Positional
 
 from slviewer import terminal, workflow
 from slviewer.commands.parsing import Axis, Role, deferred, ui, union
+from slviewer.errors import InputError, UsageError
 
 Channel = Literal["red", "green", "blue", "luma", "max"]
 Codec = Literal["2x3", "nstep", "3", "4", "gray"]
@@ -138,13 +139,15 @@ def _import_slstudio(
 
 @deferred
 def _import_frames(
-    source: Positional[Path],
-    session: Positional[Path],
+    source: Positional[Path | None] = None,
+    session: Positional[Path | None] = None,
     sequence: Path | None = None,
     projector: str | None = None,
+    guess: Path | None = None,
+    out: Path | None = None,
     common: _Common = _COMMON,
 ) -> None:
-    """Import any folder of images with a TOML that describes them.
+    """Import any folder of images with a TOML that describes them, or propose that TOML with --guess FOLDER.
 
     Args:
         source: One folder of images, or a folder of such folders.
@@ -152,8 +155,20 @@ def _import_frames(
         sequence: The TOML that says what each file shows, by default the one in the source; the README describes it,
             and `slviewer patterns` writes one.
         projector: Width x height of the projector, px, where the TOML does not say it.
+        guess: A capture folder, whose TOML is proposed from its images; nothing is imported. Exit status 1 where a part
+            of it is unsure.
+        out: File for the proposed TOML, by default standard output.
         common: What every layout takes.
     """
+    if guess is not None:
+        if source is not None or sequence is not None:
+            raise UsageError("--guess proposes a TOML and imports nothing: give it without SOURCE, SESSION, --sequence")
+        _propose(guess, out, projector, common.channel)
+        return
+    if source is None or session is None:
+        raise UsageError("SOURCE or SESSION is missing: give both, or --guess FOLDER for a TOML")
+    if out is not None:
+        raise UsageError("--out is the file for the TOML of --guess: give --guess FOLDER, or leave --out away")
     _import(source, session, "frames", common, sequence=sequence, projector=projector)
 
 
@@ -211,6 +226,18 @@ bring_in.__annotations__["command"] = union(
         "opencv-calibration": _import_opencv_calibration,
     }
 )
+
+
+def _propose(folder: Path, out: Path | None, projector: str | None, channel: Channel | None) -> None:
+    guessed = workflow.guess_description(folder, projector=projector, channel=channel)
+    if out is None:
+        print(guessed.toml, end="")
+    else:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(guessed.toml, encoding="utf-8")
+        print(f"written to {out}")
+    if guessed.doubts:
+        raise InputError(f"unsure: {'; '.join(guessed.doubts)}. Correct the entries marked UNSURE in the TOML")
 
 
 def _import(source: Path, session: Path, layout: str, common: _Common, **options: Any) -> None:

@@ -54,8 +54,12 @@ class LineSample:
 
 def sample_lines(sequence: PatternSequence, stack: np.ndarray, pixels: int = PIXELS) -> LineSample:
     """Rows and columns of an (n, h, w) stack, spread evenly over what the patterns illuminate."""
+    return sample_frames(stack, coded_frames(sequence), pixels)
+
+
+def sample_frames(stack: np.ndarray, coded: list[int], pixels: int = PIXELS) -> LineSample:
+    """The same of a stack whose frames ``coded`` carry a pattern."""
     height, width = stack.shape[1:]
-    coded = coded_frames(sequence)
     step = max(1, min(height, width) // GRID)
     grid = np.ascontiguousarray(stack[:, step // 2 :: step, step // 2 :: step])
     seen = grid[coded]

@@ -12,6 +12,7 @@ _HOMES = {
     "import_p18": "importing",
     "import_procam_calibration": "importing",
     "import_frames": "importing",
+    "guess_description": "importing",
     "import_opencv_calibration": "importing_calibration",
     "identify_calibration_keys": "importing_calibration",
     "devices": "connecting",

@@ -12,6 +12,8 @@ from typing import Any, Literal, get_args
 from slviewer.errors import InputError
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import PerAxis, parse_size
+from slviewer.session.importers import guessed_description
+from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportedCapture, Imports, Recording, Skipped, none_usable
 from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
@@ -91,6 +93,18 @@ def import_frames(source: Path | str, session: SessionLike, sequence: Path | str
     Where the TOML does not state at which projector coordinate Gray code 0 begins, that is estimated from the images.
     """
     return import_captures(source, session, "frames", sequence=sequence, **options)
+
+
+def guess_description(
+    folder: Path | str, *, projector: Size | None = None, channel: Channel | None = None
+) -> GuessedDescription:
+    """The TOML of a capture that nobody described, from its images; ``doubts`` name what stays open. Nothing is saved.
+
+    Of a folder of captures, the first is read. Raises InputError where the images cannot belong to one capture.
+    """
+    return guessed_description.guess_description(
+        Path(folder), None if projector is None else parse_size(projector), channel
+    )
 
 
 def _save(

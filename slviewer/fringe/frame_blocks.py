@@ -1,0 +1,296 @@
+"""Which images of an undescribed capture belong together: runs of phase steps, blocks of Gray bits, even light.
+
+Every image is compared with the darkest and the brightest level of each pixel: stripes of a code are at either end,
+phase steps add up to one level in all pixels.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from typing import Literal
+
+import numpy as np
+
+from slviewer.fringe.line_sample import LineSample, sample_frames
+
+MOST_STEPS = 36
+MOST_BITS = 16
+MAX_SPREAD = 0.12
+"""Of half the swing, standard deviation over the pixels of the mean of all steps, which is one level for a cosine.
+Three bits of a code give 0.5, three of four steps 0.24."""
+MIN_MIDDLE = 0.15
+"""Share of the levels of phase steps in the middle half of the swing: a third of a cosine's, none of a code's."""
+MAX_COMMON = 0.9
+"""Length of the phases' mean unit vector; above it the view would hold a quarter of a period at most."""
+MAX_MISFIT = 0.25
+"""Of the amplitude, that a curved response and noise may leave of the steps. Frames of another period leave 0.7."""
+DECIDED = 0.3
+"""Of half the swing, from which a pixel is on either side of a stripe's edge."""
+READABLE = 0.5
+"""Share of decided pixels from which the stripes of a bit are wider than their blur."""
+EVEN = 0.9
+"""Share of pixels at the bright or the dark end from which an image shows no stripes."""
+OPPOSITE = 0.9
+"""Share of decided pixels that differ between a pattern and its inverse; two bits differ in about half."""
+OPPOSITE_BLURRED = -0.5
+"""The correlation of a pattern and its inverse where blur decides few pixels."""
+REACH = 16
+"""px between two decided pixels of neighbouring stripes, across the blur of their edge."""
+DROP = 0.6
+"""An image with fewer edges than this share of those before begins another code; each finer bit has about twice."""
+FEWEST_EDGES = 20
+"""Edges of stripes from which a share of them is known to a fifth."""
+DIM = 0.25
+"""Of the brightest pixels' swing, below which light of other stripes may be reflected into a pixel."""
+
+Even = Literal["white", "black"]
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseRun:
+    """Images of all steps of a period. ``gradient`` (x, y) rad per camera px, the median, for a phase that rises by
+    2 pi / n from step to step; ``misfit`` of the cosine, in parts of the amplitude."""
+
+    images: tuple[int, ...]
+    gradient: tuple[float, float]
+    misfit: float
+
+
+@dataclass(frozen=True)
+class Bit:
+    """An image of stripes, or of even light (``even``), and its inverse. ``edges`` (x, y) per camera px along rows and
+    along columns, ``count`` of them; ``is_readable``: whether most pixels lie inside of stripes."""
+
+    image: int
+    inverse: int | None
+    edges: tuple[float, float]
+    count: int
+    is_readable: bool
+    even: Even | None
+
+    @property
+    def images(self) -> tuple[int, ...]:
+        return (self.image,) if self.inverse is None else (self.image, self.inverse)
+
+
+@dataclass(frozen=True)
+class GrayBlock:
+    """Bits of a code, widest stripes first. ``is_reversed``: the finest was captured first."""
+
+    bits: tuple[Bit, ...]
+    is_reversed: bool
+
+    @property
+    def images(self) -> tuple[int, ...]:
+        return tuple(sorted(image for bit in self.bits for image in bit.images))
+
+    @property
+    def direction(self) -> tuple[float, float]:
+        """Edges (x, y) of the finest bit that can be read."""
+        seen = [bit for bit in self.bits if bit.is_readable and bit.even is None]
+        return seen[-1].edges
+
+
+@dataclass(frozen=True)
+class FrameBlocks:
+    """All images of a capture in blocks, and what does not fit: (images, text)."""
+
+    runs: tuple[PhaseRun, ...]
+    codes: tuple[GrayBlock, ...]
+    even: dict[int, Even]
+    doubts: tuple[tuple[tuple[int, ...], str], ...]
+
+
+def sample_undescribed(stack: np.ndarray) -> LineSample:
+    """Lines of an (n, h, w) stack of which any image may carry a pattern."""
+    return sample_frames(stack, list(range(len(stack))))
+
+
+class BlockReader:
+    """Levels (n, p) of the pixels that vary: -1 the darkest of all images, 1 the brightest."""
+
+    def __init__(self, sample: LineSample) -> None:
+        high, low = sample.frames.max(axis=0), sample.frames.min(axis=0)
+        swing = high - low
+        self.illuminated = swing > sample.least_swing
+        if self.illuminated.any():  # dim pixels show noise and reflections of other stripes
+            self.illuminated &= swing > DIM * float(np.quantile(swing[self.illuminated], 0.95))
+        seen = np.flatnonzero(self.illuminated)
+        self.levels = (2 * (sample.frames[:, seen] - low[seen]) / np.maximum(swing[seen], 1e-6) - 1).astype(np.float32)
+        line, place = sample.line[seen], sample.place[seen]
+        self.line, self.place, self.across = line, place, line >= sample.rows
+        self.adjacent = (np.diff(place) == 1) & (np.diff(line) == 0)
+
+    @property
+    def count(self) -> int:
+        return self.levels.shape[1]
+
+    def phasor(self, images: tuple[int, ...]) -> np.ndarray:
+        """(p,) complex64, for a phase that rises with the step."""
+        wave = np.exp(-2j * np.pi * np.arange(len(images)) / len(images)) * (2 / len(images))
+        return np.asarray(wave.astype(np.complex64) @ self.levels[list(images)])
+
+    def run(self, images: tuple[int, ...]) -> PhaseRun | None:
+        """The images as all steps of one period; None where they are not."""
+        n = len(images)
+        levels = self.levels[list(images)]
+        mean = levels.mean(axis=0)
+        if float(np.std(mean)) > MAX_SPREAD or float(np.mean(np.abs(levels) < 0.5)) < MIN_MIDDLE:
+            return None
+        # Three images fit any cosine, also a bit with its inverse and even light.
+        if n == 3 and any(self.are_opposite(a, b) for a, b in combinations(images, 2)):
+            return None
+        phasor = self.phasor(images)
+        amplitude = float(np.median(np.abs(phasor)))
+        turned = phasor[None] * np.exp(2j * np.pi * np.arange(n) / n).astype(np.complex64)[:, None]
+        misfit = float(np.sqrt(np.mean((levels - mean - turned.real) ** 2))) / max(amplitude, 1e-6)
+        unit = phasor / np.maximum(np.abs(phasor), 1e-6)
+        if amplitude < DECIDED or misfit > MAX_MISFIT or abs(complex(unit.mean())) > MAX_COMMON:
+            return None
+        step = np.angle(phasor[1:] * np.conj(phasor[:-1]))
+        along, across = (float(np.median(step[self.adjacent & part])) for part in (~self.across[1:], self.across[1:]))
+        return PhaseRun(images, (along, across), misfit)
+
+    def bit(self, image: int, inverse: int | None) -> Bit:
+        level = self.levels[image] if inverse is None else (self.levels[image] - self.levels[inverse]) / 2
+        decided = np.abs(level) > DECIDED
+        bright = float(np.mean(level > DECIDED))
+        dark = float(np.mean(level < -DECIDED))
+        even: Even | None = "white" if bright > EVEN else "black" if dark > EVEN else None
+        kept = np.flatnonzero(decided)
+        near = (np.diff(self.place[kept]) <= REACH) & (np.diff(self.line[kept]) == 0)
+        edge = near & np.diff(level[kept] > 0)
+        across = self.across[kept[1:]]
+        total = np.array([np.count_nonzero(~self.across), np.count_nonzero(self.across)])
+        x, y = np.array([np.count_nonzero(edge & ~across), np.count_nonzero(edge & across)]) / np.maximum(total, 1)
+        return Bit(image, inverse, (float(x), float(y)), int(edge.sum()), float(decided.mean()) > READABLE, even)
+
+    def are_opposite(self, first: int, second: int) -> bool:
+        a, b = self.levels[first], self.levels[second]
+        decided = (np.abs(a) > DECIDED) & (np.abs(b) > DECIDED)
+        if decided.mean() > READABLE:
+            return float(np.mean(a[decided] * b[decided] < 0)) > OPPOSITE
+        if a.std() < 1e-3 or b.std() < 1e-3:
+            return False
+        return float(np.corrcoef(a, b)[0, 1]) < OPPOSITE_BLURRED
+
+
+def group_frames(reader: BlockReader) -> FrameBlocks:
+    """The images in blocks, in their order."""
+    runs = _phase_runs(reader)
+    taken = {image for run in runs for image in run.images}
+    codes: list[GrayBlock] = []
+    even: dict[int, Even] = {}
+    doubts: list[tuple[tuple[int, ...], str]] = []
+    segment: list[int] = []
+    for image in range(len(reader.levels) + 1):
+        if image < len(reader.levels) and image not in taken:
+            segment.append(image)
+            continue
+        if segment:
+            _split_segment(_paired(reader, segment), codes, even, doubts)
+        segment = []
+    return FrameBlocks(tuple(runs), tuple(codes), even, tuple(doubts))
+
+
+def _phase_runs(reader: BlockReader) -> list[PhaseRun]:
+    runs, start, count = [], 0, len(reader.levels)
+    while start < count:
+        fitting = [
+            run
+            for n in range(3, min(MOST_STEPS, count - start) + 1)
+            if (run := reader.run(tuple(range(start, start + n)))) is not None
+        ]
+        if fitting:
+            runs.append(min(fitting, key=lambda run: run.misfit + 0.3 / len(run.images)))  # three steps fit anything
+            start = runs[-1].images[-1]
+        start += 1
+    return runs
+
+
+def _paired(reader: BlockReader, images: list[int]) -> list[Bit]:
+    """Images of a segment one by one, or each with the inverse that follows, or that lies half a block later."""
+    bits = [reader.bit(image, None) for image in images]
+    striped = [bit.image for bit in bits if bit.even is None]
+    half = len(striped) // 2
+    if half > 1 and len(striped) % 2 == 0 and all(map(reader.are_opposite, striped[:half], striped[half:])):
+        inverse = dict(zip(striped[:half], striped[half:], strict=True))
+        return [reader.bit(bit.image, inverse.get(bit.image)) for bit in bits if bit.image not in set(inverse.values())]
+    out: list[Bit] = []
+    place = 0
+    while place < len(images):
+        here = bits[place : place + 2]
+        # Stripes too fine to be read follow the pairs before them.
+        blurred = bool(out) and out[-1].inverse is not None and not any(bit.is_readable for bit in here)
+        if len(here) == 2 and (blurred or reader.are_opposite(here[0].image, here[1].image)):
+            out.append(reader.bit(images[place], images[place + 1]))
+            place += 1
+        else:
+            out.append(bits[place])
+        place += 1
+    return out
+
+
+def _split_segment(
+    bits: list[Bit], codes: list[GrayBlock], even: dict[int, Even], doubts: list[tuple[tuple[int, ...], str]]
+) -> None:
+    """Sort the images between two runs of phase steps into codes and even light."""
+    striped = [bit for bit in bits if bit.even is None and bit.is_readable]
+    rises = sum(b.count > a.count for a, b in pairwise(striped))
+    is_reversed = 2 * rises < len(striped) - 1
+    with_inverse = 2 * sum(bit.inverse is not None for bit in striped) > len(striped)
+    waiting: list[Bit] = []
+    block: list[Bit] = []
+
+    def close() -> None:
+        if block:
+            _add_block(block, is_reversed, codes, doubts)
+        block.clear()
+
+    for bit in bits[::-1] if is_reversed else bits:
+        if bit.even is not None:
+            waiting.append(bit)
+            continue
+        last = max((b.count for b in block if b.is_readable), default=0)
+        if bit.is_readable and last > FEWEST_EDGES and bit.count < DROP * last:
+            close()
+        # Stripes grow finer within a code: what is even between two of its bits is a bit as well.
+        block += waiting if block else _leading_bits(waiting, even, with_inverse)
+        waiting = []
+        block.append(bit)
+    close()
+    _set_even(waiting, even)
+
+
+def _leading_bits(waiting: list[Bit], even: dict[int, Even], with_inverse: bool) -> list[Bit]:
+    """Of the evenly lit images before a code, the most significant bits, which are 0 in all of the view."""
+    leading: list[Bit] = []
+    while waiting and waiting[-1].even == "black" and (waiting[-1].inverse is not None) == with_inverse:
+        leading.insert(0, waiting.pop())
+    _set_even(waiting, even)
+    return leading
+
+
+def _set_even(bits: list[Bit], even: dict[int, Even]) -> None:
+    for bit in bits:
+        assert bit.even is not None
+        even[bit.image] = bit.even
+        if bit.inverse is not None:
+            even[bit.inverse] = "black" if bit.even == "white" else "white"
+
+
+def _add_block(
+    block: list[Bit], is_reversed: bool, codes: list[GrayBlock], doubts: list[tuple[tuple[int, ...], str]]
+) -> None:
+    images = tuple(sorted(image for bit in block for image in bit.images))
+    paired = {bit.inverse is not None for bit in block}
+    readable = [bit for bit in block if bit.is_readable and bit.even is None]
+    if not readable:
+        doubts.append((images, "they show neither phase steps, nor stripes of a code, nor even light"))
+        return
+    if len(block) > MOST_BITS:
+        doubts.append((images, f"{len(block)} bits of one code: no projector has so many lines"))
+        return
+    if len(paired) > 1:
+        doubts.append((images, "some of these bits are followed by their inverse, and some are not"))
+        return
+    codes.append(GrayBlock(tuple(block), is_reversed))

@@ -1,0 +1,99 @@
+"""The `frames` TOML of a folder whose images nobody described, as the images themselves suggest it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from slviewer.errors import InputError
+from slviewer.fringe.guess import Guess, guess_sequence
+from slviewer.session.importers.frame_groups import images_by_name
+from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
+from slviewer.session.importers.imported import listed, visible
+
+
+@dataclass(frozen=True)
+class GuessedDescription:
+    """``toml``: the text, whose comments say what supports each entry. ``doubts``: what stays open; empty where the
+    description is sure."""
+
+    toml: str
+    doubts: tuple[str, ...]
+
+
+def guess_description(
+    folder: Path, projector: tuple[int, int] | None = None, channel: Channel | None = None
+) -> GuessedDescription:
+    """What the images of a folder show, in natural order of their names; of a folder of captures, those of the first.
+
+    Raises InputError where there are no images, or they cannot belong to one capture (other sizes, damaged).
+    """
+    folder = _capture_folder(Path(folder).expanduser())
+    files = images_by_name(folder)
+    images = read_frames(files, channel=channel or DEFAULT_CHANNEL)
+    guess = guess_sequence(images.stack, projector)
+    names = [file.name for file in files]
+    shown = (channel or DEFAULT_CHANNEL) if images.in_colour else channel
+    doubts = tuple(f"{_span(names, indices)}: {text}" for indices, text in guess.doubts)
+    return GuessedDescription(_toml(folder, names, guess, shown, projector, doubts), doubts)
+
+
+def _capture_folder(source: Path) -> Path:
+    if not source.is_dir():
+        raise InputError(f"{source} is no folder: give the folder of a capture")
+    folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
+    for folder in folders:
+        if len(images_by_name(folder)) >= 3:
+            return folder
+    raise InputError(f"{source} and the folders in it hold fewer than three images: give the folder of a capture")
+
+
+def _span(names: list[str], indices: tuple[int, ...]) -> str:
+    whole = len(indices) > 1 and indices == tuple(range(indices[0], indices[-1] + 1))
+    return f"{names[indices[0]]} to {names[indices[-1]]}" if whole else listed([names[i] for i in indices])
+
+
+def _toml(
+    folder: Path,
+    names: list[str],
+    guess: Guess,
+    channel: Channel | None,
+    projector: tuple[int, int] | None,
+    doubts: tuple[str, ...],
+) -> str:
+    described = guess.sequence.to_dict() if guess.sequence else {}
+    lines = [f"# Guessed from the {len(names)} images of {folder.name}."]
+    lines += [f"# UNSURE: {doubt}" for doubt in doubts]
+    lines += [f"# {note}" for note in guess.notes]
+    if projector is None:
+        lines.append('# projector = "1280x800"  # unknown: needed to calibrate and to reconstruct')
+    else:
+        lines.append(f'projector = "{projector[0]}x{projector[1]}"')
+    lines.append('order = "name"  # all images of a folder in natural order of their names')
+    if channel is not None:
+        lines.append(f"channel = {_value(channel)}")
+    # Without gray_origin the import estimates it from the images.
+    keys = ("phase_sign", "phase_offset", "gray_cell_px", "relative")
+    lines += [f"{key} = {_value(described[key])}" for key in keys if key in described]
+    evidence: dict[int, list[str]] = {}
+    for image, text in guess.evidence:
+        evidence.setdefault(image, []).append(text)
+    doubtful = {image: text for images, text in guess.doubts if len(images) < len(names) for image in images}
+    for index, (name, frame) in enumerate(zip(names, guess.frames, strict=True)):
+        lines += ["", *(f"# {text}" for text in evidence.get(index, []))]
+        if index in doubtful:
+            lines.append(f"# UNSURE: {doubtful[index]}")
+        if frame is None:
+            lines.append(f"# [[frame]] of {name}: add its kind")
+            continue
+        lines.append(f"[[frame]]  # {name}")
+        lines += [f"{key} = {_value(value)}" for key, value in frame.to_dict().items()]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_value(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f'"{value}"' if isinstance(value, str) else repr(value)
