@@ -89,7 +89,7 @@ def test_presets_are_recognised(name: str) -> None:
 
 
 def test_a_period_that_the_view_leaves_open_is_a_doubt() -> None:
-    sequence, frames = taken("three")
+    _, frames = taken("three")
     guess = guess_sequence(frames, PROJECTOR)
     assert [images[0] for images, _ in guess.doubts] == [0, 9]
     assert guess.sequence is not None and guess.sequence.projector_size == PROJECTOR
