@@ -40,6 +40,8 @@ class FakeModel:
 
 @dataclass
 class FakePhase:
+    is_relative = False
+
     axis: str
     offset: np.ndarray
 
