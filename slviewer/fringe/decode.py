@@ -3,6 +3,7 @@
 import numpy as np
 
 from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
+from slviewer.fringe.frame_light import CLIPPED, equalized_axis, original_levels
 from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
 from slviewer.fringe.levels import cell_misfit, code_cell_px, found_levels, lowest_coordinate, unambiguous_px
 from slviewer.fringe.noise import measure_noise
@@ -18,15 +19,20 @@ __all__ = ["decode", "decode_reference", "texture"]
 def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
     """The phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
-    A pixel is masked, with a reason, rather than given a doubtful phase. Raises InputError when the frames are not
+    A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the frames
+    (see `frame_light`), they are decoded as they would be under equal light. Raises InputError when the frames are not
     those of the sequence, or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
     found = layout(sequence, axis)
     stack = np.ascontiguousarray(stack)
     white = white_level(stack, sequence.select(axis))
-    noise = measure_noise(found, stack, white)
-    scale = grey_scale(found, noise, white)
+    sequence, stack, factor = equalized_axis(sequence, stack, axis)
+    if factor != 1:
+        found = layout(sequence, axis)
+    clipped = white if factor == 1 else CLIPPED
+    noise = measure_noise(found, stack, clipped)
+    scale = grey_scale(found, noise, white * factor)._replace(white=clipped)
     if not found.shifts:
         maps = _gray_alone(found, stack, scale)
     elif found.numbers_periods:
@@ -37,6 +43,8 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
         maps = _levels(found, stack, scale)
     phase, wrapped, modulation, background, reason = maps
     phase = _settled(found, phase, reason)
+    if factor != 1:
+        modulation, background, noise = original_levels(modulation, background, noise, factor)
     unambiguous = unambiguous_px(found)
     return PhaseMap(
         axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps, unambiguous

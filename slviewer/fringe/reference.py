@@ -3,6 +3,7 @@
 import numpy as np
 
 from slviewer.fringe import limits
+from slviewer.fringe.frame_light import CLIPPED, equalized_axis, original_levels
 from slviewer.fringe.layout import Layout, check_stack, layout, white_level
 from slviewer.fringe.levels import (
     cell_misfit,
@@ -25,7 +26,11 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     """What `decode.decode` returns, computed without kernels: same wrapped phase to 1e-5 rad, absolute to 1e-4 rad."""
     check_stack(sequence, stack)
     found = layout(sequence, axis)
-    white = white_level(stack, sequence.select(axis))
+    full = white_level(stack, sequence.select(axis))
+    sequence, stack, factor = equalized_axis(sequence, stack, axis)
+    if factor != 1:
+        found = layout(sequence, axis)
+    white = full if factor == 1 else CLIPPED
     noise = measure_noise(found, stack, white)
     if not found.shifts:
         phase, modulation, background, inconsistent, dark = _gray_alone(found, stack, noise)
@@ -43,12 +48,14 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
             order, inconsistent = _order_by_levels(found, [psi for psi, _, _, _ in shifted], cell)
         phase = (wrapped + TWO_PI * order).astype(np.float32)
         dark = np.zeros(phase.shape, bool)
-    dark |= weakest < dark_limit(background, noise, white, dark_sigmas(found))
+    dark |= weakest < dark_limit(background, noise, full * factor, dark_sigmas(found))
     reason = np.select(
         [saturated, dark, inconsistent], [Reason.SATURATED, Reason.DARK, Reason.INCONSISTENT], Reason.VALID
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
     phase, reason = settle(found, phase, reason)
+    if factor != 1:
+        modulation, background, noise = original_levels(modulation, background, noise, factor)
     unambiguous = unambiguous_px(found)
     return PhaseMap(
         axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps, unambiguous

@@ -1,26 +1,23 @@
 """Whether the frames of a capture fit together: what each leaves unexplained, and which of them stand out.
 
 Phase-shifted frames are one cosine per pixel, so that more than three of them say too much, and contradict each other
-when one was late, lost, repeated, or lit otherwise. What the projector's gamma adds is common to all frames, and is not
-held against one of them. Frames of a Gray code contradict each other too: see `residual_gray`.
+when one was late, lost or repeated. Frames of unequal light are compared as they would be under equal light. What the
+projector's gamma adds is common to all frames, and is not held against one of them. Frames of a Gray code contradict
+each other too: see `residual_gray`.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from slviewer.fringe.frame_light import CLIPPED, equalize_frames, estimate_frame_light, light_suspects
 from slviewer.fringe.layout import check_stack, layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.residual_gray import code_suspects
 from slviewer.fringe.residual_order import order_suspects, strange_suspects
 from slviewer.fringe.residual_sample import Fringe, fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.fringe.suspect import Suspect
-
-FLICKER = 0.025
-"""A frame whose light differs by so much from that of the others is named."""
-_STANDS_OUT = 5.0  # times the spread of the other frames' light
-_FEW = 4  # so few steps tell that a frame is wrong, and not which
+from slviewer.fringe.suspect import LIGHT_FAULTS, Suspect
 
 
 @dataclass(frozen=True)
@@ -59,10 +56,14 @@ def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
     """
     check_stack(sequence, stack)
     found = layout(sequence, axis)
-    white = white_level(stack, sequence.select(axis))
+    light = estimate_frame_light(sequence, stack)
+    white, factor = white_level(stack, sequence.select(axis)), 1.0
+    if light.is_significant:
+        stack, factor = equalize_frames(stack, light, sequence)
+        white = CLIPPED
     noise = measure_noise(found, stack, white)
     residuals: list[FrameResidual] = []
-    suspects: list[Suspect] = []
+    suspects = light_suspects(sequence, light)
     said: list[str] = []
     for shift in found.shifts:
         sampled = fringe(stack, shift, noise, white)
@@ -73,15 +74,14 @@ def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
             continue
         if len(shift.indices) == 3:
             said.append(f"{what}: three steps fit any three frames, so that only a repeated one can be told")
-        lit = _light(sampled)
-        suspects += order_suspects(sampled) or strange_suspects(sampled) or _flickering(sampled, lit)
-        residuals += _residuals(sampled, lit)
+        suspects += order_suspects(sampled) or strange_suspects(sampled)
+        residuals += _residuals(sampled, _light(sampled) * light.light.gain[list(shift.indices)], factor)
     if found.gray:
         suspects += code_suspects(sequence, found, stack, white)
     return FrameResiduals(axis, tuple(residuals), tuple(_once(suspects)), "; ".join(said))
 
 
-def _residuals(sampled: Fringe, lit: np.ndarray) -> list[FrameResidual]:
+def _residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list[FrameResidual]:
     n = sampled.steps
     if n == 3:
         return [FrameResidual(i, np.nan, np.nan, np.nan) for i in sampled.shift.indices]
@@ -90,7 +90,8 @@ def _residuals(sampled: Fringe, lit: np.ndarray) -> list[FrameResidual]:
     expected = np.maximum((a + b * sampled.fitted.mean(axis=0)) * (1 - 3 / n), 1e-6)
     rms, sigmas = (np.sqrt(np.mean(square, axis=1)) for square in (left**2, left**2 / expected))
     return [
-        FrameResidual(i, float(rms[k]), float(sigmas[k]), float(lit[k])) for k, i in enumerate(sampled.shift.indices)
+        FrameResidual(i, float(rms[k]) / factor, float(sigmas[k]), float(gain[k]))
+        for k, i in enumerate(sampled.shift.indices)
     ]
 
 
@@ -110,47 +111,9 @@ def _light(sampled: Fringe) -> np.ndarray:
     return 1 + excess - np.median(excess)
 
 
-def _flickering(sampled: Fringe, lit: np.ndarray) -> list[Suspect]:
-    if not np.isfinite(lit).all():
-        return []
-    excess = lit - 1
-    if sampled.steps <= _FEW:
-        worst = float(np.abs(excess).max())
-        i, j = sampled.shift.indices[0], sampled.shift.indices[-1]
-        text = f"frames {i + 1} to {j + 1} contradict each other: one of them was late, lost, or lit otherwise"
-        return [Suspect(i, "strange", text)] if worst > FLICKER else []
-    out = []
-    for k in np.argsort(-np.abs(excess)):
-        others = np.delete(excess, k)
-        if abs(excess[k]) < max(FLICKER, _STANDS_OUT * 1.5 * float(np.median(np.abs(others)))):
-            break
-        more = "brighter" if excess[k] > 0 else "darker"
-        i = sampled.shift.indices[k]
-        out.append(
-            Suspect(
-                i,
-                "light",
-                f"frame {i + 1} is {100 * abs(excess[k]):.0f} % {more} than the frames around it: the light flickered, "
-                "or something moved",
-            )
-        )
-    spread = float(np.sqrt(np.mean(excess**2)))
-    if not out and spread > FLICKER:
-        i, j = sampled.shift.indices[0], sampled.shift.indices[-1]
-        out.append(
-            Suspect(
-                sampled.shift.indices[int(np.argmax(np.abs(excess)))],
-                "light",
-                f"the light varies by {100 * spread:.0f} % from frame to frame (frames {i + 1} to {j + 1}): keep out "
-                "mains light, or make the exposure a multiple of its period",
-            )
-        )
-    return out
-
-
 def _once(suspects: list[Suspect]) -> list[Suspect]:
-    """One word about a frame is enough, the first; in the order of the frames."""
-    kept: dict[int, Suspect] = {}
+    """Of the findings about the order of a frame the first, and all about light; in the order of the frames."""
+    kept: dict[tuple[int, str], Suspect] = {}
     for suspect in suspects:
-        kept.setdefault(suspect.frame, suspect)
-    return [kept[i] for i in sorted(kept)]
+        kept.setdefault((suspect.frame, suspect.fault if suspect.fault in LIGHT_FAULTS else ""), suspect)
+    return [kept[key] for key in sorted(kept)]

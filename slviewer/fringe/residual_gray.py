@@ -26,10 +26,6 @@ _SHARP = 0.5  # of the pixels, that must be read in it: fine stripes blur to the
 _STRIPED = 0.03  # of the pixels that must be dark, and bright, in a frame that could be told from its neighbour
 _SUM = 0.2  # rms, as a share of the contrast, by which a bit and its inverse may differ from what all pairs add up to
 _READABLE = 6.0  # px: mean width of stripes that can be read at most pixels
-_WIDE = 16.0  # px: narrower stripes are dimmed by blur
-_BLURRED = 5  # px from the edge of a stripe
-_LIGHT = 0.035
-_LIGHT_STANDS_OUT = 6.0
 _NOT_WHITE = 0.2  # of the pixels
 
 
@@ -67,8 +63,6 @@ def code_suspects(sequence: PatternSequence, found: Layout, stack: np.ndarray, w
         out = _sums(lines, found)
     if not out:
         out = _disordered(lines, bits, found.inverse)
-    if not out:
-        out = _flickering(lines, (*bits, *found.inverse))
     return out + _not_white(sequence, lines)
 
 
@@ -241,48 +235,6 @@ def _stripe(lines: _Lines, i: int) -> float:
     edges = (bit[1:] != bit[:-1]) & near
     across = lines.line[1:] >= lines.columns
     return min(float(np.count_nonzero(part)) / (1 + np.count_nonzero(edges & part)) for part in (across, ~across))
-
-
-def _inside(lines: _Lines, bit: np.ndarray) -> np.ndarray:
-    """(p,) bool: in the middle of a bright stripe, where no blur reaches."""
-    inside = bit.copy()
-    for away in range(1, _BLURRED + 1):
-        same = bit[away:] & (lines.place[away:] - lines.place[:-away] == away)
-        inside[:-away] &= same
-        inside[away:] &= bit[:-away] & (lines.place[away:] - lines.place[:-away] == away)
-        inside[:away] = inside[-away:] = False
-    return inside
-
-
-def _flickering(lines: _Lines, code: Sequence[int]) -> list[Suspect]:
-    """Frames whose bright stripes are brighter or darker than those of the others."""
-    bright = {i: _inside(lines, lines.bit(i)) for i in code if _stripe(lines, i) > _WIDE}
-    if len(bright) < 3:
-        return []
-    count = sum(b.astype(np.float32) for b in bright.values())
-    level = sum(lines.frames[i] * b for i, b in bright.items()) / np.maximum(count, 1)
-    usable = count >= 2
-    light = {}
-    for i, b in bright.items():
-        here = b & usable
-        if np.count_nonzero(here) >= FEWEST:
-            light[i] = float(np.median(lines.frames[i][here] / level[here]))
-    if len(light) < 3:
-        return []
-    values = np.array(list(light.values()))
-    excess = values / np.median(values) - 1
-    out = []
-    for n in np.argsort(-np.abs(excess)):
-        others = np.median(np.abs(np.delete(excess, n)))
-        if abs(excess[n]) < max(_LIGHT, _LIGHT_STANDS_OUT * 1.5 * float(others)):
-            break
-        i, more = list(light)[n], "brighter" if excess[n] > 0 else "darker"
-        text = (
-            f"frame {i + 1} is {100 * abs(excess[n]):.0f} % {more} than the other bits: the light flickered, "
-            "or something moved"
-        )
-        out.append(Suspect(i, "light", text))
-    return out
 
 
 def _not_white(sequence: PatternSequence, lines: _Lines) -> list[Suspect]:

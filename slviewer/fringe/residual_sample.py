@@ -74,7 +74,7 @@ def fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: f
     clipped = (frames >= white) | (frames == 0)
     frames = frames.astype(np.float32)
     n = len(frames)
-    background, phasor = _cosine(frames)
+    background, phasor = fit_cosine(frames)
     rough = roughness(frames, stack.shape[2])
     least = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * rough)
     modulated = np.abs(phasor) > least
@@ -90,8 +90,8 @@ def fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: f
     # n steps leave harmonics of each pixel's own to fit, as long as enough remains to contradict.
     own = 2 if n >= 10 else 1
     if n > 3:
-        frames = seen - _gamma(seen, phasor, own)
-        background, phasor = _cosine(frames)
+        frames = seen - common_harmonics(seen, phasor, own)
+        background, phasor = fit_cosine(frames)
     angle = (2 * np.pi * np.arange(n) / n)[:, None]
     fitted = background + np.real(phasor * np.exp(1j * angle).astype(np.complex64))
     beside = {i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _neighbours(shift.indices, len(stack))}
@@ -104,7 +104,7 @@ def roughness(frames: np.ndarray, width: int) -> float:
     return float(np.median(np.abs(third))) / (0.6745 * np.sqrt(20))  # 1 + 9 + 9 + 1 variances
 
 
-def _cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Background (p,) float32 and modulation e^(i phase) (p,) complex64, for a positive sign of the phase shift."""
     n = len(frames)
     wave = np.exp(-2j * np.pi * np.arange(n) / n).astype(np.complex64) * np.float32(2 / n)
@@ -112,7 +112,7 @@ def _cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return frames.mean(axis=0), cosine + 1j * sine
 
 
-def _gamma(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:
+def common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:
     """(n, p): the harmonics beyond `own` that all pixels have in common, each with its own fringe's phase and strength.
 
     Harmonic m of the fringe appears among n steps as the m-th, or as the one that it cannot be told from.

@@ -3,10 +3,16 @@
 from dataclasses import dataclass
 from typing import Literal
 
-Fault = Literal["late", "early", "swapped", "dropped", "lag", "light", "strange"]
+Fault = Literal[
+    "late", "early", "swapped", "dropped", "lag", "strange", "exposure-drift", "flicker", "room-light", "gamma"
+]  # fmt: skip
 """It shows the pattern before its own; the one after it; two have changed places; this one is lost and those that
-follow come too early; all come too late from here on; it is brighter or darker; it fits nothing that was to be shown.
+follow come too early; all come too late from here on; it fits nothing that was to be shown. Of the light: frames are
+brighter or darker than others; rows of a frame are; the room's light changed; it is not proportional to the pattern's
+grey level.
 """
+LIGHT_FAULTS: tuple[Fault, ...] = ("exposure-drift", "flicker", "room-light", "gamma")
+"""Faults that decoding corrects, and that say nothing about the order of the frames."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.verdict import Cause, Finding, Severity
+from slviewer.fringe.suspect import LIGHT_FAULTS
 
 MOST = 0.5
 """What is seen in so many of the poses is no accident of one."""
@@ -30,7 +31,7 @@ def unfit(pose: PoseEvidence, most_moved_px: float) -> str:
     """Why a pose whose board was read must not be calibrated from; empty where it may."""
     order = frame_order(pose)
     if order:
-        sentence = next((s.sentence for s in pose.suspects if s.fault not in ("light", "strange")), "")
+        sentence = next((s.sentence for s in pose.suspects if s.fault not in (*LIGHT_FAULTS, "strange")), "")
         return f"its frames are out of order ({sentence or ORDER[order]}): take the pose again"
     if pose.moved_px > most_moved_px:
         return (

@@ -8,6 +8,7 @@ from slviewer.devices.capture import capture
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.residual import frame_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.fringe.suspect import LIGHT_FAULTS
 from slviewer.workflow.preflight.bench import Bench
 from slviewer.workflow.preflight.checks import Check
 
@@ -42,7 +43,7 @@ def _judged(bench: Bench, sequence: PatternSequence, stack: np.ndarray) -> Check
     mixed = [i for i, on in levels.items() if part < abs(shares[i] - on) <= 0.4]
     found = frame_residuals(sequence, stack, "x")
     # Where the light flickers, a frame that fits no step needs no other explanation.
-    ignored = ("light", "strange") if bench.unsteady > 0.01 else ("light",)
+    ignored = (*LIGHT_FAULTS, "strange") if bench.unsteady > 0.01 else LIGHT_FAULTS
     misplaced = [s for s in found.suspects if s.fault not in ignored]
     figures = {
         "frames": n,

@@ -1,0 +1,310 @@
+"""The light of each frame of a capture: estimated from the frames themselves, and made equal.
+
+Frame i shows ``g_i(v) S_i(p) + o_i(p)``: S_i is what the scene shows of its pattern; the gain g_i varies with automatic
+exposure and unsteady lamps, under a rolling shutter also along the image rows v; o_i is the light of the room that is
+more or less than in the other frames, uniform or in proportion to the scene's albedo. Of several models the simplest
+that explains the frames is taken; see `light_fit`.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slviewer.fringe.kernels_light import equalize, mark_clipped
+from slviewer.fringe.layout import check_stack, white_level
+from slviewer.fringe.light_fit import Fit, Light, LightModel, Remainder, Term, equalized_sample, fit_light, room_changes
+from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.suspect import Suspect
+
+LEAST_GAIN = 0.003
+"""rms variation of the gains below which they are left alone: what a camera's curve and blur pretend at most."""
+NOISE_PART = 0.25
+"""... and so is a variation below this part of the noise of a grey level, which adds 3 % to it."""
+BETTER = 1.03
+"""Factor by which a wave along the rows or room light must lower the mean squared residual to be believed."""
+AS_GOOD = 1.02
+"""Models within this factor of the best explain the frames as well: the first, simplest, is taken."""
+EXPLAINED = 0.5
+"""Part of the excess over the noise that light must explain: frames in the wrong order leave more."""
+CYCLES = np.arange(0.5, 8.25, 0.25)
+"""Waves along the image's height that are tried."""
+FINE = 0.05
+"""A coded frame of which so few pixels lie inside a stripe has fine stripes throughout."""
+CLIPPED = 65535.0
+"""The grey level of equalized frames where the camera clipped."""
+
+MODELS: tuple[tuple[Term, ...], ...] = (
+    ("gain",),
+    ("uniform", "albedo"),
+    ("gain", "wave"),
+    ("gain", "uniform", "albedo"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameLight:
+    """The light of each of n frames, relative to their mean; `terms` is empty where it need not be corrected.
+
+    ``drift``: rms of the gains' logarithm; ``wave``: rms amplitude of the wave along the rows, relative; ``room``
+    (n,): room light of each frame as a share of the mean grey level, from 0 on.
+    """
+
+    light: Light
+    terms: tuple[Term, ...]
+    drift: float = 0.0
+    wave: float = 0.0
+    room: np.ndarray | None = None
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the frames differ by more than can be neglected."""
+        return bool(self.terms)
+
+
+def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameLight:
+    """The light of the frames (n, h, w) uint8 or uint16 of a capture, from all of them together.
+
+    A small sample decides first whether there is anything to estimate. Frames of which nothing is known keep gain 1.
+    Raises InputError when the frames are not those of the sequence.
+    """
+    check_stack(sequence, stack)
+    steady = FrameLight(Light.constant(len(stack)), ())
+    coarse = sample_light(sequence, stack, coarse=True)
+    if coarse is None or not _varies(coarse):
+        return steady
+    sample = sample_light(sequence, stack)
+    if sample is None:
+        return steady
+    fit = fit_light(sample, ("gain",), Light.constant(len(stack)))
+    if np.ptp(np.log(fit.light.gain)) > 0.2 and sample.coded:  # bits and inverses can now be told apart better
+        sample = sample_light(sequence, stack, fit.light.gain) or sample
+        coarse = sample_light(sequence, stack, fit.light.gain, coarse=True) or coarse
+        fit = fit_light(sample, ("gain",), fit.light)
+    fit = _simplest(coarse, sample, fit)
+    if not _explains(sample, fit):
+        return steady
+    light = _with_fine_stripes(sample, _with_nearest(sample, fit))
+    used = list(fit.informed)
+    level = float(np.mean(sample.frames[used]))
+    albedo = float(np.mean(sample.albedo(light.changes)))
+    room = (light.uniform + light.albedo[:, 0] * albedo) / level
+    drift = float(np.std(np.log(fit.light.gain[used])))
+    wave = float(np.sqrt(np.mean(light.wave[used] ** 2)))
+    return FrameLight(light, fit.terms, drift, wave, room - room[used].min())
+
+
+def equalize_frames(
+    stack: np.ndarray, light: FrameLight, sequence: PatternSequence, frames: Sequence[int] | None = None
+) -> tuple[np.ndarray, float]:
+    """(k, h, w) uint16 frames as they were under equal light, and the factor by which grey levels were multiplied.
+
+    ``frames``: indices of those that are wanted, all if None. Phase-shifted frames are 65535 throughout at pixels that
+    the camera clipped in one of the frames of their period, and nowhere else. Room light is added to the frames that
+    lack it rather than subtracted, so that nothing becomes negative.
+    """
+    chosen = list(range(len(stack)) if frames is None else frames)
+    height, values = stack.shape[1], light.light
+    angle = 2 * np.pi * values.cycles * np.arange(height) / (height - 1)
+    waves = np.stack([np.cos(angle), np.sin(angle)])
+    gain = values.gain[:, None] * (1 + values.wave @ waves)
+    along_rows = values.albedo[:, :1] + values.albedo[:, 2:] * (np.arange(height) / (height - 1) - 0.5)
+    offset, along_columns = values.uniform - values.uniform.max(), values.albedo[:, 1] - values.albedo[:, 1].max()
+    along_rows = along_rows - along_rows.max(axis=0)
+    white = white_level(stack, chosen)
+    albedo = np.zeros((0, 0), np.float32)
+    highest = white - offset.min()
+    if values.albedo.any():
+        albedo = estimate_albedo(sequence, stack, values.changes)
+        # A column's part reaches from -0.5 to 0.5 of its slope.
+        highest -= float(albedo.max()) * (along_rows.min() - 0.5 * np.abs(along_columns).max())
+        along_rows = along_rows - 0.5 * np.abs(along_columns).max()
+    scale = float(min(256.0, 65000.0 / (highest / gain.min())))
+    out = np.empty((len(chosen), *stack.shape[1:]), np.uint16)
+    equalize(
+        stack, np.array(chosen), gain[chosen].astype(np.float32), offset[chosen].astype(np.float32),
+        along_rows[chosen].astype(np.float32), along_columns[chosen].astype(np.float32), albedo, scale, out,
+    )  # fmt: skip
+    for axis in sequence.axes:
+        for period in sequence.periods_px(axis):
+            places = [
+                k
+                for k, i in enumerate(chosen)
+                if (f := sequence.frames[i]).kind == "phase" and f.axis == axis and f.period_px == period
+            ]
+            if places:
+                mark_clipped(stack, np.array([chosen[k] for k in places]), white, np.array(places), out)
+    return out, scale
+
+
+def equalized_axis(
+    sequence: PatternSequence, stack: np.ndarray, axis: Axis
+) -> tuple[PatternSequence, np.ndarray, float]:
+    """The frames that an axis needs under equal light, their sequence, and the factor of their grey levels.
+
+    Sequence and stack as they are, and 1, where the light needs no correction.
+    """
+    light = estimate_frame_light(sequence, stack)
+    if not light.is_significant:
+        return sequence, stack, 1.0
+    chosen = sequence.select(axis)
+    frames, scale = equalize_frames(stack, light, sequence, chosen)
+    return replace(sequence, frames=tuple(sequence.frames[i] for i in chosen)), frames, scale
+
+
+def original_levels(
+    modulation: np.ndarray, background: np.ndarray, noise: tuple[float, float], factor: float
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Modulation, background and noise (a, b) of equalized frames in the grey levels of the capture."""
+    per_level = np.float32(1 / factor)
+    return modulation * per_level, background * per_level, (noise[0] / factor**2, noise[1] / factor)
+
+
+def light_suspects(sequence: PatternSequence, light: FrameLight) -> list[Suspect]:
+    """What the operator should know about the light of the frames, and change."""
+    out = []
+    used = [i for i, f in enumerate(sequence.frames) if f.kind != "texture"]
+    gain = light.light.gain[used]
+    if "gain" in light.terms and light.drift > LEAST_GAIN:
+        span = 100 * (float(gain.max() / gain.min()) - 1)
+        text = (
+            f"the brightness of the frames varies by {span:.1f} % (automatic exposure, or an unsteady lamp): "
+            "corrected; lock the camera's exposure, gain and white balance"
+        )
+        out.append(Suspect(used[int(np.argmax(np.abs(np.log(gain))))], "exposure-drift", text))
+    if "wave" in light.terms:
+        text = (
+            f"the light varies along the image rows by {100 * np.sqrt(2) * light.wave:.0f} %, in "
+            f"{light.light.cycles:.1f} waves per image (mains flicker under a rolling shutter): corrected; make the "
+            "exposure time a multiple of 10 ms (8.33 ms where the mains have 60 Hz)"
+        )
+        out.append(Suspect(used[0], "flicker", text))
+    if light.room is not None and ("uniform" in light.terms or "albedo" in light.terms):
+        for k in light.light.changes:
+            change = 100 * float(light.room[k] - light.room[k - 1])
+            more = "brighter" if change > 0 else "darker"
+            text = (
+                f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}: "
+                "corrected; keep the light of the room constant, or switch it off"
+            )
+            out.append(Suspect(k, "room-light", text))
+    return out
+
+
+def _varies(sample: LightSample) -> bool:
+    """Whether one step of any model, on a small sample, promises enough."""
+    model, count = LightModel(sample), len(sample.frames)
+    if not model.informed:
+        return False
+    weight = np.ones(sample.frames.shape[1], np.float32)
+    gains = fit_light(sample, ("gain",), Light.constant(count), weight, most_steps=1)
+    if _is_large(sample, gains):
+        return True
+    return any(
+        fit_light(sample, terms, start, weight, most_steps=1).variance * BETTER < gains.variance
+        for terms, start in _candidates(sample, gains)
+    )
+
+
+def _candidates(sample: LightSample, gains: Fit) -> Iterator[tuple[tuple[Term, ...], Light]]:
+    """The models beside gains alone, each with the light to start from."""
+    constant = Light.constant(len(sample.frames))
+    left = LightModel(sample).eliminate(gains.light, gains.share, gains.weight)
+    for terms in MODELS[1:]:
+        start = replace(constant, gain=gains.light.gain) if "gain" in terms else constant
+        if "wave" in terms:
+            yield terms, replace(start, cycles=_strongest_wave(left))
+        else:
+            changes = room_changes(sample, constant, "gain" in terms, gains.weight)
+            if changes:
+                yield terms, replace(start, gain=constant.gain, changes=changes)
+
+
+def _is_large(sample: LightSample, fit: Fit) -> bool:
+    used = list(fit.informed)
+    level = float(np.mean(sample.frames[used]))
+    return float(np.std(np.log(fit.light.gain[used]))) > max(LEAST_GAIN, NOISE_PART * np.sqrt(fit.variance) / level)
+
+
+def _simplest(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
+    """The simplest model that explains the frames about as well as the best: chosen on a coarse sample."""
+    weight = np.ones(coarse.frames.shape[1], np.float32)
+    own = fit_light(coarse, ("gain",), first.light, weight, 2)
+    fits = [own, *(fit_light(coarse, terms, start, weight, 3) for terms, start in _candidates(coarse, own))]
+    best = min(fit.variance for fit in fits)
+    if own.variance < BETTER * best:
+        return first
+    chosen = next(fit for fit in fits if fit.variance <= AS_GOOD * best)
+    if any("wave" in term for term in chosen.terms):
+        chosen = _refined(coarse, chosen)
+    return fit_light(sample, chosen.terms, chosen.light, most_steps=3)
+
+
+def _refined(sample: LightSample, fit: Fit) -> Fit:
+    """The fit at the wave's own number of cycles, from three around it."""
+    tried = [fit]
+    for step in (-0.12, 0.12):
+        tried.append(fit_light(sample, fit.terms, replace(fit.light, cycles=fit.light.cycles + step), fit.weight, 2))
+    middle, below, above = (f.variance for f in tried)
+    curvature = below + above - 2 * middle
+    if curvature <= 0:
+        return min(tried, key=lambda f: f.variance)
+    cycles = fit.light.cycles + 0.12 * float(np.clip(0.5 * (below - above) / curvature, -1.5, 1.5))
+    tried.append(fit_light(sample, fit.terms, replace(fit.light, cycles=cycles), fit.weight, 3))
+    return min(tried, key=lambda f: f.variance)
+
+
+def _strongest_wave(left: Remainder) -> float:
+    """Cycles per image height of the wave that the frames' light has along the rows."""
+    excess, rows = left.row_excess()
+    excess = excess - excess.mean(axis=1, keepdims=True)
+    power = [float(np.sum(np.abs(excess @ np.exp(-2j * np.pi * f * rows)) ** 2)) for f in CYCLES]
+    return float(CYCLES[int(np.argmax(power))])
+
+
+def _explains(sample: LightSample, fit: Fit) -> bool:
+    """Whether the light explains most of what the noise does not."""
+    if fit.terms == ("gain",) and not _is_large(sample, fit):
+        return False
+    steady = LightModel(sample).eliminate(Light.constant(len(sample.frames)), fit.share, fit.weight)
+    noise = min(fit.variance, sample.roughness**2)
+    return steady.variance - fit.variance > EXPLAINED * (steady.variance - noise)
+
+
+def _with_nearest(sample: LightSample, fit: Fit) -> Fit:
+    """The fit, with the gain of the nearest frame, and the room light since its last change, of frames without own."""
+    light, known, used = fit.light, np.array(fit.informed), LightModel(sample).used
+    frames = np.arange(len(light.gain))
+    nearest = known[np.argmin(np.abs(frames[:, None] - known), axis=1)]
+    since = np.searchsorted(light.changes, frames, side="right")
+    alike = np.array([next((i for i in used if since[i] == s), used[0]) for s in since])
+    own = replace(
+        light,
+        gain=light.gain[nearest],
+        wave=light.wave[nearest],
+        uniform=light.uniform[alike],
+        albedo=light.albedo[alike],
+    )
+    return replace(fit, light=own)
+
+
+def _with_fine_stripes(sample: LightSample, fit: Fit) -> Light:
+    """The light, with gains of coded frames whose stripes are too fine to have an interior.
+
+    Over many fine stripes the mean of a bit and that of its inverse are the same share of white, and that is half of
+    dark and bright together.
+    """
+    model, light = LightModel(sample), fit.light
+    left = model.eliminate(light, fit.share, fit.weight)
+    inside = sample.interior.mean(axis=1) if sample.coded else np.zeros(0)
+    fine = [i for i, share in zip(sample.coded, inside, strict=True) if share < FINE and i not in fit.informed]
+    dark, bright = left.levels
+    both = (left.counts[0] > 0) & (left.counts[1] > 0)
+    if not fine or np.count_nonzero(both) < MIN_PIXELS:
+        return light
+    middle = float(np.mean(0.5 * (dark + bright)[both]))
+    frames, _ = equalized_sample(sample, light, fine)
+    gain = light.gain.copy()
+    gain[fine] *= frames[:, both].mean(axis=1) / middle
+    return replace(light, gain=gain)

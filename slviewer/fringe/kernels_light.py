@@ -1,0 +1,48 @@
+"""Frames brought to equal light, compiled."""
+
+import numba
+import numpy as np
+
+from slviewer.geometry.jit import kernel
+
+
+@kernel(parallel=True)
+def equalize(stack, frames, gain, offset, along_rows, along_columns, albedo, scale, out):
+    """Fill ``out`` (k, h, w) uint16: frames (k,) of the stack less their room light, over their gain, times ``scale``.
+
+    ``gain`` (k, h); room light ``offset[k] + albedo (along_rows[k, y] + along_columns[k] (x / (w - 1) - 0.5))``, with
+    ``albedo`` (h, w), or (0, 0) where there is none in proportion to it.
+    """
+    _, height, width = stack.shape
+    per_column = np.float32(1.0 / max(width - 1, 1))
+    for row in numba.prange(height):
+        for k in range(len(frames)):
+            times = np.float32(scale / gain[k, row])
+            added = np.float32(offset[k])
+            source, target = stack[frames[k], row], out[k, row]
+            if len(albedo):
+                a, b = np.float32(along_rows[k, row]), np.float32(along_columns[k])
+                for x in range(width):
+                    room = added + albedo[row, x] * (a + b * (np.float32(x) * per_column - np.float32(0.5)))
+                    level = (np.float32(source[x]) - room) * times + np.float32(0.5)
+                    target[x] = np.uint16(min(max(level, np.float32(0)), np.float32(65534)))
+            else:
+                for x in range(width):
+                    level = (np.float32(source[x]) - added) * times + np.float32(0.5)
+                    target[x] = np.uint16(min(max(level, np.float32(0)), np.float32(65534)))
+
+
+@kernel(parallel=True)
+def mark_clipped(stack, frames, white, places, out):
+    """Set all samples ``places`` (k,) of ``out`` to 65535 where one of the ``frames`` (k,) of the stack is clipped."""
+    _, height, width = stack.shape
+    for row in numba.prange(height):
+        peak = np.zeros(width, stack.dtype)
+        for k in range(len(frames)):
+            source = stack[frames[k], row]
+            for x in range(width):
+                peak[x] = max(peak[x], source[x])
+        for x in range(width):
+            if peak[x] >= white:
+                for k in range(len(places)):
+                    out[places[k], row, x] = 65535

@@ -1,0 +1,451 @@
+"""The gains and offsets of a capture's frames that explain a sample of its pixels.
+
+Per pixel, the phase-shifted frames have one background in common and one phasor for each period; Gray, white and black
+frames show one of two levels, dark or bright; and the background lies between these at one share for the whole image.
+What remains when these unknowns are eliminated depends on the light of the frames alone, and is solved for it by
+Gauss-Newton steps (variable projection), with priors where the frames do not determine it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from slviewer.fringe.light_sample import LightSample
+from slviewer.fringe.residual_sample import columns, common_harmonics, fit_cosine
+
+Term = Literal["gain", "wave", "uniform", "albedo"]
+
+PRIOR: dict[Term, float] = {"gain": 0.3, "wave": 0.1, "uniform": 0.3, "albedo": 0.3}
+"""Standard deviation of each parameter: of a gain's logarithm, of the amplitude of its wave along the rows, and of the
+room's light as a share of the mean grey level."""
+WIDTH: dict[Term, int] = {"gain": 1, "wave": 2, "uniform": 1, "albedo": 3}
+"""Values of each term per frame."""
+SHARE_PRIOR = 0.5, 0.2
+"""Where the mean of the fringes lies between dark and bright: 0.5, or 0.3 to 0.65 under the usual gammas."""
+GROUP_PRIOR = 0.003
+"""By how much all coded frames together may differ from all phase-shifted ones, relative: that difference can hardly be
+determined from the share above, and decoding has no need to tell them apart."""
+LINK_ERROR = 0.02
+"""Share of the contrast by which blur moves a pixel's background off its place between dark and bright."""
+COMMON = 1e4
+"""Precision, relative to the priors', with which the mean over all frames is kept: it is the scene's own."""
+HARMONIC_PRIOR = 0.1
+HARMONIC_STEPS = 4
+"""Up to so many steps, n, the fringe's harmonic n is large enough to be seen in the background."""
+ONE_SIDED = 0.5
+"""Length of the mean unit phasor above which a shift's pixels do not see all phases."""
+MIN_ENTRIES = 0.03
+"""Share of the sampled pixels that must lie inside a coded frame's bright stripes."""
+MAX_STEPS = 6
+CONVERGED = 5e-4
+OUTLIER = 4.0
+"""A pixel whose residual is larger than the median pixel's by this factor in square loses weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """What multiplies and what is added to each of n frames.
+
+    ``gain`` (n,); ``wave`` (n, 2): relative cosine and sine of ``cycles`` per image height along the rows; ``uniform``
+    (n,) grey levels; ``albedo`` (n, 3) times the scene's albedo (in grey levels): constant, along columns, along rows
+    (both -0.5 ... 0.5). The room's light, `uniform` and `albedo`, changes before the frames ``changes`` only: of room
+    light that varies freely, a part in step with the fringes could not be told from them.
+    """
+
+    gain: np.ndarray
+    wave: np.ndarray
+    cycles: float
+    uniform: np.ndarray
+    albedo: np.ndarray
+    changes: tuple[int, ...] = ()
+
+    @classmethod
+    def constant(cls, count: int, cycles: float = 0.0) -> "Light":
+        """Frames of equal light."""
+        return cls(np.ones(count), np.zeros((count, 2)), cycles, np.zeros(count), np.zeros((count, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A light, the mean squared residual that it leaves, and where the fringes' mean lies between dark and bright.
+
+    ``weight`` (p,): what each sampled pixel counts; ``informed``: the frames that the sample says something about.
+    """
+
+    light: Light
+    terms: tuple[Term, ...]
+    variance: float
+    share: float
+    weight: np.ndarray
+    informed: tuple[int, ...]
+
+
+def fit_light(
+    sample: LightSample,
+    terms: Sequence[Term],
+    start: Light,
+    weight: np.ndarray | None = None,
+    most_steps: int = MAX_STEPS,
+) -> Fit:
+    """The light of the given terms that leaves the least; ``start`` also says the wave's cycles."""
+    light, share = start, SHARE_PRIOR[0]
+    fixed = weight
+    weight = np.ones(sample.frames.shape[1], np.float32) if weight is None else weight
+    variance = max(sample.roughness**2, 1 / 12)
+    model = LightModel(sample)
+    for _ in range(most_steps):
+        left = model.eliminate(light, share, weight)
+        variance = max(left.variance, 1e-3)
+        change, share_change = left.solve(light, terms, variance, share)
+        light, share = _moved(light, change, model), float(np.clip(share + share_change, 0.05, 0.95))
+        if fixed is None:
+            weight = left.robust_weight()
+        if all(np.abs(values).max() < CONVERGED * left.scale(term) for term, values in change.items()):
+            break
+    left = model.eliminate(light, share, weight)
+    return Fit(light, tuple(terms), left.variance, share, weight, model.informed)
+
+
+def room_changes(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
+    """The frame from which on a change of the room's light, beside gains or alone, explains the most; empty if none."""
+    model = LightModel(sample)
+    left = model.eliminate(light, SHARE_PRIOR[0], weight)
+    normal, moment = left.normal_equations(
+        light, ("gain", "uniform", "albedo"), max(left.variance, 1e-3), SHARE_PRIOR[0]
+    )
+    used, u = np.array(model.used), len(model.used)
+    beside = [*(range(u) if with_gain else ()), *range(5 * u, len(normal))]
+    # Unknowns that every change has beside it are eliminated first.
+    inverse = np.linalg.inv(normal[np.ix_(beside, beside)])
+    cross = normal[u : 3 * u, beside] @ inverse
+    own = normal[u : 3 * u, u : 3 * u] - cross @ normal[beside, u : 3 * u]
+    target = moment[u : 3 * u] - cross @ moment[beside]
+    best, at = 0.0, ()
+    for k in sorted(used)[1:]:
+        step = np.kron(np.eye(2), (used >= k).astype(float)[:, None])
+        part = step.T @ target
+        gain = float(part @ np.linalg.solve(step.T @ own @ step, part))
+        if gain > best:
+            best, at = gain, (int(k),)
+    return at
+
+
+def equalized_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """(u, p) samples under equal light, and the gains that they were divided by."""
+    cosine, sine = _wave(sample, light.cycles)
+    wave = light.wave[used].astype(np.float32)
+    gain = light.gain[used, None].astype(np.float32) * (1 + wave[:, :1] * cosine + wave[:, 1:] * sine)
+    shapes = np.stack([np.ones_like(cosine), sample.column - 0.5, sample.row - 0.5])
+    added = light.uniform[used, None] + (light.albedo[used] @ (shapes * sample.albedo(light.changes)))
+    return ((sample.frames[used] - added.astype(np.float32)) / gain), gain
+
+
+def _wave(sample: LightSample, cycles: float) -> tuple[np.ndarray, np.ndarray]:
+    angle = np.float32(2 * np.pi * cycles) * sample.row
+    return np.cos(angle), np.sin(angle)
+
+
+def _moved(light: Light, change: dict[Term, np.ndarray], model: "LightModel") -> Light:
+    """The light after a step; frames that the sample says nothing about keep the mean of the others."""
+    gain, wave, uniform, albedo = light.gain.copy(), light.wave.copy(), light.uniform.copy(), light.albedo.copy()
+    used, known = model.used, np.isin(model.used, model.informed)
+    for term in ("gain", "wave"):
+        if term in change:
+            values = change[term]
+            change[term] = np.where(known[:, None], values - values[known].mean(axis=0), 0)
+    if "gain" in change:
+        gain[used] *= np.exp(np.clip(change["gain"][:, 0], -0.5, 0.5))
+    if "wave" in change:
+        wave[used] += change["wave"]
+    if "uniform" in change:
+        uniform[used] += change["uniform"][:, 0]
+    if "albedo" in change:
+        albedo[used] += change["albedo"]
+    return replace(light, gain=gain, wave=wave, uniform=uniform, albedo=albedo)
+
+
+class LightModel:
+    """Which frames share what."""
+
+    def __init__(self, sample: LightSample) -> None:
+        self.sample = sample
+        self.phased = [i for shift in sample.shifts for i in shift]
+        self.used = [*self.phased, *sample.coded]
+        n = len(self.phased)
+        parts, first = [np.ones((n, 1))], 0
+        self.places, self.turning = [], []
+        for shift in sample.shifts:
+            steps = len(shift)
+            place = slice(first, first + steps)
+            phasor = fit_cosine(sample.frames[list(shift)])[1]
+            turning = abs(complex(np.mean(phasor / np.maximum(np.abs(phasor), 1e-6)))) < ONE_SIDED
+            # Of a fringe seen in part of its phases, harmonics cannot be separated from light: its frames are free.
+            part = np.zeros((n, 2 if turning else steps))
+            part[place] = columns(np.arange(steps), steps, 1)[:, 1:] if turning else np.eye(steps)
+            parts.append(part)
+            self.places.append(place)
+            self.turning.append(turning)
+            first += steps
+        self.determined = [
+            k for place, turning in zip(self.places, self.turning, strict=True) if turning for k in range(n)[place]
+        ]
+        design = np.concatenate(parts, axis=1)
+        basis, sizes, _ = np.linalg.svd(design, full_matrices=False) if n else (design, np.zeros(0), None)
+        basis = basis[:, sizes > 1e-9]
+        self.keep = np.eye(n) - basis @ basis.T
+        self.phase_freedom = n - basis.shape[1]
+        least = MIN_ENTRIES * sample.frames.shape[1]
+        seen = (sample.interior & sample.bright).sum(axis=1) >= least  # dark stripes alone hardly depend on the gain
+        self.informed = (
+            *(self.phased[k] for k in self.determined),
+            *(i for i, enough in zip(sample.coded, seen, strict=True) if enough),
+        )
+
+    def eliminate(self, light: Light, share: float, weight: np.ndarray) -> "Remainder":
+        sample, n = self.sample, len(self.phased)
+        frames, gain = equalized_sample(sample, light, self.used)
+        shown, left = np.zeros_like(frames), np.zeros_like(frames)
+        harmonics: list[tuple[slice, np.ndarray]] = []
+        if n:
+            phases = frames[:n].copy()
+            for place, shift, turning in zip(self.places, sample.shifts, self.turning, strict=True):
+                phasor = fit_cosine(phases[place])[1]
+                strength = np.abs(phasor)
+                unit = phasor / np.maximum(strength, 1e-6)
+                steps = len(shift)
+                if steps > 3 and turning:
+                    phases[place] -= common_harmonics(phases[place], phasor, 1)
+                if steps <= HARMONIC_STEPS and turning:  # it looks like a change of the background
+                    wave = (strength * unit**steps).astype(np.complex64)
+                    harmonics += [(place, np.tile(part, (steps, 1))) for part in (wave.real, wave.imag)]
+            left[:n] = self.keep.astype(np.float32) @ phases
+            shown[:n] = phases - left[:n]
+        inside, bright = sample.interior, sample.bright
+        levels, counts = [], []
+        for members in (inside & ~bright, inside & bright):
+            count = members.sum(axis=0).astype(np.float32)
+            level = (frames[n:] * members).sum(axis=0) / np.maximum(count, 1)
+            shown[n:] += level * members
+            levels.append(level)
+            counts.append(count)
+        left[n:] = (frames[n:] - shown[n:]) * inside
+        return Remainder(self, gain, shown, left, levels, counts, harmonics, share, weight)
+
+
+@dataclass(eq=False)
+class Remainder:
+    """What the frames of some light leave when each pixel's own unknowns are eliminated."""
+
+    model: LightModel
+    gain: np.ndarray
+    shown: np.ndarray
+    left: np.ndarray
+    levels: list[np.ndarray]
+    counts: list[np.ndarray]
+    harmonics: list[tuple[slice, np.ndarray]]
+    share: float
+    weight: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.model.phased)
+        dark, bright = self.levels
+        self.contrast = bright - dark
+        linked = (self.counts[0] > 0) & (self.counts[1] > 0) & bool(self.model.determined)
+        self.linked = linked
+        background = self.shown[self.model.determined].mean(axis=0) if n else np.zeros_like(dark)
+        self.link = np.where(linked, background - (1 - self.share) * dark - self.share * bright, 0).astype(np.float32)
+
+    def scale(self, term: Term) -> float:
+        """The unit of a term: 1, or what makes the albedo or 1 the mean grey level."""
+        level = float(np.mean(self.shown[self.shown > 0])) if (self.shown > 0).any() else 1.0
+        if term == "uniform":
+            return level
+        return level / max(float(np.mean(self.model.sample.amplitudes[-1])), 1e-3) if term.startswith("albedo") else 1.0
+
+    @property
+    def freedom(self) -> float:
+        entries = sum(np.maximum(count - 1, 0) for count in self.counts)
+        return float(np.sum(self.weight * (self.model.phase_freedom + entries)))
+
+    @property
+    def variance(self) -> float:
+        """Mean squared residual of a sample, of the link among them."""
+        own, freedom = float(np.sum(self.weight * (self.left**2).sum(axis=0))), self.freedom
+        variance = max(own / max(freedom, 1.0), 1 / 12)
+        weight = self._link_weight(variance, self.share)
+        return (own + float(np.sum(weight * self.link**2))) / max(
+            freedom + float(np.sum(self.weight * self.linked)), 1.0
+        )
+
+    def row_excess(self) -> tuple[np.ndarray, np.ndarray]:
+        """Relative light (u, rows) that each image row leaves in each frame, and the rows' places, 0 ... 1."""
+        rows, place = np.unique(self.model.sample.row, return_inverse=True)
+        inside = np.ones_like(self.shown)
+        inside[len(self.model.phased) :] = self.model.sample.interior
+        both, square = self.weight * self.shown * self.left, self.weight * inside * self.shown**2
+        sums = [np.stack([np.bincount(place, line, len(rows)) for line in lines]) for lines in (both, square)]
+        return sums[0] / np.maximum(sums[1], 1e-6), rows
+
+    def robust_weight(self) -> np.ndarray:
+        entries = sum(np.maximum(count - 1, 0) for count in self.counts)
+        ratio = (self.left**2).sum(axis=0) / np.maximum(self.model.phase_freedom + entries, 1)
+        return (1 / (1 + (ratio / max(OUTLIER * float(np.median(ratio)), 1e-6)) ** 2)).astype(np.float32)
+
+    def solve(
+        self, light: Light, terms: Sequence[Term], variance: float, share: float
+    ) -> tuple[dict[Term, np.ndarray], float]:
+        """The change of each term (u, k), and of the share."""
+        normal, moment = self.normal_equations(light, terms, variance, share)
+        into = self._by_changes(terms, light.changes, len(normal))
+        solution = into @ np.linalg.solve(into.T @ normal @ into, into.T @ moment)
+        change: dict[Term, np.ndarray] = {}
+        at, u = 0, len(self.model.used)
+        for term in terms:
+            count = WIDTH[term]
+            change[term] = solution[at : at + count * u].reshape(count, u).T
+            at += count * u
+        return change, float(solution[-1])
+
+    def normal_equations(
+        self, light: Light, terms: Sequence[Term], variance: float, share: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix and moment, with priors: for each term each of its shapes (u,), harmonics, and the share."""
+        model, sample = self.model, self.model.sample
+        n, u = len(model.phased), len(model.used)
+        cosine, sine = _wave(sample, light.cycles)
+        albedo = sample.albedo(light.changes)
+        one = np.ones_like(cosine)
+        shapes: dict[Term, list[np.ndarray]] = {
+            "gain": [one],
+            "wave": [cosine, sine],
+            "uniform": [one],
+            "albedo": [albedo, albedo * (sample.column - 0.5), albedo * (sample.row - 0.5)],
+        }
+        regressors: list[np.ndarray] = []
+        for term in terms:
+            by = self.shown if term in ("gain", "wave") else 1 / self.gain
+            regressors += [by * shape for shape in shapes[term]]
+        total = u * len(regressors)
+        extra = len(self.harmonics) + 1
+        normal, moment = np.zeros((total + extra, total + extra)), np.zeros(total + extra)
+        weight = self.weight
+        members = [sample.interior & ~sample.bright, sample.interior & sample.bright]
+        per_class = [weight / np.maximum(count, 1) for count in self.counts]
+        share_of = [1 - share, share]
+        link_weight = self._link_weight(variance, share)
+        # How a frame's change moves the link: through the background, and through the levels of dark and bright.
+        reach = np.empty_like(self.shown)
+        reach[:n] = 0
+        reach[model.determined] = 1 / max(len(model.determined), 1)
+        reach[n:] = -sum(
+            part * m / np.maximum(count, 1) for part, m, count in zip(share_of, members, self.counts, strict=True)
+        )
+        weighted = [r * weight for r in regressors]
+        moved = [r * reach for r in regressors]
+        for a, first in enumerate(regressors):
+            at = slice(a * u, (a + 1) * u)
+            moment[at] = (weighted[a] * self.left).sum(axis=1) + (moved[a] * (link_weight * self.link)).sum(axis=1)
+            for b in range(a, len(regressors)):
+                second = regressors[b]
+                block = np.zeros((u, u))
+                block[:n, :n] = model.keep * (weighted[a][:n] @ second[:n].T)
+                block[np.arange(n, u), np.arange(n, u)] = (weighted[a][n:] * second[n:] * sample.interior).sum(axis=1)
+                for m, by in zip(members, per_class, strict=True):
+                    block[n:, n:] -= (first[n:] * m * by) @ (second[n:] * m).T
+                block += (moved[a] * link_weight) @ moved[b].T
+                normal[at, b * u : (b + 1) * u] = block
+                normal[b * u : (b + 1) * u, at] = block.T
+        self._add_harmonics(normal, moment, regressors, moved, link_weight)
+        last = total + extra - 1
+        for a, change in enumerate(moved):
+            normal[a * u : (a + 1) * u, last] = normal[last, a * u : (a + 1) * u] = change @ (
+                link_weight * self.contrast
+            )
+        normal[last, last] = np.sum(link_weight * self.contrast**2)
+        moment[last] = np.sum(link_weight * self.contrast * self.link)
+        normal /= variance
+        moment /= variance
+        self._add_priors(normal, moment, light, terms, share, total)
+        return normal, moment
+
+    def _by_changes(self, terms: Sequence[Term], changes: tuple[int, ...], total: int) -> np.ndarray:
+        """(total, unknowns): from gains, waves, and the steps of the room's light to what each frame has."""
+        used = np.array(self.model.used)
+        after = np.stack([used >= k for k in changes], axis=1).astype(float) if changes else np.zeros((len(used), 0))
+        blocks = []
+        for term in terms:
+            blocks += [np.eye(len(used)) if term in ("gain", "wave") else after] * WIDTH[term]
+        rest = total - len(blocks) * len(used)
+        out = np.zeros((total, sum(block.shape[1] for block in blocks) + rest))
+        row = column = 0
+        for block in [*blocks, np.eye(rest)]:
+            out[row : row + block.shape[0], column : column + block.shape[1]] = block
+            row, column = row + block.shape[0], column + block.shape[1]
+        return out
+
+    def _link_weight(self, variance: float, share: float) -> np.ndarray:
+        dark, bright = (np.maximum(count, 1) for count in self.counts)
+        parts = 1 / max(len(self.model.determined), 1) + (1 - share) ** 2 / dark + share**2 / bright
+        error = (LINK_ERROR * self.contrast) ** 2
+        return np.where(self.linked, self.weight * variance / (variance * parts + error), 0).astype(np.float32)
+
+    def _add_harmonics(
+        self,
+        normal: np.ndarray,
+        moment: np.ndarray,
+        regressors: list[np.ndarray],
+        moved: list[np.ndarray],
+        link_weight: np.ndarray,
+    ) -> None:
+        """Harmonic n of the fringe in the background of a shift of n steps, as unknowns beside the light."""
+        n, u, total = len(self.model.phased), len(self.model.used), len(regressors) * len(self.model.used)
+        kept = [(self.model.keep[:, place].astype(np.float32) @ wave) * self.weight for place, wave in self.harmonics]
+        count = len(self.model.determined)
+        means = [link_weight * wave.sum(axis=0) / count for _, wave in self.harmonics]
+        for a, (own, mean) in enumerate(zip(kept, means, strict=True)):
+            row = total + a
+            moment[row] = np.sum(own * self.left[:n]) + np.sum(mean * self.link)
+            for k, (regressor, change) in enumerate(zip(regressors, moved, strict=True)):
+                both = change @ mean
+                both[:n] += (own * regressor[:n]).sum(axis=1)
+                normal[row, k * u : (k + 1) * u] = normal[k * u : (k + 1) * u, row] = both
+            for b, (place, wave) in enumerate(self.harmonics):
+                normal[row, total + b] = np.sum(own[place] * wave) + np.sum(mean * wave.sum(axis=0)) / len(
+                    self.model.determined
+                )
+            normal[row, -1] = normal[-1, row] = np.sum(mean * self.contrast)
+
+    def _add_priors(
+        self, normal: np.ndarray, moment: np.ndarray, light: Light, terms: Sequence[Term], share: float, total: int
+    ) -> None:
+        model = self.model
+        n, u = len(model.phased), len(model.used)
+        now: dict[Term, np.ndarray] = {
+            "gain": np.log(light.gain[model.used])[:, None],
+            "wave": light.wave[model.used],
+            "uniform": light.uniform[model.used, None],
+            "albedo": light.albedo[model.used],
+        }
+        at = 0
+        apart = np.zeros(u)
+        if n and self.linked.any():
+            apart[:n], apart[n:] = 1 / n, -1 / (u - n)
+        for term in terms:
+            for k in range(now[term].shape[1]):
+                here = slice(at, at + u)
+                unit = self.scale(term)
+                precision = (PRIOR[term] * unit) ** -2
+                common = COMMON if term in ("gain", "wave") else 0.0  # the frames' mean is the scene's own
+                normal[here, here] += precision * (np.eye(u) + common)
+                moment[here] -= precision * now[term][:, k]
+                if term == "gain" and apart.any():
+                    stiff = (GROUP_PRIOR * unit) ** -2
+                    normal[here, here] += stiff * np.outer(apart, apart)
+                    moment[here] -= stiff * apart * (apart @ now[term][:, k])
+                at += u
+        extra = np.arange(total, len(normal) - 1)
+        normal[extra, extra] += HARMONIC_PRIOR**-2
+        normal[-1, -1] += SHARE_PRIOR[1] ** -2
+        moment[-1] += SHARE_PRIOR[1] ** -2 * (SHARE_PRIOR[0] - share)
