@@ -26,12 +26,17 @@ BETTER = 1.03
 """Factor by which a wave along the rows or room light must lower the mean squared residual to be believed."""
 AS_GOOD = 1.02
 """Models within this factor of the best explain the frames as well: the first, simplest, is taken."""
-EXPLAINED = 0.5
-"""Part of the excess over the noise that light must explain: frames in the wrong order leave more."""
+LEFT, LEFT_CONTRAST = 4.0, 0.02
+"""Light explains the frames if the mean squared residual is below so many times the square of the grey levels by which
+neighbouring pixels differ, plus the square of this share of the contrast for what blur and the camera's curve add."""
+ONE_FRAME = 6.0
+"""... and no frame has so many times the residual of the median frame: frames that show another's pattern have more."""
 CYCLES = np.arange(0.5, 8.25, 0.25)
 """Waves along the image's height that are tried."""
 FINE = 0.05
 """A coded frame of which so few pixels lie inside a stripe has fine stripes throughout."""
+FARTHEST = 0.7
+"""Logarithm of a gain beyond which a frame shows something else."""
 CLIPPED = 65535.0
 """The grey level of equalized frames where the camera clipped."""
 
@@ -264,12 +269,19 @@ def _strongest_wave(left: Remainder) -> float:
 
 
 def _explains(sample: LightSample, fit: Fit) -> bool:
-    """Whether the light explains most of what the noise does not."""
+    """Whether what the light leaves is like noise: little, and as much in one frame as in another."""
     if fit.terms == ("gain",) and not _is_large(sample, fit):
         return False
-    steady = LightModel(sample).eliminate(Light.constant(len(sample.frames)), fit.share, fit.weight)
-    noise = min(fit.variance, sample.roughness**2)
-    return steady.variance - fit.variance > EXPLAINED * (steady.variance - noise)
+    model = LightModel(sample)
+    left = model.eliminate(fit.light, fit.share, fit.weight)
+    energy = (fit.weight * left.left**2).sum(axis=1)
+    entries = np.full(len(energy), float(fit.weight.sum()))
+    entries[len(model.phased) :] = (fit.weight * sample.interior).sum(axis=1)
+    judged = np.isin(model.used, fit.informed)
+    each = energy[judged] / np.maximum(entries[judged], 1)
+    return fit.variance < LEFT * sample.roughness**2 + LEFT_CONTRAST**2 * float(
+        np.mean(sample.amplitudes) ** 2
+    ) and each.max() < ONE_FRAME * max(float(np.median(each)), sample.roughness**2 / 2)
 
 
 def _with_nearest(sample: LightSample, fit: Fit) -> Fit:
@@ -305,6 +317,8 @@ def _with_fine_stripes(sample: LightSample, fit: Fit) -> Light:
         return light
     middle = float(np.mean(0.5 * (dark + bright)[both]))
     frames, _ = equalized_sample(sample, light, fine)
-    gain = light.gain.copy()
-    gain[fine] *= frames[:, both].mean(axis=1) / middle
+    gain, excess = light.gain.copy(), frames[:, both].mean(axis=1) / middle
+    gain[fine] *= np.where(
+        np.abs(np.log(np.maximum(excess, 1e-3))) < FARTHEST, excess, 1
+    )  # else something else was shown
     return replace(light, gain=gain)

@@ -429,16 +429,18 @@ class Remainder:
             "albedo": light.albedo[model.used],
         }
         at = 0
-        apart = np.zeros(u)
-        if n and self.linked.any():
-            apart[:n], apart[n:] = 1 / n, -1 / (u - n)
+        known = np.isin(model.used, model.informed)
+        apart, coded = np.zeros(u), known & (np.arange(u) >= n)
+        if self.linked.any() and coded.any():
+            apart[known & ~coded] = 1 / np.count_nonzero(known & ~coded)
+            apart[coded] = -1 / np.count_nonzero(coded)
         for term in terms:
             for k in range(now[term].shape[1]):
                 here = slice(at, at + u)
                 unit = self.scale(term)
                 precision = (PRIOR[term] * unit) ** -2
                 common = COMMON if term in ("gain", "wave") else 0.0  # the frames' mean is the scene's own
-                normal[here, here] += precision * (np.eye(u) + common)
+                normal[here, here] += precision * (np.eye(u) + common * np.outer(known, known))
                 moment[here] -= precision * now[term][:, k]
                 if term == "gain" and apart.any():
                     stiff = (GROUP_PRIOR * unit) ** -2

@@ -15,6 +15,10 @@ ROWS, COLUMNS = 48, 88
 AROUND = (-6, -3, 2, 5)
 """px: the interior of a Gray stripe has its own class at these distances, along rows and columns. Narrower stripes
 are blurred, and have none."""
+DECIDED = 0.3
+"""Distance of a stripe's inside from its threshold, as a share of half the contrast."""
+SHOWN = 0.03
+"""Share of the pixels that must be bright in a Gray frame of an axis that was shown."""
 MIN_PIXELS = 60
 
 
@@ -75,6 +79,10 @@ def sample_light(
     limit = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * rough)
     if phased:
         amplitudes = np.stack([np.abs(fit_cosine(frames[list(shift)])[1]) for shift in shifts])
+        seen = np.count_nonzero(amplitudes > limit, axis=1)
+        shown = np.flatnonzero(seen > 0.5 * seen.max())  # an axis that was not shown, or is out of view, is no witness
+        amplitudes, shifts = amplitudes[shown], tuple(shifts[s] for s in shown)
+        phased = [i for shift in shifts for i in shift]
         valid = (amplitudes.min(axis=0) > limit) & (frames[phased].max(axis=0) < white)
     else:
         amplitudes = estimate_albedo(sequence, frames)[None]
@@ -83,7 +91,10 @@ def sample_light(
         return None
     row, column, frames = row[valid], column[valid], frames[:, valid]
     partner = _partners(sequence, coded)
-    interior, bright = _interiors(sequence, stack, frames, coded, partner, row, column, gain)
+    amplitudes = amplitudes[:, valid]
+    interior, bright = _interiors(
+        sequence, stack, frames, coded, partner, row, column, gain, DECIDED * amplitudes[-1], phased
+    )
     if coded:
         interior &= frames[list(coded)] < white
     return LightSample(
@@ -95,7 +106,7 @@ def sample_light(
         partner,
         interior,
         bright,
-        amplitudes[:, valid],
+        amplitudes,
         rough,
     )
 
@@ -146,10 +157,11 @@ def _interiors(
     row: np.ndarray,
     column: np.ndarray,
     gain: np.ndarray | None,
+    least: np.ndarray,
+    phased: list[int],
 ) -> tuple[np.ndarray, np.ndarray]:
     """(c, p) bool each: where a coded frame shows a stripe's inside, and whether it is bright."""
     gain = np.ones(len(stack)) if gain is None else gain
-    phased = [i for i, f in enumerate(sequence.frames) if f.kind == "phase"]
     ends = [i for i in coded if sequence.frames[i].kind in ("white", "black")]
     reference = phased or (ends if len(ends) > 1 else list(coded))
     threshold = np.mean([frames[i] / np.float32(gain[i]) for i in reference], axis=0)
@@ -170,5 +182,11 @@ def _interiors(
                 above[m] = level > stack[coded[other]][row + down, column + right] / np.float32(gain[coded[other]])
             else:
                 above[m] = level > threshold
-        bright[k], interior[k] = above[0], (above == above[0]).all(axis=0)
+        reference_level = frames[coded[other]] / np.float32(gain[coded[other]]) if other > -1 else threshold
+        decided = np.abs(frames[i] / np.float32(gain[i]) - reference_level) > least
+        bright[k], interior[k] = above[0], (above == above[0]).all(axis=0) & decided
+    for axis in sequence.axes:
+        own = [k for k, i in enumerate(coded) if sequence.frames[i].axis == axis]
+        if own and not (interior[own] & bright[own]).mean(axis=1).max() > SHOWN:
+            interior[own] = False  # the axis was not shown, or is out of view
     return interior, bright

@@ -1,0 +1,122 @@
+"""Frames of unequal light are measured as if the light had been equal, and the cause is named."""
+
+import numpy as np
+import pytest
+from fringe_scene import capture, coverage, slope, wrong
+
+from slviewer.fringe.decode import decode, decode_reference
+from slviewer.fringe.frame_light import estimate_frame_light, light_suspects
+from slviewer.fringe.phase import Reason
+from slviewer.fringe.presets import complementary, gray, p18
+from slviewer.fringe.sequence import PatternSequence
+
+PROJECTOR = (256, 128)
+TRUTH = slope(240, 320, per_px=0.5, start=20.0)
+
+
+def one_axis(sequence):
+    return PatternSequence(PROJECTOR, tuple(f for f in sequence.frames if f.axis in ("x", None)))
+
+
+SEQUENCES = {
+    "p18": one_axis(p18(PROJECTOR)),
+    "four": one_axis(complementary(PROJECTOR, 4, 16.0)),
+    "three": one_axis(complementary(PROJECTOR, 3, 16.0)),
+}
+
+
+def relit(stack, gain=1.0, offset=0.0):
+    light = gain * stack.astype(float) + offset
+    return np.clip(np.rint(light), 0, 255).astype(np.uint8)
+
+
+def gains(count, spread, seed=1):
+    return np.random.default_rng(seed).uniform(1 - spread, 1, count)[:, None, None]
+
+
+def rms_px(phase):
+    inner = np.s_[8:-8, 8:-8]
+    return float(np.sqrt(np.nanmean((phase.coordinate - TRUTH)[inner] ** 2)))
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_drifting_exposure_costs_nothing(name):
+    sequence = SEQUENCES[name]
+    stack = capture(sequence, TRUTH, shot=0.02)
+    floor = rms_px(decode(sequence, stack, "x"))
+    for spread in (0.1, 0.3):
+        phase = decode(sequence, relit(stack, gains(len(stack), spread)), "x")
+        assert wrong(phase, TRUTH) == 0 and coverage(phase) > 0.99
+        assert 0.8 * floor < rms_px(phase) < 1.3 * floor
+
+
+@pytest.mark.parametrize("name", ["p18", "three"])
+def test_gains_are_those_that_were_applied(name):
+    sequence = SEQUENCES[name]
+    gain = gains(len(sequence.frames), 0.2)
+    light = estimate_frame_light(sequence, relit(capture(sequence, TRUTH, shot=0.02), gain))
+    steps = [i for i, f in enumerate(sequence.frames) if f.kind == "phase"]
+    ratio = light.light.gain[steps] / gain[steps, 0, 0]
+    assert ratio.std() / ratio.mean() < 0.004
+    (suspect,) = light_suspects(sequence, light)
+    assert suspect.fault == "exposure-drift" and "corrected" in suspect.sentence
+
+
+def test_a_steady_capture_is_left_as_it_is():
+    for sequence in SEQUENCES.values():
+        for gamma in (1.0, 2.2):
+            light = estimate_frame_light(sequence, capture(sequence, TRUTH, shot=0.02, gamma=gamma))
+            assert not light.is_significant and light_suspects(sequence, light) == []
+
+
+def test_mains_flicker_under_a_rolling_shutter():
+    sequence = SEQUENCES["p18"]
+    stack = capture(sequence, TRUTH, shot=0.02)
+    v, k = np.linspace(0, 1, stack.shape[1])[:, None], np.arange(len(stack))[:, None, None]
+    flickering = relit(stack, 1 + 0.05 * np.sin(2 * np.pi * (3.2 * v + 0.37 * k)))
+    light = estimate_frame_light(sequence, flickering)
+    assert light.light.cycles == pytest.approx(3.2, abs=0.05)
+    assert [s.fault for s in light_suspects(sequence, light)] == ["flicker"]
+    assert rms_px(decode(sequence, flickering, "x")) < 1.15 * rms_px(decode(sequence, stack, "x"))
+
+
+@pytest.mark.parametrize("first", [7, 20])
+def test_room_light_that_is_switched_on(first):
+    sequence = SEQUENCES["p18"]
+    stack = capture(sequence, TRUTH, shot=0.02, gain=140)
+    lit = relit(stack, 1, np.where(np.arange(len(stack)) >= first, 40, 0)[:, None, None])
+    light = estimate_frame_light(sequence, lit)
+    (suspect,) = light_suspects(sequence, light)
+    assert (suspect.fault, suspect.frame) == ("room-light", first)
+    phase = decode(sequence, lit, "x")
+    assert coverage(phase) > 0.99 and rms_px(phase) < 1.15 * rms_px(decode(sequence, stack, "x"))
+
+
+def test_gray_code_whose_pairs_drift_two_to_one():
+    sequence = one_axis(gray(PROJECTOR))
+    stack = capture(sequence, TRUTH, defocus=0.3, gain=220)
+    sums = np.repeat(np.linspace(1, 0.5, 1 + len(stack) // 2), 2)[: len(stack), None, None]
+    phase = decode(sequence, relit(stack, sums * gains(len(stack), 0.2)), "x")
+    assert wrong(phase, TRUTH, part=3) == 0 and coverage(phase) > 0.97
+
+
+def test_clipped_pixels_stay_saturated_and_levels_are_the_captures():
+    sequence = SEQUENCES["p18"]
+    white = np.full(TRUTH.shape, 100.0)
+    white[:, :80] = 235.0
+    stack = capture(sequence, TRUTH, gain=white, ambient=10)
+    phase = decode(sequence, relit(stack, 1.4 * gains(len(stack), 0.06)), "x")
+    before = decode(sequence, relit(stack, 1.4), "x")
+    assert (before.reason[:, :70] == Reason.SATURATED).mean() > 0.9
+    assert (phase.reason[:, :70] == Reason.SATURATED).mean() > 0.9
+    assert phase.mask[:, 90:].mean() > 0.99
+    ratio = np.median((phase.modulation / before.modulation)[:, 90:])
+    assert 0.94 < ratio < 1.0 and 0.7 < phase.noise[0] / before.noise[0] < 1.2
+
+
+def test_the_definition_agrees():
+    sequence = SEQUENCES["four"]
+    stack = relit(capture(sequence, TRUTH), gains(len(sequence.frames), 0.2))
+    fast, slow = decode(sequence, stack, "x"), decode_reference(sequence, stack, "x")
+    np.testing.assert_array_equal(fast.reason, slow.reason)
+    np.testing.assert_allclose(fast.phase, slow.phase, atol=1e-4)
