@@ -122,7 +122,7 @@ def room_changes(sample: LightSample, light: Light, with_gain: bool, weight: np.
     cross = normal[u : 3 * u, beside] @ inverse
     own = normal[u : 3 * u, u : 3 * u] - cross @ normal[beside, u : 3 * u]
     target = moment[u : 3 * u] - cross @ moment[beside]
-    best, at = 0.0, ()
+    best, at = 0.0, tuple[int, ...]()
     for k in sorted(used)[1:]:
         step = np.kron(np.eye(2), (used >= k).astype(float)[:, None])
         part = step.T @ target
