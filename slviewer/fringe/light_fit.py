@@ -123,7 +123,12 @@ def room_changes(sample: LightSample, light: Light, with_gain: bool, weight: np.
     own = normal[u : 3 * u, u : 3 * u] - cross @ normal[beside, u : 3 * u]
     target = moment[u : 3 * u] - cross @ moment[beside]
     best, at = 0.0, tuple[int, ...]()
+    if model.phased and not model.phase_freedom:  # three steps: nothing but the Gray code contradicts a change
+        return at
+    phased, coded = set(model.phased), set(sample.coded)
     for k in sorted(used)[1:]:
+        if {i for i in used if i >= k} in (phased, coded):  # indistinguishable from where the fringes' mean lies
+            continue
         step = np.kron(np.eye(2), (used >= k).astype(float)[:, None])
         part = step.T @ target
         gain = float(part @ np.linalg.solve(step.T @ own @ step, part))
