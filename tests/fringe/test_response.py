@@ -13,7 +13,7 @@ from slviewer.fringe.presets import complementary, gray
 from slviewer.fringe.response import fitted_gamma, harmonic_error_rad, linearising, nonlinearity
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.exporters import write_pattern_folder
-from slviewer.session.importers.frames import read_sequence
+from slviewer.session.importers.frames import read_description
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -85,7 +85,7 @@ def test_the_table_is_kept_with_the_sequence(tmp_path):
     assert "levels" not in complementary((64, 48)).to_dict()
     write_pattern_folder(tmp_path / "patterns", sequence)
     toml = next((tmp_path / "patterns").glob("*.toml"))
-    assert read_sequence(toml)[0] == sequence
+    assert read_description(toml).sequence == sequence
 
 
 @pytest.mark.parametrize(
