@@ -13,6 +13,7 @@ from slviewer.fringe.agreement_tests import failed_tests, is_sure, score_of
 from slviewer.fringe.axis_agreement import Agreement, AxisReader, agreement, coordinates, described_frames
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
+from slviewer.fringe.frame_light import equalize_frames, estimate_frame_light
 from slviewer.fringe.frame_order import fitting_order, misplaced_steps, unexplained_steps
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.line_sample import LineSample, coded_frames, grid_sample, sample_lines
@@ -30,10 +31,18 @@ MIRRORED = 0.8
 
 def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
     """What in the description of an (n, h, w) stack contradicts its frames, the most probable first; empty where the
-    description holds. Some rows and columns are read, weighed by modulation. Raises InputError for a stack that is none
+    description holds. Some rows and columns are read, weighed by modulation; frames of
+    unequal light are compared as they would be under equal light. Raises InputError for a stack that is none
     of this sequence.
     """
     check_stack(sequence, stack)
+    contradictions = _find_contradictions(sequence, stack)
+    if not contradictions or not (light := estimate_frame_light(sequence, stack)).is_significant:
+        return contradictions
+    return _find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
+
+
+def _find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
     if not sequence.axes:
         return ()
     sample = sample_lines(sequence, stack)

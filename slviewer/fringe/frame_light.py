@@ -18,8 +18,14 @@ from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albed
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.suspect import Suspect
 
-LEAST_GAIN = 0.003
+LEAST_GAIN = 0.005
 """rms variation of the gains below which they are left alone: what a camera's curve and blur pretend at most."""
+LEAST_OF_THREE = 0.02
+"""The same of three steps, whose gains are known only as far as the scene's texture is independent of the fringes."""
+LEAST_CODED_GAIN = 0.045
+"""The same of a frame without phase shift: between blurred stripes the light of neighbours adds to it."""
+LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
+"""rms of a wave along the rows, and change of the room's light over the mean grey level, that are corrected."""
 NOISE_PART = 0.25
 """... and so is a variation below this part of the noise of a grey level, which adds 3 % to it."""
 BETTER = 1.03
@@ -29,12 +35,17 @@ AS_GOOD = 1.02
 LEFT, LEFT_CONTRAST = 4.0, 0.02
 """Light explains the frames if the mean squared residual is below so many times the square of the grey levels by which
 neighbouring pixels differ, plus the square of this share of the contrast for what blur and the camera's curve add."""
+LEFT_OF_ROOM = 1.5
+"""... so many times where gains and room light together explain them: they have so many values that they can pretend to
+explain a frame out of its place."""
 ONE_FRAME = 6.0
 """... and no frame has so many times the residual of the median frame: frames that show another's pattern have more."""
 CYCLES = np.arange(0.5, 8.25, 0.25)
 """Waves along the image's height that are tried."""
 FINE = 0.05
 """A coded frame of which so few pixels lie inside a stripe has fine stripes throughout."""
+REPORTED = 3.0
+"""Percent of brightness, from the darkest to the brightest frame, that the operator should know about."""
 FARTHEST = 0.7
 """Logarithm of a gain beyond which a frame shows something else."""
 CLIPPED = 65535.0
@@ -87,14 +98,15 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
         sample = sample_light(sequence, stack, fit.light.gain) or sample
         coarse = sample_light(sequence, stack, fit.light.gain, coarse=True) or coarse
         fit = fit_light(sample, ("gain",), fit.light)
-    fit = _simplest(coarse, sample, fit)
+    gains = fit
+    fit = _simplest(coarse, sample, gains)
+    if fit is not gains and not _is_worth_it(sample, fit):
+        fit = gains
     if not _explains(sample, fit):
         return steady
     light = _with_fine_stripes(sample, _with_nearest(sample, fit))
     used = list(fit.informed)
-    level = float(np.mean(sample.frames[used]))
-    albedo = float(np.mean(sample.albedo(light.changes)))
-    room = (light.uniform + light.albedo[:, 0] * albedo) / level
+    room = _room(sample, light, used)
     drift = float(np.std(np.log(fit.light.gain[used])))
     wave = float(np.sqrt(np.mean(light.wave[used] ** 2)))
     return FrameLight(light, fit.terms, drift, wave, room - room[used].min())
@@ -171,14 +183,14 @@ def light_suspects(sequence: PatternSequence, light: FrameLight) -> list[Suspect
     out = []
     used = [i for i, f in enumerate(sequence.frames) if f.kind != "texture"]
     gain = light.light.gain[used]
-    if "gain" in light.terms and light.drift > LEAST_GAIN:
-        span = 100 * (float(gain.max() / gain.min()) - 1)
+    span = 100 * (float(gain.max() / gain.min()) - 1)
+    if "gain" in light.terms and span > REPORTED:
         text = (
             f"the brightness of the frames varies by {span:.1f} % (automatic exposure, or an unsteady lamp): "
             "corrected; lock the camera's exposure, gain and white balance"
         )
         out.append(Suspect(used[int(np.argmax(np.abs(np.log(gain))))], "exposure-drift", text))
-    if "wave" in light.terms:
+    if "wave" in light.terms and light.wave > LEAST_WAVE:
         text = (
             f"the light varies along the image rows by {100 * np.sqrt(2) * light.wave:.0f} %, in "
             f"{light.light.cycles:.1f} waves per image (mains flicker under a rolling shutter): corrected; make the "
@@ -227,9 +239,34 @@ def _candidates(sample: LightSample, gains: Fit) -> Iterator[tuple[tuple[Term, .
 
 
 def _is_large(sample: LightSample, fit: Fit) -> bool:
+    """Whether the gains vary by more than can be neglected among the steps of a period, or among the other frames.
+
+    Only the former shift the phase. Of the latter, blurred stripes pretend some percent, and thresholds bear more.
+    """
     used = list(fit.informed)
     level = float(np.mean(sample.frames[used]))
-    return float(np.std(np.log(fit.light.gain[used]))) > max(LEAST_GAIN, NOISE_PART * np.sqrt(fit.variance) / level)
+    gain = np.log(fit.light.gain)
+    spread = {shift: float(np.std(gain[list(shift)])) for shift in sample.shifts if set(shift) <= set(used)}
+    within = max((s for shift, s in spread.items() if len(shift) > 3 or s > LEAST_OF_THREE), default=0.0)
+    coded = [i for i in used if i in sample.coded]
+    between = float(np.abs(gain[coded] - np.median(gain[coded])).max()) if coded else 0.0
+    least = max(LEAST_GAIN, NOISE_PART * np.sqrt(fit.variance) / level)
+    return within > least or between > max(LEAST_CODED_GAIN, least)
+
+
+def _is_worth_it(sample: LightSample, fit: Fit) -> bool:
+    """Whether a wave along the rows, or a change of the room's light, is large enough to be corrected."""
+    light, used = fit.light, list(fit.informed)
+    if "wave" in fit.terms and np.sqrt(np.mean(light.wave[used] ** 2)) > LEAST_WAVE:
+        return True
+    room = _room(sample, light, used)
+    return any(abs(float(room[k] - room[k - 1])) > LEAST_ROOM for k in light.changes)
+
+
+def _room(sample: LightSample, light: Light, used: Sequence[int]) -> np.ndarray:
+    """(n,) room light of each frame as a share of the mean grey level."""
+    albedo = float(np.mean(sample.albedo(light.changes)))
+    return (light.uniform + light.albedo[:, 0] * albedo) / float(np.mean(sample.frames[list(used)]))
 
 
 def _simplest(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
@@ -279,7 +316,8 @@ def _explains(sample: LightSample, fit: Fit) -> bool:
     entries[len(model.phased) :] = (fit.weight * sample.interior).sum(axis=1)
     judged = np.isin(model.used, fit.informed)
     each = energy[judged] / np.maximum(entries[judged], 1)
-    return fit.variance < LEFT * sample.roughness**2 + LEFT_CONTRAST**2 * float(
+    most = LEFT if len(fit.terms) < 3 else LEFT_OF_ROOM
+    return fit.variance < most * sample.roughness**2 + LEFT_CONTRAST**2 * float(
         np.mean(sample.amplitudes) ** 2
     ) and each.max() < ONE_FRAME * max(float(np.median(each)), sample.roughness**2 / 2)
 

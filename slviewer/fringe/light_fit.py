@@ -36,6 +36,8 @@ HARMONIC_STEPS = 4
 """Up to so many steps, n, the fringe's harmonic n is large enough to be seen in the background."""
 ONE_SIDED = 0.5
 """Length of the mean unit phasor above which a shift's pixels do not see all phases."""
+MIN_FRAMES = 3
+"""Frames that must be known on either side of a change of the room's light: one or two may just be of other gain."""
 MIN_ENTRIES = 0.03
 """Share of the sampled pixels that must lie inside a coded frame's bright stripes."""
 MAX_STEPS = 6
@@ -126,7 +128,10 @@ def room_changes(sample: LightSample, light: Light, with_gain: bool, weight: np.
     if model.phased and not model.phase_freedom:  # three steps: nothing but the Gray code contradicts a change
         return at
     phased, coded = set(model.phased), set(sample.coded)
+    informed = np.array(model.informed)
     for k in sorted(used)[1:]:
+        if min(np.count_nonzero(informed < k), np.count_nonzero(informed >= k)) < MIN_FRAMES:
+            continue
         if {i for i in used if i >= k} in (phased, coded):  # indistinguishable from where the fringes' mean lies
             continue
         step = np.kron(np.eye(2), (used >= k).astype(float)[:, None])

@@ -80,6 +80,8 @@ def sample_light(
     if phased:
         amplitudes = np.stack([np.abs(fit_cosine(frames[list(shift)])[1]) for shift in shifts])
         seen = np.count_nonzero(amplitudes > limit, axis=1)
+        if seen.max() < MIN_PIXELS:
+            return None
         shown = np.flatnonzero(seen > 0.5 * seen.max())  # an axis that was not shown, or is out of view, is no witness
         amplitudes, shifts = amplitudes[shown], tuple(shifts[s] for s in shown)
         phased = [i for shift in shifts for i in shift]

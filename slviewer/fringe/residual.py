@@ -6,18 +6,21 @@ projector's gamma adds is common to all frames, and is not held against one of t
 each other too: see `residual_gray`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slviewer.fringe.frame_light import CLIPPED, equalize_frames, estimate_frame_light, light_suspects
-from slviewer.fringe.layout import check_stack, layout, white_level
+from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_frames, estimate_frame_light, light_suspects
+from slviewer.fringe.layout import Layout, check_stack, layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.residual_gray import code_suspects
 from slviewer.fringe.residual_order import order_suspects, strange_suspects
 from slviewer.fringe.residual_sample import Fringe, fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.fringe.suspect import LIGHT_FAULTS, Suspect
+from slviewer.fringe.suspect import LIGHT_FAULTS, ORDER_FAULTS, Suspect
+
+SMALL_DRIFT = 0.05
+"""rms variation of the light up to which a misplaced frame is recognised without correcting the light first."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +61,28 @@ def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
     found = layout(sequence, axis)
     light = estimate_frame_light(sequence, stack)
     white, factor = white_level(stack, sequence.select(axis)), 1.0
-    if light.is_significant:
-        stack, factor = equalize_frames(stack, light, sequence)
-        white = CLIPPED
+    if not light.is_significant:
+        return _compare(sequence, found, stack, white, light, factor)
+    if light.drift < SMALL_DRIFT and light.wave < SMALL_DRIFT:
+        # A frame out of its place is a simpler explanation than many frames each in a light of its own.
+        as_seen = _compare(sequence, found, stack, white, light, factor)
+        if any(suspect.fault in ORDER_FAULTS for suspect in as_seen.suspects):
+            return as_seen
+    stack, factor = equalize_frames(stack, light, sequence)
+    compared = _compare(sequence, found, stack, CLIPPED, light, factor)
+    if compared.suspects:  # a frame out of its place spoils what is known of the light, too
+        return compared
+    return replace(compared, suspects=tuple(_once(light_suspects(sequence, light))))
+
+
+def _compare(
+    sequence: PatternSequence, found: Layout, stack: np.ndarray, white: float, light: FrameLight, factor: float
+) -> FrameResiduals:
+    """The residuals of one axis, from frames whose grey levels were multiplied by ``factor``."""
+    axis = found.axis
     noise = measure_noise(found, stack, white)
     residuals: list[FrameResidual] = []
-    suspects = light_suspects(sequence, light)
+    suspects: list[Suspect] = []
     said: list[str] = []
     for shift in found.shifts:
         sampled = fringe(stack, shift, noise, white)

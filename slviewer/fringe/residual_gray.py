@@ -24,7 +24,8 @@ _BROKEN, _WHOLE = 0.5, 0.9
 _SAME = 0.1  # rms difference of repeated frames, as a share of the contrast
 _SHARP = 0.5  # of the pixels, that must be read in it: fine stripes blur to the same grey
 _STRIPED = 0.03  # of the pixels that must be dark, and bright, in a frame that could be told from its neighbour
-_SUM = 0.2  # rms, as a share of the contrast, by which a bit and its inverse may differ from what all pairs add up to
+_INSIDE = 0.35  # of the contrast: blurred stripes seen through a gamma of 2.2 lie 0.28 from the middle
+_ALIKE = 0.2  # of these pixels, that may be alike in a bit and its inverse; half are in frames that are no pair
 _READABLE = 6.0  # px: mean width of stripes that can be read at most pixels
 _NOT_WHITE = 0.2  # of the pixels
 
@@ -47,9 +48,9 @@ class _Lines:
         """(p,) bool."""
         return self.frames[index] > self.middle
 
-    def decided(self, index: int) -> np.ndarray:
-        """(p,) bool: not on the edge of a stripe."""
-        return np.abs(self.frames[index] - self.middle) > _DECIDED * self.contrast
+    def decided(self, index: int, part: float = _DECIDED) -> np.ndarray:
+        """(p,) bool: not on the edge of a stripe, farther from the middle than this part of the contrast."""
+        return np.abs(self.frames[index] - self.middle) > part * self.contrast
 
 
 def code_suspects(sequence: PatternSequence, found: Layout, stack: np.ndarray, white: float) -> list[Suspect]:
@@ -119,14 +120,21 @@ def _repeated(lines: _Lines, code: list[int]) -> list[Suspect]:
 
 
 def _sums(lines: _Lines, found: Layout) -> list[Suspect]:
-    """Bits and inverses that do not add up to what the other pairs add up to."""
-    both = {(i, j): lines.frames[i] + lines.frames[j] for i, j in zip(found.gray, found.inverse, strict=True)}
-    whole = 2 * lines.middle
-    off = {pair: float(np.sqrt(np.mean(((total - whole) / lines.contrast) ** 2))) for pair, total in both.items()}
-    wrong = [pair for pair, share in off.items() if share > _SUM]
+    """Bits and inverses that are bright together, or dark together.
+
+    Only pixels inside stripes count: where stripes are finer than the blur, both frames show the same grey, which a
+    camera's gamma moves away from the middle.
+    """
+    pairs = list(zip(found.gray, found.inverse, strict=True))
+    wrong = []
+    for i, j in pairs:
+        inside = lines.decided(i, _INSIDE) & lines.decided(j, _INSIDE)
+        alike = lines.bit(i) == lines.bit(j)
+        if np.count_nonzero(inside) >= FEWEST and np.mean(alike[inside]) > _ALIKE:
+            wrong.append((i, j))
     out = []
     # Where one image is lost or comes twice, all that follow have moved.
-    if len(wrong) > 2 and wrong == list(both)[-len(wrong) :]:
+    if len(wrong) > 2 and wrong == pairs[-len(wrong) :]:
         i = min(wrong[0])
         text = (
             f"from frame {i + 1} on bits and inverses do not add up to white: the camera is an image behind or ahead, "

@@ -11,6 +11,8 @@ follow come too early; all come too late from here on; it fits nothing that was 
 brighter or darker than others; rows of a frame are; the room's light changed; it is not proportional to the pattern's
 grey level.
 """
+ORDER_FAULTS: tuple[Fault, ...] = ("late", "early", "swapped", "dropped", "lag")
+"""Faults of the order in which the frames were taken."""
 LIGHT_FAULTS: tuple[Fault, ...] = ("exposure-drift", "flicker", "room-light", "gamma")
 """Faults that decoding corrects, and that say nothing about the order of the frames."""
 
