@@ -3,6 +3,7 @@
 import numpy as np
 
 from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
+from slviewer.fringe.aliased_harmonics import correct_harmonics, estimate_aliased_harmonics
 from slviewer.fringe.frame_light import CLIPPED, equalized_axis, original_levels
 from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
 from slviewer.fringe.levels import cell_misfit, code_cell_px, found_levels, lowest_coordinate, unambiguous_px
@@ -20,8 +21,9 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
     """The phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
     A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the frames
-    (see `frame_light`), they are decoded as they would be under equal light. Raises InputError when the frames are not
-    those of the sequence, or cannot give an absolute phase.
+    (see `frame_light`), they are decoded as they would be under equal light; what gamma leaves in the phase of three or
+    four steps (see `aliased_harmonics`) is corrected. Raises InputError when the frames are not those of the sequence,
+    or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
     found = layout(sequence, axis)
@@ -43,11 +45,23 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
         maps = _levels(found, stack, scale)
     phase, wrapped, modulation, background, reason = maps
     phase = _settled(found, phase, reason)
+    harmonics = estimate_aliased_harmonics(found, stack, clipped, noise)
+    phase, wrapped = correct_harmonics(harmonics, found, phase, wrapped)
     if factor != 1:
         modulation, background, noise = original_levels(modulation, background, noise, factor)
     unambiguous = unambiguous_px(found)
     return PhaseMap(
-        axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps, unambiguous
+        axis,
+        found.period_px,
+        phase,
+        wrapped,
+        modulation,
+        background,
+        reason,
+        noise,
+        found.steps,
+        unambiguous,
+        harmonics.error_rad,
     )
 
 

@@ -20,8 +20,9 @@ def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[floa
 
     From what an n-step phase shift cannot explain: per pixel, cosines up to a harmonic that n allows are removed; then,
     from all pixels together, what the remaining harmonics have in common with the fringe, so that gamma is not taken
-    for noise. Three steps, and Gray code alone, leave no such remainder: then from differences along the rows, or from
-    the constancy of Gray + inverse. Sampled from a few rows of the image.
+    for noise. Three steps, and Gray code alone, leave no such remainder: then from the constancy of Gray + inverse, or
+    from differences along image rows or columns, whichever are smaller: those along the stripes. Sampled from a few
+    rows, or columns, of the image.
     """
     if layout.steps >= 4:
         levels, variances, freedom = _from_phase(sample(stack, layout.shifts[-1].indices), white)
@@ -29,8 +30,17 @@ def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[floa
         levels, variances, freedom = _from_inverses(sample(stack, layout.gray), sample(stack, layout.inverse), white)
     else:
         frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
-        levels, variances, freedom = _from_differences(sample(stack, tuple(i for i in frames if i is not None)), white)
+        indices = tuple(i for i in frames if i is not None)
+        along = [_from_differences(sample(s, indices), white) for s in (stack, stack.transpose(0, 2, 1))]
+        fits = [_binned(*differences) for differences in along if len(differences[0])]
+        # Fringes and texture only ever add to the differences.
+        return _fit_line(*min(fits, key=_mean_variance)) if fits else (0.0, 0.0)
     return _fit_line(*_binned(levels, variances, freedom))
+
+
+def _mean_variance(bins: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+    _, variances, counts = bins
+    return float(variances @ counts / counts.sum())
 
 
 def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
@@ -93,7 +103,7 @@ def _from_inverses(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple
 
 
 def _from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Variance from third differences along the row: fringes and shading are nearly quadratic over four pixels."""
+    """Variance from third differences along a line: fringes and shading are nearly quadratic over four pixels."""
     if samples.shape[-1] < BLOCK:
         return np.zeros(0), np.zeros(0), 1.0
     usable = _usable(samples, white)

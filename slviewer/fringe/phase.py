@@ -35,7 +35,7 @@ class PhaseMap:
     ``modulation`` and ``background`` float32 grey levels. ``noise`` = (a, b): the variance of one frame's grey level is
     a + b * level, measured from this capture. ``steps``: phase steps of the finest period, 0 for Gray code alone, whose
     ``period_px`` is the width of its cells. ``unambiguous_px``: the coordinate is known only modulo so many px of the
-    projector; infinite where it is absolute.
+    projector; infinite where it is absolute. ``model_error_rad``: rms error of the phase beside noise, as gamma leaves it.
     """
 
     axis: Axis
@@ -48,6 +48,7 @@ class PhaseMap:
     noise: tuple[float, float]
     steps: int
     unambiguous_px: float = np.inf
+    model_error_rad: float = 0.0
 
     def __post_init__(self) -> None:
         maps = (self.phase, self.wrapped, self.modulation, self.background, self.reason)
@@ -78,8 +79,8 @@ class PhaseMap:
 
     @property
     def sigma_phase(self) -> np.ndarray:
-        """(h, w) float32 rad: standard deviation of the phase, sqrt(2 / n) sigma_I / B; 2 pi / sqrt(12) for Gray code
-        alone. NaN where the phase is.
+        """(h, w) float32 rad: standard deviation of the phase, sqrt(2 / n) sigma_I / B and `model_error_rad` in
+        quadrature; 2 pi / sqrt(12) for Gray code alone. NaN where the phase is.
         """
         if self.steps == 0:
             sigma = np.full_like(self.phase, 2 * np.pi * GRAY_SIGMA_CELLS)
@@ -87,4 +88,6 @@ class PhaseMap:
             a, b = self.noise
             variance = np.float32(a) + np.float32(b) * self.background
             sigma = np.sqrt(variance * np.float32(2 / self.steps)) / np.maximum(self.modulation, np.float32(1e-6))
+            if self.model_error_rad:
+                sigma = np.hypot(sigma, np.float32(self.model_error_rad))
         return np.where(self.mask, sigma, np.float32(np.nan))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from slviewer.fringe import limits
+from slviewer.fringe.aliased_harmonics import correct_harmonics, estimate_aliased_harmonics
 from slviewer.fringe.frame_light import CLIPPED, equalized_axis, original_levels
 from slviewer.fringe.layout import Layout, check_stack, layout, white_level
 from slviewer.fringe.levels import (
@@ -54,11 +55,23 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
     phase, reason = settle(found, phase, reason)
+    harmonics = estimate_aliased_harmonics(found, stack, white, noise)
+    phase, wrapped = correct_harmonics(harmonics, found, phase, wrapped)
     if factor != 1:
         modulation, background, noise = original_levels(modulation, background, noise, factor)
     unambiguous = unambiguous_px(found)
     return PhaseMap(
-        axis, found.period_px, phase, wrapped, modulation, background, reason, noise, found.steps, unambiguous
+        axis,
+        found.period_px,
+        phase,
+        wrapped,
+        modulation,
+        background,
+        reason,
+        noise,
+        found.steps,
+        unambiguous,
+        harmonics.error_rad,
     )
 
 

@@ -2,7 +2,8 @@
 
 Phase-shifted frames are one cosine per pixel, so that more than three of them say too much, and contradict each other
 when one was late, lost or repeated. Frames of unequal light are compared as they would be under equal light. What the
-projector's gamma adds is common to all frames, and is not held against one of them. Frames of a Gray code contradict
+projector's gamma adds is common to all frames, and is not held against one of them; where it shifts the phase of three
+or four steps, it is reported. Frames of a Gray code contradict
 each other too: see `residual_gray`.
 """
 
@@ -10,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slviewer.fringe.aliased_harmonics import estimate_aliased_harmonics, harmonics_suspects
 from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_frames, estimate_frame_light, light_suspects
 from slviewer.fringe.layout import Layout, check_stack, layout, white_level
 from slviewer.fringe.noise import measure_noise
@@ -95,6 +97,7 @@ def _compare(
             said.append(f"{what}: three steps fit any three frames, so that only a repeated one can be told")
         suspects += order_suspects(sampled) or strange_suspects(sampled)
         residuals += _residuals(sampled, _light(sampled) * light.light.gain[list(shift.indices)], factor)
+    suspects += harmonics_suspects(estimate_aliased_harmonics(found, stack, white, noise), found)
     if found.gray:
         suspects += code_suspects(sequence, found, stack, white)
     return FrameResiduals(axis, tuple(residuals), tuple(_once(suspects)), "; ".join(said))

@@ -1,0 +1,269 @@
+"""Phase errors that gamma leaves in three and four phase steps: estimated from the frames themselves, and corrected.
+
+A response that is not linear adds harmonics to the fringe, B_m cos(m theta) with theta the argument of the cosine. Among
+n steps harmonics n - 1 and n + 1 appear as the first, which is measured as
+B_1 e^(i theta) (1 + M cos(n theta) - i d sin(n theta)), with M = (B_{n-1} + B_{n+1}) / B_1 and
+d = (B_{n-1} - B_{n+1}) / B_1. So the modulation ripples with the cosine, and the phase with the sine: the error is
+atan2(-d sin(n theta), 1 + M cos(n theta)). Each is fitted, beside a parabola, to pieces of image lines about one fringe
+long. Texture disturbs the modulation alone and relief the phase alone, and neither follows the fringe, so that gamma is
+what both agree upon. Gamma makes no sine of the modulation and no cosine of the phase: what is fitted to these is the
+part that texture and relief pretend.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.fringe import limits
+from slviewer.fringe.layout import Layout
+from slviewer.fringe.residual_sample import fit_cosine, spread_rows
+from slviewer.fringe.suspect import Suspect
+
+MOST_STEPS = 4
+"""From five steps on harmonics below the fourth leave no error, and blur leaves little of the others."""
+SIGMAS = 5.0
+"""Standard errors beyond which a ripple is no accident: one in two million."""
+CONTROL = 3.0
+"""... and times the ripple that gamma cannot make."""
+NOISE_PART = 0.5
+"""An error below this part of the phase noise is neglected: it adds 12 % to it."""
+PIXELS = 20_000
+"""So many are sampled: they tell a ripple of half a thousandth."""
+MOST_CYCLES = 0.4
+"""Fringes per camera pixel up to which neighbouring phases can be unwrapped."""
+SHORTEST = 16
+"""Pixels that a piece has at least, for seven coefficients."""
+BANDS = 6
+"""Parts of the image's height and width, whose means tell how certain the mean of all is."""
+FEWEST_BLOCKS = 6
+ROUNDS = 6
+"""The phase itself is the argument of the ripple: fit and correct in turns, until both settle."""
+OUTLIER = 4.0
+"""Times the usual deviation beyond which a piece (an edge, a step) does not count."""
+
+
+@dataclass(frozen=True)
+class AliasedHarmonics:
+    """The ripple of n phase steps: amplitudes ``modulation`` (M, relative) and ``phase`` (d, rad), zero where none is
+    significant.
+
+    ``is_corrected``: whether d is known well enough to be removed; ``error_rad``: rms error of the phase that remains.
+    """
+
+    steps: int = 0
+    modulation: float = 0.0
+    phase: float = 0.0
+    is_corrected: bool = False
+    error_rad: float = 0.0
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether gamma shows."""
+        return self.steps > 0
+
+    def correction(self, theta: np.ndarray) -> np.ndarray:
+        """rad float32, of theta's shape: what to add to a measured argument ``theta`` of the cosine, rad."""
+        return _correction(theta, self.steps, self.modulation, self.phase).astype(np.float32)
+
+
+def estimate_aliased_harmonics(
+    found: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]
+) -> AliasedHarmonics:
+    """What harmonics leave in the finest period of an axis; nothing where it has five or more steps.
+
+    ``stack`` (n, h, w) under equal light, which clips at ``white``; ``noise`` (a, b) of its grey levels. About 20,000
+    pixels along the image lines that cross the fringes are used.
+    """
+    none = AliasedHarmonics()
+    if not 0 < found.steps <= MOST_STEPS:
+        return none
+    pieces = _cut_pieces(found, stack, white, noise)
+    if pieces is None:
+        return none
+    fit = _fit_ripple(pieces)
+    if fit is None:
+        return none
+    M, d, spread, second = fit
+    size = float(np.hypot(M.value, M.control)) if abs(d.value) < abs(M.value) else abs(d.value)
+    if not M.is_significant or size / np.sqrt(2) < NOISE_PART * pieces.sigma:
+        return none
+    n = pieces.steps
+    if d.is_significant and d.value * M.value > 0 and _slope(n, M.value, d.value).min() > 0.1:
+        noise_gain = float(np.mean(_slope(n, M.value, d.value) ** -2.0)) - 1
+        left = float(np.sqrt((spread**2 + d.error**2 + second**2) / 2 + max(noise_gain, 0.0) * pieces.sigma**2))
+        return AliasedHarmonics(n, M.value, d.value, True, left)
+    if abs(d.value - M.value) > SIGMAS * d.error + abs(M.value) / 2:  # no phase follows: the modulation is texture's
+        return none
+    return AliasedHarmonics(n, M.value, d.value, False, abs(M.value) / np.sqrt(2))
+
+
+def correct_harmonics(
+    harmonics: AliasedHarmonics, found: Layout, phase: np.ndarray, wrapped: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Absolute and wrapped phase (h, w) float32 rad without the ripple, where it is to be corrected; else as given."""
+    if not harmonics.is_corrected:
+        return phase, wrapped
+    added = harmonics.correction(wrapped + np.float32(found.offset_rad))
+    turned = wrapped + added
+    turned -= np.float32(2 * np.pi) * np.rint(turned * np.float32(0.5 / np.pi))
+    return phase + added, turned
+
+
+def harmonics_suspects(harmonics: AliasedHarmonics, found: Layout) -> list[Suspect]:
+    """What the operator should know about gamma, and change."""
+    if not harmonics.is_significant:
+        return []
+    per_rad = found.period_px / (2 * np.pi)
+    theta = np.linspace(0, 2 * np.pi, 361)
+    largest = float(np.abs(harmonics.correction(theta)).max()) * per_rad
+    remaining = harmonics.error_rad * per_rad
+    treated = (
+        f"corrected, and {remaining:.2g} px was added to the uncertainty"
+        if harmonics.is_corrected
+        else f"it could not be measured well enough to correct it, and {remaining:.2g} px was added to the uncertainty"
+    )
+    text = (
+        f"the light does not grow evenly with the grey level (gamma): with {harmonics.steps} phase steps this shifts "
+        f"the coordinates of axis {found.axis} by up to {largest:.2g} px: {treated}; make the responses of projector "
+        "and camera linear, or use 5 phase steps or more"
+    )
+    return [Suspect(found.shifts[-1].indices[0], "gamma", text)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """k pieces of image lines, s pixels each: ``theta`` (k, s) rad, unwrapped; ``modulation`` (k, s) relative to the
+    piece's mean; ``block`` (k,) part of the image; ``sigma`` median phase noise, rad."""
+
+    steps: int
+    theta: np.ndarray
+    modulation: np.ndarray
+    block: np.ndarray
+    sigma: float
+
+
+@dataclass(frozen=True)
+class _Amplitude:
+    value: float
+    error: float
+    control: float
+
+    @property
+    def is_significant(self) -> bool:
+        return abs(self.value) > max(SIGMAS * self.error, CONTROL * abs(self.control))
+
+
+def _cut_pieces(found: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]) -> _Pieces | None:
+    indices = list(found.shifts[-1].indices)
+    candidates = [_sample_lines(stack, indices, white, noise)]
+    candidates.append(_sample_lines(stack.transpose(0, 2, 1), indices, white, noise))
+    phasor, background, valid, cycles = max(candidates, key=lambda c: c[3])
+    if not 0 < cycles < MOST_CYCLES:
+        return None
+    size = max(SHORTEST, int(np.ceil(1 / cycles)))
+    lines, count = len(phasor), phasor.shape[1] // size
+    if count == 0:
+        return None
+    shape = (lines, count, size)
+    usable = valid[:, : count * size].reshape(shape).all(axis=2)
+    if not usable.any():
+        return None
+    band = BANDS * np.arange(lines) // lines
+    block = (BANDS * band[:, None] + BANDS * np.arange(count) // count)[usable]
+    chosen = phasor[:, : count * size].reshape(shape)[usable].astype(np.complex128)
+    modulation = np.abs(chosen)
+    level = background[:, : count * size].reshape(shape)[usable]
+    sigma = np.sqrt(2 / len(indices) * np.maximum(noise[0] + noise[1] * level, 0)) / modulation
+    theta = np.unwrap(np.angle(chosen), axis=1)
+    relative = modulation / modulation.mean(axis=1, keepdims=True)
+    return _Pieces(len(indices), theta, relative, block, float(np.median(sigma)))
+
+
+def _sample_lines(
+    stack: np.ndarray, indices: list[int], white: float, noise: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Phasor, background and validity (lines, pixels) of some image rows, and the fringes per pixel along them."""
+    rows = spread_rows(*stack.shape[1:], PIXELS)
+    frames = np.stack([stack[i][rows] for i in indices])
+    clipped = (frames >= white).any(axis=0)
+    background, phasor = fit_cosine(frames.reshape(len(frames), -1).astype(np.float32))
+    shape = frames.shape[1:]
+    background, phasor = background.reshape(shape), phasor.reshape(shape)
+    sigma = np.sqrt(np.maximum(noise[0] + noise[1] * background, 0))
+    valid = (np.abs(phasor) > np.maximum(limits.DARK_SIGMAS * sigma, 1e-3)) & ~clipped
+    both = valid[:, 1:] & valid[:, :-1]
+    if not both.any():
+        return phasor, background, valid, 0.0
+    turn = np.angle(phasor[:, 1:] * np.conj(phasor[:, :-1]))[both]
+    return phasor, background, valid, float(np.median(np.abs(turn))) / (2 * np.pi)
+
+
+def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] | None:
+    """M and d; how d varies over the image; and the phase ripple that is left at twice the waves."""
+    M = d = 0.0
+    n, size = pieces.steps, pieces.theta.shape[1]
+    x = np.broadcast_to(np.linspace(-1, 1, size), pieces.theta.shape)
+    for _ in range(ROUNDS):
+        added = _correction(pieces.theta, n, M, d)
+        theta = pieces.theta + added
+        ripples = [f(m * n * theta) for m in (1, 2) for f in (np.cos, np.sin)]
+        design = np.stack([np.ones_like(x), x, x**2, *ripples], axis=2)
+        centred = theta - theta.mean(axis=1, keepdims=True)
+        target = np.stack([centred, pieces.modulation * np.cos(added)], axis=2)
+        transposed = design.transpose(0, 2, 1)
+        inverse = np.linalg.inv(transposed @ design + 1e-6 * size * np.eye(design.shape[2]))
+        weights = inverse @ (transposed @ target)
+        left = np.sqrt(np.mean((target - design @ weights) ** 2, axis=1))
+        good = (left < OUTLIER * np.median(left, axis=0)).all(axis=1)
+        information = 1 / np.diagonal(inverse, axis1=1, axis2=2)
+
+        def mean(row: int, column: int) -> tuple[float, float, float]:
+            chosen = weights[good, row, column], information[good, row], pieces.block[good]
+            return _robust_mean(*chosen)
+
+        phase_sine, error, spread = mean(4, 0)
+        modulation_cosine, modulation_error, _ = mean(3, 1)
+        if not np.isfinite([phase_sine, modulation_cosine]).all():
+            return None
+        limit = 0.9 / n
+        M, d = float(np.clip(modulation_cosine, -0.9, 0.9)), float(np.clip(d - phase_sine, -limit, limit))
+    return (
+        _Amplitude(M, modulation_error, mean(4, 1)[0]),
+        _Amplitude(d, error, mean(3, 0)[0]),
+        spread,
+        mean(6, 0)[0],
+    )
+
+
+def _robust_mean(values: np.ndarray, weights: np.ndarray, block: np.ndarray) -> tuple[float, float, float]:
+    """Weighted mean without outliers, its standard error, and the standard deviation of the blocks' means."""
+    if len(values) == 0:
+        return np.nan, np.nan, np.nan
+    middle = np.median(values)
+    kept = np.abs(values - middle) <= OUTLIER * 1.4826 * np.median(np.abs(values - middle))
+    values, weights, block = values[kept], weights[kept], block[kept]
+    total = np.bincount(block, weights)
+    used = total > 0
+    if np.count_nonzero(used) < FEWEST_BLOCKS:
+        return np.nan, np.nan, np.nan
+    total, means = total[used], np.bincount(block, weights * values)[used] / total[used]
+    share = total / total.sum()
+    mean = float(share @ means)
+    many = 1 - float(share @ share)
+    spread = float(np.sqrt(share @ (means - mean) ** 2 / max(many, 0.1)))
+    return mean, spread * float(np.sqrt(share @ share)), spread
+
+
+def _correction(theta: np.ndarray, n: int, M: float, d: float) -> np.ndarray:
+    """What to add to measured arguments ``theta``: the ripple's inverse, from a table over one wave."""
+    wave = np.linspace(-np.pi, np.pi, 1025)
+    error = np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))
+    place = n * theta
+    place = place - 2 * np.pi * np.rint(place / (2 * np.pi))
+    return np.interp(place, np.maximum.accumulate(wave + n * error), -error)
+
+
+def _slope(n: int, M: float, d: float) -> np.ndarray:
+    """Derivative of the measured argument with respect to the true one, over one wave."""
+    wave = np.linspace(-np.pi, np.pi, 1025)
+    return np.diff(wave + n * np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))) / np.diff(wave)
