@@ -27,7 +27,7 @@ CONTROL = 3.0
 """... and times the ripple that gamma cannot make."""
 NOISE_PART = 0.5
 """An error below this part of the phase noise is neglected: it adds 12 % to it."""
-PIXELS = 20_000
+PIXELS = 40_000
 """So many are sampled: they tell a ripple of half a thousandth."""
 MOST_CYCLES = 0.4
 """Fringes per camera pixel up to which neighbouring phases can be unwrapped."""
@@ -71,7 +71,7 @@ def estimate_aliased_harmonics(
 ) -> AliasedHarmonics:
     """What harmonics leave in the finest period of an axis; nothing where it has five or more steps.
 
-    ``stack`` (n, h, w) under equal light, which clips at ``white``; ``noise`` (a, b) of its grey levels. About 20,000
+    ``stack`` (n, h, w) under equal light, which clips at ``white``; ``noise`` (a, b) of its grey levels. About 40,000
     pixels along the image lines that cross the fringes are used.
     """
     none = AliasedHarmonics()

@@ -109,7 +109,7 @@ def _from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarray, np
     usable = _usable(samples, white)
     samples = samples[:, usable].reshape(-1, samples.shape[-1])  # each frame has its own level
     third = np.diff(samples, n=3, axis=-1)
-    return samples.mean(axis=-1), (third**2).mean(axis=-1) / 20, 3.0  # 1 + 9 + 9 + 1; overlapping differences
+    return samples.mean(axis=-1), (third**2).mean(axis=-1) / 20, 2.5  # 1 + 9 + 9 + 1; five that overlap
 
 
 def _usable(samples: np.ndarray, white: float) -> np.ndarray:
