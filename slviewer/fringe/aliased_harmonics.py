@@ -1,7 +1,7 @@
 """Phase errors that gamma leaves in three and four phase steps: estimated from the frames themselves, and corrected.
 
-A response that is not linear adds harmonics to the fringe, B_m cos(m theta) with theta the argument of the cosine. Among
-n steps harmonics n - 1 and n + 1 appear as the first, which is measured as
+A response that is not linear adds harmonics to the fringe, B_m cos(m theta) with theta the argument of the cosine.
+Among n steps harmonics n - 1 and n + 1 appear as the first, which is measured as
 B_1 e^(i theta) (1 + M cos(n theta) - i d sin(n theta)), with M = (B_{n-1} + B_{n+1}) / B_1 and
 d = (B_{n-1} - B_{n+1}) / B_1. So the modulation ripples with the cosine, and the phase with the sine: the error is
 atan2(-d sin(n theta), 1 + M cos(n theta)). Each is fitted, beside a parabola, to pieces of image lines about one fringe
@@ -183,7 +183,7 @@ def _sample_lines(
     stack: np.ndarray, indices: list[int], white: float, noise: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Phasor, background and validity (lines, pixels) of some image rows, and the fringes per pixel along them."""
-    rows = spread_rows(*stack.shape[1:], PIXELS)
+    rows = spread_rows(stack.shape[1], stack.shape[2], PIXELS)
     frames = np.stack([stack[i][rows] for i in indices])
     clipped = (frames >= white).any(axis=0)
     background, phasor = fit_cosine(frames.reshape(len(frames), -1).astype(np.float32))
@@ -216,22 +216,20 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
         left = np.sqrt(np.mean((target - design @ weights) ** 2, axis=1))
         good = (left < OUTLIER * np.median(left, axis=0)).all(axis=1)
         information = 1 / np.diagonal(inverse, axis1=1, axis2=2)
-
-        def mean(row: int, column: int) -> tuple[float, float, float]:
-            chosen = weights[good, row, column], information[good, row], pieces.block[good]
-            return _robust_mean(*chosen)
-
-        phase_sine, error, spread = mean(4, 0)
-        modulation_cosine, modulation_error, _ = mean(3, 1)
-        if not np.isfinite([phase_sine, modulation_cosine]).all():
+        # rows: constant, x, x^2, cos, sin, cos 2, sin 2; columns: phase, modulation
+        phase_cosine, phase_sine, second, modulation_cosine, modulation_sine = (
+            _robust_mean(weights[good, row, column], information[good, row], pieces.block[good])
+            for row, column in ((3, 0), (4, 0), (6, 0), (3, 1), (4, 1))
+        )
+        if not np.isfinite([phase_sine[0], modulation_cosine[0]]).all():
             return None
         limit = 0.9 / n
-        M, d = float(np.clip(modulation_cosine, -0.9, 0.9)), float(np.clip(d - phase_sine, -limit, limit))
+        M, d = float(np.clip(modulation_cosine[0], -0.9, 0.9)), float(np.clip(d - phase_sine[0], -limit, limit))
     return (
-        _Amplitude(M, modulation_error, mean(4, 1)[0]),
-        _Amplitude(d, error, mean(3, 0)[0]),
-        spread,
-        mean(6, 0)[0],
+        _Amplitude(M, modulation_cosine[1], modulation_sine[0]),
+        _Amplitude(d, phase_sine[1], phase_cosine[0]),
+        phase_sine[2],
+        second[0],
     )
 
 

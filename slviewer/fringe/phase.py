@@ -35,7 +35,8 @@ class PhaseMap:
     ``modulation`` and ``background`` float32 grey levels. ``noise`` = (a, b): the variance of one frame's grey level is
     a + b * level, measured from this capture. ``steps``: phase steps of the finest period, 0 for Gray code alone, whose
     ``period_px`` is the width of its cells. ``unambiguous_px``: the coordinate is known only modulo so many px of the
-    projector; infinite where it is absolute. ``model_error_rad``: rms error of the phase beside noise, as gamma leaves it.
+    projector; infinite where it is absolute. ``model_error_rad``: rms error of the phase that gamma leaves,
+    beside noise.
     """
 
     axis: Axis

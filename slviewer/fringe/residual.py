@@ -72,9 +72,9 @@ def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
             return as_seen
     stack, factor = equalize_frames(stack, light, sequence)
     compared = _compare(sequence, found, stack, CLIPPED, light, factor)
-    if compared.suspects:  # a frame out of its place spoils what is known of the light, too
-        return compared
-    return replace(compared, suspects=tuple(_once(light_suspects(sequence, light))))
+    if any(suspect.fault != "gamma" for suspect in compared.suspects):
+        return compared  # a frame out of its place spoils what is known of the light, too
+    return replace(compared, suspects=tuple(_once([*light_suspects(sequence, light), *compared.suspects])))
 
 
 def _compare(

@@ -1,4 +1,4 @@
-"""What gamma leaves in three and four phase steps is measured, corrected and reported; textures are not taken for it."""
+"""Gamma in three and four phase steps is measured, corrected and reported, and textures are not taken for it."""
 
 import numpy as np
 import pytest
