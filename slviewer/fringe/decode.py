@@ -11,6 +11,7 @@ from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.reference import code_bits, dark_sigmas, decode_reference, phase_shift
 from slviewer.fringe.reference_spikes import border_rad, cell_rad, is_plain, repeat_cells
+from slviewer.fringe.scatter import with_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
 
@@ -50,7 +51,7 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
     if factor != 1:
         modulation, background, noise = original_levels(modulation, background, noise, factor)
     unambiguous = unambiguous_px(found)
-    return PhaseMap(
+    phase_map = PhaseMap(
         axis,
         found.period_px,
         phase,
@@ -63,6 +64,7 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
         unambiguous,
         harmonics.error_rad,
     )
+    return with_scatter(phase_map)
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:

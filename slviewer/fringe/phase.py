@@ -35,8 +35,9 @@ class PhaseMap:
     ``modulation`` and ``background`` float32 grey levels. ``noise`` = (a, b): the variance of one frame's grey level is
     a + b * level, measured from this capture. ``steps``: phase steps of the finest period, 0 for Gray code alone, whose
     ``period_px`` is the width of its cells. ``unambiguous_px``: the coordinate is known only modulo so many px of the
-    projector; infinite where it is absolute. ``model_error_rad``: rms error of the phase that gamma leaves,
-    beside noise.
+    projector; infinite where it is absolute. ``model_error_rad``: rms error of the phase that gamma leaves, beside
+    noise. ``sigma_scale``: factor by which neighbouring pixels scatter more than both predict, 1 where they do not (see
+    `scatter`).
     """
 
     axis: Axis
@@ -50,6 +51,7 @@ class PhaseMap:
     steps: int
     unambiguous_px: float = np.inf
     model_error_rad: float = 0.0
+    sigma_scale: float = 1.0
 
     def __post_init__(self) -> None:
         maps = (self.phase, self.wrapped, self.modulation, self.background, self.reason)
@@ -81,7 +83,7 @@ class PhaseMap:
     @property
     def sigma_phase(self) -> np.ndarray:
         """(h, w) float32 rad: standard deviation of the phase, sqrt(2 / n) sigma_I / B and `model_error_rad` in
-        quadrature; 2 pi / sqrt(12) for Gray code alone. NaN where the phase is.
+        quadrature, times `sigma_scale`; 2 pi / sqrt(12) for Gray code alone. NaN where the phase is.
         """
         if self.steps == 0:
             sigma = np.full_like(self.phase, 2 * np.pi * GRAY_SIGMA_CELLS)
@@ -91,4 +93,6 @@ class PhaseMap:
             sigma = np.sqrt(variance * np.float32(2 / self.steps)) / np.maximum(self.modulation, np.float32(1e-6))
             if self.model_error_rad:
                 sigma = np.hypot(sigma, np.float32(self.model_error_rad))
+            if self.sigma_scale != 1:
+                sigma *= np.float32(self.sigma_scale)
         return np.where(self.mask, sigma, np.float32(np.nan))

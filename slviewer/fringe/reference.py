@@ -17,6 +17,7 @@ from slviewer.fringe.levels import (
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference_spikes import settle
+from slviewer.fringe.scatter import with_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import fringe_mean
 
@@ -60,7 +61,7 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     if factor != 1:
         modulation, background, noise = original_levels(modulation, background, noise, factor)
     unambiguous = unambiguous_px(found)
-    return PhaseMap(
+    phase_map = PhaseMap(
         axis,
         found.period_px,
         phase,
@@ -73,6 +74,7 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
         unambiguous,
         harmonics.error_rad,
     )
+    return with_scatter(phase_map)
 
 
 def phase_shift(

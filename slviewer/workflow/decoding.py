@@ -13,6 +13,7 @@ from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
+from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
@@ -111,7 +112,22 @@ def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping
                 "nearer projector, darker room)"
             )
             break
-    return messages
+    return messages + scatter_warnings(phases)
+
+
+def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:
+    """Where neighbouring pixels scatter more than the camera's noise explains: by how much, and what to do."""
+    worst = max(phases.values(), key=lambda phase: phase.sigma_scale, default=None)
+    if worst is None or worst.sigma_scale <= SIGNIFICANT:
+        return []
+    if measure_scatter(worst).is_compressed:
+        cause, cure = "the images were compressed (blocks of 8 x 8 pixels, as of JPEG)", "record without compression"
+    else:
+        cause, cure = "sharpening or compression may be the cause", "switch them off in the camera"
+    return [
+        f"neighbouring pixels scatter {worst.sigma_scale:.1f} times as much in {worst.axis} as the camera's noise "
+        f"explains, and the predicted uncertainty includes this: {cause}; {cure}"
+    ]
 
 
 def _saturated_share(phase: PhaseMap) -> float:

@@ -2,10 +2,12 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
 from slviewer.fringe.presets import complementary
+from slviewer.fringe.scatter import SIGNIFICANT
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -31,3 +33,17 @@ def test_the_reason_of_many_masked_pixels_is_named(peak_level, word):
 @pytest.mark.parametrize("peak_level", [212.0, 60.0])
 def test_a_sound_capture_says_nothing(peak_level):
     assert said(peak_level) == ""
+
+
+def test_compressed_frames_are_named():
+    rig = letter(0.3)
+    sequence = complementary(rig.projector.size)
+    frames = Renderer(rig, PLANE).capture(sequence)
+    recorded = [cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 60])[1] for frame in frames]
+    frames = np.stack([cv2.imdecode(each, cv2.IMREAD_GRAYSCALE) for each in recorded])
+    phases = decode_frames("plane", sequence, frames)
+    factor = max(phase.sigma_scale for phase in phases.values())
+    [message] = loss_warnings(sequence, frames, phases)
+    assert factor > SIGNIFICANT
+    assert f"{factor:.1f} times" in message
+    assert "JPEG" in message

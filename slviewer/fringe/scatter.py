@@ -1,0 +1,132 @@
+"""Noise of the phase from neighbouring pixels: what no residual over the phase steps contains.
+
+Lossy compression adds errors that lie partly in the fringe's own harmonic. The n steps of a pixel fit these as well as
+the fringe itself, so that the noise of grey levels explains too little; but the phase of a smooth surface then scatters
+more than predicted from pixel to pixel, or, where JPEG has smoothed its blocks of 8 x 8 pixels, from block to block.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slviewer.fringe.phase import PhaseMap, Reason
+
+WINDOW = 16
+"""px: side of a window, two blocks of JPEG."""
+WINDOWS = 14
+"""Windows that are sampled along a column of the image, and along a row."""
+FEWEST = 30
+"""Fewer valid windows say nothing."""
+BLOCK = 8
+"""px: side of a block of JPEG, and of the parts of a window whose third differences are averaged."""
+QUANTILE = 0.25
+"""Of the blocks' ratios of observed to predicted variance decides whether the prediction holds: up to three quarters of
+a scene may be edges and texture."""
+SIGNIFICANT = 1.2
+"""Times the predicted standard deviation, below which none is raised: noise depends on more than the mean level."""
+BLOCKINESS = 1.5
+"""Third differences across the borders of blocks over those inside, from which an image counts as compressed: without
+compression noise leaves it within 1.15, with JPEG of quality 85 it is 2 to 3."""
+ROUNDING = 1 / 12
+"""Variance of a rounded grey level: frames without noise still have it, and residuals may not see it."""
+_VARIANCES = 20.0  # of a third difference: 1 + 9 + 9 + 1
+_FREEDOM = 25.0  # of the mean over a block: its differences overlap
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """``ratio``: observed over predicted standard deviation of the phase; NaN where too little is seen.
+    ``blockiness``: phase differences across the borders of a grid of 8 x 8 pixels over those inside; 1 without a grid.
+    """
+
+    ratio: float
+    blockiness: float
+
+    @property
+    def is_compressed(self) -> bool:
+        """Whether the frames went through JPEG."""
+        return self.blockiness > BLOCKINESS
+
+
+def with_scatter(phase: PhaseMap) -> PhaseMap:
+    """The same phase map with a ``sigma_scale`` as measured, where it is significant."""
+    found = measure_scatter(phase)
+    raised = found.ratio > (1.0 if found.is_compressed else SIGNIFICANT)
+    return replace(phase, sigma_scale=found.ratio) if raised else phase
+
+
+def measure_scatter(phase: PhaseMap) -> Scatter:
+    """How the phase scatters between neighbouring pixels of smooth surfaces, compared with what ``phase.noise``
+    predicts.
+    """
+    if not phase.steps or min(phase.phase.shape) < WINDOW:
+        return Scatter(np.nan, 1.0)
+    where, first = _valid_windows(phase)
+    if len(first) < FEWEST:
+        return Scatter(np.nan, 1.0)
+    values = phase.phase[where]
+    values = values - values.mean(axis=(1, 2), keepdims=True)  # exact enough in float32
+    third = [np.diff(values, n=3, axis=axis) for axis in (1, 2)]
+    blockiness = max(_blockiness(np.abs(np.moveaxis(third[i], i + 1, 2)), first[:, i]) for i in range(2))
+    a, b = phase.noise
+    predicted = np.maximum(np.float32(a) + np.float32(b) * phase.background[where], np.float32(ROUNDING))
+    predicted *= np.float32(2 / phase.steps) / np.maximum(phase.modulation[where], np.float32(1e-6)) ** 2
+    predicted += np.float32(phase.model_error_rad**2)
+    if blockiness > BLOCKINESS:
+        ratio = float(np.median(_window_variance(values) / predicted.mean(axis=(1, 2))))
+        return Scatter(float(np.sqrt(ratio)), blockiness)
+    ratios = np.sort(_block_variance(values) / _blocks(predicted).mean(axis=(1, 2)))
+    # A chi squared of so many degrees of freedom has its quantile here (Wilson and Hilferty 1931).
+    spread = 2 / (9 * _FREEDOM)
+    expected = (1 - spread - 0.6745 * np.sqrt(spread)) ** 3
+    return Scatter(float(np.sqrt(ratios[int(QUANTILE * len(ratios))] / expected)), blockiness)
+
+
+def _valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Indices (m, WINDOW, WINDOW) of rows and columns, and the first ones (m, 2), of evenly spread windows in which
+    every pixel is valid."""
+    height, width = phase.phase.shape
+    corners = [
+        np.unique(np.linspace(0, size - WINDOW, min(WINDOWS, size // WINDOW)).astype(int)) for size in (height, width)
+    ]
+    first = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 2)
+    reach = np.arange(WINDOW)
+    rows, columns = first[:, :1, None] + reach[:, None], first[:, 1:, None] + reach
+    valid = (phase.reason[rows, columns] == Reason.VALID).all(axis=(1, 2))
+    return (rows[valid], columns[valid]), first[valid]
+
+
+def _blockiness(third: np.ndarray, first: np.ndarray) -> float:
+    """From sizes of third differences (m, lines, WINDOW - 3) along the last axis of windows that begin at ``first``."""
+    offset = (first[:, None] + np.arange(third.shape[2])) % BLOCK
+    size = third.mean(axis=1)
+    sizes = np.array([np.median(size[offset == k]) if (offset == k).any() else np.nan for k in range(BLOCK)])
+    if not np.isfinite(sizes).all():
+        return 1.0
+    k = int(np.argmax(sizes))
+    # A pattern of columns that repeats every two or four is the sensor's.
+    return float(sizes[k] / max(np.median(sizes), sizes[(k + BLOCK // 2) % BLOCK], 1e-12))
+
+
+def _window_variance(values: np.ndarray) -> np.ndarray:
+    """(m,) variance of (m, WINDOW, WINDOW) about the cubic surface through each window."""
+    x = np.linspace(-1, 1, WINDOW)
+    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+    basis, _ = np.linalg.qr(np.stack([np.outer(x**i, x**j).ravel() for i, j in powers], axis=1))
+    flat = values.reshape(len(values), -1).astype(np.float64)
+    remaining = (flat**2).sum(axis=1) - (np.einsum("mp,pk->mk", flat, basis) ** 2).sum(axis=1)
+    return np.asarray(remaining / (WINDOW**2 - len(powers)))
+
+
+def _block_variance(values: np.ndarray) -> np.ndarray:
+    """(4 m,) variance from third differences along rows and columns of each block of the windows."""
+    blocks = _blocks(values)
+    squares = [(np.diff(blocks, n=3, axis=axis) ** 2).mean(axis=(1, 2)) for axis in (1, 2)]
+    return np.asarray((squares[0] + squares[1]) / (2 * _VARIANCES))
+
+
+def _blocks(windows: np.ndarray) -> np.ndarray:
+    """(4 m, BLOCK, BLOCK) of (m, WINDOW, WINDOW)."""
+    parts = WINDOW // BLOCK
+    split = windows.reshape(-1, parts, BLOCK, parts, BLOCK)
+    return split.transpose(0, 1, 3, 2, 4).reshape(-1, BLOCK, BLOCK)
