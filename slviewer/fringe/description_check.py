@@ -31,9 +31,8 @@ MIRRORED = 0.8
 
 def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
     """What in the description of an (n, h, w) stack contradicts its frames, the most probable first; empty where the
-    description holds. Some rows and columns are read, weighed by modulation; frames of
-    unequal light are compared as they would be under equal light. Raises InputError for a stack that is none
-    of this sequence.
+    description holds. Some rows and columns are read, weighed by modulation; frames of unequal light are compared as
+    they would be under equal light. Raises InputError for a stack that is none of this sequence.
     """
     check_stack(sequence, stack)
     contradictions = _find_contradictions(sequence, stack)

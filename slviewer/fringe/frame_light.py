@@ -46,6 +46,9 @@ FINE = 0.05
 """A coded frame of which so few pixels lie inside a stripe has fine stripes throughout."""
 REPORTED = 3.0
 """Percent of brightness, from the darkest to the brightest frame, that the operator should know about."""
+FEW_STEPS = 4
+"""Up to so many steps, a change of room light between them is not corrected reliably: on a textured board in four steps
+light of a quarter of the mean left 1.4 px where it was taken for uniform."""
 FARTHEST = 0.7
 """Logarithm of a gain beyond which a frame shows something else."""
 CLIPPED = 65535.0
@@ -201,12 +204,27 @@ def light_suspects(sequence: PatternSequence, light: FrameLight) -> list[Suspect
         for k in light.light.changes:
             change = 100 * float(light.room[k] - light.room[k - 1])
             more = "brighter" if change > 0 else "darker"
-            text = (
-                f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}: "
-                "corrected; keep the light of the room constant, or switch it off"
+            steps = _few_steps_across(sequence, k)
+            outcome = (
+                f"between {steps} phase steps this cannot be corrected reliably; capture again in constant room light"
+                if steps
+                else "corrected; keep the light of the room constant, or switch it off"
             )
+            seen = f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}"
+            text = f"{seen}: {outcome}"
             out.append(Suspect(k, "room-light", text))
     return out
+
+
+def _few_steps_across(sequence: PatternSequence, k: int) -> int:
+    """The phase steps of the period between whose frames frame k lies, where they are too few to tell light that is
+    uniform from light in proportion to the albedo; else 0."""
+    for axis in sequence.axes:
+        for period in sequence.periods_px(axis):
+            frames = [i for i in sequence.find("phase", axis) if sequence.frames[i].period_px == period]
+            if len(frames) <= FEW_STEPS and min(frames) < k <= max(frames):
+                return len(frames)
+    return 0
 
 
 def _varies(sample: LightSample) -> bool:

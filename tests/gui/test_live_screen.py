@@ -16,6 +16,8 @@ from slviewer.workflow.wizard.live import LiveCloud
 from slviewer.workflow.wizard.operator import Operator
 
 SCALE = 0.15
+COMPILED_MS = 240_000
+"""Until the first live cloud, where no kernel was compiled before."""
 
 
 @pytest.fixture
@@ -37,7 +39,7 @@ def test_live_clouds_are_seen_kept_and_ended(browser: Browser, app: App) -> None
     page.goto(app.server.url)
     button(page, "6. Scan").click()
     button(page, "Live").click()
-    expect(page.get_by_text("clouds/s").first).to_be_visible()
+    expect(page.get_by_text("clouds/s").first).to_be_visible(timeout=COMPILED_MS)
     expect(page.get_by_text("nothing is saved yet")).to_be_visible()
     button(page, "Keep this one").click()
     expect(page.get_by_text("scan_01").first).to_be_visible()
