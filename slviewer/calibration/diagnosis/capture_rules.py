@@ -111,6 +111,8 @@ def period(e: Evidence) -> Iterator[Finding]:
         return
     if any(mirrored(e)):  # whatever the code says, it is not of this axis, or from its other end
         return
+    if _aliased_gamma(e):  # it moves the phase at which the code begins
+        return
     sound = [pose for pose in e.poses if not frame_order(pose)]
     wrong = {}
     for axis in ("x", "y"):
@@ -217,8 +219,25 @@ def rippled(e: Evidence) -> Iterator[Finding]:
         )
 
 
+def _aliased_gamma(e: Evidence) -> tuple[str, ...]:
+    """Poses in which gamma shifts the phase of three or four steps; empty unless they are most of them."""
+    names = tuple(pose.name for pose in e.poses if any(s.fault == "gamma" for s in pose.suspects))
+    return names if len(names) > MOST * len(e.poses) else ()
+
+
 def gamma(e: Evidence) -> Iterator[Finding]:
     """Light that does not grow evenly with the grey level."""
+    if names := _aliased_gamma(e):
+        yield Finding(
+            "gamma",
+            "doubtful",
+            f"{where(e, names)} the light does not grow evenly with the grey level (gamma), which so few phase steps "
+            "do not average out: the phase was corrected as far as this could be measured",
+            "set the projector's gamma to 1, or let the preflight make light linear, and take eight phase steps or "
+            "more",
+            names,
+        )
+        return
     ratios = [a.harmonic for p in e.poses if not frame_order(p) for a in p.axes.values() if np.isfinite(a.harmonic)]
     if not ratios:
         return
