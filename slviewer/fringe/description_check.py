@@ -38,7 +38,10 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
     contradictions = _find_contradictions(sequence, stack)
     if not contradictions or not (light := estimate_frame_light(sequence, stack)).is_significant:
         return contradictions
-    return _find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
+    under_equal_light = _find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
+    is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
+    # Frames out of their place spoil the estimate of the light: what explains them as they are is believed.
+    return contradictions if under_equal_light and is_explained else under_equal_light
 
 
 def _find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
