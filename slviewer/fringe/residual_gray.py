@@ -125,16 +125,15 @@ def _sums(lines: _Lines, found: Layout) -> list[Suspect]:
     Only pixels inside stripes count: where stripes are finer than the blur, both frames show the same grey, which a
     camera's gamma moves away from the middle.
     """
-    pairs = list(zip(found.gray, found.inverse, strict=True))
-    wrong = []
-    for i, j in pairs:
+    alike = {}
+    for i, j in zip(found.gray, found.inverse, strict=True):
         inside = lines.decided(i, _INSIDE) & lines.decided(j, _INSIDE)
-        alike = lines.bit(i) == lines.bit(j)
-        if np.count_nonzero(inside) >= FEWEST and np.mean(alike[inside]) > _ALIKE:
-            wrong.append((i, j))
+        if np.count_nonzero(inside) >= FEWEST:
+            alike[i, j] = float(np.mean((lines.bit(i) == lines.bit(j))[inside]))
+    wrong = [pair for pair, share in alike.items() if share > _ALIKE]
     out = []
     # Where one image is lost or comes twice, all that follow have moved.
-    if len(wrong) > 2 and wrong == pairs[-len(wrong) :]:
+    if len(wrong) > 2 and wrong == list(alike)[-len(wrong) :]:
         i = min(wrong[0])
         text = (
             f"from frame {i + 1} on bits and inverses do not add up to white: the camera is an image behind or ahead, "
