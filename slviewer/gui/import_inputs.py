@@ -39,7 +39,7 @@ class ImportInputs:
             )
             self._codec = gui.add_dropdown("Codec", (_TELL, *get_args(Codec)), visible=False, hint="SLStudio's")
             self._prefix = gui.add_text("Prefix", "", hint="Before the names, as part gives part_pose_01")
-            self._folder = gui.add_text("Folder", "", hint="On the computer that runs slviewer")
+            self._folder = gui.add_text("Image folder", "", hint="On the computer that runs slviewer")
             self._import = gui.add_button("Import folder", icon=viser.Icon.FOLDER_SYMLINK)
             self._import.on_click(safely(self._import_folder))
             self._upload = gui.add_upload_button("Upload a zip", icon=viser.Icon.UPLOAD, color="gray", mime_type=".zip")
