@@ -259,12 +259,11 @@ class Remainder:
     weight: np.ndarray
 
     def __post_init__(self) -> None:
-        n = len(self.model.phased)
         dark, bright = self.levels
         self.contrast = bright - dark
         linked = (self.counts[0] > 0) & (self.counts[1] > 0) & bool(self.model.determined)
         self.linked = linked
-        background = self.shown[self.model.determined].mean(axis=0) if n else np.zeros_like(dark)
+        background = self.shown[self.model.determined].mean(axis=0) if self.model.determined else np.zeros_like(dark)
         self.link = np.where(linked, background - (1 - self.share) * dark - self.share * bright, 0).astype(np.float32)
 
     def scale(self, term: Term) -> float:

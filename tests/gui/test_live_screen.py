@@ -43,8 +43,7 @@ def test_live_clouds_are_seen_kept_and_ended(browser: Browser, app: App) -> None
     expect(page.get_by_text("nothing is saved yet")).to_be_visible()
     button(page, "Keep this one").click()
     expect(page.get_by_text("scan_01").first).to_be_visible()
-    shown = app.operator.snapshot().live
-    assert shown is not None and shown.shown_per_s > 0
+    assert app.operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, COMPILED_MS / 1000)
     app.shell.go("merge")  # to leave the step ends it
     assert app.operator.wait_for(lambda s: s.live is None, 10)
     assert found.errors == []

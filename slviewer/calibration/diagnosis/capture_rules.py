@@ -140,7 +140,7 @@ def period(e: Evidence) -> Iterator[Finding]:
             "code's edges fall in them",
             "correct period_px in the description, or project the patterns without scaling",
         )
-    elif e.solution is not None and e.solution.aspect > 0:
+    elif e.solution is not None and e.solution.aspect > 0 and not e.tilts_undetermined:
         ratio = min((e.solution.aspect / a for a in ASPECTS), key=lambda r: abs(np.log(r)))
         if abs(ratio - 1) > ASPECT_OFF:
             yield Finding(

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.diagnosis.ripple import Ripple
+from slviewer.calibration.soundness import MIN_TILT_SPREAD_DEG
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis
 from slviewer.fringe.suspect import Suspect
@@ -124,6 +125,12 @@ class Evidence:
     contradiction: str = ""
     tilt_spread_deg: float = np.nan
     solution: SolutionEvidence | None = None
+
+    @property
+    def tilts_undetermined(self) -> bool:
+        """Whether the boards are so nearly parallel that a fit, where there is one, found angles and focal lengths that
+        nothing determines."""
+        return self.tilt_spread_deg < MIN_TILT_SPREAD_DEG
 
     @property
     def usable(self) -> tuple[PoseEvidence, ...]:

@@ -30,7 +30,7 @@ def too_few(e: Evidence) -> Iterator[Finding]:
 
 def parallel(e: Evidence) -> Iterator[Finding]:
     """Boards that are all tilted alike."""
-    solved = e.solution
+    solved = None if e.tilts_undetermined else e.solution
     spread = solved.tilt_spread_deg if solved else e.tilt_spread_deg
     if not spread < LITTLE_TILT_DEG or len(e.usable) < MIN_POSES:
         return
@@ -38,7 +38,7 @@ def parallel(e: Evidence) -> Iterator[Finding]:
     yield Finding(
         "parallel-poses",
         "rejected" if rejected else "doubtful",
-        f"all {len(solved.used if solved else e.usable)} poses are nearly parallel "
+        f"all {len(e.solution.used if e.solution else e.usable)} poses are nearly parallel "
         f"(tilts differ by {spread:.1f} degrees)",
         "tilt the board by 15 to 30 degrees, in different directions",
     )

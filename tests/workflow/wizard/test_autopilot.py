@@ -116,7 +116,7 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
     [
         ("calibrating.calibrate_pixelwise", lambda store, r: work.make_calibration(store, TARGET, r, print)),
         ("poses.observe", lambda store, r: work.make_calibration(store, TARGET, r, print)),
-        ("scaling.reconstruct", lambda store, r: work.make_cloud(store, "scan_01", None, r, print)),
+        ("capture_clouds.reconstruct", lambda store, r: work.make_cloud(store, "scan_01", None, r, print)),
         ("merging.fuse", lambda store, r: work.merge_scans(store, ["scan_01"], "scan_02", r, print)),
         ("verifying.compare", lambda store, r: work.measure(store, ["plane_01"], "plane", None, r, print)),
     ],

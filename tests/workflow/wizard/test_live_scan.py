@@ -130,8 +130,7 @@ def test_stopping_frees_the_devices_and_starting_again_goes_on(wizard: Wizard) -
     until(lambda: operator.preview().number > number + 1)  # type: ignore[union-attr]
     assert len(wizard.clouds) == seen and operator.snapshot().rig.state == "open"
     assert operator.stop_live()  # twice does no harm
-    threads = {thread.name for thread in threading.enumerate()}
-    assert "slviewer live" not in threads
+    until(lambda: "slviewer live" not in {thread.name for thread in threading.enumerate()})
 
 
 def test_a_fault_ends_it_with_a_sentence_and_what_was_kept_stays(wizard: Wizard) -> None:
