@@ -1,6 +1,6 @@
 """slviewer: a camera and a projector as a metrology-grade 3D scanner.
 
-Conventions, the same in every room:
+Conventions, the same everywhere:
 
 =================  ==========================================================================================
 image              ``(h, w)``, uint8 or uint16; a texture may be ``(h, w, 3)`` RGB; a stack is ``(n, h, w)``,
@@ -21,8 +21,8 @@ depth ranges       R1 in front of the calibrated depths, R2 inside, R3 behind
 Optics Letters 2023; symbols follow it, and docstrings cite its equation or step.
 
 Data flows one way: geometry, fringe, target, calibration, reconstruction, registration, surface, evaluation,
-inspection, simulation, devices, session, report, workflow, server, gui, and the command line at the end. A folder
-imports only from those before it.
+inspection, simulation, devices, session, report, pipeline, preflight, wizard, server, gui, validation, and the
+command line at the end. A package imports only from those before it.
 """
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""The command line: every command is the public function of the same name in ``slviewer.workflow``, and its words.
+"""The command line: every command is a function of ``slviewer.pipeline``, ``preflight`` or ``validation``.
 
 Results go to standard output, progress and warnings to standard error. Exit status: 0 done, 1 failed, 2 usage,
 3 calibration rejected, 130 cancelled. Nothing heavy is imported before a command needs it.

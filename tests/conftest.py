@@ -1,4 +1,4 @@
-"""What every room's tests may use."""
+"""What all tests may use."""
 
 import os
 
@@ -8,7 +8,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,7 +19,7 @@ from numba.core.dispatcher import Dispatcher
 from playwright.sync_api import Browser, sync_playwright
 
 TESTS = Path(__file__).parent
-FIRST = ("workflow/test_commands.py", "server/", "devices/", "gui/", "workflow/")
+FIRST = ("commands/", "server/", "devices/", "gui/", "wizard/", "pipeline/", "preflight/", "validation/")
 """One worker compiles the kernels in the first of these, while the other runs what needs few of them."""
 
 
@@ -99,3 +99,16 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert main(["calibrate", str(session), "--target", "circles:21x16:9", "--json", str(found)]) == 0
     assert json.loads(found.read_text())["poses_used"], "the worker that made it failed"
     return folder
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Run a command: its status, and what it wrote to standard output and error."""
+    from slviewer.cli import main
+
+    def command(*arguments: object) -> tuple[int, str, str]:
+        status = main([str(a) for a in arguments])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return command

@@ -23,9 +23,12 @@ ROOMS = [
     "devices",
     "session",
     "report",
-    "workflow",
+    "pipeline",
+    "preflight",
+    "wizard",
     "server",
     "gui",
+    "validation",
     "terminal",
     "commands",
     "cli",
@@ -37,7 +40,7 @@ STRANGERS = [
     ("simulation", "slviewer.geometry.brown"),
     ("simulation", "slviewer.geometry.rig"),
     ("simulation", "slviewer.geometry.triangulation"),
-    # replay takes frames, and the workflow opens the session
+    # replay takes frames, and the pipeline opens the session
     ("session", "slviewer.devices"),
 ]
 NUMERIC = ROOMS[1 : ROOMS.index("simulation")]

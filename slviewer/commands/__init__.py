@@ -1,4 +1,5 @@
-"""The commands of the command line, one file a family: each is a public function of `slviewer.workflow`, and its words.
+"""The commands of the command line, one file a family: each is a function of `slviewer.pipeline`, `preflight` or
+`validation`, and its messages.
 
 Nothing heavy is imported before a command needs it.
 """

@@ -5,7 +5,6 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import ModelName, deferred, ui, write_json
 from slviewer.errors import SlviewerError
 
@@ -38,7 +37,9 @@ def batch(
         json: Write the summary to this file too.
         accept_rejected: Use calibrations although their verdict rejects them.
     """
-    result = workflow.batch(
+    from slviewer.pipeline import batch
+
+    result = batch.batch(
         sessions,
         do,
         captures=captures,

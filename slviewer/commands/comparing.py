@@ -5,7 +5,6 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import ModelName, deferred, ui, write_json
 
 
@@ -37,7 +36,9 @@ def compare(
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
-    result = workflow.compare(
+    from slviewer.pipeline import compare
+
+    result = compare.compare(
         session,
         scan,
         nominal,

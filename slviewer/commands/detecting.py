@@ -4,7 +4,6 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import deferred, write_json
 from slviewer.errors import DetectionError
 
@@ -29,7 +28,9 @@ def detect(
         csv: Table of all features: image, index, place on the board in mm, place in the image in px.
         json: Write the result to this file too.
     """
-    result = workflow.detect_board(images, target, out=out, csv_out=csv)
+    from slviewer.pipeline import detect
+
+    result = detect.detect_board(images, target, out=out, csv_out=csv)
     write_json(json, result.to_json())
     print(result.text())
     if result.detected < len(result.images):

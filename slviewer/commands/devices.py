@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from slviewer import terminal, workflow
+from slviewer import terminal
 from slviewer.commands.parsing import Role, deferred, ui, write_json
 from slviewer.errors import DeviceError, InputError, UsageError
 
 if TYPE_CHECKING:
     from slviewer.devices.channel import Channel
-    from slviewer.workflow.wizard.rigs import SetUp
+    from slviewer.pipeline.rig_choice import SetUp
 
 PAGE_PATIENCE_S = 600.0
 """How long somebody may take to walk to the projector and open its page."""
@@ -22,8 +22,10 @@ PAGE_PATIENCE_S = 600.0
 @deferred
 def devices() -> None:
     """List the drivers: which can be used here, what is connected, what each needs, and the rigs to choose from."""
-    print(workflow.devices())
-    print(workflow.rigs())
+    from slviewer.pipeline import devices, rig_presets
+
+    print(devices.devices())
+    print(rig_presets.rigs())
 
 
 @deferred
@@ -56,8 +58,10 @@ def capture(
         force: Replace a capture of that name (the old one goes to the session's trash).
         port: Port of the projector page, where the rig's projector is one; 0 takes any free one.
     """
+    from slviewer.pipeline import capture, inspect
+
     with _set_up(port) as set_up:
-        saved = workflow.capture(
+        saved = capture.capture(
             session,
             name,
             rig,
@@ -71,7 +75,7 @@ def capture(
             set_up=set_up,
             **ui(),
         )
-    print(workflow.summary(saved))
+    print(inspect.summary(saved))
 
 
 @deferred
@@ -97,19 +101,21 @@ def preflight(
         port: Port of the projector page, where the rig's projector is one; 0 takes any free one.
         json: Write the result to this file too.
     """
-    if (rig is None) == (capture is None):
-        raise UsageError("give --rig to check a rig, or --capture SESSION NAME to check the frames of a capture")
-    if capture is not None:
-        recorded = workflow.check_capture(*capture, progress=terminal.progress)
+    from slviewer.preflight import check_rig
+
+    if capture is not None and rig is None:
+        recorded = check_rig.check_capture(*capture, progress=terminal.progress)
         write_json(json, recorded.to_dict())
-        print(workflow.in_words(recorded))
+        print(check_rig.in_words(recorded))
         if recorded.verdict == "bad":
             raise InputError("the capture is not fit to measure with: correct what is marked bad, then capture again")
         return
+    if rig is None or capture is not None:
+        raise UsageError("give --rig to check a rig, or --capture SESSION NAME to check the frames of a capture")
     with _set_up(port) as set_up:
-        found = workflow.check_rig(rig, session=session, exposure_ms=exposure_ms, gain=gain, set_up=set_up, **ui())
+        found = check_rig.check_rig(rig, session=session, exposure_ms=exposure_ms, gain=gain, set_up=set_up, **ui())
     write_json(json, found.to_dict())
-    print(workflow.in_words(found))
+    print(check_rig.in_words(found))
     if found.verdict == "bad":
         raise DeviceError("the rig is not fit to capture with: mend what is marked bad, then check it again")
 
@@ -117,7 +123,7 @@ def preflight(
 @contextmanager
 def _set_up(port: int) -> Iterator["SetUp"]:
     """How rigs are set up; the projector page is served for one that needs it, until the block ends."""
-    from slviewer.workflow.wizard.rigs import Bench, Board, Choice, needs_page, set_up
+    from slviewer.pipeline.rig_choice import Bench, Board, Choice, needs_page, set_up
 
     with ExitStack() as ended:
 

@@ -5,7 +5,6 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import ModelName, deferred, ui
 
 
@@ -35,9 +34,10 @@ def measure(
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
-    from slviewer.workflow.measuring import in_words
+    from slviewer.pipeline import measure
+    from slviewer.pipeline.measurements import in_words
 
-    made = workflow.measure(
+    made = measure.measure(
         session, scan, what, at=at, ball=ball, box=box, name=name, model=model, accept_rejected=accept_rejected, **ui()
     )
     print(in_words(made))
@@ -62,4 +62,6 @@ def measurements(
         bring_back: Undo the last deletion.
         csv: Write them all to this table too.
     """
-    print(workflow.tell_measurements(session, relate=relate, name=name, delete=delete, bring_back=bring_back, csv=csv))
+    from slviewer.pipeline import measure
+
+    print(measure.tell_measurements(session, relate=relate, name=name, delete=delete, bring_back=bring_back, csv=csv))

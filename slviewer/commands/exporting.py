@@ -5,7 +5,6 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import Method, ModelName, deferred, ui
 
 What = Literal["cloud", "mesh", "merge", "merged-mesh", "calibration", "coefficients", "poses", "report", "table"]
@@ -46,9 +45,10 @@ def export(
         watertight: Of a mesh: closed, or refused.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
+    from slviewer.pipeline import export
     from slviewer.surface.meshing import MeshingPlan  # only now: nothing heavy is imported before it is needed
 
-    found = workflow.export(
+    found = export.export(
         session,
         what,
         name,
@@ -77,4 +77,6 @@ def decode(
         out: Folder for the files; made if it does not exist. decoded.json in it explains them.
         format: npy (NumPy) or exr (OpenEXR) for the maps, float32, NaN where masked.
     """
-    print(workflow.decode(session, capture, out, file_format=format, **ui()).text())
+    from slviewer.pipeline import decode
+
+    print(decode.decode(session, capture, out, file_format=format, **ui()).text())

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from slviewer import terminal, workflow
+from slviewer import terminal
 from slviewer.commands.parsing import Axis, Role, deferred, ui, union
 from slviewer.errors import InputError, UsageError
 
@@ -192,10 +192,12 @@ def _import_opencv_calibration(
         camera: Width x height of the camera, px; by default what the file states, else the session's captures.
         force: Replace the session's stereo calibration (the old one goes to the session's trash).
     """
+    from slviewer.pipeline import import_calibration
+
     if keys is None:
-        identified = workflow.identify_calibration_keys(file)
+        identified = import_calibration.identify_calibration_keys(file)
         print("taken from the file: " + ", ".join(f"{entry} = {key}" for entry, key in identified.items()))
-    model = workflow.import_opencv_calibration(
+    model = import_calibration.import_opencv_calibration(
         file, session, keys, projector=projector, camera=camera, force=force, warn=terminal.warn
     )
     if model is None:
@@ -229,7 +231,9 @@ bring_in.__annotations__["command"] = union(
 
 
 def _propose(folder: Path, out: Path | None, projector: str | None, channel: Channel | None) -> None:
-    guessed = workflow.guess_description(folder, projector=projector, channel=channel)
+    from slviewer.pipeline import import_captures
+
+    guessed = import_captures.guess_description(folder, projector=projector, channel=channel)
     if out is None:
         print(guessed.toml, end="")
     else:
@@ -241,8 +245,10 @@ def _propose(folder: Path, out: Path | None, projector: str | None, channel: Cha
 
 
 def _import(source: Path, session: Path, layout: str, common: _Common, **options: Any) -> None:
+    from slviewer.pipeline import import_captures
+
     if layout == "detect":
-        layout = workflow.detect_layout(source)
+        layout = import_captures.detect_layout(source)
         print(f"layout {layout}")
-    names = workflow.import_captures(source, session, layout, **asdict(common), **options, **ui())
+    names = import_captures.import_captures(source, session, layout, **asdict(common), **options, **ui())
     print(f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}")

@@ -5,7 +5,6 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import Axis, ModelName, Start, deferred, ui, write_json
 from slviewer.errors import UsageError
 
@@ -42,20 +41,23 @@ def calibrate(
         out: With --camera-only: write the lens to this .yml, .xml or .json, for OpenCV.
         json: Write the result to this file too.
     """
+    from slviewer.pipeline import calibrate, calibrate_camera
+    from slviewer.pipeline.validate import validate as compare_models
+
     if camera_only:
-        camera = workflow.calibrate_camera_alone(session, target, poses=poses, exclude=exclude, out=out, **ui())
+        camera = calibrate_camera.calibrate_camera_alone(session, target, poses=poses, exclude=exclude, out=out, **ui())
         write_json(json, camera.to_json())
         print(camera.text())
         return
     if out is not None:
         raise UsageError("--out belongs to --camera-only: `slviewer export calibration` writes the rig's calibration")
-    result = workflow.calibrate(
+    result = calibrate.calibrate(
         session, target, models=models, poses=poses, exclude=exclude, smoothing=smoothing, degree=degree, **ui()
     )
     data = result.to_json()
     print(result.text())
     if validate:
-        compared = workflow.validate(session, models=models, **ui())
+        compared = compare_models(session, models=models, **ui())
         data["validation"] = compared.to_json()
         print(compared.text())
     write_json(json, data)
@@ -73,7 +75,9 @@ def validate(
         folds: In how many parts the poses are left out, one after the other.
         json: Write the result to this file too.
     """
-    result = workflow.validate(session, models=models, folds=folds, **ui())
+    from slviewer.pipeline import validate
+
+    result = validate.validate(session, models=models, folds=folds, **ui())
     write_json(json, result.to_json())
     print(result.text())
 
@@ -105,7 +109,9 @@ def reconstruct(
         mesh: Put the triangles between neighbouring pixels into the PLY.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
-    result = workflow.reconstruct(
+    from slviewer.pipeline import reconstruct
+
+    result = reconstruct.reconstruct(
         session,
         capture,
         model=model,
@@ -145,7 +151,9 @@ def verify(
         json: Write the result to this file too.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
-    result = workflow.verify(
+    from slviewer.pipeline import verify
+
+    result = verify.verify(
         session,
         captures,
         shape,
@@ -189,7 +197,9 @@ def merge(
         json: Write the registrations to this file too.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
-    result = workflow.merge(
+    from slviewer.pipeline import merge
+
+    result = merge.merge(
         session,
         captures,
         reference,

@@ -4,7 +4,6 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import Method, ModelName, Start, deferred, ui, write_json
 
 
@@ -44,9 +43,10 @@ def mesh(
         json: Write the figures to this file too.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
+    from slviewer.pipeline import mesh
     from slviewer.surface.meshing import MeshingPlan
 
-    result = workflow.mesh(
+    result = mesh.mesh(
         session,
         names,
         out,

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from slviewer import terminal, workflow
+from slviewer import terminal
 from slviewer.commands.parsing import deferred, write_json
 from slviewer.errors import SlviewerError
 
@@ -29,7 +29,9 @@ def prove(
         seed: Another seed proves it on other rigs of the same kinds.
         json: Write all figures to this file too.
     """
-    result = workflow.prove(only, quick=quick, cases=case, seed=seed, progress=terminal.progress)
+    from slviewer.validation import prove
+
+    result = prove.prove(only, quick=quick, cases=case, seed=seed, progress=terminal.progress)
     write_json(json, result.to_json())
     print(result.text())
     if result.failed:

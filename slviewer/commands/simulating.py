@@ -5,7 +5,6 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import deferred, ui, write_json
 
 
@@ -30,9 +29,10 @@ def simulate(
         poses: How many target poses.
         seed: Another seed is another rig of the same kind.
     """
-    from slviewer.workflow.simulating import TARGET  # only now: nothing heavy is imported before it is needed
+    from slviewer.pipeline import simulate
+    from slviewer.pipeline.simulate import TARGET  # only now: nothing heavy is imported before it is needed
 
-    names = workflow.simulate(session, preset=preset, scale=scale, poses=poses, seed=seed, **ui())
+    names = simulate.simulate(session, preset=preset, scale=scale, poses=poses, seed=seed, **ui())
     print(f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}")
 
 
@@ -51,7 +51,9 @@ def reproduce(
         json: Write the figures to this file too.
         seed: Another seed is another rig of the same kind.
     """
+    from slviewer.validation import reproduce
+
     folder = out or Path("reproduction-quick" if quick else "reproduction")
-    result = workflow.reproduce(folder, quick=quick, seed=seed, **ui())
+    result = reproduce.reproduce(folder, quick=quick, seed=seed, **ui())
     write_json(json, result.to_json())
     print(result.text())

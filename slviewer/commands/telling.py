@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from slviewer import terminal, workflow
+from slviewer import terminal
 from slviewer.commands.parsing import deferred, ui, write_json
 
 
@@ -17,7 +17,9 @@ def patterns(preset: str, projector: str, out: Path) -> None:
         projector: Width x height of the projector, px.
         out: Folder to make.
     """
-    print(f"{workflow.patterns(preset, projector, out)} patterns written to {out}")
+    from slviewer.pipeline import printouts
+
+    print(f"{printouts.patterns(preset, projector, out)} patterns written to {out}")
 
 
 @deferred
@@ -28,7 +30,9 @@ def target(board: Positional[str], out: Path) -> None:
         board: circles:21x16:9, acircles:…, chessboard:9x7:75 or charuco:….
         out: A .pdf or .svg file.
     """
-    workflow.target(board, out)
+    from slviewer.pipeline import printouts
+
+    printouts.target(board, out)
     print(f"{board} drawn to {out}: print at 100 %, and measure it")
 
 
@@ -40,7 +44,9 @@ def report(session: Positional[Path], out: Path) -> None:
         session: Session folder.
         out: The .html file.
     """
-    workflow.report(session, out, **ui())
+    from slviewer.pipeline import report
+
+    report.report(session, out, **ui())
     print(f"report written to {out}")
 
 
@@ -51,7 +57,9 @@ def inspect(session: Positional[Path]) -> None:
     Args:
         session: Session folder.
     """
-    print(workflow.inspect(session))
+    from slviewer.pipeline import inspect
+
+    print(inspect.inspect(session))
 
 
 @deferred
@@ -67,11 +75,13 @@ def bench(
         scale: Resolution of the camera, as a share of 1600x1200.
         json: Write the figures to this file too.
     """
-    result = workflow.bench(calibration=calibration, scale=scale, progress=terminal.progress)
+    from slviewer.validation import bench
+
+    result = bench.bench(calibration=calibration, scale=scale, progress=terminal.progress)
     print(result.text())
     figures = result.to_json()
     if live:
-        from slviewer.gui.live_rate import live_rate
+        from slviewer.validation.bench_live import live_rate
 
         streamed = live_rate(0.5 * scale, 60 * minutes, terminal.progress)
         print(streamed.text())

@@ -4,7 +4,6 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from slviewer import workflow
 from slviewer.commands.parsing import ModelName, deferred, ui, write_json
 
 
@@ -17,7 +16,9 @@ def check(session: Positional[Path], capture: Positional[str], json: Path | None
         capture: Name of a capture, of any role, that shows the calibration's board.
         json: Write the result to this file too.
     """
-    result = workflow.check(session, capture, **ui())
+    from slviewer.pipeline import check
+
+    result = check.check(session, capture, **ui())
     write_json(json, result.to_json())
     print(result.text())
 
@@ -41,6 +42,8 @@ def accept(
         apply_scale: Record the scale that is found as a correction.
         json: Write the result to this file too.
     """
-    result = workflow.accept(session, artefact, model=model, still=still, apply_scale_found=apply_scale, **ui())
+    from slviewer.pipeline import accept
+
+    result = accept.accept(session, artefact, model=model, still=still, apply_scale_found=apply_scale, **ui())
     write_json(json, result.to_json())
     print(result.text())

@@ -19,16 +19,16 @@ from slviewer.gui.panel import Stage
 from slviewer.gui.scene import Scene
 from slviewer.gui.shell import Shell
 from slviewer.gui.views import FIELD_OF_VIEW, OVERVIEW, Eyes
+from slviewer.pipeline.rig_choice import set_up
+from slviewer.pipeline.rig_presets import load_rig
 from slviewer.server.projector_page import serve_projector
 from slviewer.server.secure import SafeServer, serve
 from slviewer.server.text import escape
 from slviewer.server.viewers import Viewers
 from slviewer.session.store import Session
-from slviewer.workflow.rig_presets import load_rig
-from slviewer.workflow.wizard.notices import words_for
-from slviewer.workflow.wizard.operator import Operator
-from slviewer.workflow.wizard.rigs import set_up
-from slviewer.workflow.wizard.snapshot import Level
+from slviewer.wizard.notices import words_for
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import Level
 
 log = logging.getLogger("slviewer.gui")
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.gui.widgets import Html, Tone, block, boxed, cell, table, toned
-from slviewer.workflow.wizard.snapshot import CalibrationView, ComparisonView, SplinedView
+from slviewer.wizard.snapshot import CalibrationView, ComparisonView, SplinedView
 
 _LEVELS: dict[str, tuple[Tone, str, str]] = {
     "good": ("good", "Good", "nothing that was seen speaks against this calibration."),

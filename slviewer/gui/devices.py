@@ -4,7 +4,7 @@ import numpy as np
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.gui.scene import CAMERA, PROJECTOR, Scene
-from slviewer.workflow.wizard.snapshot import CalibrationView, Snapshot
+from slviewer.wizard.snapshot import CalibrationView, Snapshot
 
 LAYER = "devices"
 

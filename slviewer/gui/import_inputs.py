@@ -11,7 +11,7 @@ from slviewer.session.capture import Role
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel
 from slviewer.session.importers.layouts import LAYOUTS
 from slviewer.session.importers.slstudio import Codec
-from slviewer.workflow.wizard.snapshot import Snapshot
+from slviewer.wizard.snapshot import Snapshot
 
 _DETECT = "detect"
 _TELL = "by their number"

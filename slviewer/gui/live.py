@@ -11,7 +11,7 @@ import viser
 
 from slviewer.gui.panel import Stage
 from slviewer.gui.scene import spacing
-from slviewer.workflow.wizard.live import LiveCloud
+from slviewer.wizard.live_scan import LiveCloud
 
 LAYER = "live"
 MOST_POINTS, FEWEST_POINTS = 60_000, 15_000

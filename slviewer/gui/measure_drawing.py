@@ -7,8 +7,8 @@ import numpy as np
 from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
+from slviewer.pipeline.measurements import quantities_of
 from slviewer.session.measurements import Measurement
-from slviewer.workflow.measuring import quantities_of
 
 _UNITS = {"deg": "°", "%": " %", "": ""}
 _ROUND = 48

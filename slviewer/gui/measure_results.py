@@ -16,10 +16,10 @@ from slviewer.gui.pictures import Painter, Plot, opened
 from slviewer.gui.widgets import Words, block, link
 from slviewer.inspection.colours import colour_limit
 from slviewer.inspection.section import CutPlane
+from slviewer.pipeline.measurements import section_lines
 from slviewer.session.measurements import Measurement, measurement_arrays
-from slviewer.workflow.measuring import section_lines
-from slviewer.workflow.wizard.measure_requests import TABLE
-from slviewer.workflow.wizard.snapshot import SessionView
+from slviewer.wizard.measure_requests import TABLE
+from slviewer.wizard.snapshot import SessionView
 
 CHOSEN, OTHER, STALE = (200, 40, 40), (30, 90, 160), (140, 140, 140)
 Lines = list[np.ndarray]

@@ -14,10 +14,10 @@ from slviewer.gui.steps.scan import ordered
 from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, colour_bar, colours
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
+from slviewer.pipeline.measured_surface import MERGED, Place, Surface
 from slviewer.session.measurements import Measurement, measurement_arrays
-from slviewer.workflow.measured_surface import MERGED, Place, Surface
-from slviewer.workflow.wizard.snapshot import SessionView
-from slviewer.workflow.wizard.surfaces import place_at
+from slviewer.wizard.snapshot import SessionView
+from slviewer.wizard.surfaces import place_at
 
 COLOURS = ("texture", "depth", "uncertainty")
 DEVIATION = "deviation"

@@ -1,6 +1,6 @@
 """The tools of the step Measure: which there are, what each asks for now, and what was clicked so far."""
 
-from slviewer.workflow.measured_surface import Place
+from slviewer.pipeline.measured_surface import Place
 
 PICK = ("Point", "Distance", "Section")
 FIT = ("Plane", "Sphere", "Cylinder")

@@ -10,11 +10,11 @@ from slviewer.gui.pictures import PLOT_PX
 from slviewer.gui.widgets import Html, Tone, block, boxed, cell, table, toned
 from slviewer.inspection.colours import deviation_colours
 from slviewer.inspection.tolerance import DECIDED
+from slviewer.pipeline.measurements import quantities_of
 from slviewer.report.canvas import finish, new_figure, tidy
 from slviewer.report.measurements import draw_deviations
 from slviewer.report.page import Figure
 from slviewer.session.measurements import Measurement
-from slviewer.workflow.measuring import quantities_of
 
 _HEADLINES = {"point": 3, "deviation": 2}
 """How many of a measurement's numbers the list shows, two where nothing is said."""

@@ -19,7 +19,7 @@ from slviewer.gui.views import ASIDE
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, table, toned
 from slviewer.registration.multiway import Pair
 from slviewer.registration.picked import LEAST_PICKS, picked_start
-from slviewer.workflow.wizard.looking import ScanCloud, nearest, scan_cloud
+from slviewer.wizard.result_views import ScanCloud, nearest, scan_cloud
 
 LAYER = "merge picks"
 Side = Literal["scan", "onto"]

@@ -11,7 +11,7 @@ from slviewer.gui.scene import Colour
 from slviewer.gui.widgets import Html, block, cell, colour_bar, colours, toned
 from slviewer.session.ply import Ply
 from slviewer.session.store import Session
-from slviewer.workflow.wizard import looking
+from slviewer.wizard import result_views
 
 AFTER, BEFORE = "after, coloured by scan", "before, coloured by scan"
 OWN = "merged points in their own colours"
@@ -45,7 +45,7 @@ def scans_drawn(
     """Scans, each in a colour, where ``places`` (4, 4) put them, or where they were measured."""
     clouds: dict[str, tuple[np.ndarray, np.ndarray | Colour]] = {}
     for i, name in enumerate(names):
-        cloud = looking.scan_cloud(session, name)
+        cloud = result_views.scan_cloud(session, name)
         rows, columns = cloud.thinned(_SHOWN)
         points = cloud.points[rows, columns].reshape(-1, 3)
         T = places.get(name, np.eye(4))
@@ -55,7 +55,7 @@ def scans_drawn(
 
 def merged_drawn(session: Session, merge: str, view: str, titles: Sequence[str]) -> Drawn:
     """The surface of a merge, in one of MERGED; ``titles`` are those of its scans, in their order."""
-    surface = looking.merged_cloud(session, merge)
+    surface = result_views.merged_cloud(session, merge)
     legend, painted = _painted(surface, view, titles)
     return Drawn("merged", {"merged": (surface.points, painted)}, legend)
 

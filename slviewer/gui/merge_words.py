@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 from slviewer.evaluation import letter
 from slviewer.gui.widgets import Html, block, boxed, cell, meter, table, toned
-from slviewer.workflow.wizard.snapshot import MergedLoop, MergedPair, MergeView
+from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 
 _LOW = 0.3
 """Overlap below which an alignment is doubted."""

@@ -12,7 +12,7 @@ import viser
 from slviewer.devices.channel import Standing
 from slviewer.gui.scene import Scene
 from slviewer.server.viewers import Viewers
-from slviewer.workflow.wizard.snapshot import Level, PreviewView, Snapshot
+from slviewer.wizard.snapshot import Level, PreviewView, Snapshot
 
 if TYPE_CHECKING:
     from slviewer.gui.views import Eyes

@@ -16,7 +16,7 @@ from slviewer.errors import InputError
 from slviewer.gui.widgets import Words, block, toned
 from slviewer.report.page import Figure
 from slviewer.session.store import Session
-from slviewer.workflow.wizard.operator import Operator
+from slviewer.wizard.operator import Operator
 
 PLOT_PX = 440
 """CSS px: as wide as the page's panel, so that letters in a figure are as large as the panel's own."""

@@ -9,7 +9,7 @@ import numpy as np
 from slviewer.gui.scene import Colour, Scene
 from slviewer.gui.widgets import Html, Tone, block, cell, thumbnail, toned
 from slviewer.target.board import Board
-from slviewer.workflow.wizard.snapshot import PoseView
+from slviewer.wizard.snapshot import PoseView
 
 TONES: dict[str, Tone] = {
     "judging": "info",

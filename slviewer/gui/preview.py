@@ -5,7 +5,7 @@ import numpy as np
 
 from slviewer.gui.widgets import PICTURE_PX, Html, block, cell, fitted, toned
 from slviewer.target.board import Board
-from slviewer.workflow.wizard.snapshot import PreviewView
+from slviewer.wizard.snapshot import PreviewView
 
 _FOUND, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
 DIM = 0.35

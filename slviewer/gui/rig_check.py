@@ -5,8 +5,8 @@ import viser
 from slviewer.gui.inputs import Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.widgets import Html, Tone, Words, block, cell, toned
-from slviewer.workflow.preflight.checks import Preflight, Verdict
-from slviewer.workflow.wizard.snapshot import Snapshot
+from slviewer.pipeline.check_results import Preflight, Verdict
+from slviewer.wizard.snapshot import Snapshot
 
 _TONES: dict[Verdict, Tone] = {"good": "good", "warning": "warning", "bad": "error", "unknown": "dim"}
 _MARKS: dict[Verdict, str] = {"good": "✓", "warning": "!", "bad": "✕", "unknown": "?"}

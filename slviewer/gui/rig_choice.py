@@ -10,9 +10,9 @@ from slviewer.errors import InputError
 from slviewer.gui.inputs import Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.widgets import Html, Tone, Words, block, boxed, cell, toned
-from slviewer.workflow.rig_presets import Preset, check_choice, presets
-from slviewer.workflow.wizard.rigs import Choice
-from slviewer.workflow.wizard.snapshot import RigView, SessionView, Snapshot
+from slviewer.pipeline.rig_choice import Choice
+from slviewer.pipeline.rig_presets import Preset, check_choice, presets
+from slviewer.wizard.snapshot import RigView, SessionView, Snapshot
 
 SIMULATED: dict[str, dict[str, Any]] = {
     "Simulated, half resolution": {"driver": "simulated", "scale": 0.5},

@@ -13,7 +13,7 @@ from slviewer.gui.devices import Devices
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import Panel, Stage
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, meter, toned
-from slviewer.workflow.wizard.snapshot import Notice, PreviewView, Snapshot, StepView
+from slviewer.wizard.snapshot import Notice, PreviewView, Snapshot, StepView
 
 STEPS_PX, STEP_PX = 236, 452
 """Widths of the two panels: at 1280 px of page, as much is left for the scene as the step takes."""

@@ -8,7 +8,7 @@ import numpy as np
 from slviewer.gui.inputs import Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.widgets import Words
-from slviewer.workflow.wizard.snapshot import Snapshot
+from slviewer.wizard.snapshot import Snapshot
 
 NEAREST_MM, FARTHEST_MM = 250.0, 1500.0
 _GIZMO = "thing"

@@ -11,7 +11,7 @@ from slviewer.calibration.guidance.information import Information, Sight
 from slviewer.calibration.guidance.rough import rough_rig
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
-from slviewer.workflow.wizard.suggestion import LEAST_POSES, Features, plan
+from slviewer.wizard.pose_plan import LEAST_POSES, Features, plan
 
 
 @pytest.fixture(autouse=True)

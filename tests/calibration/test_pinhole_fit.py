@@ -11,10 +11,10 @@ from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
+from slviewer.pipeline.export import export
+from slviewer.pipeline.models import frame_of, save_fitted, save_stereo, warn_if_frame_changed
 from slviewer.session.importers import opencv_calibration
 from slviewer.session.store import Session
-from slviewer.workflow.exporting import export
-from slviewer.workflow.models import frame_of, save_fitted, save_stereo, warn_if_frame_changed
 
 __all__ = ["coarse_knots"]  # a fixture for every test here
 

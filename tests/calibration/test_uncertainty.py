@@ -22,7 +22,7 @@ from slviewer.inspection.uncertainty import Spread, splined_shared
 from slviewer.reconstruction.reconstruct import reconstruct
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.workflow.proving_uncertainty import Honesty, UncertaintyProof, compare_with_truth
+from slviewer.validation.prove_uncertainty import Honesty, UncertaintyProof, compare_with_truth
 
 
 @pytest.fixture(scope="module")

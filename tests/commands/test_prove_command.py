@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from slviewer.cli import main
-from slviewer.workflow import proving
+from slviewer.validation import prove
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[float, int]]:
 
         return run
 
-    for claim in proving.CLAIMS:
-        monkeypatch.setattr(proving, f"prove_{claim}", stand_in(claim))
+    for claim in prove.CLAIMS:
+        monkeypatch.setattr(prove, f"prove_{claim}", stand_in(claim))
     return ran
 
 
@@ -45,7 +45,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
     out = tmp_path / "figures.json"
     assert main(["prove", "--json", str(out)]) == 1
     said = capsys.readouterr()
-    assert asked == {claim: (0.5 if claim == "hostile" else 1.0, 0) for claim in proving.CLAIMS}
+    assert asked == {claim: (0.5 if claim == "hostile" else 1.0, 0) for claim in prove.CLAIMS}
     assert said.out.count("a table") == 6 and said.out.count("pass  ") == 5
     assert "FAIL  faults called by their names" in said.out and "not proven: causes:" in said.err
     assert {claim: proof["holds"] for claim, proof in json.loads(out.read_text()).items()} == {
@@ -60,7 +60,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
 
 def test_some_claims_at_reduced_scale(asked, capsys) -> None:
     assert main(["prove", "--quick", "--only", "uncertainty", "accuracy", "--seed", "7"]) == 0
-    assert asked == {"accuracy": (proving.QUICK_SCALE, 7), "uncertainty": (proving.QUICK_SCALE, 7)}
+    assert asked == {"accuracy": (prove.QUICK_SCALE, 7), "uncertainty": (prove.QUICK_SCALE, 7)}
     said = capsys.readouterr()
     assert "FAIL" not in said.out and said.err == ""
     assert main(["prove", "--only", "everything"]) == 2

@@ -20,13 +20,13 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.simulate import one_axis
 from slviewer.reconstruction.reconstruct import reconstruct
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import rig_record
-from slviewer.workflow.simulating import one_axis
 
 EXAMPLES = Path(__file__).parents[2] / "assets" / "artefacts"
 SIMULATED = letter(0.25, seed=1, local_distortion_px=0)

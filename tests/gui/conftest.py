@@ -9,8 +9,8 @@ from wizard_page import SIZE, Opened, button
 
 from slviewer.calibration.guidance import choosing
 from slviewer.gui.app import App
-from slviewer.workflow.wizard import acquisition
-from slviewer.workflow.wizard.operator import Operator
+from slviewer.wizard import acquisition
+from slviewer.wizard.operator import Operator
 
 RIG = {"driver": "simulated", "scale": 0.25}
 

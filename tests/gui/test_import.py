@@ -14,7 +14,7 @@ from wizard_page import PATIENCE_MS, Opened, button, choose, field
 
 from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import gray
-from slviewer.workflow.wizard.operator import Operator
+from slviewer.wizard.operator import Operator
 
 PROJECTOR = (120, 90)
 

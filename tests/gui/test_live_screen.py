@@ -8,12 +8,12 @@ import pytest
 from playwright.sync_api import Browser, expect
 from wizard_page import SIZE, Opened, button
 
-from slviewer.gui import live_rate as rate
 from slviewer.gui.app import App
 from slviewer.gui.live import thinned
-from slviewer.gui.live_rate import true_calibration
-from slviewer.workflow.wizard.live import LiveCloud
-from slviewer.workflow.wizard.operator import Operator
+from slviewer.validation import bench_live as rate
+from slviewer.validation.bench_live import true_calibration
+from slviewer.wizard.live_scan import LiveCloud
+from slviewer.wizard.operator import Operator
 
 SCALE = 0.15
 COMPILED_MS = 240_000

@@ -13,9 +13,9 @@ from slviewer.gui.measure_words import deviation_figure, measurement_words, meas
 from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
+from slviewer.pipeline.measured_surface import Surface
 from slviewer.session.measurements import Measurement
-from slviewer.workflow.measured_surface import Surface
-from slviewer.workflow.wizard.surfaces import place_at
+from slviewer.wizard.surfaces import place_at
 
 CENTRE = np.array([10.0, 20.0, 500.0])
 TOP = CENTRE - np.array([0.0, 0.0, 30.0])

@@ -9,7 +9,7 @@ from slviewer.gui.merge_views import BY_SCAN, BY_SIGMA, OWN, SCAN_COLOURS, merge
 from slviewer.gui.merge_words import merge_words, named, refusal_words, turn_words
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
-from slviewer.workflow.wizard.snapshot import MergedLoop, MergedPair, MergeView
+from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 
 LABELS = {"scan_01": "Lion <b>", "scan_02": "scan_02", "scan_03": "Lion, behind", "scan_10": "Tail"}
 PAIR = MergedPair("scan_02", "scan_01", 0.117, 0.2, 0.0231, 0.0363, 297.2, 4.46, 0.24)

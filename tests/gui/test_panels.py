@@ -23,15 +23,15 @@ from slviewer.gui.inputs import titled
 from slviewer.gui.pictures import Painter, spread
 from slviewer.gui.steps.scan import ordered, painting, point_words, uncertainty
 from slviewer.gui.steps.verify import distances_table, likely, results_table
+from slviewer.pipeline.calibration_verdict import save_verdict
+from slviewer.pipeline.measurements import quantities_of
 from slviewer.session.measurements import Measurement
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
-from slviewer.workflow.diagnosing import save_verdict
-from slviewer.workflow.measuring import quantities_of
-from slviewer.workflow.wizard.looking import ScanCloud
-from slviewer.workflow.wizard.operator import Operator
-from slviewer.workflow.wizard.snapshot import CentreDistance, ComparisonView, ModelFigures, ScanView, VerificationRow
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.result_views import ScanCloud
+from slviewer.wizard.snapshot import CentreDistance, ComparisonView, ModelFigures, ScanView, VerificationRow
 
 REJECTED = Verdict.of(
     [Finding("moved", "rejected", "pose_03 moved by 0.9 px", "hold the <b>board</b> still", ("pose_03",))]

@@ -6,7 +6,7 @@ from slviewer.devices.browser import browser_projector
 from slviewer.devices.channel import Channel
 from slviewer.fringe.presets import gray
 from slviewer.gui.app import App
-from slviewer.workflow.wizard.operator import Operator
+from slviewer.wizard.operator import Operator
 
 
 def test_the_wizard_serves_the_projector_page(browser: Browser) -> None:

@@ -13,11 +13,11 @@ from wizard_page import SIZE, Opened, button, choose, field
 from slviewer.devices.channel import Channel
 from slviewer.fringe.decode import decode
 from slviewer.gui.app import App
+from slviewer.pipeline.rig_choice import set_up
+from slviewer.pipeline.rig_presets import save_rig
 from slviewer.session.store import Session
-from slviewer.workflow.rig_presets import save_rig
-from slviewer.workflow.wizard.operator import Operator
-from slviewer.workflow.wizard.rigs import set_up
-from slviewer.workflow.wizard.snapshot import Snapshot
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import Snapshot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "devices"))
 from mjpeg import NetworkCamera, network_camera

@@ -8,7 +8,7 @@ from wizard_page import SIZE, Opened, button, field
 
 from slviewer.errors import UsageError
 from slviewer.gui.app import App, rig_choice
-from slviewer.workflow.wizard.operator import Operator
+from slviewer.wizard.operator import Operator
 
 STEPS = ("Rig", "Target", "Poses", "Calibrate", "Verify", "Scan", "Merge", "Measure", "Export")
 

@@ -15,12 +15,12 @@ from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose,
 
 from slviewer.devices.faults import Faults, breakable
 from slviewer.gui.app import App
+from slviewer.pipeline.rig_choice import Bench, Choice, set_up
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.workflow.wizard import work
-from slviewer.workflow.wizard.operator import Operator
-from slviewer.workflow.wizard.rigs import Bench, Choice, set_up
-from slviewer.workflow.wizard.snapshot import SessionView
+from slviewer.wizard import tasks
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import SessionView
 
 TARGET = "circles:21x16:9"
 RIG = {"driver": "simulated", "scale": 0.25}
@@ -74,7 +74,7 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # the joint adjustment takes long, and the autopilot's flight makes it
-    monkeypatch.setattr(work, "lacking_for_splined", lambda session: "it is made elsewhere")
+    monkeypatch.setattr(tasks, "lacking_for_splined", lambda session: "it is made elsewhere")
     app = App(bare, port=0)
     opened = visit(browser, app.server.url)
     page = opened.page

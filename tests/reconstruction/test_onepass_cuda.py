@@ -27,7 +27,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.reconstruction.onepass_cuda import CudaPass, has_pass, one_pass
-from slviewer.workflow import benchmarking_gpu
+from slviewer.validation import bench_gpu
 
 ROOT = Path(__file__).parents[2]
 PROJECTOR = (912, 1140)
@@ -124,8 +124,8 @@ def scans_to(folder):
         assert cuda_device.device() is not None
         maps = {key: value for key, value in vars(scan).items() if isinstance(value, np.ndarray)}
         np.savez(folder / f"{number}.npz", **maps)
-    benchmarking_gpu.TIMES = benchmarking_gpu.AHEAD = 1
-    (folder / "rows.json").write_text(json.dumps(benchmarking_gpu.gpu_rows(*made("complementary code, splined"))))
+    bench_gpu.TIMES = bench_gpu.AHEAD = 1
+    (folder / "rows.json").write_text(json.dumps(bench_gpu.gpu_rows(*made("complementary code, splined"))))
     for case in list(CASES)[::2]:
         sequence, model, frames = made(case)
         one = CudaPass(sequence, model, "x")

@@ -19,6 +19,7 @@ from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened, spread
 from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, block, cell, colours, table, toned
+from slviewer.pipeline.report import calibration_view
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationView as Details
 from slviewer.report.data import DeviceParameters
@@ -26,9 +27,8 @@ from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.target.board import Board
-from slviewer.workflow.reporting import calibration_view
-from slviewer.workflow.wizard import looking
-from slviewer.workflow.wizard.snapshot import CalibrationView, PreviewView, SessionView, Snapshot
+from slviewer.wizard import result_views
+from slviewer.wizard.snapshot import CalibrationView, PreviewView, SessionView, Snapshot
 
 LAYER, BOARDS = "calibrate", "calibrated boards"
 DEVICES = ("camera", "projector")
@@ -48,7 +48,7 @@ class Panel:
         self._visible = False
         self._pixel_chosen = False
         self._boards: tuple[Any, ...] = ()
-        self._cloud: looking.ScanCloud | None = None
+        self._cloud: result_views.ScanCloud | None = None
         self._details: tuple[tuple[Any, ...], Details] | None = None
         self._chosen = ""  # the operator's model, as the session said last
 
@@ -214,14 +214,14 @@ class Panel:
             self._painter.ask(
                 "maps",
                 (made, axis),
-                lambda: rms_maps(looking.pixel_fits(opened(operator))[axis].rms_mm, axis, width=PLOT_PX),
+                lambda: rms_maps(result_views.pixel_fits(opened(operator))[axis].rms_mm, axis, width=PLOT_PX),
                 self._maps.set,
             )
             pixel = (int(self._column.value), int(self._row.value))
             self._painter.ask(
                 "curves",
                 (made, axis, pixel),
-                lambda: (pixel, looking.pixel_curve(opened(operator), pixel, axis)),
+                lambda: (pixel, result_views.pixel_curve(opened(operator), pixel, axis)),
                 self._draw_curve,
             )
 
@@ -343,9 +343,9 @@ class Panel:
             return
         self._refresh()
         operator = self._stage.operator
-        self._painter.ask("cloud", name, lambda: looking.scan_cloud(opened(operator), name), self._draw_cloud)
+        self._painter.ask("cloud", name, lambda: result_views.scan_cloud(opened(operator), name), self._draw_cloud)
 
-    def _draw_cloud(self, cloud: looking.ScanCloud) -> None:
+    def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
         self._cloud = cloud
         rows, columns = cloud.thinned(100_000)
         z = cloud.points[rows, columns, 2]

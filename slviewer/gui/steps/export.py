@@ -13,9 +13,9 @@ from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
 from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, block, cell, link, table, toned
-from slviewer.workflow.exporting import FORMATS, What, file_name, foreseen_bytes, size, units
-from slviewer.workflow.wizard import looking
-from slviewer.workflow.wizard.snapshot import ExportView, SessionView, Snapshot
+from slviewer.pipeline.export import FORMATS, What, file_name, foreseen_bytes, size, units
+from slviewer.wizard import result_views
+from slviewer.wizard.snapshot import ExportView, SessionView, Snapshot
 
 LAYER = "export"
 LIST_PX = 250
@@ -172,9 +172,9 @@ class Panel:
 
         def load() -> tuple[np.ndarray, np.ndarray | None]:
             if name == MERGED:
-                whole = looking.merged_cloud(opened(operator), merge)
+                whole = result_views.merged_cloud(opened(operator), merge)
                 return whole.points, whole.colours
-            cloud = looking.scan_cloud(opened(operator), name)
+            cloud = result_views.scan_cloud(opened(operator), name)
             rows, columns = cloud.thinned(120_000)
             return cloud.points[rows, columns], cloud.texture[rows, columns]
 

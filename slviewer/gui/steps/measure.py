@@ -16,12 +16,12 @@ from slviewer.gui.scene import GHOST
 from slviewer.gui.widgets import Html, Tone, Words, block, boxed, cell, toned
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
+from slviewer.pipeline.measured_surface import Place
 from slviewer.report.canvas import rounded_up
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import MM
-from slviewer.workflow.measured_surface import Place
-from slviewer.workflow.wizard.snapshot import SessionView, Snapshot
-from slviewer.workflow.wizard.surfaces import point_at
+from slviewer.wizard.snapshot import SessionView, Snapshot
+from slviewer.wizard.surfaces import point_at
 
 LAYER = "measure"
 NOT_SAID = "not said"

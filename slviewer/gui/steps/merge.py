@@ -15,7 +15,7 @@ from slviewer.gui.pictures import Painter, opened
 from slviewer.gui.steps.verify import likely
 from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Words
-from slviewer.workflow.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
+from slviewer.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
 
 LAYER = "merge"
 SHAPES, TURNTABLE, LYING, PICKED = "by their shapes", "on a turntable", "as they lie", "by points that I pick"

@@ -16,7 +16,7 @@ from slviewer.gui.scene import GHOST
 from slviewer.gui.undelete import Undelete
 from slviewer.gui.widgets import Html, Picture, Sound, Words, block, boxed, cell, thumbnail, toned
 from slviewer.target.board import Board
-from slviewer.workflow.wizard.snapshot import Foreseen, PoseView, PreviewView, Snapshot
+from slviewer.wizard.snapshot import Foreseen, PoseView, PreviewView, Snapshot
 
 LAYER, WORLD = "poses", "board"
 _DRAG_S = 0.15  # between two places that a dragged board is brought to

@@ -10,7 +10,7 @@ from slviewer.gui.preview import histogram_chart, legend, light_words
 from slviewer.gui.rig_check import RigCheck
 from slviewer.gui.rig_choice import RigChoice
 from slviewer.gui.widgets import Picture, Words
-from slviewer.workflow.wizard.snapshot import PreviewView, RigView, Snapshot
+from slviewer.wizard.snapshot import PreviewView, RigView, Snapshot
 
 LIGHTS = {"Even white": "white", "Even grey": "grey", "Dark": "dark", "Test stripes": "pattern"}
 _STOP = 2 ** (1 / 3)

@@ -20,8 +20,8 @@ from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Picture, Words, block, boxed, cell, colour_bar, colours, table, thumbnail, toned
 from slviewer.gui.world import Stand
 from slviewer.report.maps import error_limit
-from slviewer.workflow.wizard.looking import ScanCloud, scan_cloud
-from slviewer.workflow.wizard.snapshot import LiveView, PreviewView, ScanView, Snapshot
+from slviewer.wizard.result_views import ScanCloud, scan_cloud
+from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, Snapshot
 
 LAYER = "scan"
 SMALL_PX = 380

@@ -10,9 +10,9 @@ from slviewer.gui.inputs import change
 from slviewer.gui.panel import Stage
 from slviewer.gui.preview import board_words, drawn, legend, light_words
 from slviewer.gui.widgets import Html, Picture, Words, block, boxed, cell, link, toned
+from slviewer.pipeline.printouts import target as write_target
 from slviewer.target.board import EXAMPLES, Board, Kind
-from slviewer.workflow.printing import target as write_target
-from slviewer.workflow.wizard.snapshot import PreviewView, Snapshot
+from slviewer.wizard.snapshot import PreviewView, Snapshot
 
 KINDS: dict[str, Kind] = {
     "Circle grid": "circles",

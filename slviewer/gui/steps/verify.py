@@ -14,11 +14,11 @@ from slviewer.gui.preview import drawn, legend, light_words
 from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Picture, Words, block, cell, colour_bar, colours, link, table, toned
 from slviewer.gui.world import Stand
+from slviewer.pipeline.verify import Shape
 from slviewer.report.maps import error_limit, error_maps
 from slviewer.report.page import Figure
-from slviewer.workflow.verifying import Shape
-from slviewer.workflow.wizard import looking
-from slviewer.workflow.wizard.snapshot import (
+from slviewer.wizard import result_views
+from slviewer.wizard.snapshot import (
     CentreDistance,
     PreviewView,
     ScanView,
@@ -46,7 +46,7 @@ class Panel:
         self._lock = threading.RLock()
         self._snapshot: Snapshot | None = None
         self._measured: tuple[str, ...] = ()
-        self._cloud: looking.ScanCloud | None = None
+        self._cloud: result_views.ScanCloud | None = None
         self._visible = False
 
     def build(self) -> None:
@@ -151,13 +151,13 @@ class Panel:
             self._words.set(result_words(rows))
             operator, key = self._stage.operator, (name, tuple((row.model, row.rms_mm) for row in rows))
             self._painter.ask(
-                "maps", key, lambda: _maps(looking.error_maps(opened(operator), name), rows), self._maps.set
+                "maps", key, lambda: _maps(result_views.error_maps(opened(operator), name), rows), self._maps.set
             )
             model = self._model.value
             self._painter.ask(
                 "cloud",
                 (key, model),
-                lambda: (looking.scan_cloud(opened(operator), name), model, rows[0].shape),
+                lambda: (result_views.scan_cloud(opened(operator), name), model, rows[0].shape),
                 self._draw_cloud,
             )
 

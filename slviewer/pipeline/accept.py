@@ -1,0 +1,184 @@
+"""The acceptance test: artefacts with certificates against the session's calibration."""
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.evaluation.acceptance.artefact import Artefact
+from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, measure
+from slviewer.evaluation.acceptance.result import Acceptance, conclude
+from slviewer.evaluation.budget import Budget, Contribution, budget
+from slviewer.evaluation.repeatability import Repeatability, repeatability
+from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
+from slviewer.pipeline.capture_phases import capture_texture, decoded
+from slviewer.pipeline.check import Checked, history
+from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.models import best, check_accepted, load_model, load_stereo, warn_if_stale
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.reconstruct import board_region
+from slviewer.pipeline.scale import apply_scale, scale_factor
+from slviewer.session.store import Session
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """What ``accept`` found. ``factor`` is the scale correction in force during the test, ``applied`` the one that it
+    put in force, or None; ``budget`` of the artefact's length, None for a plane; ``repeatability`` where still captures
+    were named."""
+
+    acceptance: Acceptance
+    factor: float
+    applied: float | None
+    budget: Budget | None
+    repeatability: Repeatability | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``accept --json``."""
+        return self.acceptance.to_dict() | {
+            "scale_factor": self.factor,
+            "scale_applied": self.applied,
+            "budget": None if self.budget is None else self.budget.to_dict(),
+            "repeatability": None if self.repeatability is None else self.repeatability.to_dict(),
+        }
+
+    def text(self) -> str:
+        """For people."""
+        blocks = [self.acceptance.text()]
+        if self.factor != 1.0:
+            blocks.append(f"a scale correction of {1e6 * (self.factor - 1):+.0f} ppm was in force during the test")
+        if self.applied is not None:
+            blocks.append(
+                f"scale correction recorded: clouds of {self.acceptance.model} are multiplied by {self.applied:.7f}"
+            )
+        elif self.acceptance.scale is not None:
+            blocks.append("the scale was not corrected: --apply-scale does so")
+        blocks += [part.text() for part in (self.budget, self.repeatability) if part is not None]
+        return "\n\n".join(blocks)
+
+
+def accept(
+    session: SessionLike,
+    artefact: Path | str,
+    *,
+    model: str | None = None,
+    still: Sequence[str] = (),
+    apply_scale_found: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Accepted:
+    """Test one calibration with the artefact that a TOML file describes, in the captures that it names.
+
+    ``still``: captures of a still object, for the repeatability. ``apply_scale_found`` records the scale that was found
+    as a correction of later clouds. The result stays in the session as ``acceptance/1``, ``acceptance/2``, ...
+    """
+    thing = read_artefact(artefact)
+    with opened(session, write=True) as store:
+        check_accepted(store)
+        name = model or best(store)
+        chosen, factor = load_model(store, name), scale_factor(store, name)
+        warn_if_stale(store, warn)
+        if apply_scale_found and thing.kind == "plane":
+            raise InputError("a plane says nothing of scale: apply that of a ball bar or a sphere")
+        captures = _captures(store, thing)
+        check_capture_sizes(store, [*captures, *still])
+        depth_range = load_stereo(store).depth_range_mm
+        measuring = part(progress, 0, 0.9 if not still else 0.5)
+        found: list[Position] = []
+        for i, (shot, frames, phases) in enumerate(decoded(store, list(captures))):
+            measuring(i / len(captures), f"measuring {shot.name}")
+            cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
+            plate = None
+            if thing.kind == "plane" and shot.role == "calibration":
+                plate = board_region(store, shot, capture_texture(shot, frames), warn)
+            try:
+                found.append(measure(thing, cloud, captures[shot.name], shot.name, depth_range, plate))
+            except InputError as error:
+                raise InputError(f"{shot.name}: {error}") from error
+        test = conclude(thing, name, found)
+        steady = None
+        if still:
+            watching = part(progress, 0.5, 0.95)
+
+            def clouds() -> Any:
+                for i, (shot, _, phases) in enumerate(decoded(store, list(still))):
+                    watching(i / len(still), f"repeating {shot.name}")
+                    cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
+                    yield cloud.points[..., 2], cloud.sigma_z
+
+            steady = repeatability(clouds())
+        calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
+        checks = [checked for checked in history(store) if checked.calibration == calibration]
+        applied = apply_scale(store, test) if apply_scale_found else None
+        result = Accepted(test, factor, applied, _budget(test, applied, checks), steady)
+        numbers = [int(n.removeprefix("acceptance/")) for n in store.result_names() if n.startswith("acceptance/")]
+        meta = {
+            "accepted": result.to_json(),
+            "time": datetime.now(UTC).isoformat(timespec="seconds"),
+            "inputs": store.input_hashes(f"calibration/{name}", *captures, *still),
+        }
+        store.save_result(f"acceptance/{1 + max(numbers, default=0)}", meta, {})
+        progress(1.0, "tested")
+    return result
+
+
+def read_artefact(path: Path | str) -> Artefact:
+    """The artefact that a TOML file describes."""
+    try:
+        given = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no TOML file ({error}): see assets/artefacts for examples") from error
+    try:
+        return Artefact.from_dict(given)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _captures(store: Session, thing: Artefact) -> dict[str, str]:
+    """{capture: position}; a capture's own name where a pattern stands for several."""
+    found: dict[str, str] = {}
+    for position, pattern in thing.positions.items():
+        names = [name for name in store.capture_names() if fnmatchcase(name, pattern)]
+        if not names:
+            there = ", ".join(store.capture_names()) or "none"
+            raise InputError(f"no capture is called {pattern!r}: the captures are {there}")
+        found |= {name: position if len(names) == 1 else name for name in names}
+    return found
+
+
+def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) -> Budget | None:
+    """Of the artefact's length, from what the test and the drift checks found."""
+    scale = test.scale
+    if scale is None:
+        return None
+    thing, mm = test.artefact, scale.length_mm
+    name = SIZE if thing.spacing is None else SPACING
+    errors = np.array([f.error_mm for p in test.positions for f in p.figures if f.property == name])
+    noise = float(np.sqrt(np.mean([p.noise_mm**2 for p in test.positions])))
+    scatter = None if len(errors) < 2 else float(np.sqrt(max(errors.var(ddof=1) - noise**2, 0.0)))
+    left = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0  # known, and left in
+    board = mm * 1e-6 * float(np.hypot(scale.u_ppm, left))
+    warmth = mm * 1e-6 * thing.expansion.ppm_per_kelvin * thing.temperature.U_kelvin / 2
+    drift, since = None, "no drift check of this calibration: run `slviewer check`"
+    if checks:
+        last = checks[-1].drift
+        drift = mm * 1e-6 * float(np.hypot(last.scale_ppm, last.scale_sigma_ppm))
+        since = f"the drift check of {last.capture}"
+    return budget(
+        mm,
+        [
+            Contribution("phase noise", noise, "A", "the scatter of the points about their fits"),
+            Contribution("calibration", scatter, "A", f"the errors' scatter over {len(errors)} places"),
+            Contribution(
+                "board scale", board, "B", "this test's scale" + (", which was left uncorrected" if left else "")
+            ),
+            Contribution("temperature", warmth, "B", f"{thing.expansion.ppm_per_kelvin:g} ppm/K of the artefact"),
+            Contribution("drift", drift, "B", since),
+        ],
+    )

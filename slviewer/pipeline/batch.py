@@ -1,0 +1,251 @@
+"""Many captures at once, on Dask's distributed scheduler: a cluster of this machine's own cores, or one given."""
+
+import os
+import secrets
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from slviewer.errors import InputError, SlviewerError, UsageError
+from slviewer.evaluation.render import render
+from slviewer.pipeline.batch_storage import resolved, swept
+from slviewer.pipeline.batch_tasks import Do, Done, Task, joined, listed, verification_file, worked
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.verify import Shape, Verification
+
+INSTALL = "pip install 'slviewer[batch]'"
+PATIENCE_S = 10.0
+"""How long a scheduler may take to answer, and to find a worker."""
+BYTES_PER_WORKER = 3 << 30
+"""What reconstructing a capture of two megapixels may need, with every calibration loaded."""
+
+_DEAF = """
+import signal
+
+def dask_setup(worker):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+"""
+"""A terminal's Ctrl-C reaches workers too: they leave it to the process that started them, which ends them."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What came of every capture, in the order of the sessions. ``broken``: {session: why} of those without any."""
+
+    done: tuple[Done, ...]
+    broken: Mapping[str, str]
+    task: Task
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """{session, or session and capture: why}."""
+        failed = {f"{done.session} {done.capture}": done.failed for done in self.done if done.failed}
+        return {**self.broken, **failed}
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``batch --json``."""
+        sessions: dict[str, Any] = {address: {"failed": why, "captures": {}} for address, why in self.broken.items()}
+        for done in self.done:
+            captures = sessions.setdefault(done.session, {"failed": None, "captures": {}})["captures"]
+            captures[done.capture] = {
+                **done.figures,
+                "failed": done.failed or None,
+                "warnings": list(done.warnings),
+            }
+        return {"do": self.task.do, "sessions": sessions}
+
+    def text(self) -> str:
+        """For people: a table a session, then what failed and why."""
+        blocks = []
+        for address in dict.fromkeys(done.session for done in self.done):
+            rows = [{"capture": d.capture, **d.figures} for d in self.done if d.session == address and not d.failed]
+            if rows:
+                wrote = f" -> exports/{verification_file(self.task)}" if self.task.do == "verify" else ""
+                blocks.append(f"{address}{wrote}\n{render(rows)}\n")
+        failed = self.failed
+        blocks += [f"failed: {what}: {why}" for what, why in failed.items()]
+        good = sum(not done.failed for done in self.done)
+        return "\n".join([*blocks, f"{good} captures done, {len(failed)} failed"])
+
+
+def batch(
+    sessions: Sequence[Path | str],
+    do: Do,
+    *,
+    captures: Sequence[str] = (),
+    model: str | None = None,
+    shape: Shape | None = None,
+    radius: float | None = None,
+    accept_rejected: bool = False,
+    scheduler: str | None = None,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Batch:
+    """Do the same with captures of many sessions, each as the command of that name does it alone.
+
+    ``sessions``: folders that every worker sees, or fsspec addresses; captures are read, and files written into the
+    sessions' exports, where the workers are. ``captures``: names or patterns such as ``plane_*``; by default the scans.
+    ``scheduler``: the address of a Dask scheduler; by default a cluster of this machine's cores is started and ended.
+
+    A capture that fails is named in the result and ends nothing else; one whose worker dies is done again by another.
+    Raises SlviewerError without ``distributed``, or where no scheduler answers or it has no workers.
+    """
+    if do == "verify" and shape is None:
+        raise UsageError("what the captures show is not known: give --shape plane or --shape sphere")
+    if do != "verify" and (shape is not None or radius is not None):
+        raise UsageError(f"--shape and --radius belong to --do verify, not to --do {do}")
+    addresses = list(dict.fromkeys(resolved(session) for session in sessions))
+    if not addresses:
+        raise UsageError("no session named: give the folders or addresses of one or more")
+    task = Task(do, secrets.token_hex(4), model, shape, radius, accept_rejected)
+    looking = {address: (address, tuple(captures), task.version) for address in addresses}
+    progress(0.0, f"looking into {len(addresses)} sessions")
+    try:
+        with ExitStack() as ended:
+            if scheduler is None:  # workers will see what is seen from here, and are as many as there is work for
+                plans: dict[str, list[str] | str] = {address: listed(*given) for address, given in looking.items()}
+                client = ended.enter_context(_own(sum(len(plan) for plan in plans.values() if isinstance(plan, list))))
+            else:
+                client = ended.enter_context(_theirs(scheduler))
+                plans = _gathered(client, {a: (listed, *given) for a, given in looking.items()}, unheard, warn)
+            broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
+            wanted = [(a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan]
+            done = _worked(client, wanted, task, progress, warn)
+            broken |= _joined(client, done, task, warn)
+            progress(1.0, "done")
+    finally:
+        for address in addresses:
+            swept(address, task.batch)
+    return Batch(done, broken, task)
+
+
+def _worked(
+    client: Any, wanted: Sequence[tuple[str, str]], task: Task, progress: Progress, warn: Warn
+) -> tuple[Done, ...]:
+    """What came of each (session, capture)."""
+    found = _gathered(client, {(a, name): (worked, a, name, task) for a, name in wanted}, progress, warn)
+    done = tuple(came if isinstance(came, Done) else Done(a, name, failed=came) for (a, name), came in found.items())
+    for sentence in dict.fromkeys(f"{one.session}: {words}" for one in done for words in one.warnings):
+        warn(sentence)
+    return done
+
+
+def _joined(client: Any, done: Sequence[Done], task: Task, warn: Warn) -> dict[str, str]:
+    """Have each session's verifications written; {session: why it could not be done}."""
+    parts: dict[str, list[Verification]] = {}
+    for one in done:
+        if one.verification is not None:
+            parts.setdefault(one.session, []).append(one.verification)
+    writing = {address: (joined, address, tuple(verified), task) for address, verified in parts.items()}
+    return {address: why for address, why in _gathered(client, writing, unheard, warn).items() if why}
+
+
+@contextmanager
+def _theirs(scheduler: str) -> Iterator[Any]:
+    """A client of a scheduler that runs already, and has a worker."""
+    _check_installed()
+    from distributed import Client
+
+    try:
+        client = Client(scheduler, timeout=PATIENCE_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise SlviewerError(
+            f"no Dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`, or leave "
+            "--scheduler out to use this machine's cores"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE_S)
+        except TimeoutError as error:
+            raise SlviewerError(
+                f"the scheduler at {scheduler} has no workers: start some with `dask worker {scheduler}`"
+            ) from error
+        yield client
+
+
+@contextmanager
+def _own(most: int) -> Iterator[Any]:
+    """A client of worker processes on this machine, which end with it and share its cores among them: ``most``, or as
+    many as cores and memory allow."""
+    _check_installed()
+    import dask.config
+    from dask.system import CPU_COUNT
+    from distributed import Client, LocalCluster
+    from distributed.system import MEMORY_LIMIT
+
+    workers = max(1, min(most, CPU_COUNT, MEMORY_LIMIT // BYTES_PER_WORKER))
+    threads = str(max(1, CPU_COUNT // workers))
+    libraries = ("OMP", "OPENBLAS", "MKL", "NUMBA")
+    environ = {f"{library}_NUM_THREADS": os.environ.get(f"{library}_NUM_THREADS", threads) for library in libraries}
+    with (
+        dask.config.set({"distributed.nanny.pre-spawn-environ": environ}),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=MEMORY_LIMIT // workers,
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+            preload=_DEAF,
+            security=True,  # whoever reaches a scheduler runs what they like as its user; others share this machine
+            silence_logs="ERROR",
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+def _check_installed() -> None:
+    for package in ("distributed", "fsspec", "cryptography"):
+        if find_spec(package) is None:
+            raise SlviewerError(f"a batch needs the package {package}, which is missing: {INSTALL}")
+
+
+def _gathered(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progress, warn: Warn) -> dict[Any, Any]:
+    """What each call (function, arguments ...) returned, in their order; the reason as text where a worker could not.
+
+    What is left of them is given up if this raises.
+    """
+    from distributed import as_completed
+
+    futures = {client.submit(*call, pure=False): key for key, call in calls.items()}
+    answers: dict[Any, Any] = {}
+    told = time.monotonic()
+    try:
+        ahead = as_completed(futures, loop=client.loop)
+        while len(answers) < len(futures):
+            ready = ahead.next_batch(block=False)
+            for future in ready:
+                key = futures[future]
+                answers[key] = _answer(future)
+                name = " ".join(key) if isinstance(key, tuple) else key
+                progress(len(answers) / len(futures), f"{len(answers)} of {len(futures)}: {name}")
+            if not ready:
+                time.sleep(0.05)
+                if time.monotonic() - told > PATIENCE_S:
+                    told = time.monotonic()
+                    if not client.scheduler_info()["workers"]:
+                        warn("the scheduler has no workers at the moment: waiting for some")
+    finally:
+        client.cancel([future for future in futures if not future.done()])
+    return {key: answers[key] for key in calls}
+
+
+def _answer(future: Any) -> Any:
+    """Its result, or why there is none."""
+    from concurrent.futures import CancelledError
+
+    from distributed import KilledWorker
+
+    try:
+        return future.result()
+    except KilledWorker:
+        return "every worker that tried it died: it may need more memory than they have"
+    except CancelledError:
+        return "the scheduler was lost, or gave the work up"
+    except ImportError as error:
+        raise InputError(f"the workers cannot run slviewer ({error}): install it where they are") from error
+    except Exception as error:  # whatever a worker met with ends that capture alone
+        return f"{type(error).__name__}: {error}"

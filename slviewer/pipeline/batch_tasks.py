@@ -1,0 +1,162 @@
+"""What a worker of a batch is asked to do: the commands' own functions, on one capture at a time."""
+
+import json
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer import __version__
+from slviewer.errors import InputError, SlviewerError
+from slviewer.pipeline.batch_storage import at_hand, delivered, described
+from slviewer.pipeline.reconstruct import reconstruct
+from slviewer.pipeline.verify import Shape, Verification, verify
+from slviewer.session.atomic import write_bytes
+from slviewer.session.store import Session
+
+Do = Literal["reconstruct", "verify", "mesh"]
+
+_ONE = threading.Lock()
+"""A process works on one capture at a time, however many threads its worker has: the kernels use its cores already, and
+each capture more would need as much memory again."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """The same work for all captures of a batch. ``batch``: its name, ``version``: the program's that asks."""
+
+    do: Do
+    batch: str
+    model: str | None = None
+    shape: Shape | None = None
+    radius: float | None = None
+    accept_rejected: bool = False
+    version: str = __version__
+
+
+@dataclass(frozen=True)
+class Done:
+    """What came of one capture: its figures by name, or why it failed.
+
+    ``verification``: without its maps, to be joined with those of the session's other captures.
+    """
+
+    session: str
+    capture: str
+    figures: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    failed: str = ""
+    verification: Verification | None = None
+
+
+def listed(address: str, patterns: Sequence[str], version: str) -> list[str] | str:
+    """Names of a session's captures that match any of the patterns, of its scans where there is none; else why not."""
+    try:
+        _check(version)
+        with described(address) as folder, Session.open(folder) as store:
+            if not patterns:
+                names = store.capture_names("scan")
+                return names or "it holds no scan: name the captures, such as 'pose_*'"
+            there = store.capture_names()
+            names = [name for name in there if any(fnmatchcase(name, pattern) for pattern in patterns)]
+            return names or f"no capture is called {' or '.join(patterns)}: there are {', '.join(there) or 'none'}"
+    except Exception as error:  # whatever it is ends this session alone
+        return _reason(error)
+
+
+def worked(address: str, capture: str, task: Task) -> Done:
+    """Do the task with one capture; what it makes lies in the session's exports when this returns."""
+    warnings: list[str] = []
+    started = time.perf_counter()
+    try:
+        _check(task.version)
+        with at_hand(address, capture) as folder, _ONE, Session.open(folder) as store:
+            done = _verified(store, capture, task, warnings) if task.do == "verify" else None
+            if done is None:
+                with delivered(address, task.batch) as made:
+                    done = _reconstructed(store, capture, task, made, warnings)
+    except Exception as error:  # whatever it is ends this capture alone
+        return Done(address, capture, warnings=tuple(warnings), failed=_reason(error))
+    figures = done.figures | {"s": round(time.perf_counter() - started, 1)}
+    return replace(done, session=address, figures=figures, warnings=tuple(warnings))
+
+
+def joined(address: str, parts: Sequence[Verification], task: Task) -> str:
+    """Write the verifications of one session as one, as ``verify --json`` does; returns why not, or an empty text."""
+    whole = Verification({name: comparison for part in parts for name, comparison in part.captures.items()})
+    try:
+        with delivered(address, task.batch) as made:
+            text = json.dumps(whole.to_json(), indent=2) + "\n"
+            write_bytes(made / verification_file(task), text.encode())
+    except Exception as error:
+        return _reason(error)
+    return ""
+
+
+def verification_file(task: Task) -> str:
+    """Its name in the exports."""
+    return f"verification_{task.shape}.json"
+
+
+def _reason(error: Exception) -> str:
+    return str(error) if isinstance(error, SlviewerError) else f"{type(error).__name__}: {error}"
+
+
+def _check(version: str) -> None:
+    if version != __version__:
+        raise InputError(f"the worker runs slviewer {__version__}, the batch {version}: install the same on both")
+
+
+def _reconstructed(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> Done:
+    found = reconstruct(
+        store,
+        capture,
+        model=task.model,
+        out=made / "cloud.ply",
+        mesh=task.do == "mesh",
+        accept_rejected=task.accept_rejected,
+        warn=warnings.append,
+    )
+    name = f"{capture}_{found.cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
+    found.ply.rename(made / name)
+    sigma = float(np.median(found.cloud.sigma_z[found.cloud.mask]))
+    return Done("", capture, {"points": found.points, "noise mm": sigma, "file": name})
+
+
+def _verified(store: Session, capture: str, task: Task, warnings: list[str]) -> Done:
+    assert task.shape is not None
+    found = verify(
+        store,
+        (capture,),
+        task.shape,
+        models=(task.model,) if task.model else (),
+        radius=task.radius,
+        accept_rejected=task.accept_rejected,
+        warn=warnings.append,
+    )
+    (comparison,) = found.captures.values()
+    figures = {f"{model} RMS mm": result.rms_mm for model, result in comparison.results.items()}
+    return Done("", capture, figures, verification=_without_maps(found))
+
+
+def _without_maps(found: Verification) -> Verification:
+    """All that its JSON is made of, without what has as many values as the camera has pixels."""
+    none = np.zeros((0, 0), bool)
+    captures = {
+        name: replace(
+            comparison,
+            region=none,
+            common=none,
+            results={
+                model: replace(result, error_map=none.astype(np.float32), inliers=none)
+                for model, result in comparison.results.items()
+            },
+        )
+        for name, comparison in found.captures.items()
+    }
+    return replace(found, captures=captures)

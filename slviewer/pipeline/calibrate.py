@@ -1,0 +1,235 @@
+"""From a session's target poses to calibrations."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from typing import Any, TypeVar
+
+import numpy as np
+
+from slviewer.calibration.anchored import AnchoredModel, calibrate_anchored
+from slviewer.calibration.diagnosis.splined_rules import judge_splined
+from slviewer.calibration.diagnosis.verdict import Verdict
+from slviewer.calibration.observe import Observation, Smoothing
+from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
+from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import CalibrationRejected, InputError, UsageError
+from slviewer.pipeline.calibration_verdict import attempt, keep_rejected, rejected, save_verdict
+from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.models import available, preferred, save_fitted, save_stereo, warn_if_frame_changed
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.target.board import Board
+
+_LENGTH = {"pixelwise": 1.0, "anchored": 1.0, "splined": 2.0}
+"""How long each model takes, roughly, for the progress."""
+DEFAULT_MODELS = ("stereo", "pixelwise", "splined")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """What ``calibrate`` found."""
+
+    stereo: StereoModel
+    pixelwise: PixelwiseModel | None
+    anchored: AnchoredModel | None = None
+    splined: SplinedModel | None = None
+    verdict: Verdict = field(default_factory=Verdict)
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``calibrate --json``."""
+        rig = self.stereo.rig
+        models: dict[str, Any] = {
+            "stereo": {
+                "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
+                "K_camera": rig.camera.K.tolist(),
+                "D_camera": rig.camera.D.tolist(),
+                "K_projector": rig.projector.K.tolist(),
+                "D_projector": rig.projector.D.tolist(),
+                "R": rig.R.tolist(),
+                "T": rig.t.tolist(),
+            }
+        }
+        if self.pixelwise is not None:
+            models["pixelwise"] = {
+                "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.axes[0]),
+                "axes": {axis: self.pixelwise.median_rms_mm(axis) for axis in self.pixelwise.axes},
+            }
+        if self.anchored is not None:
+            models["anchored"] = {"axes": {axis: self.anchored.median_rms_px(axis) for axis in self.anchored.axes}}
+        if self.splined is not None:
+            models["splined"] = self.splined.bundle.summary()
+        return {
+            "models": models,
+            "poses_used": list(self.stereo.poses),
+            "poses_left_out": dict(self.stereo.left_out),
+            "verdict": self.verdict.to_json(),
+        }
+
+    def text(self) -> str:
+        """For people."""
+        s = self.stereo
+        rms, total = s.reprojection_rms_px, len(s.poses) + len(s.left_out)
+        fc, fp = s.rig.camera.K, s.rig.projector.K
+        sigma = s.focal_sigma_px
+        near, far = s.depth_range_mm or (np.nan, np.nan)
+        lines = [
+            f"poses: {len(s.poses)} of {total} used, boards at {near:.0f}-{far:.0f} mm",
+            *(f"  left out: {name}: {why}" for name, why in s.left_out.items()),
+            f"stereo: reprojection RMS camera {rms['camera']:.3f} px, projector {rms['projector']:.3f} px, "
+            f"stereo {rms['stereo']:.3f} px",
+            f"  camera focal length {fc[0, 0]:.1f}, {fc[1, 1]:.1f} px (+- {sigma['camera']:.1f}); "
+            f"projector {fp[0, 0]:.1f}, {fp[1, 1]:.1f} px (+- {sigma['projector']:.1f}); "
+            f"baseline {s.baseline_mm:.2f} mm",
+        ]
+        if s.features_set_aside:
+            lines.append(f"  {s.features_set_aside} features set aside beyond 6 robust sigma")
+        if self.pixelwise is not None:
+            for axis in self.pixelwise.axes:
+                fit = self.pixelwise.fits[axis]
+                fitted = np.isfinite(fit.coefficients[0])
+                fit_rms = self.pixelwise.median_rms_mm(axis)
+                lines.append(
+                    f"pixelwise {axis}: {100 * fitted.mean():.1f} % of the pixels fitted, "
+                    f"in {np.median(fit.poses[fitted]):.0f} poses (median); "
+                    f"fit RMS z {fit_rms['z']:.3f}, x {fit_rms['x']:.3f}, y {fit_rms['y']:.3f} mm (median)"
+                )
+        if self.anchored is not None:
+            lines += [
+                f"anchored {axis}: corrections of {np.sqrt(c.prior[0, 0]):.3f} px (standard deviation at mid depth), "
+                f"fit RMS {self.anchored.median_rms_px(axis):.4f} px (median)"
+                for axis, c in self.anchored.corrections.items()
+            ]
+        if self.splined is not None:
+            lines.append(self.splined.bundle.text())
+        lines.append(self.verdict.text())
+        return "\n".join(lines)
+
+
+def calibrate(
+    session: SessionLike,
+    target: str,
+    *,
+    models: Sequence[str] = (),
+    poses: Sequence[str] = (),
+    exclude: Sequence[str] = (),
+    smoothing: str = "spline",
+    degree: int = 5,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> CalibrationResult:
+    """Calibrate from the session's captures of role calibration, and save the models in the session.
+
+    ``models``: by default stereo, pixelwise and splined. ``stereo`` is always made; ``pixelwise`` and ``anchored`` are
+    fitted on top of it, and ``splined`` starts from it. ``poses``: the only ones to calibrate from, ``exclude``: those
+    to leave out; names or patterns such as ``pose_0*``, for this calibration alone. A pose that cannot be used is left
+    out with the reason. The verdict is saved beside the models. Raises CalibrationRejected with its reason where it
+    rejects them: then stereo alone is kept to look into, and used only where that is insisted on; where none could be
+    made at all, what the session held stays.
+    """
+    board = Board.parse(target)
+    models = models or DEFAULT_MODELS
+    step_2 = Smoothing(smoothing, degree)
+    with opened(session, write=True) as store:
+        excluded = store.excluded()
+        before = preferred(store) if available(store) else ""
+        names = store.capture_names("calibration")
+        if not names:
+            raise InputError(
+                f"{store.folder} holds no target poses: import some with --role calibration, or capture them first"
+            )
+        left_out = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
+        left_out |= _unselected(names, poses, exclude)
+        names = [name for name in names if name not in left_out]
+        if not names:
+            raise InputError("every target pose is excluded: include some again")
+        found = attempt(store, names, board, step_2, left_out, part(progress, 0, 0.65))
+        if found.stereo is None:
+            save_verdict(store, found.verdict, names)
+            raise rejected(found.verdict, kept=False)
+        stereo = found.stereo
+        settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
+        if found.verdict.level == "rejected":
+            keep_rejected(store, stereo, settings, found.verdict)
+            save_verdict(store, found.verdict, names)
+            raise rejected(found.verdict, kept=True)
+        if found.warning:
+            warn(found.warning)
+        for name, why in stereo.left_out.items():
+            if name not in left_out:
+                warn(f"{name} is left out: {why}")
+        for finding in found.verdict.findings:
+            if finding.severity == "doubtful":
+                warn(finding.text())
+        made = _made(models, stereo, found.observations, part(progress, 0.66, 0.97), warn)
+        verdict = judge_splined(found.verdict, made.splined.bundle.noise) if made.splined else found.verdict
+        for finding in verdict.findings:
+            if finding not in found.verdict.findings:
+                warn(finding.text())
+        if verdict.level == "rejected":
+            keep_rejected(store, stereo, settings, verdict)
+            save_verdict(store, verdict, names)
+            raise rejected(verdict, kept=True)
+        progress(0.97, "saving")
+        inputs = store.input_hashes(*stereo.poses)
+        save_stereo(store, stereo, inputs, settings, verdict)
+        for model in (made.pixelwise, made.anchored, made.splined):
+            if model is not None:
+                save_fitted(store, model, inputs, settings)
+        save_verdict(store, verdict, names)
+        warn_if_frame_changed(store, before, warn)
+        progress(1.0, "calibrated")
+    return replace(made, verdict=verdict)
+
+
+def _unselected(names: Sequence[str], poses: Sequence[str], exclude: Sequence[str]) -> dict[str, str]:
+    """{pose: why} of the target poses that are not among ``poses``, where any are named, or that ``exclude`` names.
+
+    Raises UsageError for a name or pattern that fits no target pose.
+    """
+    for pattern in (*poses, *exclude):
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise UsageError(f"no target pose is called {pattern!r}: there are {', '.join(names)}")
+    chosen = {name for name in names if not poses or any(fnmatchcase(name, pattern) for pattern in poses)}
+    out = {name: "not among the poses that were named" for name in names if name not in chosen}
+    return out | {name: "excluded for this calibration" for name in names for p in exclude if fnmatchcase(name, p)}
+
+
+def _made(
+    models: Sequence[str], stereo: StereoModel, observations: Sequence[Observation], progress: Progress, warn: Warn
+) -> CalibrationResult:
+    """The models that follow from stereo; what one of them lacks is told, and keeps none of the others."""
+    wanted = [name for name in models if name != "stereo"]
+    longest = sum(_LENGTH[name] for name in wanted) or 1
+    ended = 0.0
+
+    def told(name: str, doing: str) -> Callable[[float], None]:
+        nonlocal ended
+        begun, ended = ended, ended + _LENGTH[name] / longest
+        span = part(progress, begun, ended)
+        span(0.0, doing)
+        return lambda done: span(done, doing)
+
+    def tried(name: str, make: Callable[[], T]) -> T | None:
+        try:
+            return make()
+        except (CalibrationRejected, InputError) as error:
+            if len(models) == 1:
+                raise
+            warn(f"no {'pixel-wise' if name == 'pixelwise' else name} model: {error}")
+            return None
+
+    pixelwise = anchored = splined = None
+    if "pixelwise" in models:
+        fitting = told("pixelwise", "pixel-wise fit")
+        pixelwise = tried("pixelwise", lambda: calibrate_pixelwise(observations, stereo, fitting))
+    if "anchored" in models:
+        correcting = told("anchored", "anchored fit")
+        anchored = tried("anchored", lambda: calibrate_anchored(observations, stereo, progress=correcting))
+    if "splined" in models:
+        adjusting = told("splined", "joint adjustment")
+        splined = tried("splined", lambda: calibrate_splined(observations, stereo, adjusting))
+        for name, why in splined.bundle.left_out.items() if splined else ():
+            warn(f"{name} is left out of the splined model: it {why}")
+    return CalibrationResult(stereo, pixelwise, anchored, splined)

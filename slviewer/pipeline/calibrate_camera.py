@@ -1,0 +1,104 @@
+"""The camera alone, from the pictures of a board that a folder or a session holds."""
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+
+from slviewer import __version__
+from slviewer.calibration.camera import CameraCalibration, calibrate_camera
+from slviewer.errors import DetectionError, InputError, UsageError
+from slviewer.pipeline.capture_phases import capture_texture
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.session.exporters import write_calibration
+from slviewer.session.importers.frame_groups import images_by_name
+from slviewer.session.importers.images import read_image
+from slviewer.session.store import Session, is_session
+from slviewer.target.board import Board
+from slviewer.target.detect import Detection, detect
+
+
+def calibrate_camera_alone(
+    source: Path | str,
+    target: str,
+    *,
+    poses: Sequence[str] = (),
+    exclude: Sequence[str] = (),
+    out: Path | str | None = None,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> CameraCalibration:
+    """Calibrate the camera from a folder of pictures, or from the target poses of a session; a session stays as it is.
+
+    ``poses``, ``exclude``: names or patterns of pictures. ``out``: .yml, .xml or .json for OpenCV. Pictures in which
+    the board is not detected are excluded with the reason. Raises CalibrationRejected for fewer than three.
+    """
+    board, source = Board.parse(target), Path(source)
+    names = _names(source)
+    for pattern in (*poses, *exclude):
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise UsageError(f"no picture is called {pattern!r}: there are {', '.join(names)}")
+    chosen = [name for name in names if not poses or any(fnmatchcase(name, p) for p in poses)]
+    chosen = [name for name in chosen if not any(fnmatchcase(name, p) for p in exclude)]
+    detections: dict[str, Detection] = {}
+    excluded: dict[str, str] = {}
+    size: tuple[int, int] | None = None
+    for i, name in enumerate(chosen):
+        progress(i / len(chosen), f"detecting the board in {name}")
+        image = _picture(source, name)
+        height, width = image.shape[:2]
+        if size is not None and size != (width, height):
+            raise InputError(f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}: use pictures of one size")
+        size = width, height
+        try:
+            detections[name] = detect(board, image)
+        except DetectionError as error:
+            excluded[name] = str(error)
+            warn(f"{name} is excluded: {error}")
+    if size is None:
+        raise InputError(f"{source} holds no picture to calibrate from: name some")
+    found = calibrate_camera(board, detections, size, excluded)
+    if out is not None:
+        write_calibration(Path(out), _entries(found), _MEANINGS)
+    progress(1.0, "calibrated")
+    return found
+
+
+def _names(source: Path) -> list[str]:
+    if is_session(source):
+        with Session.open(source) as store:
+            return store.capture_names("calibration")
+    if not source.is_dir():
+        raise InputError(f"{source} is no folder: give a folder of pictures of the board, or a session")
+    return [path.name for path in images_by_name(source)]
+
+
+def _picture(source: Path, name: str) -> np.ndarray:
+    if is_session(source):
+        with Session.open(source) as store:
+            capture = store.load_capture(name)
+            return capture_texture(capture, capture.stack())
+    image = read_image(source / name)
+    return np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
+
+
+_MEANINGS = {
+    "camera_size": "width and height of the image, px; pixel (0, 0) is the centre of the top left one",
+    "K_camera": "intrinsics: fx 0 cx, 0 fy cy, 0 0 1, px",
+    "D_camera": "distortion: k1 k2 p1 p2 k3, as OpenCV orders them",
+    "focal_sigma_px": "standard deviations of fx and fy, px",
+}
+
+
+def _entries(found: CameraCalibration) -> Mapping[str, object]:
+    return {
+        "program": f"slviewer {__version__}",
+        "target": found.board,
+        "camera_size": np.array(found.lens.size),
+        "K_camera": found.lens.K,
+        "D_camera": found.lens.D,
+        "focal_sigma_px": np.array(found.focal_sigma_px),
+        "reprojection_rms_px_camera": found.rms_px,
+        "verdict": found.verdict.level,
+    }

@@ -1,0 +1,141 @@
+"""Captures without a browser: what is shown, what is taken, how it is kept. The wizard keeps its own the same way."""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from slviewer.devices.capture import Taken, check_exposures, take
+from slviewer.devices.protocols import CameraSettings, Rig
+from slviewer.errors import InputError, SessionError, SlviewerError
+from slviewer.fringe.presets import PRESETS
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.frame_residuals import keep_residuals
+from slviewer.pipeline.open_session import opened_or_made
+from slviewer.pipeline.rig_choice import Bench, SetUp, set_up
+from slviewer.pipeline.rig_presets import load_rig
+from slviewer.session.atomic import megabytes
+from slviewer.session.capture import Capture, Role
+from slviewer.session.names import safe_name
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+
+PATTERNS = "complementary"
+"""The sequence where nobody names one: its codes forgive blurred edges, and it is shorter than the Letter's."""
+
+
+def capture(
+    session: Path | str,
+    name: str,
+    rig: Mapping[str, Any] | Path | str,
+    *,
+    role: Role = "calibration",
+    board: str | None = None,
+    patterns: str | None = None,
+    exposure_ms: float | None = None,
+    exposures_ms: Sequence[float] = (),
+    gain: float | None = None,
+    force: bool = False,
+    set_up: SetUp = set_up,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Capture:
+    """Show a pattern sequence, photograph it, and save it in a session, which is made if it does not exist.
+
+    `rig` is a choice, a TOML file that holds one, or a preset's name. `patterns` names a sequence, by default the
+    session's, and `board` the target of a calibration pose, by default the session's too. `exposure_ms` and `gain` are
+    by default the rig's; two or more `exposures_ms` are merged, pixel by pixel, when the capture is read. `warn` hears
+    what the camera could not be set to, and which frames contradict the others. Raises InputError, DeviceError,
+    SessionError, and whatever `progress` raises before the capture is saved; nothing is kept then.
+    """
+    if exposure_ms is not None and exposures_ms:
+        raise InputError("one exposure and several were asked for: give either")
+    exposures = check_exposures(exposures_ms) if exposures_ms else []
+    target = None if board is None else Board.parse(board)
+    safe_name(name)
+    with opened_or_made(session) as store:
+        if name in store.capture_names() and not force:
+            raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")
+        choice = rig if isinstance(rig, Mapping) else load_rig(rig, store)
+        target = target or (Board.parse(known) if (known := store.decision("target")) else None)
+        progress(0.0, "opening the devices")
+        bench = set_up(choice, target)
+        sequence = sequence_for(bench, patterns or str(store.decision("patterns") or PATTERNS))
+        _check_space(store, bench, len(sequence.frames) * max(1, len(exposures)))
+        with bench.rig.opened() as devices:
+            set_camera(devices, choice, exposure_ms, gain, warn)
+            taken = take(
+                devices,
+                sequence,
+                exposures,
+                progress=lambda done, n: progress(0.95 * done / n, f"{name}: frame {done} of {n}"),
+            )
+        progress(0.95, "saving")
+        purpose = "pose" if role == "calibration" else "scan"
+        shown = str(target) if target is not None and role == "calibration" else None
+        saved = keep(store, name, role, sequence, taken, source=devices.name, purpose=purpose, board=shown, force=force)
+        try:
+            for sentence in keep_residuals(store, name):
+                warn(f"{name}: {sentence}")
+        except SlviewerError as error:  # it is saved, and can be looked at later
+            warn(f"{name} is saved, and its frames could not be checked: {error}")
+    progress(1.0, "captured")
+    return saved
+
+
+def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn) -> None:
+    """Set the open rig's camera to what is asked for, else to what its choice says; `warn` hears what could not be."""
+    wanted = CameraSettings(exposure_ms or choice.get("exposure_ms"), gain or choice.get("gain"))
+    if wanted != CameraSettings():
+        rig.camera.apply(wanted)
+    for note in getattr(rig.camera, "notes", ()):
+        warn(note)
+
+
+def sequence_for(bench: Bench, patterns: str) -> PatternSequence:
+    """What is shown: the sequence of that name for the rig's projector, or the only one that the rig answers to."""
+    if bench.reel is not None:
+        return bench.reel.sequence
+    if patterns not in PRESETS:
+        raise InputError(f"no pattern sequence is called {patterns!r}: use {', '.join(PRESETS)}")
+    return PRESETS[patterns](bench.rig.projector.size)
+
+
+def keep(
+    store: Session,
+    name: str,
+    role: Role,
+    sequence: PatternSequence,
+    taken: Taken,
+    *,
+    source: str,
+    purpose: str,
+    board: str | None = None,
+    force: bool = False,
+) -> Capture:
+    """Save what was taken, with all that is known of it."""
+    exposure = {} if taken.exposures_ms else {"exposure_ms": taken.settings.exposure_ms}
+    return store.save_capture(
+        name,
+        role,
+        sequence,
+        taken.frames,
+        source=source,
+        texture=taken.texture,
+        settings={"purpose": purpose, **exposure, "gain": taken.settings.gain},
+        board=board,
+        exposures_ms=taken.exposures_ms,
+        force=force,
+    )
+
+
+def _check_space(store: Session, bench: Bench, frames: int) -> None:
+    """Raise SessionError before anything is captured that the disk would refuse."""
+    (width, height), dtype = bench.rig.camera.size, bench.rig.camera.dtype
+    needed, free = frames * width * height * dtype.itemsize, shutil.disk_usage(store.folder).free
+    if free < needed:
+        raise SessionError(
+            f"the capture needs {megabytes(needed)} and {megabytes(free)} are free on {store.folder}: "
+            "free some space first"
+        )

@@ -1,0 +1,122 @@
+"""The cloud of a capture by one of the session's calibrations, once it is known that they belong together."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import InputError
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
+from slviewer.pipeline.feedback import Warn, unwarned
+from slviewer.pipeline.models import Model, load_stereo
+from slviewer.pipeline.scale import scale_factor, scaled
+from slviewer.reconstruction.axis_agreement import CaptureCheck, check_phases, check_sizes
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.reconstruction.relative_phase import resolve_phase
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+
+
+def check_capture_sizes(store: Session, names: Iterable[str]) -> None:
+    """Raise InputError where a capture's camera or projector has not the size that the session's calibration has:
+    before anything is decoded, which would fail for reasons that follow from it."""
+    rig = load_stereo(store).rig
+    for capture in (store.load_capture(name) for name in names):
+        check_sizes(capture.name, capture.size, capture.sequence.projector_size, rig)
+
+
+def capture_cloud(
+    store: Session,
+    model: Model,
+    capture: Capture,
+    phases: Mapping[Axis, PhaseMap],
+    *,
+    axis: Axis | None = None,
+    texture: np.ndarray | None = None,
+    accept_rejected: bool = False,
+    warn: Warn = unwarned,
+) -> Cloud:
+    """The organised cloud of a decoded capture, with the scale that was applied to the calibration.
+
+    Raises InputError where capture and calibration do not belong together: by their sizes, or by how far the axes of
+    the capture miss each other, which is a warning if ``accept_rejected``. Where they miss each other by more than
+    noise explains, the cloud's sigmas are raised by that factor, and ``warn`` says so.
+    """
+    check = check_capture(store, model, capture, phases, accept_rejected)
+    for message in check.warnings:
+        warn(message)
+    cloud = scaled(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
+    return raised(cloud, check.sigma_factor)
+
+
+def check_capture(
+    store: Session,
+    model: Model,
+    capture: Capture,
+    phases: Mapping[Axis, PhaseMap],
+    accept_rejected: bool = False,
+) -> CaptureCheck:
+    """Whether a capture belongs to a calibration, as ``axis_agreement.check_phases`` finds it."""
+    stereo = load_stereo(store)
+    check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
+    calibration = model if isinstance(model, SplinedModel) else stereo
+    return check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
+
+
+def absolute_phases(
+    store: Session,
+    name: str,
+    phases: Mapping[Axis, PhaseMap],
+    depth_range: tuple[float, float] | None = None,
+    warn: Warn = unwarned,
+) -> dict[Axis, PhaseMap]:
+    """A capture's phases, those that repeat made absolute by the depths (near, far) mm between which the scene lies; by
+    default the calibrated ones. An axis that more than one depth fits is left to the other axis, with a warning.
+
+    Raises InputError where no axis is unique in the range, and where no range is known.
+    """
+    if not any(phase.is_relative for phase in phases.values()):
+        if depth_range is not None:
+            warn(f"{name}: its phase is absolute, and the depth range is not needed: it was not used")
+        return dict(phases)
+    stereo = load_stereo(store)
+    near_far, whose = depth_range or stereo.depth_range_mm, "" if depth_range else ", the calibrated depths"
+    if near_far is None:
+        raise InputError(
+            f"{name}: its phase is not absolute, and the calibration knows no depths: state those of the scene with "
+            "--depth-range NEAR FAR, mm"
+        )
+    absolute, refusals = {axis: phase for axis, phase in phases.items() if not phase.is_relative}, []
+    for axis, phase in phases.items():
+        if not phase.is_relative:
+            continue
+        try:
+            resolved = resolve_phase(stereo.rig, phase, near_far)
+        except InputError as error:
+            refusals.append(str(error))
+            continue
+        absolute[axis] = resolved.phase
+        warn(
+            f"{name}: the phase of axis {axis} repeats every {phase.unambiguous_px:g} px, and each pixel was given its "
+            f"one depth between {near_far[0]:.0f} and {near_far[1]:.0f} mm{whose}; {100 * resolved.outside:.1f} % of "
+            "the decoded pixels have none and are masked. A surface outside of this range would be measured about "
+            f"{resolved.spacing_mm:.0f} mm from its place: change it with --depth-range"
+        )
+    if not absolute:
+        raise InputError(
+            f"{name}: {'; '.join(refusals)} (--depth-range NEAR FAR{whose and '; by default' + whose[1:]})"
+        )
+    for refusal in refusals:
+        warn(f"{name}: {refusal}; this axis was not used")
+    return absolute
+
+
+def raised(cloud: Cloud, factor: float) -> Cloud:
+    """The cloud with sigmas larger by a factor."""
+    if factor == 1.0:
+        return cloud
+    left = None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor)
+    return replace(cloud, sigma_z=cloud.sigma_z * np.float32(factor), sigma_calibration=left)

@@ -1,0 +1,136 @@
+"""Is the saved calibration still good? One capture of its board answers, and the session remembers."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from slviewer.calibration.drift.check import Drift, check_drift
+from slviewer.calibration.drift.floor import Reference, refer
+from slviewer.calibration.drift.view import View
+from slviewer.calibration.observe import Smoothing, observe
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.models import load_stereo, warn_if_stale
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.poses import load_observations
+from slviewer.reconstruction.axis_agreement import check_sizes
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.target.detect import detect
+
+REFERENCE = "drift_reference"
+
+
+@dataclass(frozen=True)
+class Checked:
+    """One answer of the drift check: ``time`` is ISO 8601, UTC; ``calibration`` the hash of what was checked."""
+
+    time: str
+    calibration: str
+    drift: Drift
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {"time": self.time, "calibration": self.calibration} | self.drift.to_dict()
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """What ``check`` found, and what was found before of the same calibration, the oldest first."""
+
+    found: Checked
+    before: tuple[Checked, ...]
+
+    @property
+    def drift(self) -> Drift:
+        return self.found.drift
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``check --json``."""
+        return self.found.to_json() | {"before": [checked.to_json() for checked in self.before]}
+
+    def text(self) -> str:
+        """For people: the answer, then the history."""
+        lines = [self.drift.text()]
+        if self.before:
+            lines.append("earlier checks of this calibration:")
+            lines += [f"  {told(checked)}" for checked in self.before]
+        return "\n".join(lines)
+
+
+def told(checked: Checked) -> str:
+    """One line of the history."""
+    d = checked.drift
+    across = "" if d.across_px is None else f", {d.across_px:+.4f} px off its epipolar lines"
+    return (
+        f"{checked.time[:16].replace('T', ' ')}  {d.capture}: {d.verdict}; board {d.scale_ppm:+.0f} +- "
+        f"{d.scale_sigma_ppm:.0f} ppm{across}"
+    )
+
+
+def check(session: SessionLike, capture: str, *, progress: Progress = unheard, warn: Warn = unwarned) -> CheckResult:
+    """Whether the session's calibration still holds, from one later capture of its board, of any role.
+
+    Kept in the session as ``drift/1``, ``drift/2``, ... Raises DetectionError where the capture does not show the
+    board, InputError where the calibration has too few poses to tell, or was made elsewhere.
+    """
+    with opened(session, write=True) as store:
+        stereo = load_stereo(store)
+        if not stereo.poses:
+            raise InputError(
+                f"the calibration of {store.folder} was made elsewhere and has no poses: a drift check needs them "
+                "to know how well one board tells where the projector stands; run `slviewer calibrate` first"
+            )
+        warn_if_stale(store, warn)
+        shot = store.load_capture(capture)
+        progress(0.0, f"reading {capture}")
+        frames = shot.stack()
+        phases = decode_capture(shot, frames)
+        check_capture(capture, shot.sequence, frames, phases)
+        check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
+        board = Board.parse(stereo.board)
+        observation = observe(capture, board, detect(board, capture_texture(shot, frames)), phases, _smoothing(store))
+        progress(0.3, "what the calibration's own poses say")
+        drift = check_drift(_reference(store, stereo, capture), View.of(observation))
+        progress(0.95, "saving")
+        calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
+        before = tuple(checked for checked in history(store) if checked.calibration == calibration)
+        found = Checked(datetime.now(UTC).isoformat(timespec="seconds"), calibration, drift)
+        number = 1 + max((int(name.removeprefix("drift/")) for name in _names(store)), default=0)
+        inputs = store.input_hashes(capture, "calibration/stereo")
+        store.save_result(f"drift/{number}", {"checked": found.to_json(), "inputs": inputs}, {})
+        progress(1.0, "checked")
+    return CheckResult(found, before)
+
+
+def _reference(store: Session, stereo: StereoModel, capture: str) -> Reference:
+    """What the calibration's poses but for the capture say; kept, for it takes many seconds and does not change."""
+    if store.state_of(REFERENCE) == "fresh" and capture not in stereo.poses:
+        return Reference.restored(stereo.rig, store.load_result(REFERENCE)[1])
+    poses = [name for name in stereo.poses if name != capture]
+    reference = refer(stereo.rig, [View.of(o) for o in load_observations(store, poses)])
+    if capture not in stereo.poses:
+        meta = {"inputs": store.input_hashes("calibration/stereo", *poses)}
+        store.save_result(REFERENCE, meta, reference.to_arrays())
+    return reference
+
+
+def history(store: Session) -> tuple[Checked, ...]:
+    """Every drift check that the session remembers, the oldest first."""
+    found = []
+    for name in _names(store):
+        values = dict(store.load_result(name, only=())[0]["checked"])
+        found.append(Checked(values.pop("time"), values.pop("calibration"), Drift.from_dict(values)))
+    return tuple(found)
+
+
+def _names(store: Session) -> list[str]:
+    return [name for name in store.result_names() if name.startswith("drift/")]
+
+
+def _smoothing(store: Session) -> Smoothing:
+    """The smoothing of the calibration's own poses."""
+    settings = store.load_result("calibration/stereo", only=())[0]["settings"]
+    return Smoothing(settings["smoothing"], settings["degree"])

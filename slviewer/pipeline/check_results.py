@@ -1,0 +1,59 @@
+"""What the checks of a rig or of a capture say."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Verdict = Literal["good", "warning", "bad", "unknown"]
+"""Capture; capture if you must; do not capture before it is mended; it could not be found out."""
+
+_WORST_FIRST: tuple[Verdict, ...] = ("bad", "warning", "good")
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at: what was found, in a sentence; what to do about it, empty where nothing is to do;
+    and the figures behind it, whose names say their units.
+    """
+
+    name: str
+    verdict: Verdict
+    sentence: str
+    remedy: str
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """All checks of one rig, and what follows from them for its captures.
+
+    ``settle_ms``: what `Rig.settle_ms` should be, None where it could not be measured. ``levels``: the table for
+    `PatternSequence.levels` that makes the light proportional, None where it was not measured. ``exposure_ms``: the
+    exposure to set, None where the one that is set is right, or unknown. ``seconds``: how long it took.
+    """
+
+    checks: tuple[Check, ...]
+    settle_ms: float | None
+    levels: tuple[int, ...] | None
+    exposure_ms: float | None
+    seconds: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of all checks; what is unknown does not make a good rig worse."""
+        found = {check.verdict for check in self.checks}
+        return next((verdict for verdict in _WORST_FIRST if verdict in found), "unknown")
+
+    def check(self, name: str) -> Check:
+        """The check called `name`. Raises KeyError."""
+        return {check.name: check for check in self.checks}[name]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "verdict": self.verdict,
+            "settle_ms": self.settle_ms,
+            "exposure_ms": self.exposure_ms,
+            "levels": None if self.levels is None else list(self.levels),
+            "seconds": round(self.seconds, 2),
+            "checks": [vars(check) for check in self.checks],
+        }

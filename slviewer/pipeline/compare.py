@@ -1,0 +1,280 @@
+"""A scan against a nominal model: aligned, compared, judged, written and kept."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import UsageError
+from slviewer.evaluation.render import Row, render
+from slviewer.inspection.colours import colour_limit, deviation_colours
+from slviewer.inspection.deviation import Deviation, deviation
+from slviewer.inspection.quantities import Quantity
+from slviewer.inspection.tolerance import DECIDED, RULE, Verdict, judged
+from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.measured_surface import Surface, surface
+from slviewer.pipeline.measurements import triangles_of
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.session.measurements import Measurement, save_measurement
+from slviewer.session.nominal import Nominal, Units, check_size, read_nominal
+from slviewer.session.ply import write_ply
+from slviewer.session.store import Session
+
+MOST_KEPT = 120_000
+"""Points that a session keeps of a deviation, for pictures of it; the figures are of all."""
+LIKELY_COVERAGE = 0.05
+SCALARS = "deviation"
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A scan against a nominal model: the ``found`` deviation, the ``verdict`` where a tolerance was given, the noise
+    that the scan alone has along the nominal's normals (RMS, ``noise_mm``), and where it went: ``ply``, and the
+    ``measurement`` that the session keeps."""
+
+    scan: str
+    model: str
+    nominal: Nominal
+    found: Deviation
+    verdict: Verdict | None
+    noise_mm: float
+    ply: Path | None
+    measurement: Measurement | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``compare --json``."""
+        return {
+            "scan": self.scan,
+            "model": self.model,
+            "nominal": {
+                "name": self.nominal.name,
+                "hash": self.nominal.hash,
+                "units": self.nominal.units or "mm",
+                "triangles": len(self.nominal.mesh.faces),
+                "size_mm": self.nominal.size_mm.tolist(),
+                "closed": self.nominal.closed,
+                "notes": list(self.nominal.notes),
+            },
+            "noise_mm": self.noise_mm,
+            **self.found.to_dict(),
+            "tolerance": None if self.verdict is None else self.verdict.to_dict() | {"rule": RULE},
+        }
+
+    def text(self) -> str:
+        """For people."""
+        numbers = self.found.statistics()
+        lines = [f"{self.scan} by {self.model} against {self.nominal.text()}"]
+        lines += [f"{self.nominal.name}: {note}" for note in self.nominal.notes]
+        lines.append(render(_rows(numbers, self.noise_mm)))
+        share = 100 * numbers["left_out"] / (numbers["points"] + numbers["left_out"])
+        lines.append(
+            f"{numbers['points']:,} points; {numbers['left_out']:,} ({share:.1f} %) lie farther than "
+            f"{self.found.reach_mm:.3g} mm from the nominal or face another way, and are left out"
+        )
+        lines.append(
+            f"{100 * self.found.coverage:.1f} % of the nominal's area was measured; the best fit adds "
+            f"{self.found.alignment_mm:.4f} mm (1 sigma)"
+        )
+        if self.verdict is not None:
+            v = self.verdict
+            lines.append(
+                f"tolerance ± {v.tolerance_mm:g} mm: {v.within:.2f} % of the points within; by more than U = "
+                f"{v.U_mm:.4f} mm (k = 2) {v.inside:.2f} % inside and {v.outside:.2f} % outside, {v.close:.2f} % too "
+                "close to tell"
+            )
+            lines.append(
+                f"lowest {v.lowest[0]:+.4f} mm: {DECIDED[v.lowest[1]]}; highest {v.highest[0]:+.4f} mm: "
+                f"{DECIDED[v.highest[1]]} (99.7 % of the points)"
+            )
+            lines.append(f"{DECIDED[v.decision].upper()}: {RULE}")
+        if self.ply is not None:
+            lines.append(f"coloured points -> {self.ply}")
+        return "\n".join(lines)
+
+
+def compare(
+    session: SessionLike,
+    scan: str,
+    nominal: Path | str,
+    *,
+    tolerance: float | None = None,
+    units: Units | None = None,
+    reach: float | None = None,
+    out: Path | str | None = None,
+    model: str | None = None,
+    name: str = "",
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Compared:
+    """Compare a capture, or a kept merge (``merge/<number>``), with a nominal model (STL, PLY or OBJ) after best-fit
+    alignment, and keep what is found.
+
+    ``tolerance``: plus and minus, mm. ``units`` of the model's numbers; where none are given and the sizes do not fit,
+    InputError asks for them. ``reach``: mm, beyond which points belong to something else. ``out``: the coloured PLY, by
+    default in the session's exports.
+    """
+    if out is not None and Path(out).suffix.lower() != ".ply":
+        raise UsageError(f"coloured points are written as .ply, not as {Path(out).name}: end its name so")
+    ideal = read_nominal(nominal, units)  # a wrong file is told before minutes of work
+    with opened(session, write=True) as store:
+        reading = part(progress, 0.0, 0.4)
+        on = surface(store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn)
+        default = store.exports / f"{_plain(scan)}_{_plain(Path(ideal.name).stem)}_deviation.ply"
+        return compare_surface(
+            store,
+            on,
+            ideal,
+            tolerance=tolerance,
+            reach=reach,
+            out=default if out is None else out,
+            name=name,
+            progress=part(progress, 0.4, 1.0),
+            warn=warn,
+        )
+
+
+def compare_surface(
+    store: Session,
+    on: Surface,
+    nominal: Nominal,
+    *,
+    tolerance: float | None = None,
+    reach: float | None = None,
+    initial: np.ndarray | None = None,
+    out: Path | str | None = None,
+    name: str = "",
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Compared:
+    """As ``compare``, of a surface that is there already, in a session open for writing. ``initial`` (4, 4), scan to
+    nominal, replaces the search for a start; without ``out`` no file is written."""
+    measured = on.measured
+    points = on.points[measured].astype(np.float64)
+    check_size(nominal, points)
+    normals = None if on.normals is None else on.normals[measured]
+    sigma = on.sigma_mm[measured]
+    typical = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None
+    aligning = part(progress, 0.0, 0.85)
+    found = deviation(
+        points,
+        nominal.mesh,
+        normals=normals,
+        sigma_mm=typical,
+        reach_mm=reach,
+        initial=initial,
+        progress=lambda done: aligning(done, "aligning"),
+    )
+    if found.coverage < LIKELY_COVERAGE:
+        warn(f"only {100 * found.coverage:.1f} % of {nominal.name} were measured: see that it is the same part")
+    towards = np.nan_to_num(found.normals.astype(np.float64))
+    along = on.sigma_along(towards)
+    kept = found.counted
+    noise = float(np.sqrt(np.nanmean(along[kept] ** 2))) if np.isfinite(along[kept]).any() else float("nan")
+    verdict = None if tolerance is None else judged(found, on.sigma_along(towards, whole=True), tolerance)
+    progress(0.9, "writing")
+    ply = None
+    if out is not None:
+        ply = Path(out)
+        ply.parent.mkdir(parents=True, exist_ok=True)
+        _write(ply, on, found, nominal, tolerance)
+    measurement = _kept(store, on, nominal, found, verdict, noise, points, name)
+    progress(1.0, "compared")
+    return Compared(on.source, on.model, nominal, found, verdict, noise, ply, measurement)
+
+
+def _rows(numbers: dict[str, float], noise: float) -> list[Row]:
+    """The table of figures, mm."""
+    return [
+        {"deviation, mm": words, "value": f"{value:+.4f}" if signed else f"{value:.4f}"}
+        for words, value, signed in (
+            ("mean", numbers["mean"], True),
+            ("RMS", numbers["rms"], False),
+            ("RMS of noise alone", noise, False),
+            ("95 % are off by less than", numbers["within_95"], False),
+            ("range of 99.7 %, lower end", numbers["p_low"], True),
+            ("range of 99.7 %, upper end", numbers["p_high"], True),
+            ("lowest", numbers["lowest"], True),
+            ("highest", numbers["highest"], True),
+        )
+    ]
+
+
+def _write(ply: Path, on: Surface, found: Deviation, nominal: Nominal, tolerance: float | None) -> None:
+    """The points that belong to the nominal, with their deviation as a scalar and as colours, and the triangles between
+    them where there are any."""
+    kept = found.counted
+    signed = found.signed[kept]
+    limit = colour_limit(signed, tolerance)
+    faces = None
+    if on.organised or on.faces is not None:
+        _, every = triangles_of(on)
+        number = np.cumsum(kept) - 1
+        faces = number[every[kept[every].all(axis=1)]]
+    write_ply(
+        ply,
+        on.points[on.measured][kept],
+        colours=deviation_colours(signed, limit),
+        normals=None if on.normals is None else on.normals[on.measured][kept],
+        scalars={SCALARS: signed},
+        faces=faces,
+        notes=[f"{on.source} against {nominal.name}", f"colours from {-limit:.4g} to {limit:.4g} mm"],
+    )
+
+
+def _kept(
+    store: Session,
+    on: Surface,
+    nominal: Nominal,
+    found: Deviation,
+    verdict: Verdict | None,
+    noise: float,
+    points: np.ndarray,
+    name: str,
+) -> Measurement:
+    numbers = found.statistics()
+    quantities = [
+        Quantity("mean", numbers["mean"], "mm"),
+        Quantity("RMS", numbers["rms"], "mm"),
+        Quantity("95 % off by less than", numbers["within_95"], "mm"),
+        Quantity("range of 99.7 %, lower end", numbers["p_low"], "mm"),
+        Quantity("range of 99.7 %, upper end", numbers["p_high"], "mm"),
+        Quantity("area measured", 100 * found.coverage, "%"),
+    ]
+    if verdict is not None:
+        quantities.append(Quantity("within tolerance", verdict.within, "%"))
+    edges, counts = found.histogram()
+    kept = np.flatnonzero(found.counted)
+    some = kept[:: -(-len(kept) // MOST_KEPT)]
+    data = {
+        "quantities": [each.to_dict() for each in quantities],
+        "scale": on.scale,
+        "nominal": {"name": nominal.name, "hash": nominal.hash, "units": nominal.units or "mm"},
+        "noise_mm": noise,
+        "verdict": None if verdict is None else verdict.to_dict(),
+        **found.to_dict(),
+    }
+    arrays = {
+        "points": points[some].astype(np.float32),
+        "normals": found.normals[some],
+        "signed": found.signed[some],
+        "uncovered": found.uncovered,
+        "edges": edges,
+        "counts": counts,
+    }
+    return save_measurement(
+        store,
+        "deviation",
+        source=on.source,
+        model=on.model,
+        inputs=on.inputs,
+        data=data,
+        arrays=arrays,
+        name=name or f"{on.source} against {nominal.name}",
+    )
+
+
+def _plain(name: str) -> str:
+    """A name that a file can have on every system."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in name)[:60]

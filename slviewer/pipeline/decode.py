@@ -1,0 +1,167 @@
+"""The decoded phase of a capture as files for other programs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.sequence import Axis
+from slviewer.pipeline.capture_phases import decode_capture
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.frame_residuals import told
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.report.phase_maps import REASON_LABELS, phase_maps, reason_shares
+from slviewer.session.atomic import to_json
+from slviewer.session.exr import write_exr
+
+MapFormat = Literal["npy", "exr"]
+REASONS = {
+    Reason.VALID: "the phase is valid",
+    Reason.DARK: "too little modulation for the noise: shadow, black surface, or outside of the projector's light",
+    Reason.SATURATED: "the camera clipped the patterns",
+    Reason.INCONSISTENT: "a bit could not be decided, or the fringe order contradicts the phase or the neighbourhood",
+    Reason.OUTSIDE: "the coordinate lies outside of the projector",
+}
+"""What the codes of the files `reason_<axis>` stand for."""
+
+
+@dataclass(frozen=True)
+class DecodedFiles:
+    """A decoded capture and the files that it was written to, by what they hold."""
+
+    capture: str
+    phases: Mapping[Axis, PhaseMap]
+    folder: Path
+    files: Mapping[str, str]
+
+    def to_json(self) -> dict[str, Any]:
+        """What `decoded.json` explains: files, units, codes, and the figures of each axis."""
+        return {
+            "capture": self.capture,
+            "files": dict(self.files),
+            "units": {
+                "phase": "rad, 2 pi u / period_px, 0 at the centre of projector column (row) 0; NaN: masked",
+                "coordinate": "projector px, 0 at the centre of column (row) 0; modulo unambiguous_px where that is a "
+                "number; NaN: masked",
+                "sigma": "projector px, standard deviation of the coordinate by the camera's noise; NaN: masked",
+                "modulation": "grey levels, amplitude of the fringes; of Gray code alone half its contrast",
+                "reason": "uint8 code, see reasons",
+            },
+            "reasons": {str(int(reason)): f"{REASON_LABELS[reason]}: {words}" for reason, words in REASONS.items()},
+            "axes": {axis: axis_figures(phase) for axis, phase in self.phases.items()},
+        }
+
+    def text(self) -> str:
+        """For people."""
+        lines = []
+        for axis, phase in self.phases.items():
+            figures = axis_figures(phase)
+            shares = ", ".join(f"{name} {100 * share:.1f} %" for name, share in figures["shares"].items())
+            lines.append(f"{self.capture}, axis {axis}: {shares}")
+            if not phase.mask.any():
+                continue
+            what = "cells of Gray code" if phase.steps == 0 else "period"
+            what += f" {phase.period_px:g} px"
+            if phase.is_relative:
+                what += f", known only modulo {phase.unambiguous_px:g} px"
+            lines.append(
+                f"  {what}: coordinates {figures['coordinate_px'][0]:.1f}-{figures['coordinate_px'][1]:.1f} px, "
+                f"modulation {figures['median_modulation']:.1f} and noise {figures['noise_levels']:.2f} grey levels, "
+                f"sigma {figures['median_sigma_px']:.4f} px (medians)"
+            )
+        lines.append(f"{len(self.files)} files -> {self.folder}; decoded.json explains them")
+        return "\n".join(lines)
+
+
+def axis_figures(phase: PhaseMap) -> dict[str, Any]:
+    """Shares of the pixels by reason, and medians over the valid ones; None where no pixel is valid.
+
+    ``noise_levels`` is the standard deviation of one frame at the median background, in grey levels.
+    """
+    valid = phase.mask
+    shares = {REASON_LABELS[reason]: round(share, 6) for reason, share in reason_shares(phase).items()}
+    figures: dict[str, Any] = {
+        "period_px": phase.period_px,
+        "steps": phase.steps,
+        "unambiguous_px": phase.unambiguous_px if phase.is_relative else None,
+        "shares": shares,
+    }
+    names = ("coordinate_px", "median_modulation", "median_background", "noise_levels", "median_sigma_px")
+    if not valid.any():
+        return figures | dict.fromkeys(names)
+    coordinate = phase.coordinate[valid]
+    background = float(np.median(phase.background[valid]))
+    a, b = phase.noise
+    values = (
+        [float(coordinate.min()), float(coordinate.max())],
+        float(np.median(phase.modulation[valid])),
+        background,
+        float(np.sqrt(a + b * background)),
+        float(np.median(sigma_px(phase)[valid])),
+    )
+    return figures | dict(zip(names, values, strict=True))
+
+
+def sigma_px(phase: PhaseMap) -> np.ndarray:
+    """(h, w) float32 px: the standard deviation of the projector coordinate; NaN where masked."""
+    return phase.sigma_phase * np.float32(phase.period_px / (2 * np.pi))
+
+
+def decode(
+    session: SessionLike,
+    capture: str,
+    out: Path | str,
+    *,
+    file_format: MapFormat = "npy",
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> DecodedFiles:
+    """Decode a capture and write its maps into the folder ``out``, replacing files of the same names.
+
+    For each axis ``phase`` (rad), ``coordinate`` and ``sigma`` (projector px), ``modulation`` (grey levels) as (h, w)
+    float32 .npy or .exr, NaN where masked (not the modulation), and ``reason``, uint8 codes, as .npy or .png; one
+    ``decoded.json`` that explains them, and the picture ``decoded.png``. Raises InputError like `decode_capture`.
+    """
+    if file_format not in ("npy", "exr"):
+        raise InputError(f"maps cannot be written as '{file_format}': use npy or exr")
+    folder = Path(out)
+    with opened(session) as store:
+        shot = store.load_capture(capture)
+        progress(0.1, "reading frames")
+        frames = shot.stack()
+        for sentence in told(store, capture, frames):
+            warn(f"{capture}: {sentence}")
+    progress(0.4, "decoding")
+    phases = decode_capture(shot, frames, relative=True)
+    progress(0.6, "writing")
+    folder.mkdir(parents=True, exist_ok=True)
+    files: dict[str, str] = {}
+    for axis, phase in phases.items():
+        maps = {
+            "phase": phase.phase,
+            "coordinate": phase.coordinate,
+            "sigma": sigma_px(phase),
+            "modulation": phase.modulation,
+        }
+        for name, values in maps.items():
+            files[f"{name}_{axis}"] = file = f"{name}_{axis}.{file_format}"
+            if file_format == "exr":
+                write_exr(folder / file, values)
+            else:
+                np.save(folder / file, values)
+        files[f"reason_{axis}"] = file = f"reason_{axis}.{'png' if file_format == 'exr' else 'npy'}"
+        if file_format == "exr":
+            (folder / file).write_bytes(cv2.imencode(".png", phase.reason)[1].tobytes())
+        else:
+            np.save(folder / file, phase.reason)
+    files["picture"] = "decoded.png"
+    (folder / "decoded.png").write_bytes(phase_maps(capture, phases).png)
+    result = DecodedFiles(capture, phases, folder, files)
+    (folder / "decoded.json").write_bytes(to_json(result.to_json()))
+    progress(1.0, "decoded")
+    return result

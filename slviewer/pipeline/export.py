@@ -1,0 +1,206 @@
+"""Files for other programs, of everything that a session holds. The wizard's step Export and the command call this."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from slviewer.errors import InputError
+from slviewer.pipeline.export_documents import (
+    write_calibration_file,
+    write_coefficients,
+    write_poses,
+    write_table,
+)
+from slviewer.pipeline.export_shapes import merge_name, merge_shape, scan_shape
+from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.models import check_accepted, preferred, warn_if_stale
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.report import report
+from slviewer.session.atomic import megabytes
+from slviewer.session.mesh_files import IN_WORDS, MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
+from slviewer.session.store import Session
+from slviewer.surface.meshing import MeshingPlan
+
+What = Literal["cloud", "mesh", "merge", "merged-mesh", "calibration", "coefficients", "poses", "report", "table"]
+"""A scan's points, its mesh, the points of a merge, one mesh through them, the calibration, the coefficients of each
+pixel, poses of devices, boards and scans, the report, the verifications."""
+FORMATS: dict[What, tuple[str, ...]] = {
+    "cloud": POINT_FORMATS,
+    "mesh": MESH_FORMATS[:4],
+    "merge": POINT_FORMATS,
+    "merged-mesh": MESH_FORMATS[:4],
+    "calibration": ("yml", "xml", "json"),
+    "coefficients": ("npz",),
+    "poses": ("json", "yml", "xml"),
+    "report": ("html",),
+    "table": ("csv",),
+}
+"""The first is the one that is written where none is asked for."""
+DOCUMENTS = {
+    "yml": "OpenCV's YAML in mm and px, explained in comments",
+    "xml": "OpenCV's XML in mm and px, explained in comments",
+    "json": "JSON in mm and px, explained beside the numbers",
+    "npz": "NumPy's arrays in mm, px and rad, explained in the one called about",
+    "html": "one page that needs nothing else",
+    "csv": "for a spreadsheet, in mm",
+}
+"""What the other formats are, and in which units."""
+_ALIASES = {"yaml": "yml", "htm": "html"}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file that was written, and what it holds, in words."""
+
+    path: Path
+    bytes: int
+    words: str
+
+    def text(self) -> str:
+        """For people."""
+        return f"{self.words}\n-> {self.path}, {size(self.bytes)}: {units(self.path.suffix.lower().removeprefix('.'))}"
+
+
+def size(count: int) -> str:
+    """Bytes as people read them."""
+    return megabytes(count) if count >= 100_000 else f"{count / 1e3:.1f} kB"
+
+
+def units(file_format: str) -> str:
+    """What a format holds and in which units, in words."""
+    return IN_WORDS.get(file_format) or DOCUMENTS.get(file_format, "")
+
+
+def foreseen_bytes(
+    what: What, file_format: str, points: int, model: str = "", triangles: int | None = None
+) -> int | None:
+    """About how large a file of a scan or a merge of so many points becomes, thinned to ``triangles`` where that is
+    wanted; None where it is not known before."""
+    if what in ("cloud", "merge"):
+        return estimated_bytes(file_format, points, scalars=3 if model == "splined" else 1)
+    faces = 2 * points if what == "mesh" else None  # between neighbouring pixels, all but those at borders
+    if triangles is not None:
+        faces = triangles if faces is None else min(triangles, faces)
+    return None if faces is None else estimated_bytes(file_format, faces // 2, faces, scalars=1)
+
+
+def check_export(what: What, file_format: str) -> None:
+    """Raise InputError for something that cannot be had, or not in this format."""
+    if what not in get_args(What):
+        raise InputError(f"{what!r} cannot be exported: choose one of {', '.join(get_args(What))}")
+    if _ALIASES.get(file_format, file_format) not in FORMATS[what]:
+        listed = ", ".join(f".{each}" for each in FORMATS[what])
+        raise InputError(f"the {what} cannot be written as .{file_format}: choose {listed}")
+
+
+def file_name(what: What, name: str, file_format: str) -> str:
+    """How a file is called where nobody names it: ``object_1_mesh.stl``."""
+    stems = {"cloud": f"{name}_cloud", "mesh": f"{name}_mesh", "merge": f"merged_{name}", "table": "verifications"}
+    stems |= {"merged-mesh": f"merged_{name}_mesh", "coefficients": f"coefficients_{name}" if name else "coefficients"}
+    return f"{stems.get(what, what)}.{file_format}"
+
+
+def export(
+    session: SessionLike,
+    what: What,
+    name: str = "",
+    *,
+    out: Path | str | None = None,
+    file_format: str = "",
+    model: str | None = None,
+    plan: MeshingPlan | None = None,
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Exported:
+    """Write one file for other programs, whole or not at all.
+
+    ``name``: the scan of a cloud or a mesh (not needed where there is one alone), the number of a merge (the last one
+    by default), the model of the coefficients. ``out``: the file, whose suffix says how it is written, or a folder; by
+    default the session's exports, as ``file_format`` or the first of ``FORMATS``. ``model``: the calibration that
+    clouds are made with, or that is written, by default the one they are kept from, else the preferred one.
+    ``plan``: how to mesh.
+    """
+    with opened(session) as store:
+        chosen = file_format.lower().removeprefix(".")
+        check_export(what, chosen or FORMATS.get(what, ("",))[0])
+        name = _named(store, what, name)
+        target = _target(store, what, name, out, chosen)
+        if what not in ("report", "table"):
+            check_accepted(store, accept_rejected)
+        if what not in ("report", "table", "merge", "merged-mesh"):  # a merge says by itself that it is stale
+            warn_if_stale(store, warn)
+        if what in ("mesh", "merged-mesh"):
+            words = _write_shape(
+                store, what, name, target, model, plan or MeshingPlan(), accept_rejected, progress, warn
+            )
+        elif what in ("cloud", "merge"):
+            words = _write_shape(store, what, name, target, model, None, accept_rejected, progress, warn)
+        elif what == "report":
+            report(store, target, progress=progress, warn=warn)
+            words = "report"
+        else:
+            progress(0.1, f"writing {target.name}")
+            words = _write_document(store, what, name, target, model)
+    progress(1.0, "exported")
+    return Exported(target, target.stat().st_size, words)
+
+
+def _write_shape(
+    store: Session,
+    what: What,
+    name: str,
+    target: Path,
+    model: str | None,
+    plan: MeshingPlan | None,
+    accept_rejected: bool,
+    progress: Progress,
+    warn: Warn,
+) -> str:
+    making = part(progress, 0, 0.8)
+    if what in ("cloud", "mesh"):
+        made = scan_shape(store, name, model, plan, making, warn, accept_rejected)
+    else:
+        made = merge_shape(store, name, plan, making, warn)
+    progress(0.85, f"writing {target.name}")
+    write_shape(target, made.shape, scalars=made.scalars, notes=made.notes)
+    return made.text()
+
+
+def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:
+    if what == "calibration":
+        chosen = model or preferred(store)
+        return f"{chosen} calibration of camera and projector, {write_calibration_file(store, target, chosen)}"
+    if what == "coefficients":
+        return f"coefficients of each pixel by the {write_coefficients(store, name, target)} model"
+    if what == "poses":
+        write_poses(store, model or preferred(store), target)
+        return "poses of the devices, the target and the scans"
+    write_table(store, target)
+    return "verifications"
+
+
+def _named(store: Session, what: What, name: str) -> str:
+    """The name of what is meant: the scan that there is alone, the last merge."""
+    if what in ("merge", "merged-mesh"):
+        return merge_name(store, name)
+    if what not in ("cloud", "mesh"):
+        return name
+    if name:
+        return store.load_capture(name).name
+    scans = store.capture_names("scan")
+    if len(scans) != 1:
+        raise InputError(f"which scan? name one of {', '.join(scans)}" if scans else "there is no scan: capture one")
+    return scans[0]
+
+
+def _target(store: Session, what: What, name: str, out: Path | str | None, chosen: str) -> Path:
+    """The file to write, with a suffix that fits."""
+    given = None if out is None else Path(out).expanduser()
+    if given is None or given.is_dir():
+        return (given or store.exports) / file_name(what, name, chosen or FORMATS[what][0])
+    suffix = given.suffix.lower().removeprefix(".")
+    if chosen and suffix != chosen:
+        return given.with_name(f"{given.name}.{chosen}")
+    check_export(what, suffix)
+    return given

@@ -1,0 +1,167 @@
+"""Scans and merges as shapes for other programs: what is kept in the session, or what its frames give."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
+from slviewer.pipeline.capture_phases import capture_texture, decode_capture
+from slviewer.pipeline.feedback import Progress, Warn, part
+from slviewer.pipeline.frame_residuals import told
+from slviewer.pipeline.models import frame_of, load_model, preferred
+from slviewer.pipeline.scale import scale_factor, told_scale
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.session.names import natural_key
+from slviewer.session.ply import Ply, read_ply
+from slviewer.session.store import Session
+from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
+from slviewer.surface.shapes import Mesh, PointSet
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """A shape, whose it is, values of its points by name, what a file's comments say of it, and of these what was done
+    to make a mesh."""
+
+    shape: PointSet | Mesh
+    whose: str
+    scalars: Mapping[str, np.ndarray] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    done: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """For people."""
+        if isinstance(self.shape, Mesh):
+            return f"{self.whose}: {'; '.join(self.done)}"
+        return f"{self.whose}: {len(self.shape)} points"
+
+
+def is_fresh(store: Session, result: str) -> bool:
+    """Whether a result's inputs are as they were, and no correction of scale has changed since."""
+    if store.state_of(result) != "fresh":
+        return False
+    scales = store.load_result(result, only=())[0].get("scales", {})
+    return all(scale_factor(store, model) == factor for model, factor in scales.items())
+
+
+def scan_shape(
+    store: Session,
+    name: str,
+    model: str | None,
+    plan: MeshingPlan | None,
+    progress: Progress,
+    warn: Warn,
+    accept_rejected: bool = False,
+) -> Described:
+    """A scan's measured points with normals, colours and sigmas, or where there is a ``plan`` a mesh of them."""
+    cloud = scan_cloud(store, name, model, part(progress, 0, 0.5), warn, accept_rejected)
+    mask = cloud.mask
+    if not mask.any():
+        raise InputError(f"{name}: no pixel was measured: does the calibration belong to this camera and projector?")
+    frame = f"frame: {frame_of(store, cloud.model)}, x right, y down, z away"
+    notes = (f"scan {name}, {frame}", *_of_model(store, cloud.model))
+    if plan is not None:
+        return _meshed(name, mesh_of(cloud, plan, part(progress, 0.5, 1)), notes)
+    progress(0.7, "normals")
+    normals, colours = grid_normals(cloud.points)[mask], cloud.colours()
+    if colours is not None and colours.ndim == 1:
+        colours = np.repeat(colours[:, None], 3, axis=1)
+    said = "sigma: expected error of the depth, mm"
+    return Described(PointSet(cloud.measured, normals, colours), name, cloud.sigmas(mask), (*notes, said))
+
+
+def scan_cloud(
+    store: Session, name: str, model: str | None, progress: Progress, warn: Warn, accept_rejected: bool = False
+) -> Cloud:
+    """A capture's cloud: the one that is kept, where it is up to date and of the model wanted, else made now."""
+    capture, model, kept = store.load_capture(name), model or None, f"clouds/{name}"
+    if store.has_result(kept) and is_fresh(store, kept):
+        meta = store.load_result(kept, only=())[0]
+        if model in (None, meta["model"]):
+            names = {"points", "sigma_z", "texture", "sigma_calibration"} & set(meta["arrays"])
+            arrays = store.load_result(kept, only=names)[1]
+            return Cloud(axis=meta["axis"], model=meta["model"], **arrays)
+    fitted = load_model(store, model or preferred(store))
+    progress(0.1, f"reading {name}")
+    check_capture_sizes(store, [name])
+    frames = capture.stack()
+    for sentence in told(store, name, frames):
+        warn(f"{name}: {sentence}")
+    progress(0.4, f"reconstructing {name}")
+    phases = decode_capture(capture, frames)
+    texture = capture_texture(capture, frames)
+    return capture_cloud(store, fitted, capture, phases, texture=texture, accept_rejected=accept_rejected, warn=warn)
+
+
+def merge_name(store: Session, name: str) -> str:
+    """The merge of that number, or the last one where none is named; InputError where there is none."""
+    there = sorted((n.removeprefix("merge/") for n in store.result_names() if n.startswith("merge/")), key=natural_key)
+    if not there:
+        raise InputError("there is no merge yet: merge scans first")
+    if name and name not in there:
+        raise InputError(f"there is no merge {name!r}: the merges are {', '.join(there)}")
+    return name or there[-1]
+
+
+def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: Progress, warn: Warn) -> Described:
+    """The points of a merge, or where there is a ``plan`` one mesh through them."""
+    name = merge_name(store, name)
+    progress(0.1, "reading the merged points")
+    meta, merged = _kept_merge(store, name, warn)
+    model = str(meta.get("model", ""))
+    notes = (
+        f"merge {name} of {', '.join(meta['scans'])}, frame: {frame_of(store, model)}, at {meta['reference']}",
+        *_of_model(store, model),
+    )
+    if plan is None:
+        said = "sigma: expected error along the normal, mm"
+        points = PointSet(merged.points, merged.normals, _rgb(merged))
+        return Described(points, f"merge {name}", merged.scalars, (*notes, said))
+    return _meshed(f"merge {name}", mesh_of(_with_normals(merged), plan, part(progress, 0.1, 1)), notes)
+
+
+def merged_points(store: Session, name: str, warn: Warn) -> PointSet:
+    """The points of a merge whose outside is known, to make a mesh of; of the last one where none is named."""
+    return _with_normals(_kept_merge(store, merge_name(store, name), warn)[1])
+
+
+def _kept_merge(store: Session, name: str, warn: Warn) -> tuple[dict[str, Any], Ply]:
+    if not is_fresh(store, f"merge/{name}"):
+        warn(f"merge {name} came from scans or a calibration that have changed since: merge again")
+    meta = store.load_result(f"merge/{name}", only=())[0]
+    return meta, read_ply(store.exports / str(meta["ply"]))
+
+
+def _with_normals(merged: Ply) -> PointSet:
+    """In such a file a normal of 0, 0, 0 and a sigma of -1 are not known."""
+    if merged.normals is None:
+        raise InputError("the merged cloud has no normals: merge the scans again")
+    known = merged.normals.any(axis=1)
+    colours, sigma = _rgb(merged), merged.scalars.get("sigma")
+    if sigma is not None and not (sigma[known] > 0).all():
+        sigma = None
+    return PointSet(
+        merged.points[known],
+        merged.normals[known],
+        None if colours is None else colours[known],
+        None if sigma is None else sigma[known],
+    )
+
+
+def _meshed(whose: str, made: Meshed, notes: tuple[str, ...]) -> Described:
+    done = tuple(made.text().splitlines())
+    return Described(made.mesh, whose, {}, (*notes, "sigma: expected error along the normal, mm", *done), done)
+
+
+def _of_model(store: Session, model: str) -> tuple[str, ...]:
+    scale = told_scale(store, model) if model else ""
+    return (f"calibration {model}", *((scale,) if scale else ())) if model else ()
+
+
+def _rgb(merged: Ply) -> np.ndarray | None:
+    colours = merged.colours
+    return np.repeat(colours[:, None], 3, axis=1) if colours is not None and colours.ndim == 1 else colours

@@ -1,0 +1,41 @@
+"""Whether a capture is too bright or too dark."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from slviewer.fringe.layout import white_level
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.residual_sample import spread_rows
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.pipeline.check_results import Check, Verdict
+
+CLIPPED, MUCH_CLIPPED = 0.005, 0.05
+"""Shares of the illuminated pixels that are saturated: a warning, and bad."""
+WEAK, TOO_WEAK = 0.4, 0.12
+"""Of full scale, that the brightest illuminated pixels should reach: below, a warning, and bad."""
+
+
+def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
+    """Whether the frames (n, h, w) of a capture are too bright or too dark, by the pixels that see the patterns."""
+    full = float(white_level(frames, list(range(len(frames)))))
+    illuminated = np.logical_or.reduce([phase.lit for phase in phases.values()])
+    if not illuminated.any():
+        return Check("exposure", "bad", "No pixel sees the patterns.", "Raise the exposure, or open the aperture.", {})
+    rows = spread_rows(*frames.shape[1:])
+    coded = [i for i, frame in enumerate(sequence.frames) if frame.kind != "texture"]
+    brightest = np.max([frames[i][rows] for i in coded], axis=0)
+    seen = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()
+    bright = float(np.quantile(seen, 0.995))
+    clipped = max(float(np.mean(phase.reason[phase.lit] == Reason.SATURATED)) for phase in phases.values())
+    figures = {"bright_share_of_full_scale": round(bright / full, 3), "saturated_share": round(clipped, 4)}
+    if clipped > CLIPPED:
+        said = f"{100 * clipped:.1f} % of the illuminated pixels are saturated."
+        verdict: Verdict = "bad" if clipped > MUCH_CLIPPED else "warning"
+        remedy = "Lower the exposure, or capture with two exposures."
+        return Check("exposure", verdict, said, remedy, figures)
+    said = f"The brightest of the scene reaches {100 * bright / full:.0f} % of the camera's range"
+    if bright < WEAK * full:
+        verdict = "bad" if bright < TOO_WEAK * full else "warning"
+        return Check("exposure", verdict, f"{said}.", "Raise the exposure, or open the aperture.", figures)
+    return Check("exposure", "good", f"{said}; {100 * clipped:.1f} % of the pixels are saturated.", "", figures)

@@ -1,0 +1,153 @@
+"""Making a calibration from elsewhere the session's own, once it agrees with itself and with the session's captures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import parse_size
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.capture_phases import decode_capture
+from slviewer.pipeline.feedback import Warn, unwarned
+from slviewer.pipeline.models import available, load_stereo, save_imported_stereo
+from slviewer.pipeline.open_session import opened_or_made
+from slviewer.reconstruction.axis_agreement import check_phases
+from slviewer.session.importers import opencv_calibration
+from slviewer.session.store import Session
+
+Size = str | tuple[int, int]
+
+
+def import_opencv_calibration(
+    file: Path | str,
+    session: Path | str,
+    keys: Sequence[str] | None = None,
+    *,
+    projector: Size | None = None,
+    camera: Size | None = None,
+    force: bool = False,
+    warn: Warn = unwarned,
+) -> StereoModel | None:
+    """Make a stereo calibration from an OpenCV FileStorage file the session's own.
+
+    ``keys`` are the file's names for K_camera, D_camera, K_projector, D_projector, R and T (camera to projector, mm),
+    by default those of `identify_calibration_keys`. Image sizes that are not given are those that the file states,
+    else those of the session's captures. Returns the model, or None while nothing tells a size. The session's other
+    calibrations go to the trash with the stereo one that they were made from.
+
+    Raises InputError, and replaces nothing, where sizes contradict each other, and where the patterns of a capture in
+    the session contradict the calibration: R and T inverted, matrices exchanged or at another pixel scale, another rig.
+    """
+    path = Path(file)
+    matrices = opencv_calibration.read(path, keys)
+    stated = opencv_calibration.read_sizes(path)
+    with opened_or_made(session) as store:
+        there = available(store)
+        if there and not force:
+            raise InputError(
+                f"{store.folder} holds a {' and a '.join(there)} calibration already: "
+                "replace it with --force (it goes to the session's trash)"
+            )
+        captures = store.captures()
+        sizes = {
+            "camera": _size(path, "camera", camera, stated, {capture.size for capture in captures}),
+            "projector": _size(
+                path, "projector", projector, stated, {capture.sequence.projector_size for capture in captures} - {None}
+            ),
+        }
+        witnessed = _check_captures(store, matrices, sizes, warn)
+        for device, size in sizes.items():
+            if size is not None and not witnessed:
+                _check_principal_point(device, matrices[f"K_{device}"], size, warn)
+        _replace(store, there, matrices, str(file), sizes)
+        return load_stereo(store) if None not in sizes.values() else None
+
+
+def identify_calibration_keys(file: Path | str) -> dict[str, str]:
+    """{entry: the file's name for it}, as ``import_opencv_calibration`` takes them by default. Raises InputError."""
+    return dict(zip(opencv_calibration.ENTRIES, opencv_calibration.identify_keys(Path(file)), strict=True))
+
+
+def _size(
+    path: Path,
+    device: str,
+    given: Size | None,
+    stated: dict[str, tuple[tuple[int, int], str]],
+    captured: set[Any],
+) -> tuple[int, int] | None:
+    """The size that is given, else stated in the file, else the captures'; InputError where these differ."""
+    sources = {f"--{device}": parse_size(given)} if given is not None else {}
+    if device in stated:
+        sources[f"{path.name}: {stated[device][1]}"] = stated[device][0]
+    if len(captured) == 1:
+        sources["the session's captures"] = next(iter(captured))
+    if len(set(sources.values())) > 1:
+        said = ", ".join(f"{width}x{height} px by {source}" for source, (width, height) in sources.items())
+        raise InputError(
+            f"the {device} has {said}: the calibration does not belong to these captures, or one size is wrong"
+        )
+    size = next(iter(sources.values()), None)
+    if len(captured) > 1 and size not in captured:
+        raise InputError(f"the session's captures have several {device} sizes: give the calibrated one with --{device}")
+    return size
+
+
+def _check_captures(
+    store: Session,
+    matrices: dict[str, np.ndarray],
+    sizes: dict[str, tuple[int, int] | None],
+    warn: Warn,
+) -> bool:
+    """Whether a capture with both axes confirms the calibration; False where there is none to ask. Raises InputError
+    where one contradicts it."""
+    camera, projector = sizes["camera"], sizes["projector"]
+    if camera is None or projector is None:
+        return False
+    rig = StereoRig(
+        Lens(matrices["K_camera"], matrices["D_camera"], camera),
+        Lens(matrices["K_projector"], matrices["D_projector"], projector),
+        matrices["R"],
+        matrices["T"],
+    )
+    for capture in store.captures():
+        if len(capture.sequence.axes) < 2 or (capture.size, capture.sequence.projector_size) != (camera, projector):
+            continue
+        check = check_phases(capture.name, decode_capture(capture), StereoModel.made_elsewhere(rig))
+        for message in check.warnings:
+            warn(message)
+        if check.agreement is not None:
+            return True
+    return False
+
+
+def _check_principal_point(device: str, K: np.ndarray, size: tuple[int, int], warn: Warn) -> None:
+    """Warn where the optical axis lies outside of the image: that is a shifted lens, or another pixel scale."""
+    (width, height), (cx, cy) = size, K[:2, 2]
+    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+        warn(
+            f"the {device}'s principal point ({cx:.0f}, {cy:.0f}) lies outside of its {width}x{height} px: the lens is "
+            "shifted, or the calibration was made at another pixel scale; import a capture with patterns along both "
+            "axes, and the calibration after it: the patterns then tell"
+        )
+
+
+def _replace(
+    store: Session,
+    there: Sequence[str],
+    matrices: dict[str, np.ndarray],
+    source: str,
+    sizes: dict[str, tuple[int, int] | None],
+) -> None:
+    """Save the calibration in place of those that are there; where saving fails, these come back."""
+    for name in there:
+        store.trash_result(f"calibration/{name}")
+    try:
+        save_imported_stereo(store, matrices, source=source, camera=sizes["camera"], projector=sizes["projector"])
+    except BaseException:
+        for name in there:
+            store.restore_result(f"calibration/{name}")
+        raise

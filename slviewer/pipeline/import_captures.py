@@ -1,0 +1,209 @@
+"""Bringing captures that other tools made into a session.
+
+Of a folder of captures, those that can be read and decoded are saved in one step, and a warning names each other with
+its reason; with `strict`, one fault refuses the folder.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from slviewer.errors import InputError
+from slviewer.fringe.origin import estimate_gray_origin
+from slviewer.fringe.sequence import PerAxis, parse_size
+from slviewer.pipeline.capture_phases import check_capture, decode_frames
+from slviewer.pipeline.exposure_check import check_capture_exposure
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.frame_residuals import keep_residuals
+from slviewer.pipeline.models import available
+from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
+from slviewer.session.importers import guessed_description
+from slviewer.session.importers.guessed_description import GuessedDescription
+from slviewer.session.importers.images import Channel
+from slviewer.session.importers.imported import ImportedCapture, Imports, Recording, Skipped, none_usable
+from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
+from slviewer.session.store import Session, is_session
+
+Role = Literal["calibration", "scan"]
+Size = str | tuple[int, int]
+
+
+def import_captures(
+    source: Path | str,
+    session: SessionLike,
+    layout: str = "detect",
+    *,
+    sequence: Path | str | None = None,
+    role: Role = "calibration",
+    prefix: str | None = None,
+    projector: Size | None = None,
+    channel: Channel | None = None,
+    origin: str | None = None,
+    force: bool = False,
+    strict: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+    **options: Any,
+) -> list[str]:
+    """Import a folder of captures that another tool made; returns the captures' names.
+
+    ``layout`` is one of `layouts.LAYOUTS`, or "detect": the one that the file names show. ``source`` is one capture
+    folder or a folder of them; captures are named after their folders, behind ``prefix_``. ``sequence`` is the TOML of
+    the layout frames, by default the one in ``source``. ``projector`` is by default the layout's own, else what
+    the session knows of its projector. ``channel`` is that of colour frames, green where nothing states it. ``origin``
+    is recorded as where the captures come from, by default their folders. ``options`` are those of the layout's `read`.
+
+    Captures that cannot be read or decoded are skipped, and ``warn`` hears why. Raises InputError where none is left,
+    or, with ``strict``, for the first of them; nothing is saved then.
+    """
+    source = Path(source).expanduser()
+    if layout == "detect":
+        layout = "frames" if sequence is not None else detect_layout(source)
+    if layout not in LAYOUTS:
+        raise InputError(f"the layout {layout!r} is unknown: use {', '.join(LAYOUTS)}")
+    size = LAYOUTS[layout].projector if projector is None else parse_size(projector)
+    if layout == "frames":
+        toml = sequence or find_description(source)
+        if toml is None:
+            raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
+        options["toml"] = Path(toml)
+    elif size is None and (size := _known_projector(session)) is not None:
+        warn(f"the projector is taken to have {size[0]}x{size[1]} px, as in the session: --projector for another size")
+    found = LAYOUTS[layout].read(source, prefix=prefix, projector=size, **options)
+    if channel is not None:
+        found = replace(found, recordings=[replace(recording, channel=channel) for recording in found.recordings])
+    return _save(found, session, role, origin, force, strict, progress, warn)
+
+
+def import_p18(source: Path | str, session: SessionLike, **options: Any) -> list[str]:
+    """Import ``pose_XX/{V,H}/P18_FNN.PNG`` folders, as ``import_captures``; the projector is 912x1140 by default."""
+    return import_captures(source, session, "p18", **options)
+
+
+def import_procam_calibration(source: Path | str, session: SessionLike, **options: Any) -> list[str]:
+    """Import ``capture_N/graycode_NN.*`` folders (Gray code with inverses, white, black), as ``import_captures``; the
+    projector is 1024x768 by default."""
+    return import_captures(source, session, "procam-calibration", **options)
+
+
+def import_frames(source: Path | str, session: SessionLike, sequence: Path | str, **options: Any) -> list[str]:
+    """Import any folder of images that a TOML describes, as ``import_captures``.
+
+    Where the TOML does not state at which projector coordinate Gray code 0 begins, that is estimated from the images.
+    """
+    return import_captures(source, session, "frames", sequence=sequence, **options)
+
+
+def guess_description(
+    folder: Path | str, *, projector: Size | None = None, channel: Channel | None = None
+) -> GuessedDescription:
+    """The TOML of a capture that nobody described, from its images; ``doubts`` name what stays open. Nothing is saved.
+
+    Of a folder of captures, the first is read. Raises InputError where the images cannot belong to one capture.
+    """
+    return guessed_description.guess_description(
+        Path(folder), None if projector is None else parse_size(projector), channel
+    )
+
+
+def _save(
+    found: Imports,
+    session: SessionLike,
+    role: Role,
+    origin: str | None,
+    force: bool,
+    strict: bool,
+    progress: Progress,
+    warn: Warn,
+) -> list[str]:
+    """Save what can be read and decoded, and warn of the rest; with `strict`, raise InputError for the first fault."""
+    for message in found.warnings:
+        warn(message)
+    skipped = list(found.skipped)
+    if strict and skipped:
+        raise InputError(str(skipped[0]))
+
+    stated: set[str] = set()
+
+    def warn_once(message: str) -> None:
+        if message not in stated:
+            stated.add(message)
+            warn(message)
+
+    def read() -> Iterator[ImportedCapture]:
+        for i, recording in enumerate(found.recordings):
+            progress(i / len(found), f"reading {recording.name}")
+            try:
+                capture = recording.read()
+                seen = checked(replace(capture, frames=capture.merged_frames(), exposures_ms=()), warn)
+            except InputError as error:
+                if strict:
+                    raise
+                skipped.append(Skipped(recording.name, str(error)))
+                continue
+            for message in _assumptions(recording, capture):
+                warn_once(message)
+            yield replace(capture, sequence=seen.sequence, source=origin or capture.source)
+        if len(skipped) == len(found.skipped) + len(found.recordings):
+            raise none_usable(skipped)
+
+    with opened_or_made(session) as store:
+        saved = store.save_captures(read(), role, force=force)
+        for each in skipped:
+            warn(f"not imported: {each}")
+        for capture in saved:
+            progress(1.0, f"looking at {capture.name}")
+            for sentence in keep_residuals(store, capture.name):
+                warn(f"{capture.name}: {sentence}")
+    progress(1.0, "imported")
+    return [capture.name for capture in saved]
+
+
+def _known_projector(session: SessionLike) -> tuple[int, int] | None:
+    """The projector's size by the session's captures, else by its imported calibration; None where neither says one."""
+    if not isinstance(session, Session) and not is_session(Path(session).expanduser()):
+        return None
+    with opened(session) as store:
+        sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
+        if not sizes and "stereo" in available(store):
+            meta = store.load_result("calibration/stereo", only=())[0]
+            return tuple(meta["projector"]) if meta.get("projector") else None
+    return sizes.pop() if len(sizes) == 1 else None
+
+
+def _assumptions(recording: Recording, capture: ImportedCapture) -> Iterator[str]:
+    """What was assumed of a capture because nothing stated it."""
+    used = capture.settings.get("channel")
+    if used and recording.channel is None:
+        others = ", ".join(channel for channel in get_args(Channel) if channel != used)
+        yield f"the frames are in colour: their {used} channel was used (--channel, or channel in the TOML: {others})"
+    if capture.sequence.projector_size is None:
+        yield (
+            "the size of the projector is not stated: the captures can be decoded, and to calibrate or reconstruct "
+            'them import them again with projector = "912x1140" in the TOML, or --projector'
+        )
+
+
+def checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
+    """The capture, with its Gray origin estimated if it was not given; InputError where its frames contradict its
+    description.
+    """
+    sequence = capture.sequence
+    if not capture.settings.get("gray_origin_given", True) and any(f.kind == "gray" for f in sequence.frames):
+        origins = {
+            axis: estimate_gray_origin(sequence, capture.frames, axis)
+            for axis in sequence.axes
+            if sequence.periods_px(axis) and sequence.find("gray", axis)
+        }
+        if origins:
+            first = next(iter(origins.values()))
+            sequence = replace(sequence, gray_origin_px=PerAxis(origins.get("x", first), origins.get("y", first)))
+            listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
+            warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
+    phases = decode_frames(capture.name, sequence, capture.frames)
+    check_capture(capture.name, sequence, capture.frames, phases)
+    exposure = check_capture_exposure(sequence, capture.frames, phases)
+    if exposure.verdict != "good":
+        warn(f"{capture.name}: {exposure.sentence} {exposure.remedy}")
+    return replace(capture, sequence=sequence)

@@ -1,0 +1,106 @@
+"""One measurement on a scan in words, and the list of those that a session holds: what the terminal asks for."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NoReturn
+
+from slviewer.errors import UsageError
+from slviewer.inspection.regions import Region
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.measured_surface import Place, surface
+from slviewer.pipeline.measurements import (
+    add_distance,
+    add_fit,
+    add_point,
+    add_relation,
+    add_section,
+    export_measurements,
+    in_words,
+    measurements,
+    remove,
+    rename,
+    restore,
+)
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.session.measurements import Measurement
+
+What = Literal["point", "distance", "section", "plane", "sphere", "cylinder"]
+
+
+def measure(
+    session: SessionLike,
+    scan: str,
+    what: What,
+    *,
+    at: Sequence[int] = (),
+    ball: Sequence[float] = (),
+    box: Sequence[float] = (),
+    name: str = "",
+    model: str | None = None,
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Measurement:
+    """Measure on a scan, and keep it.
+
+    ``at``: pixels u v of the point, or of both ends of the distance or section (of a merge, the points' indices).
+    ``ball`` (x, y, z, radius) or ``box`` (two corners) mm, in the camera's frame: the region of a fit.
+    """
+    fitted = what in ("plane", "sphere", "cylinder")
+    if fitted and (len(ball), len(box)) not in ((4, 0), (0, 6)):
+        raise UsageError(f"a {what} needs its region: give --ball x y z radius, or --box x y z x y z, in mm")
+    ends = 1 if what == "point" else 2
+    if not fitted and len(at) not in (ends, 2 * ends):
+        _refuse_places(what, ends, "pixel u v")
+    with opened(session, write=True) as store:
+        on = surface(store, scan, model=model, accept_rejected=accept_rejected, progress=progress, warn=warn)
+        if fitted:
+            region = Region.ball(ball[:3], ball[3]) if ball else Region.box(box[:3], box[3:])
+            return add_fit(store, on, what, region, name)  # type: ignore[arg-type]
+        numbers = 2 if on.organised else 1
+        if len(at) != ends * numbers:
+            _refuse_places(what, ends, "pixel u v" if on.organised else "index")
+        places: list[Place] = [(at[i], at[i + 1]) if on.organised else at[i] for i in range(0, len(at), numbers)]
+        if what == "point":
+            return add_point(store, on, places[0], name)
+        return (add_distance if what == "distance" else add_section)(store, on, places[0], places[1], name)
+
+
+def _refuse_places(what: What, ends: int, which: str) -> NoReturn:
+    example = " ".join(("180 150", "220 150")[:ends]) if which == "pixel u v" else " ".join(("1200", "3400")[:ends])
+    raise UsageError(
+        f"a {what} needs --at with the {which} of {'its point' if ends == 1 else 'both its ends'}, "
+        f"such as --at {example}"
+    )
+
+
+def tell_measurements(
+    session: SessionLike,
+    *,
+    relate: tuple[str, str] | None = None,
+    name: tuple[str, str] | None = None,
+    delete: Sequence[str] = (),
+    bring_back: bool = False,
+    csv: Path | None = None,
+) -> str:
+    """The measurements that a session holds, in words, after what is asked for: two of them related, one named (id,
+    name), some deleted, the last one deleted brought back, all written as CSV."""
+    if not (relate or name or delete or bring_back):
+        return _told(session, csv)
+    with opened(session, write=True) as store:
+        if relate:
+            add_relation(store, *relate)
+        if name:
+            rename(store, *name)
+        for each in delete:
+            remove(store, each)
+        if bring_back:
+            restore(store)
+        return _told(store, csv)
+
+
+def _told(session: SessionLike, csv: Path | None) -> str:
+    lines = [in_words(each) for each in measurements(session)] or ["nothing was measured yet"]
+    if csv is not None:
+        lines.append(f"{export_measurements(session, csv)} measurements -> {csv}")
+    return "\n".join(lines)

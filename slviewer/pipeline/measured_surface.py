@@ -1,0 +1,172 @@
+"""The surface that is measured on: a scan's points with all that is known of their errors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import InputError
+from slviewer.inspection.features import Feature
+from slviewer.inspection.regions import Region
+from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
+from slviewer.pipeline.export_shapes import is_fresh, scan_cloud
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.models import Model, check_accepted, load_model, preferred, warn_if_stale
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.scale import scale_factor, scale_sigma
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.session.ply import read_ply
+from slviewer.session.store import Session
+
+MERGED = "merge/"
+Place = tuple[int, int] | int
+"""A point of a surface: pixel (u, v) of a scan, or the index of a merged surface's point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was measured.
+
+    ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along ``normals`` for a
+    merged surface; ``left_mm`` likewise: what the calibration leaves uncertain, where that is known. ``faces`` (m, 3):
+    of a merged mesh. ``source`` is the capture or result that it came from, ``model`` the calibration, ``inputs`` the
+    hashes of both; ``shared``: how errors of that ``calibration``, by its hash, go together, where that is known.
+    """
+
+    points: np.ndarray
+    sigma_mm: np.ndarray
+    source: str
+    model: str
+    inputs: Mapping[str, str]
+    left_mm: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    faces: np.ndarray | None = None
+    shared: Shared | None = None
+    calibration: str = ""
+    texture: np.ndarray | None = None
+    scale: float = 1.0
+
+    @property
+    def organised(self) -> bool:
+        """Whether it is a scan, pixel by pixel."""
+        return self.points.ndim == 3
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Bool like the points: those that there are."""
+        return np.asarray(np.isfinite(self.points).all(axis=-1))
+
+    def within(self, region: Region) -> np.ndarray:
+        """(n, 3) float64: the points of a region."""
+        return np.asarray(self.points[region.within(self.points)], np.float64)
+
+    def noise(self, region: Region) -> float:
+        """mm: the region's expected noise in the median; infinite where it is not known."""
+        sigma = self.sigma_mm[region.within(self.points)]
+        return float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else float("inf")
+
+    def picked(self, place: Place) -> tuple[Feature, Spread]:
+        """A point, with its uncertainty. Raises InputError where nothing was measured there."""
+        if self.organised != isinstance(place, tuple):
+            raise InputError(
+                f"{place} is no place on {self.source}: give {'pixel (u, v)' if self.organised else 'an index'}"
+            )
+        index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
+        if not all(0 <= i < n for i, n in zip(index, self.points.shape, strict=False)):
+            raise InputError(f"{place} lies outside {self.source}: pick a point of it")
+        point = np.asarray(self.points[index], np.float64)
+        if not np.isfinite(point).all():
+            raise InputError(f"nothing was measured at {place} of {self.source}: pick another point")
+        sigma = float(np.nan_to_num(self.sigma_mm[index]))
+        if self.organised:
+            away = sigma * point / point[2]
+        else:
+            away = np.zeros(3) if self.normals is None else sigma * np.asarray(self.normals[index], np.float64)
+        feature = Feature("point", point)
+        if self.shared is None:
+            return feature, Spread(np.outer(away, away))
+        return feature, Spread(np.outer(away, away), self.shared(point[None], np.eye(3)[:, None]), self.calibration)
+
+    def sigma_along(self, normals: np.ndarray, whole: bool = False) -> np.ndarray:
+        """(n,) mm: standard deviation of the measured points along unit normals (n, 3), of noise alone, or on the
+        ``whole``, with what the calibration leaves uncertain."""
+        sigma = self.sigma_mm[self.measured].astype(np.float64)
+        if whole and self.left_mm is not None:
+            sigma = np.hypot(sigma, self.left_mm[self.measured])
+        if not self.organised:
+            return sigma
+        points = self.points[self.measured].astype(np.float64)
+        return sigma * np.abs(np.sum(points / points[:, 2:] * normals, axis=1))
+
+
+def surface(
+    session: SessionLike,
+    scan: str,
+    *,
+    model: str | None = None,
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Surface:
+    """Reconstruct a capture to measure on it, or read a merge that the session keeps, named ``merge/<number>``."""
+    with opened(session) as store:
+        if scan.startswith(MERGED):
+            return merged_surface(store, scan, warn)
+        check_accepted(store, accept_rejected)
+        warn_if_stale(store, warn)
+        cloud = scan_cloud(store, scan, model or preferred(store), progress, warn, accept_rejected)
+        found = surface_of(store, scan, cloud, load_model(store, cloud.model))
+        progress(1.0, "reconstructed")
+    return found
+
+
+def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surface:
+    """A capture's cloud, made with one of the session's calibrations, as a surface to measure on."""
+    calibration = f"calibration/{fitted.name}"
+    names = [scan, calibration]
+    if store.state_of(f"scale/{fitted.name}") == "fresh":
+        names.append(f"scale/{fitted.name}")
+    inputs, scale = store.input_hashes(*names), scale_factor(store, fitted.name)
+    shared = None
+    if isinstance(fitted, SplinedModel):
+        shared = splined_shared(fitted.bundle, cloud.axis, scale, scale_sigma(store, fitted.name))
+    return Surface(
+        cloud.points,
+        cloud.sigma_z,
+        scan,
+        fitted.name,
+        inputs,
+        left_mm=cloud.sigma_calibration,
+        normals=grid_normals(cloud.points),
+        shared=shared,
+        calibration="" if shared is None else inputs[calibration],
+        texture=cloud.texture,
+        scale=scale,
+    )
+
+
+def merged_surface(store: Session, merge: str, warn: Warn = unwarned) -> Surface:
+    """A merge that the session keeps as ``merge/<number>``, in the frame of its reference's camera."""
+    meta = store.load_result(merge, only=())[0]
+    if not is_fresh(store, merge):
+        warn(f"{merge} came from scans or a calibration that have changed since: merge again")
+    points = read_ply(store.exports / str(meta["ply"]))
+    sigma = points.scalars.get("sigma")
+    sigma = np.full(len(points.points), np.nan, np.float32) if sigma is None else np.where(sigma > 0, sigma, np.nan)
+    normals = points.normals
+    if normals is not None:
+        normals = np.where(normals.any(axis=1, keepdims=True), normals, np.float32(np.nan))
+    model = str(meta.get("model", ""))
+    return Surface(
+        points.points,
+        sigma,
+        merge,
+        model,
+        store.input_hashes(merge),
+        normals=normals,
+        faces=points.faces,
+        texture=points.colours,
+        scale=float(meta.get("scales", {}).get(model, 1.0)),
+    )

@@ -1,0 +1,273 @@
+"""Measurements on scans: made, saved with the session, listed, renamed, deleted and brought back, written as CSV.
+
+Every function takes a session's folder or one that is open, and saves what it makes; the browser calls the same.
+"""
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.inspection.features import Feature
+from slviewer.inspection.fitting import Fit, fit_feature
+from slviewer.inspection.quantities import Quantity
+from slviewer.inspection.regions import Region
+from slviewer.inspection.relations import distance, relation
+from slviewer.inspection.section import CutPlane, section
+from slviewer.inspection.uncertainty import Spread
+from slviewer.pipeline.measured_surface import Place, Surface
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.scale import scale_factor
+from slviewer.reconstruction.mesh import grid_triangles
+from slviewer.reconstruction.reconstruct import JUMP
+from slviewer.session.atomic import replace_file
+from slviewer.session.measurements import (
+    Measurement,
+    list_measurements,
+    load_measurement,
+    measurement_arrays,
+    rename_measurement,
+    restore_measurement,
+    save_measurement,
+    trash_measurement,
+)
+from slviewer.session.store import Session
+
+Shape = Literal["plane", "sphere", "cylinder"]
+ROUGH = 5.0
+"""Times the points' noise: a fit that leaves more is told of."""
+COLUMNS = ("id", "name", "kind", "scan", "quantity", "value", "unit", "U (k = 2)", "calibration in U", "state", "time")
+
+
+def add_point(session: SessionLike, on: Surface, at: Place, name: str = "") -> Measurement:
+    """A picked point, for relations with what is fitted."""
+    feature, spread = on.picked(at)
+    x, y, z = (Quantity(axis, float(value), "mm") for axis, value in zip("xyz", feature.place, strict=True))
+    data = {"at": at, "feature": feature.to_dict(), "scatter": spread.scatter.tolist(), "calibration": on.calibration}
+    arrays = {} if spread.shared is None else {"shared": spread.shared.astype(np.float32)}
+    with opened(session, write=True) as store:
+        return _saved(store, on, "point", [x, y, z], data, arrays, name)
+
+
+def add_distance(session: SessionLike, on: Surface, a: Place, b: Place, name: str = "") -> Measurement:
+    """The distance between two picked points."""
+    (first, first_spread), (second, second_spread) = on.picked(a), on.picked(b)
+    found = distance(first.place, second.place, first_spread, second_spread)
+    data = {"at": [a, b], "ends": [first.place.tolist(), second.place.tolist()]}
+    with opened(session, write=True) as store:
+        return _saved(store, on, "distance", [found], data, {}, name)
+
+
+def add_fit(session: SessionLike, on: Surface, shape: Shape, region: Region, name: str = "") -> Measurement:
+    """A plane, sphere or cylinder fitted to a region. Raises InputError where the region does not hold it."""
+    found = fit_feature(shape, on.within(region), on.shared, on.calibration)
+    noise = on.noise(region)
+    if found.rms > ROUGH * noise:
+        told = (
+            f"points lie {found.rms:.3g} mm (RMS) off the {shape}, and their noise is {noise:.2g} mm: see what it shows"
+        )
+        found = replace(found, warnings=(*found.warnings, told))
+    arrays = {} if found.spread.shared is None else {"shared": found.spread.shared.astype(np.float32)}
+    where = f"{region.text()}: {found.used:,} used, {found.left_out:,} left out"
+    data = {"region": region.to_dict(), "where": where, "fit": found.to_dict()}
+    with opened(session, write=True) as store:
+        return _saved(store, on, shape, found.quantities(), data, arrays, name)
+
+
+def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measurement:
+    """Angles and distances between two points or fits, by their ids. Raises InputError where one is neither, is stale,
+    or lies in another camera's frame."""
+    with opened(session, write=True) as store:
+        first, second = (load_measurement(store, each) for each in (a, b))
+        if a == b:
+            raise InputError(f"{first.name} was chosen twice: choose two measurements")
+        for each in (first, second):
+            if _stale(store, each):
+                raise InputError(f"{each.name} is stale, what it was measured on has changed: measure it again")
+        (one, one_spread), (other, other_spread) = (feature_of(store, each) for each in (first, second))
+        _check_frames(store, first, second)
+        source = first.source if first.source == second.source else f"{first.source}, {second.source}"
+        found = relation(one, one_spread, other, other_spread)
+        model = first.model if first.model == second.model else f"{first.model}, {second.model}"
+        saved = save_measurement(
+            store,
+            "relation",
+            source=source,
+            model=model,
+            inputs={},
+            data=_data(found, {"between": [first.name, second.name]}),
+            arrays={},
+            of=(a, b),
+            name=name or f"{first.name} – {second.name}",
+        )
+        return saved
+
+
+def add_section(session: SessionLike, on: Surface, a: Place, b: Place, name: str = "") -> Measurement:
+    """The surface cut along a line between two picked points, at right angles to it as nearly as the camera looks."""
+    ends = [on.picked(place)[0].place for place in (a, b)]
+    middle = (ends[0] + ends[1]) / 2
+    plane = CutPlane.through(ends[0], ends[1], -middle)
+    vertices, faces = triangles_of(on)
+    lines = section(vertices, faces, plane)
+    heights = np.concatenate(lines)
+    found = [
+        Quantity("length along", float(np.ptp(heights[:, 0])), "mm"),
+        Quantity("height range", float(np.ptp(heights[:, 1])), "mm"),
+    ]
+    data = {"at": [a, b], "plane": plane.to_dict()}
+    arrays = {
+        "lines": np.concatenate(lines).astype(np.float32),
+        "lengths": np.array([len(line) for line in lines], np.int32),
+    }
+    with opened(session, write=True) as store:
+        return _saved(store, on, "section", found, data, arrays, name)
+
+
+def section_lines(session: SessionLike, identity: str) -> tuple[CutPlane, list[np.ndarray]]:
+    """A saved section's plane, and its lines (k, 2) mm: along, and up."""
+    with opened(session) as store:
+        measured = load_measurement(store, identity)
+        if measured.kind != "section":
+            raise InputError(f"{measured.name} is a {measured.kind}, not a section: choose a section")
+        arrays = measurement_arrays(store, identity)
+    lines = np.split(arrays["lines"].astype(np.float64), np.cumsum(arrays["lengths"])[:-1])
+    return CutPlane.from_dict(measured.data["plane"]), lines
+
+
+def measurements(session: SessionLike) -> list[Measurement]:
+    """All measurements, in the order in which they were made; stale where what they were made from has changed."""
+    with opened(session) as store:
+        return [replace(each, stale=_stale(store, each)) for each in list_measurements(store)]
+
+
+def remove(session: SessionLike, identity: str) -> None:
+    """Move a measurement to the trash."""
+    with opened(session, write=True) as store:
+        trash_measurement(store, identity)
+
+
+def restore(session: SessionLike, identity: str = "") -> Measurement:
+    """Undo ``remove``, by default the last one."""
+    with opened(session, write=True) as store:
+        return restore_measurement(store, identity)
+
+
+def rename(session: SessionLike, identity: str, name: str) -> Measurement:
+    """Give a measurement another name."""
+    with opened(session, write=True) as store:
+        return rename_measurement(store, identity, name)
+
+
+def quantities_of(measured: Measurement) -> list[Quantity]:
+    """What a measurement read, with units and uncertainties."""
+    return [Quantity.from_dict(each) for each in measured.data["quantities"]]
+
+
+def in_words(measured: Measurement) -> str:
+    """A measurement in one line."""
+    mark = "  [stale: measured on what has since changed]" if measured.stale else ""
+    read = "; ".join(quantity.text() for quantity in quantities_of(measured))
+    return f"{measured.id:<4} {measured.name} ({measured.kind} on {measured.source}): {read}{mark}"
+
+
+def measurements_csv(session: SessionLike) -> str:
+    """All measurements as comma-separated values, one row a quantity; U where it is known."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for each in measurements(session):
+        for q in quantities_of(each):
+            U = "" if q.U is None else f"{q.U:.6g}"
+            whole = "" if q.U is None else ("yes" if q.whole else "no")
+            state = "stale" if each.stale else "fresh"
+            # a name is the operator's own: a spreadsheet must not take it for a formula
+            name = f"'{each.name}" if each.name[:1] in "=+-@\t\r" else each.name
+            writer.writerow(
+                [each.id, name, each.kind, each.source, q.name, f"{q.value:.6f}", q.unit, U, whole, state, each.time]
+            )
+    return text.getvalue()
+
+
+def export_measurements(session: SessionLike, out: Path | str) -> int:
+    """Write ``measurements_csv`` to a file; returns how many measurements it holds."""
+    out = Path(out)
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"{out.name} is no table: end its name in .csv")
+    with opened(session) as store:
+        replace_file(out.absolute(), measurements_csv(store).encode("utf-8-sig"))
+        return len(list_measurements(store))
+
+
+def triangles_of(on: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float64 and faces (m, 3) of a surface; a scan's end where its depth jumps."""
+    if on.faces is not None:
+        return np.asarray(on.points, np.float64), on.faces
+    if not on.organised:
+        raise InputError(f"{on.source} is a cloud without triangles: mesh it first")
+    faces = grid_triangles(on.points, JUMP * float(np.median(on.points[..., 2][on.measured])))
+    return on.points[on.measured].astype(np.float64), faces
+
+
+def feature_of(store: Session, measured: Measurement) -> tuple[Feature, Spread]:
+    """The point, plane, sphere or cylinder that a measurement is, and how sure it is."""
+    if measured.kind not in ("point", "plane", "sphere", "cylinder"):
+        raise InputError(f"{measured.name} is a {measured.kind}: choose a point, plane, sphere or cylinder")
+    shared = measurement_arrays(store, measured.id).get("shared")
+    shared = None if shared is None else shared.astype(np.float64)
+    if measured.kind == "point":
+        spread = Spread(np.array(measured.data["scatter"]), shared, measured.data["calibration"])
+        return Feature.from_dict(measured.data["feature"]), spread
+    fit = Fit.from_dict(measured.data["fit"], shared)
+    return fit.feature, fit.spread
+
+
+def _saved(
+    store: Session,
+    on: Surface,
+    kind: str,
+    found: list[Quantity],
+    data: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    name: str,
+) -> Measurement:
+    return save_measurement(
+        store,
+        kind,
+        source=on.source,
+        model=on.model,
+        inputs=on.inputs,
+        data=_data(found, data) | {"scale": on.scale},
+        arrays=arrays,
+        name=name,
+    )
+
+
+def _data(found: list[Quantity], data: dict[str, Any]) -> dict[str, Any]:
+    return {"quantities": [quantity.to_dict() for quantity in found], **data}
+
+
+def _stale(store: Session, measured: Measurement) -> bool:
+    """Also where a correction of scale was applied since, or taken away."""
+    if measured.stale:
+        return True
+    if measured.of:
+        return any(_stale(store, load_measurement(store, each)) for each in measured.of)
+    used = measured.data.get("scale")
+    return used is not None and scale_factor(store, measured.model) != used
+
+
+def _check_frames(store: Session, a: Measurement, b: Measurement) -> None:
+    """Two scans are in one frame only while camera and calibration are the same; a merged surface has its own."""
+    if a.source == b.source:
+        return
+    captures = set(store.capture_names())
+    if a.model != b.model or not {a.source, b.source} <= captures:
+        raise InputError(
+            f"{a.name} was measured on {a.source} with {a.model}, {b.name} on {b.source} with {b.model}: they do not "
+            "lie in one frame; measure both on one surface"
+        )

@@ -1,0 +1,312 @@
+"""Registering scans of one object, and fusing them into one surface."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.errors import UsageError
+from slviewer.evaluation import letter
+from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
+from slviewer.pipeline.capture_phases import capture_texture, decoded
+from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.frame_residuals import told
+from slviewer.pipeline.models import check_accepted, frame_of, load_model, preferred, warn_if_stale
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.scale import scale_factor, told_scale
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.registration.multiway import Alignment, Pair, Starts
+from slviewer.registration.pairwise import Registration
+from slviewer.registration.picked import picked_start
+from slviewer.registration.static_scene import Contradiction, ObjectAlignment, register_object
+from slviewer.registration.turntable import Axis
+from slviewer.session.ply import write_ply
+from slviewer.session.store import Session
+from slviewer.surface.fuse import Fused, fuse
+
+CONTRADICTING = 0.01
+"""Share of contradicting points from which on a pair is warned about: noise alone has fewer than one in a million."""
+StartKind = Literal["features", "turntable", "identity"]
+Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
+"""Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class Merge:
+    """How scans lie on one of them, the one surface that they were fused to, and the file it went to.
+
+    ``scale`` says, in words, what correction of scale is in it; ``kept`` names the session's result, where it is kept.
+    ``static_points``: by scan, how many points stand still while the object moves; ``contradictions`` of each pair.
+    In the file ``seen_by`` counts the scans that a point is the mean of, and ``source`` numbers the one that its place
+    comes from, 0 for the first of ``fused.names``.
+    """
+
+    alignment: Alignment
+    fused: Fused
+    clouds: Mapping[str, Cloud]
+    out: Path
+    scale: str = ""
+    kept: str = ""
+    static_points: Mapping[str, int] = field(default_factory=dict)
+    contradictions: Mapping[Pair, Contradiction] = field(default_factory=dict)
+
+    @property
+    def reference(self) -> str:
+        """The scan whose frame the surface is in."""
+        return self.alignment.reference
+
+    @property
+    def pairs(self) -> Mapping[str, Registration]:
+        """How every scan but the reference lies on it, by name."""
+        return self.alignment.on_reference()
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``merge --json``."""
+        return {
+            **alignment_json(self.alignment),
+            "static_points": dict(self.static_points),
+            "contradictions": [
+                {"scan": a, "onto": b, "share": found.share, "compared": found.compared, "gate_mm": found.gate_mm}
+                for (a, b), found in self.contradictions.items()
+            ],
+            "letter_rms_mm": dict(letter.EXPERIMENT_3_ICP_RMS_MM),
+            "points": len(self.fused.surface),
+            "shared": self.fused.shared,
+            "left_out": self.fused.left_out,
+        }
+
+    def text(self) -> str:
+        """For people."""
+        lines = [alignment_text(self.alignment)]
+        if self.contradictions:
+            worst = max(self.contradictions.values(), key=lambda found: found.share)
+            lines.append(
+                f"contradicting points: {100 * worst.share:.2g} % at most of what both scans of a pair cover lies more "
+                f"than {worst.gate_mm:.2g} mm in front of the other's surface"
+            )
+        if removed := _removed_text(self.fused):
+            lines.append(removed)
+        if self.scale:
+            lines.append(self.scale)
+        seen = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
+        lines.append(f"{len(self.fused.surface)} points, {seen} -> {self.out}")
+        if self.kept:
+            lines.append(f"the session keeps it as {self.kept}: mesh, compare and measure take it by that name")
+        return "\n".join(lines)
+
+
+def alignment_json(alignment: Alignment) -> dict[str, Any]:
+    """Plain values: every scan on the reference, every registered pair, the loops, what was dropped or refused."""
+    return {
+        "reference": alignment.reference,
+        "pairs": {name: _figures(pair) for name, pair in alignment.on_reference().items()},
+        "registered": [{"scan": a, "onto": b, **_figures(found)} for (a, b), found in alignment.pairs.items()],
+        "loops": [
+            {
+                "scans": list(loop.names),
+                "error_mm": loop.before.shift_mm,
+                "error_deg": loop.before.turn_deg,
+                "left_mm": loop.after.shift_mm,
+                "left_deg": loop.after.turn_deg,
+            }
+            for loop in alignment.loops
+        ],
+        "dropped": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.dropped.items()],
+        "refused": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.refused.items()],
+    }
+
+
+def alignment_text(alignment: Alignment) -> str:
+    """A line a pair, the loop that closes worst, and what was left out, for people."""
+    r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
+    lines = [
+        f"{a} -> {b}: RMS {found.rms_mm:.3f} mm, point to point {found.inlier_rmse_mm:.3f} mm, "
+        f"overlap {100 * found.overlap:.0f} %, sure to {1000 * found.uncertainty.shift_mm:.1f} um "
+        f"and {found.uncertainty.turn_deg:.4f} degrees"
+        for (a, b), found in alignment.pairs.items()
+    ]
+    lines.append(f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)")
+    if alignment.loops:
+        worst = alignment.loops[0]
+        way = " - ".join([*worst.names, worst.names[0]])
+        lines.append(
+            f"loop error, the worst of {len(alignment.loops)}: {worst.before.shift_mm:.3f} mm and "
+            f"{worst.before.turn_deg:.4f} degrees round {len(worst.names)} pairs ({way}); "
+            f"{max(loop.after.shift_mm for loop in alignment.loops):.3f} mm at most once closed"
+        )
+    lines += [f"left out: {why}" for why in alignment.dropped.values()]
+    lines += [f"not registered: {a} -> {b}: {why}" for (a, b), why in alignment.refused.items()]
+    return "\n".join(lines)
+
+
+def merge(
+    session: SessionLike,
+    captures: Sequence[str],
+    reference: str,
+    out: Path | str | None = None,
+    *,
+    model: str | None = None,
+    start: StartKind = "features",
+    angle: float | None = None,
+    axis: Axis | None = None,
+    poses: Mapping[str, np.ndarray] | None = None,
+    picked: Picked | None = None,
+    keep_background: bool = False,
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Merge:
+    """Reconstruct scans, register them into the frame of ``reference``, fuse them, and write the surface as one PLY.
+
+    Scans are given in the order in which they were taken. ``start``: where registration starts from; "turntable" needs
+    the ``angle`` in degrees from each scan to the next and finds the ``axis`` where it is not given; "identity" takes
+    scans to lie in one frame already, or as ``poses`` (4, 4) by name say. ``picked``: of a pair (scan, onto), three or
+    more points (n, 3) mm on either, in their cameras' frames; these pairs start from there. What stands still while
+    the object moves is measured apart from it and left off the surface, unless ``keep_background``. Without ``out`` the
+    session keeps the merge, as ``merge/<number>``, and its file in the exports.
+    """
+    given = list(dict.fromkeys(captures))
+    names = given if reference in given else [*given, reference]
+    if len(names) < 2:
+        raise UsageError(f"only {reference} was named: name the scans to merge with it")
+    if out is not None:
+        out = Path(out)
+        if out.suffix.lower() != ".ply":
+            raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
+        out.parent.mkdir(parents=True, exist_ok=True)
+    starts = _starts(names, start, angle, axis, poses, picked, warn)
+    with opened(session, write=out is None) as store:
+        check_accepted(store, accept_rejected)
+        fitted = load_model(store, model or preferred(store))
+        warn_if_stale(store, warn)
+        check_capture_sizes(store, names)
+        scale, clouds = told_scale(store, fitted.name), {}
+        for i, (shot, frames, phases) in enumerate(decoded(store, names)):
+            for sentence in told(store, shot.name, frames):
+                warn(f"{shot.name}: {sentence}")
+            progress(0.4 * i / len(names), f"reconstructing {shot.name}")
+            clouds[shot.name] = capture_cloud(
+                store,
+                fitted,
+                shot,
+                phases,
+                texture=capture_texture(shot, frames),
+                accept_rejected=accept_rejected,
+                warn=warn,
+            )
+        registering, fusing = part(progress, 0.4, 0.75), part(progress, 0.75, 0.9)
+        registered = register_object(clouds, reference, starts, lambda done: registering(done, "registering"))
+        alignment = registered.alignment
+        for why in [*alignment.dropped.values(), *_scene_warnings(clouds, registered, keep_background)]:
+            warn(why)
+        clouds = clouds if keep_background else dict(registered.clouds)
+        fused = fuse(clouds, alignment.T_reference_scan, lambda done: fusing(done, "fusing"))
+        progress(0.9, "writing")
+        surface = fused.surface
+        scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
+        scalars |= {"seen_by": fused.seen_by, "source": fused.source}
+        frame = f"{frame_of(store, fitted.name)}, at {reference}"
+        notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {fitted.name}")
+        number = 0 if out is not None else next_merge(store)
+        path = store.exports / f"merged_{number}.ply" if out is None else out
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_ply(path, surface.points, surface.colours, surface.normals, scalars, notes=notes)
+        still = {name: int(mask.sum()) for name, mask in registered.static.items()}
+        kept = f"merge/{number}" if number else ""
+        found = Merge(alignment, fused, clouds, path, scale, kept, still, registered.contradictions)
+        if found.kept:
+            store.save_result(found.kept, merge_record(store, found, fitted.name), {})
+    progress(1.0, "merged")
+    return found
+
+
+def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool) -> list[str]:
+    """What of the scans is not the object, or contradicts, and what to do."""
+    said = []
+    still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
+    if still:
+        total = sum(int(clouds[name].mask.sum()) for name in still)
+        counts = ", ".join(f"{count} of {name}" for name, count in still.items())
+        said.append(
+            f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while the object moves: "
+            + ("they are in the merge once for each scan" if keep_background else "they are not part of the merge")
+        )
+    for (one, other), found in registered.contradictions.items():
+        if found.share > CONTRADICTING:
+            said.append(
+                f"{one} -> {other}: {100 * found.share:.2g} % of the points contradict, they lie more than "
+                f"{found.gate_mm:.2g} mm in front of what the other scan sees there: something moved on its own or "
+                "stands still; restrict the scans to the object, or scan again"
+            )
+    return said
+
+
+def _removed_text(fused: Fused) -> str:
+    """How many points were removed from the surface as far from everything else; empty where none were."""
+    far = {name: counts.get("far", 0) for name, counts in fused.left_out.items() if counts.get("far")}
+    if not far:
+        return ""
+    return "removed as far from everything else: " + ", ".join(f"{n} points of {name}" for name, n in far.items())
+
+
+def next_merge(store: Session) -> int:
+    """The number of the session's next merge."""
+    numbers = (int(name.removeprefix("merge/")) for name in store.result_names() if name.startswith("merge/"))
+    return max(numbers, default=0) + 1
+
+
+def merge_record(store: Session, found: Merge, model: str) -> dict[str, Any]:
+    """What a session keeps of a merge made with that model: its figures, its file in the exports, and its inputs."""
+    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
+    return {
+        **found.to_json(),
+        "scans": list(found.fused.names),
+        "ply": found.out.name,
+        "model": model,
+        "scale": found.scale,
+        "scales": {model: scale_factor(store, model)},
+        "inputs": store.input_hashes(*found.fused.names, *calibrations),
+    }
+
+
+def _starts(
+    names: Sequence[str],
+    start: StartKind,
+    angle: float | None,
+    axis: Axis | None,
+    poses: Mapping[str, np.ndarray] | None,
+    picked: Picked | None,
+    warn: Warn,
+) -> Starts:
+    if (start == "turntable") != (angle is not None):
+        raise UsageError("a turntable's start needs its angle from scan to scan: give both, or neither")
+    if start == "identity" and poses is None:
+        poses = {name: np.eye(4) for name in names}
+    picks = {}
+    for (scan, onto), (there, here) in (picked or {}).items():
+        if not {scan, onto} <= set(names):
+            raise UsageError(f"points were picked on {scan} and {onto}, which are not both among the scans to merge")
+        picks[scan, onto], apart = picked_start(there, here)
+        warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
+    for base in {onto for _, onto in picks} if poses is None and angle is None else ():
+        if all((name, base) in picks for name in names if name != base):  # pairs that nobody picked start there too
+            poses = {base: np.eye(4)} | {name: picks[name, base].T for name in names if name != base}
+    return Starts(poses=poses, step_deg=angle, axis=axis, picked=picks)
+
+
+def _figures(found: Registration) -> dict[str, Any]:
+    return {
+        "rms_mm": found.rms_mm,
+        "point_to_point_rms_mm": found.inlier_rmse_mm,
+        "overlap": found.overlap,
+        "agreement": found.agreement,
+        "slack_mm": found.slack_mm,
+        "gate_mm": found.gate_mm,
+        "start": found.start,
+        "sigma_shift_mm": found.uncertainty.shift_mm,
+        "sigma_turn_deg": found.uncertainty.turn_deg,
+        "middle": found.uncertainty.centre.tolist(),
+        "T_reference_scan": found.T_reference_scan.tolist(),
+    }

@@ -1,0 +1,94 @@
+"""From captures, or from a merge that is kept, to a mesh in a file."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from slviewer.errors import UsageError
+from slviewer.pipeline.export import check_export
+from slviewer.pipeline.export_shapes import merged_points, scan_cloud
+from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.merge import Merge, StartKind, merge
+from slviewer.pipeline.models import check_accepted, warn_if_stale
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.session.mesh_files import write_shape
+from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
+from slviewer.surface.shapes import PointSet
+
+MERGE = "merge/"
+"""What the name of a merge that the session keeps begins with; its number follows, or nothing for the last one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A mesh, what it was made of, and the file it went to. ``merged`` says how the scans were merged for it."""
+
+    meshed: Meshed
+    sources: tuple[str, ...]
+    out: Path
+    merged: Merge | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``mesh --json``."""
+        merged = None if self.merged is None else self.merged.to_json()
+        return {"sources": list(self.sources), "out": str(self.out), **self.meshed.to_json(), "merge": merged}
+
+    def text(self) -> str:
+        """For people."""
+        lines = [] if self.merged is None else [self.merged.text()]
+        return "\n".join([*lines, f"{', '.join(self.sources)}: {self.meshed.text()}", f"-> {self.out}"])
+
+
+def mesh(
+    session: SessionLike,
+    names: Sequence[str],
+    out: Path | str | None = None,
+    *,
+    plan: MeshingPlan | None = None,
+    model: str | None = None,
+    start: StartKind = "features",
+    angle: float | None = None,
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Mesh:
+    """Mesh a scan, several scans merged, or a merge that the session keeps (``merge/2``, ``merge/`` for the last one).
+
+    ``out``: .ply, .stl, .obj or .glb; by default a .ply in the session's exports. Scans are merged into the frame of
+    the first of them, their points written beside the mesh; ``start`` and ``angle`` as ``merge`` takes them.
+    """
+    sources = tuple(dict.fromkeys(names))
+    if not sources:
+        raise UsageError("nothing was named: name one scan, several to merge, or a merge")
+    if len(sources) > 1 and any(name.startswith(MERGE) for name in sources):
+        raise UsageError("a merge is meshed by itself: name one merge, or scans")
+    if len(sources) > 1 and plan is not None and plan.method == "grid":
+        raise UsageError("the method grid joins the pixels of one scan: name one, or use poisson or volume")
+    if out is not None:
+        check_export("mesh", Path(out).suffix.lower().removeprefix("."))
+    merged = None
+    with opened(session) as store:
+        check_accepted(store, accept_rejected)
+        path = Path(out) if out is not None else store.exports / f"{'_'.join(sources).replace('/', '_')}_mesh.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        before = part(progress, 0, 0.5)
+        shape: Cloud | PointSet
+        if len(sources) > 1:
+            points = path.with_name(f"{path.stem}_points.ply")
+            merged = merge(
+                store, sources, sources[0], points, model=model, start=start, angle=angle,
+                accept_rejected=accept_rejected, progress=before, warn=warn,
+            )  # fmt: skip
+            shape = merged.fused.surface
+        elif sources[0].startswith(MERGE):
+            shape = merged_points(store, sources[0].removeprefix(MERGE), warn)
+        else:
+            warn_if_stale(store, warn)
+            shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected)
+    meshed = mesh_of(shape, plan, part(progress, 0.5, 0.95))
+    progress(0.95, f"writing {path.name}")
+    write_shape(path, meshed.mesh, notes=(f"of {', '.join(sources)}", *meshed.text().splitlines()))
+    progress(1.0, "meshed")
+    return Mesh(meshed, sources, path, merged)

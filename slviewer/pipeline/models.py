@@ -1,0 +1,241 @@
+"""Calibrations in a session: saving, loading, choosing, and noticing when one is stale."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.anchored import AnchoredModel
+from slviewer.calibration.diagnosis.verdict import Verdict
+from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import CalibrationRejected, InputError, SessionError
+from slviewer.evaluation.crossvalidation import CrossValidation
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.feedback import Warn
+from slviewer.session.store import Session
+
+Model = StereoModel | PixelwiseModel | AnchoredModel | SplinedModel
+
+MODELS = ("stereo", "pixelwise", "anchored", "splined")
+VERDICT = "calibration/verdict"
+VALIDATION = "calibration/validation"
+POSES_FOR_PIXELWISE = 8
+"""With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
+_RESTORED: dict[str, Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], Model]] = {
+    "pixelwise": PixelwiseModel.restored,
+    "anchored": AnchoredModel.restored,
+    "splined": SplinedModel.restored,
+}
+
+
+def save_stereo(
+    store: Session,
+    model: StereoModel,
+    inputs: Mapping[str, str],
+    settings: Mapping[str, Any],
+    verdict: Verdict | None = None,
+) -> None:
+    """Replace the session's stereo calibration; a verdict that rejects it stays with it."""
+    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
+    if verdict is not None:
+        meta["verdict"] = verdict.to_json()
+    store.save_result("calibration/stereo", meta, {f"residuals_{n}": r for n, r in model.residuals_px.items()})
+
+
+def save_fitted(
+    store: Session,
+    model: PixelwiseModel | AnchoredModel | SplinedModel,
+    inputs: Mapping[str, str],
+    settings: Mapping[str, Any],
+) -> None:
+    """Replace the session's calibration of this kind."""
+    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
+    store.save_result(f"calibration/{model.name}", meta, model.to_arrays())
+
+
+def available(store: Session) -> tuple[str, ...]:
+    """Names of the calibrations that the session holds."""
+    return tuple(name for name in MODELS if store.has_result(f"calibration/{name}"))
+
+
+def save_imported_stereo(
+    store: Session,
+    matrices: Mapping[str, np.ndarray],
+    *,
+    source: str,
+    camera: tuple[int, int] | None,
+    projector: tuple[int, int] | None,
+) -> None:
+    """Make matrices from elsewhere the session's stereo calibration; sizes may be left to the session's captures."""
+    imported = {name: value.tolist() for name, value in matrices.items()}
+    meta = {"imported": imported, "source": source, "camera": camera, "projector": projector, "inputs": {}}
+    store.save_result("calibration/stereo", meta, {})
+
+
+def load_stereo(store: Session) -> StereoModel:
+    """The session's stereo calibration, without its residual arrows."""
+    if "stereo" not in available(store):
+        raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
+    meta = store.load_result("calibration/stereo", only=())[0]
+    if "model" in meta:
+        return StereoModel.from_dict(meta["model"])
+    captures = store.captures()
+    if not captures and not (meta["camera"] and meta["projector"]):
+        raise InputError(f"{store.folder} holds no capture that tells the camera's size: import the scans first")
+    camera = tuple(meta["camera"] or captures[0].size)
+    projector = tuple(meta["projector"] or captures[0].sequence.projector)
+    m = {name: np.array(value) for name, value in meta["imported"].items()}
+    rig = StereoRig(
+        Lens(m["K_camera"], m["D_camera"], camera), Lens(m["K_projector"], m["D_projector"], projector), m["R"], m["T"]
+    )
+    return StereoModel.made_elsewhere(rig)
+
+
+def load_stereo_if_complete(store: Session) -> StereoModel | None:
+    """The session's stereo calibration; None where there is none, or an imported one whose sizes nothing tells yet."""
+    if "stereo" not in available(store):
+        return None
+    meta = store.load_result("calibration/stereo", only=())[0]
+    sized = "model" in meta or (meta["camera"] and meta["projector"]) or store.capture_names()
+    return load_stereo(store) if sized else None
+
+
+def load_residuals(store: Session) -> dict[str, np.ndarray]:
+    """{pose: (n, 4) px} camera and projector residuals of the stereo calibration; empty for one made elsewhere."""
+    arrays = store.load_result("calibration/stereo")[1]
+    return {name.removeprefix("residuals_"): r for name, r in arrays.items() if name.startswith("residuals_")}
+
+
+def load_model(store: Session, name: str) -> Model:
+    """One calibration by name."""
+    if name not in available(store):
+        there = ", ".join(available(store))
+        raise InputError(
+            f"{store.folder} holds no {name} calibration ({f'there is {there}' if there else 'there is none'}): "
+            "run `slviewer calibrate` first"
+        )
+    if name == "stereo":
+        return load_stereo(store)
+    meta, arrays = store.load_result(f"calibration/{name}")
+    try:
+        return _RESTORED[name](meta["model"], arrays)
+    except (KeyError, TypeError) as error:
+        raise SessionError(
+            f"the {name} calibration in {store.folder} was saved by another version of slviewer: "
+            "run `slviewer calibrate` again"
+        ) from error
+
+
+def best(store: Session, accept_rejected: bool = False) -> str:
+    """The calibration to use where none is named: see ``preferred``.
+
+    Raises CalibrationRejected, with the reason, for one that was rejected, unless that is accepted.
+    """
+    check_accepted(store, accept_rejected)
+    return preferred(store)
+
+
+def preferred(store: Session) -> str:
+    """The calibration that the operator has chosen, while there is one of that name; else the one ``recommended``."""
+    decided = store.decision("model")
+    return str(decided) if decided and decided in available(store) else recommended(store)
+
+
+def recommended(store: Session) -> str:
+    """The calibration that cross-validation recommends, where it was made for these; else splined or pixelwise, if it
+    had 8 poses or more; else stereo.
+    """
+    there = available(store)
+    if not there:
+        raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
+    compared = validation(store)
+    if compared is not None and compared.recommended in there:
+        return compared.recommended
+    for name in ("splined", "pixelwise"):
+        if name in there and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE:
+            return name
+    return there[0]
+
+
+def validation(store: Session) -> CrossValidation | None:
+    """How the session's calibrations compare on poses that they were not made from; None where nobody has compared
+    them as they are now."""
+    if store.state_of(VALIDATION) != "fresh":
+        return None
+    return CrossValidation.from_json(store.load_result(VALIDATION, only=())[0]["validation"])
+
+
+def rejection(store: Session) -> str:
+    """Why the session's calibration was rejected; empty where it was not, or was never judged."""
+    if "stereo" not in available(store):
+        return ""
+    judged = store.load_result("calibration/stereo", only=())[0].get("verdict")
+    verdict = Verdict.from_json(judged) if judged else Verdict()
+    return verdict.reason if verdict.level == "rejected" else ""
+
+
+def check_accepted(store: Session, accept_rejected: bool = False) -> None:
+    """Raise CalibrationRejected, with the reason, where the calibration was rejected and that is not accepted."""
+    reason = rejection(store)
+    if reason and not accept_rejected:
+        raise CalibrationRejected(
+            f"the calibration was rejected, and is not used unless you insist (--accept-rejected): {reason}"
+        )
+
+
+def insist(store: Session, on: bool) -> None:
+    """Remember whether the calibration at hand is to be used although it was rejected; another one is asked anew."""
+    store.decide("use_anyway", store.input_hashes("calibration/stereo")["calibration/stereo"] if on else None)
+
+
+def insisted(store: Session) -> bool:
+    """Whether that was decided of the calibration at hand."""
+    decided = store.decision("use_anyway")
+    if not decided or "stereo" not in available(store):
+        return False
+    return bool(decided == store.input_hashes("calibration/stereo")["calibration/stereo"])
+
+
+def frame_family(name: str) -> str:
+    """The calibration whose camera frame a model's clouds are in: splined has its own, the others stand on stereo's."""
+    return "splined" if name == "splined" else "stereo"
+
+
+def frame_of(store: Session, name: str) -> str:
+    """The frame of a model's clouds, in words: "camera of calibration splined 1a2b3c4d"."""
+    family = frame_family(name)
+    calibration = f"calibration/{family}"
+    if not store.has_result(calibration):
+        return f"camera of calibration {family}"
+    return f"camera of calibration {family} {store.input_hashes(calibration)[calibration][:8]}"
+
+
+def warn_if_frame_changed(store: Session, before: str, warn: Warn) -> None:
+    """Say so where another model is used than ``before`` (empty: none was), whose clouds lie in another frame."""
+    after = preferred(store) if available(store) else ""
+    if before and after and frame_family(before) != frame_family(after):
+        warn(
+            f"the {after} calibration is used from now on instead of {before}, and its clouds lie in another frame: "
+            f"the {frame_of(store, after)}. Reconstruct earlier scans again before you combine them with new ones"
+        )
+
+
+def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:
+    """Calibrations by name; all there are where none is named."""
+    load_stereo(store)
+    return {name: load_model(store, name) for name in names or available(store)}
+
+
+def warn_if_stale(store: Session, warn: Warn) -> None:
+    """Say so when target poses have changed since the calibration was made."""
+    stale = [name for name in available(store) if store.state_of(f"calibration/{name}") == "stale"]
+    if stale:
+        *others, last = stale
+        which = f"{', '.join(others)} and {last} calibrations were" if others else f"{last} calibration was"
+        warn(
+            f"the {which} made from target poses that have since been replaced or removed: run `slviewer calibrate` "
+            "again"
+        )

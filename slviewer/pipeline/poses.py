@@ -1,0 +1,128 @@
+"""What each target pose says, computed once and kept in the session beside the frames it came from."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slviewer.calibration.diagnosis.evidence import PoseEvidence
+from slviewer.calibration.observe import READING, Observation, Smoothing, observe
+from slviewer.errors import InputError
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
+from slviewer.pipeline.capture_phases import capture_texture, check_capture, decoded
+from slviewer.pipeline.pose_evidence import examine as examine_frames
+from slviewer.pipeline.pose_evidence import keep_evidence, known_evidence
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.target.detect import Detection, detect
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A pose's observation, or why there is none."""
+
+    name: str
+    observation: Observation | None
+    refused: str = ""
+    evidence: PoseEvidence | None = None
+
+
+def judge(
+    store: Session,
+    capture: Capture,
+    frames: np.ndarray,
+    phases: dict[Axis, PhaseMap],
+    board: Board,
+    smoothing: Smoothing,
+    examine: bool = False,
+) -> Judged:
+    """Detect the board and read the pose, and keep what was found in the session.
+
+    ``examine``: look at its frames too, for what may be wrong with them.
+    """
+    texture = capture_texture(capture, frames)
+    found: Detection | None = None
+    seen: Observation | None = None
+    refused = ""
+    try:
+        found = detect(board, texture)
+        seen = observe(capture.name, board, found, phases, smoothing)
+        check_capture(capture.name, capture.sequence, frames, phases)
+    except InputError as error:
+        refused = str(error).removeprefix(f"{capture.name}: ")
+    evidence = None
+    if examine:
+        evidence = examine_frames(capture.name, capture.sequence, frames, phases, board, texture, found, seen, refused)
+        keep_evidence(store, capture, board, evidence)
+    judged = Judged(capture.name, None if refused else seen, refused, evidence)
+    meta = {
+        "target": str(board),
+        "smoothing": _settings(smoothing),
+        "reading": READING,
+        "refused": judged.refused,
+        "inputs": {capture.name: capture.hash},
+    }
+    arrays = judged.observation.to_arrays() if judged.observation else {}
+    store.save_result(f"poses/{capture.name}", meta, arrays)
+    return judged
+
+
+def known(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
+    """What ``judge`` kept of a pose, if it was for these frames, this board and this smoothing."""
+    result = f"poses/{name}"
+    if store.state_of(result) != "fresh":
+        return None
+    meta = store.load_result(result, only=())[0]
+    if (meta["target"], meta["smoothing"], meta.get("reading")) != (str(board), _settings(smoothing), READING):
+        return None
+    if meta["refused"]:
+        return Judged(name, None, meta["refused"])
+    return Judged(name, Observation.from_arrays(name, store.load_result(result)[1]))
+
+
+def judge_all(
+    store: Session, names: Sequence[str], board: Board, smoothing: Smoothing, examine: bool = False
+) -> Iterator[Judged]:
+    """Every pose in order; frames are read only where a pose is not known yet.
+
+    ``examine``: each with the evidence of its frames. Raises InputError where poses come from cameras or projectors of
+    different size.
+    """
+    captures = [store.load_capture(name) for name in names]
+    for capture in captures[1:]:
+        first = captures[0]
+        if (capture.size, capture.sequence.projector) != (first.size, first.sequence.projector):
+            raise InputError(
+                f"{capture.name} has a {_wxh(capture.size)} camera and a {_wxh(capture.sequence.projector)} projector, "
+                f"{first.name} {_wxh(first.size)} and {_wxh(first.sequence.projector)}: "
+                "calibrate poses of one rig at one resolution"
+            )
+    kept = {name: known(store, name, board, smoothing) for name in names}
+    if examine:
+        for name, judged in kept.items():
+            evidence = known_evidence(store, name, board)
+            kept[name] = replace(judged, evidence=evidence) if judged and evidence else None
+    fresh = decoded(store, [name for name in names if kept[name] is None])
+    for name in names:
+        yield kept[name] or judge(store, *next(fresh), board, smoothing, examine)
+
+
+def load_observations(store: Session, names: Sequence[str]) -> list[Observation]:
+    """Observations that the session keeps, of poses by name."""
+    found = []
+    for name in names:
+        if store.has_result(f"poses/{name}"):
+            meta, arrays = store.load_result(f"poses/{name}")
+            if not meta["refused"]:
+                found.append(Observation.from_arrays(name, arrays))
+    return found
+
+
+def _settings(smoothing: Smoothing) -> list[str | int]:
+    return [smoothing.kind] if smoothing.kind == "spline" else [smoothing.kind, smoothing.degree]
+
+
+def _wxh(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

@@ -1,0 +1,210 @@
+"""From a capture to a cloud."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import DetectionError, InputError
+from slviewer.evaluation.compare import Comparison, compare
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
+from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
+from slviewer.pipeline.capture_phases import capture_texture, decode_capture, loss_warnings
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.frame_residuals import told
+from slviewer.pipeline.models import Model, check_accepted, frame_of, load_models, load_stereo, preferred, warn_if_stale
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.scale import told_scale
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.mesh import grid_triangles
+from slviewer.reconstruction.reconstruct import JUMP
+from slviewer.session.capture import Capture
+from slviewer.session.ply import write_ply
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.target.detect import board_mask, detect
+
+SAID_FROM = 1.2
+"""Times its predicted noise that a calibration's residual is, from which raising sigma is worth a sentence."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
+    measures the board. ``scale`` says, in words, what correction of scale is in it; ``masked`` is the share of the
+    pixels that were left out because no target pose lit what they look through, None for models that leave out none.
+    ``frame``: the one that the points are in, in words. ``raised``: the calibration's residuals over their predicted
+    noise, by which sigmas are raised.
+    """
+
+    cloud: Cloud
+    phases: Mapping[Axis, PhaseMap]
+    ply: Path
+    points: int
+    board: Comparison | None = None
+    scale: str = ""
+    masked: float | None = None
+    frame: str = ""
+    raised: float = 1.0
+
+    def text(self) -> str:
+        """For people."""
+        cloud = self.cloud
+        z, sigma = cloud.points[..., 2][cloud.mask], cloud.sigma_z[cloud.mask]
+        lines = [
+            f"{self.points} points by {cloud.model} from axis {cloud.axis}, z {np.percentile(z, 1):.0f}-"
+            f"{np.percentile(z, 99):.0f} mm, predicted depth noise {np.median(sigma):.3f} mm -> {self.ply}"
+        ]
+        if cloud.sigma_calibration is not None:
+            left = cloud.sigma_calibration[cloud.mask]
+            lines.append(
+                f"apart from a rigid motion, the calibration leaves {np.median(left):.4f} mm of depth uncertain in the "
+                f"median, {np.percentile(left, 95):.4f} mm at 95 % (1 sigma)"
+            )
+        if self.raised > SAID_FROM:
+            lines.append(
+                f"sigma was raised: the calibration's residuals in {cloud.axis} are {self.raised:.1f} times their "
+                "predicted noise, and what disturbs its phases disturbs this capture's as well"
+            )
+        if self.frame:
+            lines.append(f"frame: {self.frame}")
+        if self.scale:
+            lines.append(self.scale)
+        if self.masked is not None and self.masked > 0.005:
+            lines.append(f"{100 * self.masked:.1f} % of the pixels are masked: they look where no target pose was")
+        if self.board is not None:
+            lines += ["inside the board's outline:", self.board.text()]
+        return "\n".join(lines)
+
+
+def reconstruct(
+    session: SessionLike,
+    capture: str,
+    *,
+    model: str | None = None,
+    axis: Axis | None = None,
+    depth_range: tuple[float, float] | None = None,
+    out: Path | str | None = None,
+    grid: Path | str | None = None,
+    mesh: bool = False,
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Reconstruction:
+    """Reconstruct a capture, write it as PLY, and ``grid`` as an organised (h, w, 3) float32 .npy.
+
+    The PLY of a board pose holds the points inside the board's outline; a scan's holds every point. That of a ``mesh``
+    also holds the triangles between neighbouring pixels. ``depth_range`` (near, far) mm: the depths between which a
+    capture whose phase repeats has its surfaces; by default the calibrated ones.
+    """
+    with opened(session) as store:
+        check_accepted(store, accept_rejected)
+        name = model or preferred(store)
+        warn_if_stale(store, warn)
+        shot = store.load_capture(capture)
+        check_capture_sizes(store, [capture])
+        progress(0.1, "reading frames")
+        frames = shot.stack()
+        for sentence in told(store, capture, frames):
+            warn(f"{capture}: {sentence}")
+        progress(0.3, "decoding")
+        decoded = decode_capture(shot, frames, relative=True)
+        for message in loss_warnings(shot.sequence, frames, decoded):
+            warn(f"{capture}: {message}")
+        phases = absolute_phases(store, capture, decoded, depth_range, warn)
+        texture = capture_texture(shot, frames)
+        is_pose = shot.role == "calibration"
+        chosen = load_models(store, () if is_pose and model is None else (name,))
+        progress(0.6, "reconstructing")
+        clouds = {
+            n: capture_cloud(
+                store, m, shot, phases, axis=axis, texture=texture, accept_rejected=accept_rejected, warn=warn
+            )
+            for n, m in chosen.items()
+        }
+        cloud = clouds[name]
+        region = board_region(store, shot, texture, warn) if is_pose else None
+        board = None
+        if region is not None:
+            depth_range = load_stereo(store).depth_range_mm
+            board = compare("plane", clouds, lit(phases, clouds), region=region, depth_range=depth_range)
+        keep = cloud.mask if region is None else cloud.mask & region
+        if not keep.any():
+            raise InputError(
+                f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong to this camera "
+                "and projector, and is the scene within its depths?"
+            )
+        ply = Path(out) if out is not None else store.exports / f"{capture}_{name}{'_mesh' if mesh else ''}.ply"
+        progress(0.8, "writing")
+        ply.parent.mkdir(parents=True, exist_ok=True)
+        faces = triangles(cloud.points, keep) if mesh else None
+        notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}")
+        write_ply(ply, cloud.points[keep], texture[keep], scalars=cloud.sigmas(keep), faces=faces, notes=notes)
+        if grid is not None:
+            write_grid(Path(grid), cloud.points)
+        scale, fitted, frame = told_scale(store, name), chosen[name], frame_of(store, name)
+        masked = unsupported(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
+        raised = fitted.residuals_over_noise(cloud.axis) if isinstance(fitted, SplinedModel) else 1.0
+        progress(1.0, "reconstructed")
+    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked, frame, raised)
+
+
+def triangles(points: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """Faces (m, 3) int32 over the pixels ``keep`` (h, w) bool of organised points; surfaces end where depth jumps."""
+    kept = np.where(keep[..., None], points, np.float32(np.nan))
+    return grid_triangles(kept, JUMP * float(np.median(points[..., 2][keep])))
+
+
+def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
+    """(h, w) bool: the board's outline in a target pose; None, with a warning, where no board is found."""
+    board = load_stereo(store).board
+    if not board:
+        return None
+    try:
+        found = detect(Board.parse(board), texture)
+    except DetectionError as error:
+        warn(f"{shot.name}: {error}")
+        return None
+    return board_mask(Board.parse(board), found, texture.shape[:2])
+
+
+def lit(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:
+    """(h, w) bool: what a perfect decoder could have measured on the axis that the clouds came from."""
+    return phases[next(iter(clouds.values())).axis].lit
+
+
+def reconstruct_models(
+    store: Session,
+    chosen: Mapping[str, Model],
+    shot: Capture,
+    phases: Mapping[Axis, PhaseMap],
+    axis: Axis | None,
+    *,
+    accept_rejected: bool = False,
+    warn: Warn = unwarned,
+) -> dict[str, Cloud]:
+    """One cloud a model, all from the same axis so that they can be compared pixel by pixel."""
+    clouds: dict[str, Cloud] = {}
+    for name, model in chosen.items():
+        clouds[name] = capture_cloud(store, model, shot, phases, axis=axis, accept_rejected=accept_rejected, warn=warn)
+        axis = axis or clouds[name].axis
+    return clouds
+
+
+def unsupported(model: SplinedModel, phase: PhaseMap, region: np.ndarray | None = None) -> float:
+    """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are masked, because they
+    look through parts of camera or projector that no target pose lit."""
+    every = np.isfinite(model.points(phase, supported=False)[..., 2])
+    if region is not None:
+        every &= region
+    return float(1 - model.support(phase)[every].mean()) if every.any() else 0.0
+
+
+def write_grid(path: Path, points: np.ndarray) -> None:
+    """Write an organised cloud as .npy."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "wb") as file:  # a file object, so that NumPy adds no suffix of its own
+        np.save(file, points)

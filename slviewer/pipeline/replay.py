@@ -1,0 +1,110 @@
+"""Recorded captures as a rig: those of a session, or of a folder that can be imported, one after another."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.devices.protocols import Rig
+from slviewer.devices.replay import Recording, replayed
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import PatternSequence, parse_size
+from slviewer.pipeline.feedback import unwarned
+from slviewer.pipeline.import_captures import checked
+from slviewer.session.importers import frames, p18, procam_calibration
+from slviewer.session.importers.imported import Imports
+from slviewer.session.store import Session, is_session
+
+Layout = Literal["session", "p18", "procam-calibration", "frames"]
+Shot = tuple[np.ndarray, PatternSequence]
+
+
+class Reel:
+    """A rig that shows what was recorded; it answers to `sequence` alone until it is wound on."""
+
+    def __init__(self, shots: dict[str, Callable[[], Shot]]) -> None:
+        """`shots` read the frames (n, h, w) and the sequence of one capture each, by name, in order."""
+        self.names = list(shots)
+        self._shots, self._at = shots, 0
+        self._recording = Recording(*shots[self.names[0]]())
+        self.rig: Rig = replayed(self._recording)
+
+    @property
+    def sequence(self) -> PatternSequence:
+        """The patterns of the capture that is played."""
+        return self._recording.played[1]
+
+    @property
+    def has_dark(self) -> bool:
+        """Whether that capture holds a dark frame."""
+        return any(frame.kind == "black" for frame in self.sequence.frames)
+
+    def wind_on(self) -> None:
+        """Play the next capture; the first after the last. Raises InputError where it is not of the same rig."""
+        self._at = (self._at + 1) % len(self.names)
+        if len(self.names) > 1:
+            self._recording.play(*self._shots[self.names[self._at]]())
+
+
+def reel(
+    source: Path | str,
+    capture: str | None = None,
+    layout: Layout | None = None,
+    sequence: Path | str | None = None,
+    projector: str | None = None,
+) -> Reel:
+    """The captures in `source`, or the one of that name.
+
+    `layout` says what `source` is, by default whatever it looks like; `sequence` is the TOML that the layout frames
+    needs, `projector` its size, such as "912x1140", where it is not the layout's own. Raises InputError,
+    SessionError.
+    """
+    folder = Path(source).expanduser()
+    if layout == "session" or (layout is None and is_session(folder)):
+        shots = _recorded(folder)
+    else:
+        shots = _imported(folder, layout, sequence, projector)
+    if capture is not None and capture not in shots:
+        raise InputError(f"there is no capture {capture!r} in {folder}: the captures are {', '.join(shots) or 'none'}")
+    chosen = shots if capture is None else {capture: shots[capture]}
+    if not chosen:
+        raise InputError(f"{folder} holds no capture to play back: name a folder that does")
+    return Reel(chosen)
+
+
+def _recorded(folder: Path) -> dict[str, Callable[[], Shot]]:
+    with Session.open(folder) as store:
+        captures = store.captures()
+    return {capture.name: lambda shot=capture: (shot.frames, shot.sequence) for capture in captures}  # type: ignore[misc]
+
+
+def _imported(
+    folder: Path, layout: Layout | None, sequence: Path | str | None, projector: str | None
+) -> dict[str, Callable[[], Shot]]:
+    def read(recording) -> Shot:
+        found = checked(recording.read(), unwarned)
+        return found.frames, found.sequence
+
+    size: dict[str, Any] = {} if projector is None else {"projector": parse_size(projector)}
+    refusals = []
+    for name in [layout] if layout else ["frames"] if sequence else ["p18", "procam-calibration"]:
+        try:
+            found = _found(folder, name, sequence, size)
+        except InputError as error:
+            refusals.append(f"as {name}, {error}")
+            continue
+        return {recording.name: lambda one=recording: read(one) for recording in found.recordings}  # type: ignore[misc]
+    raise InputError(f"{folder} cannot be played back: {'; '.join(refusals)}")
+
+
+def _found(folder: Path, layout: str, sequence: Path | str | None, size: dict[str, Any]) -> Imports:
+    if layout == "p18":
+        return p18.read(folder, **size)
+    if layout == "procam-calibration":
+        return procam_calibration.read(folder, **size)
+    if layout != "frames":
+        raise InputError(f"no layout is called {layout!r}: use session, p18, procam-calibration or frames")
+    if sequence is None:
+        raise InputError("the layout frames needs the TOML that names each frame: give sequence")
+    return frames.read(folder, Path(sequence).expanduser(), **size)

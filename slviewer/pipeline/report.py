@@ -1,0 +1,260 @@
+"""A session as one self-contained HTML file."""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.observe import Observation
+from slviewer.calibration.pixelwise import PixelwiseModel, pixel_samples
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.lens import Lens
+from slviewer.pipeline.calibration_verdict import last_verdict
+from slviewer.pipeline.check import history
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.measured_views import measured_views
+from slviewer.pipeline.models import (
+    available,
+    load_model,
+    load_residuals,
+    load_stereo,
+    load_stereo_if_complete,
+    preferred,
+    recommended,
+    validation,
+)
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.scale import scale_factor, told_scale
+from slviewer.report.data import (
+    AcceptanceView,
+    CalibrationView,
+    CaptureRow,
+    DeviceParameters,
+    DriftRow,
+    ErrorMaps,
+    ModelsView,
+    PixelCurve,
+    PixelFitView,
+    PoseResiduals,
+    SessionData,
+    SpacingRow,
+    VerificationView,
+)
+from slviewer.report.page import write_page
+from slviewer.report.session import session_headlines, session_sections, session_title
+from slviewer.session.capture import Capture
+from slviewer.session.store import Session
+
+MOST_MAPS = 8
+"""Verified captures whose error maps are drawn; the tables hold them all."""
+
+
+def report(session: SessionLike, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> None:
+    """Write what a session holds and how well it is calibrated to ``out``."""
+    if Path(out).suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{out} is no HTML file: end its name in .html")
+    with opened(session) as store:
+        progress(0.1, "reading the session")
+        data = _data(store)
+        for message in data.warnings:
+            warn(message)
+        progress(0.4, "drawing")
+        title, subtitle = session_title(data)
+        write_page(out, title, subtitle, session_headlines(data), session_sections(data))
+    progress(1.0, "written")
+
+
+def _data(store: Session) -> SessionData:
+    stereo = load_stereo_if_complete(store)
+    observations = {o.name: o for o in load_observations(store, list(stereo.poses))} if stereo and stereo.poses else {}
+    stale = [
+        f"The {name} calibration was made from target poses that have since changed: run calibrate again."
+        for name in available(store)
+        if store.state_of(f"calibration/{name}") == "stale"
+    ]
+    fits: list[PixelFitView] = []
+    if stereo is not None and "pixelwise" in available(store):
+        model = load_model(store, "pixelwise")
+        assert isinstance(model, PixelwiseModel)
+        fits = [PixelFitView(axis, fit.rms_mm, fit.poses) for axis, fit in model.fits.items()]
+    excluded = store.excluded()
+    verdict = last_verdict(store)
+    judged = store.load_result("calibration/stereo", only=())[0].get("verdict") if stereo is not None else None
+    views, spacings = _verifications(store)
+    return SessionData(
+        name=store.folder.name,
+        captures=[_capture_row(c, stereo, excluded) for c in store.captures()],
+        calibration=None if stereo is None else _calibration(store, stereo, observations),
+        pixel_fits=fits,
+        verifications=views,
+        spacings=spacings,
+        warnings=stale,
+        verdict=verdict,
+        verdict_of_calibration=verdict is not None and judged == verdict.to_json(),
+        models=_models(store),
+        acceptances=_acceptances(store),
+        drifts=_drifts(store),
+        **measured_views(store),
+    )
+
+
+def _models(store: Session) -> ModelsView | None:
+    there = available(store)
+    if not there:
+        return None
+    splined = load_model(store, "splined") if "splined" in there else None
+    assert splined is None or isinstance(splined, SplinedModel)
+    return ModelsView(
+        used=preferred(store),
+        recommended=recommended(store),
+        comparison=validation(store),
+        splined=None if splined is None else splined.bundle.summary(),
+        scales={name: words for name in there if (words := told_scale(store, name))},
+    )
+
+
+def _results(store: Session, kind: str) -> list[str]:
+    return [name for name in store.result_names() if name.startswith(f"{kind}/")]
+
+
+def _acceptances(store: Session) -> list[AcceptanceView]:
+    found = []
+    for name in _results(store, "acceptance"):
+        meta = store.load_result(name, only=())[0]
+        found.append(AcceptanceView(meta["accepted"], meta["time"], store.state_of(name) == "stale"))
+    return found
+
+
+def _drifts(store: Session) -> list[DriftRow]:
+    if "stereo" not in available(store):
+        return []
+    now = store.input_hashes("calibration/stereo")["calibration/stereo"]
+    return [DriftRow(each.drift, each.time, each.calibration == now) for each in history(store)]
+
+
+def _verifications(store: Session) -> tuple[list[VerificationView], list[SpacingRow]]:
+    """What was measured of planes and spheres with the calibrations as they are, as `verify/<capture>` keeps it."""
+    labels = store.decision("names") or {}
+    views: list[VerificationView] = []
+    centres: dict[str, dict[str, np.ndarray]] = {}
+    for result in _results(store, "verify"):
+        name = result.removeprefix("verify/")
+        if store.state_of(result) != "fresh":
+            continue
+        meta, arrays = store.load_result(result)
+        if any(scale_factor(store, model) != used for model, used in meta.get("scales", {}).items()):
+            continue  # measured before its scale was corrected, or after a correction that is gone
+        figures = meta["models"]
+
+        def by_model(key: str, of: Mapping[str, Any] = figures) -> dict[str, float]:
+            return {m: np.nan if found[key] is None else float(found[key]) for m, found in of.items()}
+
+        title, rms, floor = str(labels.get(name, name)), by_model("rms_mm"), by_model("noise_floor_mm")
+        maps = {model: arrays[f"error_{model}"] for model in figures if f"error_{model}" in arrays}
+        views.append(
+            VerificationView(
+                name=title,
+                shape=meta["shape"],
+                incidence=meta["incidence"] or {},
+                points=max(int(found["points"]) for found in figures.values()),
+                set_aside={model: int(found["set_aside"]) for model, found in figures.items()},
+                coverage=by_model("coverage"),
+                rms_mm=rms,
+                noise_floor_mm=floor,
+                radius_mm=by_model("radius_mm"),
+                maps=ErrorMaps(title, maps, rms, list(floor.values())[-1]) if len(views) < MOST_MAPS else None,
+                masked=meta.get("masked", {}),
+            )
+        )
+        centres[title] = {model: np.array(centre) for model, centre in meta["centres_mm"].items()}
+    spacings = [
+        SpacingRow(
+            f"{a} to {b}", float("nan"), {m: float(np.linalg.norm(c - other[m])) for m, c in one.items() if m in other}
+        )
+        for (a, one), (b, other) in combinations(centres.items(), 2)
+        if one and other
+    ]
+    return views, spacings
+
+
+def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:
+    sequence = capture.sequence
+    why = ""
+    if capture.role == "scan":
+        state = "scan"
+    elif capture.name in excluded:
+        state, why = "excluded", excluded[capture.name]
+    elif stereo is None or not stereo.poses:
+        state = "waiting"
+    elif capture.name in stereo.poses:
+        state = "used"
+    else:
+        state, why = "left out", stereo.left_out.get(capture.name, "added after the calibration")
+    return CaptureRow(
+        name=capture.name,
+        role=capture.role,
+        state=state,  # type: ignore[arg-type]
+        camera=capture.size,
+        projector=sequence.projector_size,
+        frames=len(sequence.frames),
+        periods_px={axis: sequence.period_px(axis) for axis in sequence.axes},
+        why=why,
+        made=str(capture.meta.get("created", "")),
+    )
+
+
+def calibration_view(store: Session) -> CalibrationView:
+    """The session's stereo calibration as figures and tables show it, with every pose's residuals.
+
+    Raises InputError where there is none.
+    """
+    stereo = load_stereo(store)
+    return _calibration(store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))})
+
+
+def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str, Observation]) -> CalibrationView:
+    residuals = {}
+    for name, r in load_residuals(store).items():
+        if name in observations:
+            o = observations[name]
+            residuals[name] = PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
+    rig = stereo.rig
+    return CalibrationView(
+        camera=_parameters(rig.camera, stereo.focal_sigma_px.get("camera", np.nan)),
+        projector=_parameters(rig.projector, stereo.focal_sigma_px.get("projector", np.nan)),
+        R=rig.R,
+        t=rig.t,
+        target=stereo.board,
+        depth_range_mm=stereo.depth_range_mm or (np.nan, np.nan),
+        reprojection_rms_px=stereo.reprojection_rms_px,
+        pose_rms_px=stereo.pose_rms_px,
+        residuals=residuals,
+        features_set_aside=stereo.features_set_aside,
+    )
+
+
+def _parameters(lens: Lens, sigma: float) -> DeviceParameters:
+    return DeviceParameters(lens.K, lens.D, lens.size, sigma)
+
+
+def curve_at(
+    pixel: tuple[int, int],
+    model: PixelwiseModel,
+    stereo: StereoModel,
+    observations: Sequence[Observation],
+    axis: Axis,
+) -> PixelCurve | None:
+    """The data and the fit of one pixel (u, v); None where it was not fitted."""
+    u, v = pixel
+    fit = model.fits[axis]
+    phase, points = pixel_samples(observations, stereo, model, axis, pixel)
+    if not len(phase) or not np.isfinite(fit.coefficients[0, v, u]):
+        return None
+    x, y, z = points.T
+    return PixelCurve(pixel, axis, phase, z, x, y, fit.coefficients[:, v, u], fit.rms_mm[:, v, u])

@@ -1,0 +1,99 @@
+"""From what the operator chose to devices: a choice is a plain mapping, as the session keeps it.
+
+``{"driver": "simulated", "scale": 0.5, "seed": 0}`` for a rig that one driver makes, or
+``{"name": "bench", "camera": {"driver": …}, "projector": {"driver": …}}``; all other keys but `ABOUT` go to the driver.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from slviewer.devices.channel import Channel
+from slviewer.devices.drivers import Driver, driver, drivers
+from slviewer.devices.protocols import Rig
+from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.world import SimulatedWorld
+from slviewer.errors import InputError
+from slviewer.pipeline.replay import Reel, reel
+from slviewer.simulation.rig import letter
+from slviewer.target.board import Board
+
+Choice = Mapping[str, Any]
+
+ABOUT = ("name", "settle_ms", "focal_px", "exposure_ms", "gain")
+"""What a choice may say of any rig: its name, the delay of its light, the nominal focal length of its lens in camera
+px, and what its camera is set to where nobody asks for anything else."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A rig that can be opened; `world` is what stands before a simulated one, `focal_px` the lens's nominal focal
+    length in camera px, where it is known, `reel` what is played back.
+    """
+
+    rig: Rig
+    world: SimulatedWorld | None = None
+    focal_px: float | None = None
+    reel: Reel | None = None
+
+
+SetUp = Callable[[Choice, Board | None], Bench]
+
+
+def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = None) -> Bench:
+    """The devices of a choice, not opened yet; `board` is what stands before a simulated rig, `channel` leads to the
+    projector page where one is served.
+
+    Raises InputError for a choice that is none, DeviceError for a driver that cannot be used here.
+    """
+    options = {key: value for key, value in choice.items() if key not in (*ABOUT, "driver")}
+    focal, settle_ms = choice.get("focal_px"), float(choice.get("settle_ms", 0.0))
+    try:
+        if choice.get("driver") == "simulated":
+            bench = _simulated(board, **options)
+            return replace(bench, rig=replace(bench.rig, settle_ms=settle_ms))
+        if choice.get("driver") == "replay":
+            played = reel(**options)
+            return Bench(played.rig, focal_px=focal, reel=played)
+        if "driver" in choice:
+            chosen = driver(str(choice["driver"]))
+            if chosen.rig is None:
+                raise InputError(f"the driver {choice['driver']} offers no whole rig: choose a camera and a projector")
+            rig = chosen.rig(**options, **_wired(chosen, channel))
+            return Bench(replace(rig, settle_ms=settle_ms or rig.settle_ms), focal_px=focal)
+        camera, projector = (dict(options.pop(which)) for which in ("camera", "projector"))
+        eye, lamp = driver(camera.pop("driver")), driver(projector.pop("driver"))
+        if eye.camera is None or lamp.projector is None:
+            raise InputError("one of the drivers offers no such device: choose others")
+        rig = Rig(
+            str(choice.get("name", "rig")),
+            eye.camera(**camera, **_wired(eye, channel)),
+            lamp.projector(**projector, **_wired(lamp, channel)),
+            settle_ms,
+        )
+        return Bench(rig, focal_px=focal)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the rig {dict(choice)} cannot be set up ({error}): choose it again") from error
+
+
+def needs_page(choice: Choice) -> bool:
+    """Whether one of a choice's devices is reached through the projector page."""
+    parts = [choice, *(part for key in ("camera", "projector") if isinstance(part := choice.get(key), Mapping))]
+    return any(drivers()[str(part["driver"])].channel for part in parts if str(part.get("driver")) in drivers())
+
+
+def rig_factory(found: Driver) -> Callable[..., Any] | None:
+    """What the options of a choice go to that names `found` as the driver of its whole rig; None if it drives none."""
+    own: dict[str, Callable[..., Any]] = {"simulated": _simulated, "replay": reel}
+    return own.get(found.name, found.rig)
+
+
+def _wired(driver: Driver, channel: Channel | None) -> dict[str, Channel | None]:
+    return {"channel": channel} if driver.channel else {}
+
+
+def _simulated(board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0) -> Bench:
+    if preset != "letter":
+        raise InputError(f"no rig preset is called {preset!r}: use letter")
+    rig = letter(scale, seed)
+    return Bench(simulated_rig(world := SimulatedWorld(rig, board)), world, rig.camera.focal_px[0] * scale)

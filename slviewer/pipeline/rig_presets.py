@@ -1,0 +1,202 @@
+"""Rigs by name: choices of devices as TOML files, shipped in ``assets/rigs`` or the operator's own in the session.
+
+A file holds what `pipeline.rig_choice.set_up` takes, and `what`, a sentence about it. Whatever a file says is checked
+before a device is touched, so that a mistyped option is named and not ignored.
+"""
+
+import inspect
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from slviewer.devices.drivers import Driver, driver, drivers
+from slviewer.errors import InputError
+from slviewer.pipeline.rig_choice import ABOUT, Choice, rig_factory
+from slviewer.session.store import Session
+from slviewer.simulation.assets import asset_folder
+
+FOLDER = "rigs"
+_NUMBERS = ("settle_ms", "focal_px", "exposure_ms", "gain")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A rig with a name: `what` it is in a sentence, the `choice` it stands for, the file that says so, and `problem`,
+    why it cannot be used here and how to mend that, empty if it can.
+    """
+
+    name: str
+    what: str
+    choice: Mapping[str, Any]
+    source: Path
+    problem: str = ""
+
+
+def presets(session: Session | None = None) -> list[Preset]:
+    """The session's own rigs, then those that are shipped; a session's hides a shipped one of the same name."""
+    own = {} if session is None else session.rigs()
+    shipped = {path.stem: path for path in sorted(asset_folder(FOLDER).glob("*.toml")) if path.stem not in own}
+    return [_described(name, path) for name, path in {**own, **shipped}.items()]
+
+
+def rigs(session: Session | None = None) -> str:
+    """The rigs that can be chosen by name, in words."""
+    lines = ["rigs:"]
+    for preset in presets(session):
+        lines.append(f"  {preset.name}: {preset.what}" + (f" (not here: {preset.problem})" if preset.problem else ""))
+    return "\n".join(lines)
+
+
+def load_rig(path_or_name: Path | str, session: Session | None = None) -> dict[str, Any]:
+    """The checked choice in a TOML file, or of the preset of that name.
+
+    Raises InputError for a file or a name that does not exist, an unknown key or driver, DeviceError where a package is
+    missing.
+    """
+    path = Path(path_or_name).expanduser()
+    if path.suffix.lower() == ".toml" or path.is_file():
+        if not path.is_file():
+            raise InputError(
+                f"there is no file {path}: name a TOML file that describes a rig, or one of {_names(session)}"
+            )
+        found = _read(path.stem, path)
+    else:
+        named = {preset.name: preset for preset in presets(session)}
+        if str(path_or_name) not in named:
+            raise InputError(f"no rig is called {str(path_or_name)!r}: use {_names(session)}, or name a TOML file")
+        found = _read(str(path_or_name), named[str(path_or_name)].source)
+    for name in _driver_names(found.choice):
+        driver(name)  # raises where it cannot be used
+    return dict(found.choice)
+
+
+def save_rig(session: Session, name: str, choice: Choice, what: str = "") -> Preset:
+    """Keep a choice in the session under a name, in place of an older one. Raises InputError for one that is none."""
+    check_choice(choice, f"the rig {name}")
+    return _read(name, session.save_rig(name, to_toml({"what": what, **choice} if what else choice)))
+
+
+def check_choice(choice: Choice, where: str) -> None:
+    """Raise InputError, with `where` the mistake stands, unless `choice` names devices and only options they know."""
+    for key in _NUMBERS:
+        value = choice.get(key, 1)
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not 0 <= value < float("inf")
+            or (not value and key != _NUMBERS[0])
+        ):
+            raise InputError(f"{where}: {key} = {value!r} is no number above 0: mend it")
+    if not isinstance(choice.get("name", ""), str):
+        raise InputError(f"{where}: name = {choice['name']!r} is no text: mend it")
+    if "driver" in choice:
+        given = {key: value for key, value in choice.items() if key not in (*ABOUT, "driver")}
+        if {"camera", "projector"} & set(given):
+            raise InputError(f"{where} names a driver of a whole rig and a camera or a projector: keep one of both")
+        _check_options(str(choice["driver"]), "rig", given, where)
+        return
+    unknown = sorted(set(choice) - {*ABOUT, "camera", "projector"})
+    if unknown:
+        raise InputError(f"{where} has the unknown key {unknown[0]!r}: use camera, projector, {', '.join(ABOUT)}")
+    for part in ("camera", "projector"):
+        device = choice.get(part)
+        if not isinstance(device, Mapping) or "driver" not in device:
+            raise InputError(f'{where} does not say which {part}: add [{part}] with driver = "…", or a driver of a rig')
+        options = {key: value for key, value in device.items() if key != "driver"}
+        _check_options(str(device["driver"]), part, options, f"{where}, {part}")
+
+
+def to_toml(choice: Choice) -> str:
+    """The TOML text of a choice; `tomllib` reads the same from it. What is None is left out.
+
+    Raises InputError for values that TOML does not hold.
+    """
+    plain = {key: value for key, value in choice.items() if value is not None}
+    lines = [f"{_key(key)} = {_value(value)}" for key, value in plain.items() if not isinstance(value, Mapping)]
+    for key, table in plain.items():
+        if isinstance(table, Mapping):
+            lines += ["", f"[{_key(key)}]"]
+            lines += [f"{_key(inner)} = {_value(value)}" for inner, value in table.items() if value is not None]
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def _read(name: str, path: Path) -> Preset:
+    try:
+        choice = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} cannot be read as TOML ({error}): mend it") from error
+    what = choice.pop("what", "")
+    if not isinstance(what, str):
+        raise InputError(f"{path}: what = {what!r} is no text: mend it")
+    check_choice(choice, str(path))
+    return Preset(name, what, choice, path)
+
+
+def _described(name: str, path: Path) -> Preset:
+    """The preset in a file whatever is wrong with it, which its `problem` says."""
+    try:
+        found = _read(name, path)
+        needed = (drivers()[driver_name] for driver_name in dict.fromkeys(_driver_names(found.choice)))
+        return replace(found, problem="; ".join(each.missing for each in needed if each.missing))
+    except InputError as error:
+        return Preset(name, "", {}, path, str(error))
+
+
+def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:
+    if name not in drivers():
+        offering = sorted(d.name for d in drivers().values() if _factory(d, part) is not None)
+        raise InputError(f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}")
+    make = _factory(drivers()[name], part)
+    if make is None:
+        raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
+    parameters = inspect.signature(make).parameters.values()
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    # what the program supplies nobody writes into a file
+    provided = ("board", *(("channel",) if drivers()[name].channel else ()))
+    known = [parameter for parameter in parameters if parameter.name not in provided]
+    taken = [parameter.name for parameter in known]
+    unknown = sorted(set(options) - set(taken))
+    if unknown:
+        use = f"use {', '.join(taken)}" if taken else "it takes none"
+        raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}: {use}")
+    required = [p.name for p in known if p.default is p.empty and p.name not in options]
+    if required:
+        raise InputError(f"{where}: the driver {name} needs {required[0]}: add it")
+
+
+def _factory(found: Driver, part: str) -> Any:
+    return rig_factory(found) if part == "rig" else getattr(found, part)
+
+
+def _driver_names(choice: Choice) -> list[str]:
+    if "driver" in choice:
+        return [str(choice["driver"])]
+    return [str(choice[part]["driver"]) for part in ("camera", "projector")]
+
+
+def _names(session: Session | None) -> str:
+    return ", ".join(preset.name for preset in presets(session))
+
+
+def _key(key: Any) -> str:
+    text = str(key)
+    return text if text and all(c.isascii() and (c.isalnum() or c in "-_") for c in text) else _value(text)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str | Path):
+        return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_value(each) for each in value)}]"
+    if isinstance(value, Mapping):
+        inside = ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None)
+        return f"{{{inside}}}"
+    raise InputError(f"{value!r} cannot stand in a TOML file: use text, numbers, true or false, or lists of them")

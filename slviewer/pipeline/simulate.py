@@ -1,0 +1,110 @@
+"""A session filled by the simulated rig, with the truth in a file of its own."""
+
+import json
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.session.importers.imported import ImportedCapture
+from slviewer.session.ply import write_ply
+from slviewer.session.store import Session
+from slviewer.simulation.boards import printed_board
+from slviewer.simulation.plans import letter_plan, moved_objects, target_poses
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.scenes import Scene
+from slviewer.simulation.truth import rig_record, scene_record
+from slviewer.simulation.turning import stone, turning
+from slviewer.target.board import Board
+
+TARGET = "circles:21x16:9"
+TRUTH = "truth.json"
+"""In the session's folder: read by nothing but what scores a result."""
+KINDS = ("pose", "plane", "sphere", "object", "turn")
+PRESETS = ("letter", "turn")
+NOMINAL = "stone.ply"
+"""Beside the truth: the surface of what turns, in its own frame, for comparing with."""
+MIN_POSES = 3
+
+
+def simulate(
+    session: Path | str,
+    *,
+    preset: str = "letter",
+    scale: float = 1.0,
+    poses: int = 25,
+    seed: int = 0,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> list[str]:
+    """Make a session with ``pose_XX`` (both axes), ``plane_01`` ... ``plane_10``, ``sphere_1`` ... ``sphere_6`` and
+    ``object_r1`` ... ``object_r3`` (axis x), as the simulated rig sees them; returns their names.
+
+    The preset "turn" has, beside the target poses, ``object_r1`` ... ``object_r3`` turned by up to 15 degrees from one
+    to the next, and ``turn_01`` ... ``turn_12``, another object on a turntable in steps of 30 degrees.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"no rig preset is called {preset!r}: use {' or '.join(PRESETS)}")
+    if not MIN_POSES <= poses <= 200:
+        raise InputError(f"{poses} target poses cannot be simulated: ask for {MIN_POSES} to 200")
+    board = Board.parse(TARGET)
+    rig = letter(scale, seed)
+    plan = letter_plan(rig, board, poses) if preset == "letter" else turn_plan(rig, board, poses)
+    both = p18(rig.projector.size)
+    only_x = one_axis(both, "x")
+    truth: dict[str, Any] = {"preset": preset, "scale": scale, "seed": seed, "target": TARGET, "rig": rig_record(rig)}
+
+    def rendered(scenes: dict[str, Scene], sequence: PatternSequence) -> Iterator[ImportedCapture]:
+        """One capture after another; the next one is rendered while one is saved."""
+        source = f"simulated: {preset}, scale {scale:g}, seed {seed}"
+        numbers = {name: i for i, name in enumerate(plan)}
+        with ThreadPoolExecutor(1) as renderer:
+            waiting = deque[Future[np.ndarray]]()
+            ahead = iter(scenes.items())
+            for name in scenes:
+                while len(waiting) < 2 and (following := next(ahead, None)):
+                    work = Renderer(rig, following[1]).capture
+                    waiting.append(renderer.submit(work, sequence, numbers[following[0]]))
+                progress(numbers[name] / len(plan), f"rendering {name}")
+                yield ImportedCapture(name, sequence, waiting.popleft().result(), None, source)
+
+    with Session.create(session) as store:
+        groups = {kind: {n: s for n, s in plan.items() if n.startswith(f"{kind}_")} for kind in KINDS}
+        scans = {n: s for n, s in plan.items() if n not in groups["pose"]}
+        saved = store.save_captures(rendered(groups["pose"], both), "calibration", board=board)
+        saved += store.save_captures(rendered(scans, only_x), "scan")
+        for kind, scenes in groups.items():
+            if not scenes:
+                continue
+            truth[f"{kind}s"] = {name: scene_record(scene) for name, scene in scenes.items()}
+        (store.folder / TRUTH).write_text(json.dumps(truth, indent=1) + "\n")
+        if groups["turn"]:
+            vertices, triangles = stone()
+            write_ply(store.folder / NOMINAL, vertices, faces=triangles)
+    progress(1.0, "simulated")
+    return [capture.name for capture in saved]
+
+
+def turn_plan(rig: SimulatedRig, board: Board, poses: int) -> dict[str, Scene]:
+    """What the preset "turn" puts before its rig, by name."""
+    targets = {
+        f"pose_{i:02d}": printed_board(board, pose, seed=rig.seed)
+        for i, pose in enumerate(target_poses(rig, board, poses), 1)
+    }
+    return {**targets, **moved_objects(), **turning()}
+
+
+def one_axis(sequence: PatternSequence, axis: Axis) -> PatternSequence:
+    """The frames of one axis, and one texture."""
+    frames = [f for f in sequence.frames if f.axis == axis]
+    texture = [f for f in sequence.frames if f.kind == "texture"][:1]
+    return replace(sequence, frames=(*frames, *texture))

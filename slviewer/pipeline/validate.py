@@ -1,0 +1,122 @@
+"""Each calibration measured on target poses that it was not made from."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from slviewer.calibration.anchored import calibrate_anchored
+from slviewer.calibration.centres import centred
+from slviewer.calibration.observe import Observation
+from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
+from slviewer.calibration.splined.model import calibrate_splined
+from slviewer.calibration.stereo import StereoModel, calibrate_stereo
+from slviewer.errors import CalibrationRejected, InputError, UsageError
+from slviewer.evaluation.crossvalidation import FOLDS, CrossValidation, HeldOut, gathered, measure_held_out, split
+from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.models import (
+    MODELS,
+    VALIDATION,
+    available,
+    load_stereo,
+    preferred,
+    warn_if_frame_changed,
+    warn_if_stale,
+)
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.poses import load_observations
+from slviewer.reconstruction.reconstruct import Model
+
+Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], Model]
+FITS: dict[str, Fit] = {
+    "stereo": lambda observations, stereo, progress: stereo,
+    "pixelwise": calibrate_pixelwise,
+    "anchored": lambda observations, stereo, progress: calibrate_anchored(observations, stereo, progress=progress),
+    "splined": calibrate_splined,
+}
+"""How each model is made from the poses that stereo was made from."""
+
+
+def validate(
+    session: SessionLike,
+    *,
+    models: Sequence[str] = (),
+    folds: int = FOLDS,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> CrossValidation:
+    """Calibrate from all poses but a fold of them, measure that fold's boards, and so on for every fold.
+
+    ``models``: those to compare; by default all that the session holds. Nothing is decoded again: the poses are read
+    from what the session keeps of them. The result stays in the session as ``calibration/validation``, and the model
+    that it recommends becomes the one that is used where none is named.
+    """
+    with opened(session, write=True) as store:
+        stereo = load_stereo(store)
+        if not stereo.poses:
+            raise InputError("this calibration was made elsewhere, without target poses to leave out")
+        names = [name for name in MODELS if name in (models or available(store))]
+        if not names:
+            raise UsageError(f"no model is called {', '.join(models)}: use {', '.join(MODELS)}")
+        warn_if_stale(store, warn)
+        kept = load_observations(store, list(stereo.poses))
+        if missing := sorted(set(stereo.poses) - {o.name for o in kept}):
+            raise InputError(
+                f"the session no longer holds what {', '.join(missing)} said: run `slviewer calibrate` again"
+            )
+        found = cross_validate(centred(kept, stereo), stereo, names, folds, progress)
+        for model, why in found.failed.items():
+            warn(f"{model} is not judged: {why}")
+        judged = [f"calibration/{name}" for name in found.models if name in available(store)]
+        inputs = store.input_hashes(*stereo.poses, *dict.fromkeys(["calibration/stereo", *judged]))
+        before = preferred(store)
+        store.save_result(VALIDATION, {"validation": found.to_json(), "inputs": inputs}, {})
+        warn_if_frame_changed(store, before, warn)
+        progress(1.0, "validated")
+    return found
+
+
+def cross_validate(
+    observations: Sequence[Observation],
+    stereo: StereoModel,
+    models: Sequence[str],
+    folds: int = FOLDS,
+    progress: Progress = unheard,
+) -> CrossValidation:
+    """The same for poses that are at hand, with circles at their centres, and the calibration made from all of them."""
+    depths = {o.name: float(np.median(_depths(o, stereo))) for o in observations}
+    parts = split(depths, folds)
+    axis = best_axis(observations, stereo)
+    failed: dict[str, str] = {}
+    measured: list[Mapping[str, Mapping[str, HeldOut]]] = []
+    for k, fold in enumerate(parts):
+        report = part(progress, k / len(parts), (k + 1) / len(parts))
+        training = [o for o in observations if o.name not in fold]
+        try:
+            without = calibrate_stereo(training, stereo.rig.projector.size, stereo.board)
+        except CalibrationRejected as error:
+            raise InputError(
+                f"without {', '.join(fold)} the rig cannot be calibrated, and nothing can be told of poses that are "
+                f"left out ({error}): capture more poses"
+            ) from error
+        fitted: dict[str, Model] = {}
+        for i, name in enumerate(n for n in models if n not in failed):
+            fitting = part(report, i / (len(models) + 1), (i + 1) / (len(models) + 1))
+            doing = f"{name} without fold {k + 1} of {len(parts)}"
+            fitting(0.0, doing)
+            try:
+                fitted[name] = FITS[name](training, without, partial(_told, fitting, doing))
+            except (CalibrationRejected, InputError) as error:
+                failed[name] = str(error)
+        report(len(models) / (len(models) + 1), f"measuring fold {k + 1} of {len(parts)}")
+        measured.append({o.name: measure_held_out(fitted, o, axis, stereo.rig) for o in observations if o.name in fold})
+    return gathered(models, measured, parts, failed)
+
+
+def _told(progress: Progress, doing: str, share: float) -> None:
+    progress(share, doing)
+
+
+def _depths(observation: Observation, stereo: StereoModel) -> np.ndarray:
+    T = stereo.poses[observation.name]
+    return np.asarray((observation.points @ T[:3, :3].T + T[:3, 3])[:, 2])

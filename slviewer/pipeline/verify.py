@@ -1,0 +1,137 @@
+"""Measuring known shapes with each model, and comparing."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import InputError, UsageError
+from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.render import render
+from slviewer.evaluation.sphere import SphereResult
+from slviewer.fringe.sequence import Axis
+from slviewer.pipeline.capture_clouds import check_capture_sizes
+from slviewer.pipeline.capture_phases import capture_texture, decoded, loss_warnings
+from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.frame_residuals import told
+from slviewer.pipeline.models import check_accepted, load_models, load_stereo, warn_if_stale
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.reconstruct import board_region, lit, reconstruct_models, unsupported
+from slviewer.pipeline.scale import told_scale
+
+Shape = Literal["plane", "sphere"]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The comparison of the models on each capture.
+
+    ``masked``: {capture: {model: share of the shape's pixels that it leaves out because no target pose lit what they
+    look through}}, for models that do. ``scales``: {model: what correction of scale is in it, in words}.
+    """
+
+    captures: Mapping[str, Comparison]
+    masked: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    scales: Mapping[str, str] = field(default_factory=dict)
+
+    def centre_distances_mm(self) -> dict[tuple[str, str], dict[str, float]]:
+        """{(capture, capture): {model: mm}}: distances between the spheres' centres; empty for planes."""
+        found = {}
+        for (a, one), (b, other) in combinations(self.captures.items(), 2):
+            distances = {
+                model: float(np.linalg.norm(result.sphere.centre - partner.sphere.centre))
+                for model, result in one.results.items()
+                if isinstance(result, SphereResult) and isinstance(partner := other.results[model], SphereResult)
+            }
+            if distances:
+                found[a, b] = distances
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``verify --json``, and for spheres the distances between their centres."""
+        data: dict[str, Any] = {"captures": {name: comparison.to_dict() for name, comparison in self.captures.items()}}
+        if distances := self.centre_distances_mm():
+            data["centre_distances_mm"] = {f"{a} - {b}": found for (a, b), found in distances.items()}
+        return data
+
+    def text(self) -> str:
+        """For people."""
+        blocks = [f"{name}:\n{comparison.text()}" for name, comparison in self.captures.items()]
+        if distances := self.centre_distances_mm():
+            table = [
+                {"centres": f"{a} - {b}"} | {f"{model} mm": mm for model, mm in found.items()}
+                for (a, b), found in distances.items()
+            ]
+            blocks.append(f"distances between the centres:\n{render(table)}")
+        for name, shares in self.masked.items():
+            blocks += [
+                f"{name}: {model} leaves out {100 * share:.1f} % of the shape's pixels, which look where no target "
+                "pose was"
+                for model, share in shares.items()
+                if share > 0.005
+            ]
+        blocks += [f"{model}: {words}" for model, words in self.scales.items()]
+        return "\n".join(blocks)
+
+
+def verify(
+    session: SessionLike,
+    captures: Sequence[str],
+    shape: Shape,
+    *,
+    models: Sequence[str] = (),
+    depth_range: tuple[float, float] | None = None,
+    radius: float | None = None,
+    axis: Axis | None = None,
+    accept_rejected: bool = False,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Verification:
+    """Fit a plane or a sphere to each capture, by each model, over the pixels that all of them measure.
+
+    ``depth_range`` bounds R2 in mm; by default the depths of the board poses. ``radius`` mm,
+    roughly, helps to find a sphere; the fitted radius stays free, as in the Letter's Table 2.
+    """
+    if not captures:
+        raise UsageError("no capture named: give the captures to measure, for instance plane_01 plane_02")
+    if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
+        raise UsageError(f"the range {depth_range[0]:g} {depth_range[1]:g} is empty: give near and far in mm")
+    if radius is not None and not radius > 0:
+        raise UsageError(f"a radius of {radius:g} mm is not possible: give a positive one")
+    results: dict[str, Comparison] = {}
+    masked: dict[str, dict[str, float]] = {}
+    with opened(session) as store:
+        check_accepted(store, accept_rejected)
+        chosen = load_models(store, models)
+        warn_if_stale(store, warn)
+        reach = depth_range or load_stereo(store).depth_range_mm
+        check_capture_sizes(store, captures)
+        for i, (shot, frames, phases) in enumerate(decoded(store, captures)):
+            for sentence in told(store, shot.name, frames):
+                warn(f"{shot.name}: {sentence}")
+            for message in loss_warnings(shot.sequence, frames, phases):
+                warn(f"{shot.name}: {message}")
+            progress(i / len(captures), f"measuring {shot.name}")
+            clouds = reconstruct_models(store, chosen, shot, phases, axis, accept_rejected=accept_rejected, warn=warn)
+            region: np.ndarray | None = None
+            if shape == "plane" and shot.role == "calibration":
+                region = board_region(store, shot, capture_texture(shot, frames), warn)
+            try:
+                result = compare(shape, clouds, lit(phases, clouds), region=region, depth_range=reach, radius=radius)
+            except InputError as error:
+                raise InputError(f"{shot.name}: {error}") from error
+            for message in result.warnings:
+                warn(f"{shot.name}: {message}")
+            results[shot.name] = result
+            axis_used = next(iter(clouds.values())).axis
+            masked[shot.name] = {
+                name: unsupported(model, phases[axis_used], result.region)
+                for name, model in chosen.items()
+                if isinstance(model, SplinedModel)
+            }
+        scales = {name: words for name in chosen if (words := told_scale(store, name))}
+        progress(1.0, "measured")
+    return Verification(results, masked, scales)

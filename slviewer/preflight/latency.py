@@ -1,0 +1,128 @@
+"""How long light takes from the projector's word to the camera's image, and whether its images are fresh."""
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.pipeline.check_results import Check
+from slviewer.preflight.bench import Bench
+
+_CHANGES = 8
+_NEAR, _NEAREST = (
+    0.05,
+    0.4,
+)  # share of a change that may be missing from one that has arrived, and that may under flicker
+_GIVE_UP_S = 1.2
+_PROOFS = 3
+_LONG_MS = 250.0
+_FEWEST_LIT = 0.01
+
+
+@dataclass(frozen=True)
+class _Change:
+    """When each image after a change was begun, in s since the projector said "shown", until one showed the change."""
+
+    begun: tuple[float, ...]
+    arrived: bool
+
+    def arrival_ms(self, stale: int) -> float:
+        """When the first right image was begun, where images are so many behind; 0 for the very first."""
+        place = len(self.begun) - 1 - stale
+        return 1000 * self.begun[place] if place > 0 else 0.0
+
+
+def latency(bench: Bench) -> tuple[Check, float | None]:
+    """The check, and the `settle_ms` that follows from it; fills in the bench's frame time, delay and stale images."""
+    if bench.lit.mean() < _FEWEST_LIT:
+        return Check("latency", "unknown", "The delay cannot be measured: no change of light is seen.", "", {}), None
+    begun = [bench.timed()[0] for _ in range(6)]
+    bench.frame_ms = 1000 * float(np.median(np.diff(begun)))
+    changes = [_change(bench, i) for i in range(_CHANGES)]
+    if not all(change.arrived for change in changes):
+        lost = sum(not change.arrived for change in changes)
+        return (
+            Check(
+                "latency",
+                "bad",
+                f"After {lost} of {_CHANGES} changes the camera saw nothing new within {_GIVE_UP_S:g} s.",
+                "Check that the projector really changes its picture, and that the camera sends fresh images.",
+                {"changes": _CHANGES, "unseen": lost},
+            ),
+            None,
+        )
+    settle = _settle_ms([change.arrival_ms(0) for change in changes], bench.frame_ms)
+    bench.stale = max(_stale(bench, settle, i) for i in range(_PROOFS))
+    fresh = [change.arrival_ms(bench.stale) for change in changes]
+    settle = _settle_ms(fresh, bench.frame_ms)
+    bench.settle_ms = settle
+    images = [len(change.begun) - 1 - bench.stale for change in changes]
+    figures = {
+        "latency_ms": round(max(fresh), 1),
+        "median_ms": round(float(np.median(fresh)), 1),
+        "latency_frames": round(max(fresh) / bench.frame_ms, 2) if bench.frame_ms else 0.0,
+        "images_before_it": max(0, *images),
+        "frame_ms": round(bench.frame_ms, 2),
+        "settle_ms": settle,
+        "stale_images": bench.stale,
+    }
+    if bench.stale:
+        many = "one image" if bench.stale == 1 else f"{bench.stale} images"
+        return (
+            Check(
+                "latency",
+                "bad",
+                f"The camera is {many} behind: it hands out images that are older than the request, however long one "
+                "waits.",
+                "Switch the camera's buffering off, or let its driver discard old images; a longer wait does not help.",
+                figures,
+            ),
+            settle,
+        )
+    if settle == 0:
+        said = "Light arrives as soon as the projector says so: the first image after each change is right."
+    else:
+        said = (
+            f"Light arrives up to {max(fresh):.0f} ms ({max(fresh) / bench.frame_ms:.1f} camera frames) after the "
+            f"projector's word; captures wait {settle:g} ms."
+        )
+    long = settle > _LONG_MS
+    remedy = "Switch the projector's picture processing off (game mode), so that captures are quicker." if long else ""
+    return Check("latency", "warning" if long else "good", said, remedy, figures), settle
+
+
+def _change(bench: Bench, i: int) -> _Change:
+    """One change from dark to white or back; each begins at another moment of the camera's own clock."""
+    target = 0.0 if i % 2 == 0 else 1.0  # the references leave it white
+    time.sleep(bench.frame_ms / 1000 * i / _CHANGES)
+    bench.show(255 if target else None, "delay of the light")
+    shown, begun = time.monotonic(), []
+    while True:
+        begin, image = bench.timed()
+        begun.append(begin - shown)
+        if abs(bench.share(image, bench.lit) - target) < _near(bench):
+            return _Change(tuple(begun), True)
+        if begin - shown > _GIVE_UP_S:
+            return _Change(tuple(begun), False)
+
+
+def _stale(bench: Bench, settle_ms: float, i: int) -> int:
+    """How many images are still old after a wait that is long enough."""
+    target = 0.0 if i % 2 == 0 else 1.0
+    bench.show(255 if target else None, "freshness of the images")
+    time.sleep((2 * settle_ms + bench.frame_ms) / 1000)
+    old = 0
+    while old < 8 and abs(bench.share(bench.grab(), bench.lit) - target) >= _near(bench):
+        old += 1
+    return old
+
+
+def _near(bench: Bench) -> float:
+    return min(_NEAREST, max(_NEAR, 5 * bench.unsteady))
+
+
+def _settle_ms(arrivals_ms: list[float], frame_ms: float) -> float:
+    """The worst arrival, and half a frame because another one may be worse; 0 where every first image was right."""
+    worst = max(arrivals_ms)
+    return float(math.ceil(worst + 0.5 * frame_ms)) if worst else 0.0

@@ -1,0 +1,57 @@
+"""Did anything move while the rig was looked at?"""
+
+import numpy as np
+
+from slviewer.pipeline.check_results import Check
+from slviewer.preflight.bench import Bench
+from slviewer.preflight.burst import Burst
+
+_BLOCK = 6  # sampled pixels
+_SIGMAS = 8.0
+_CHANGE = 0.04  # of the projector's light
+_SOMETHING, _MUCH = 0.004, 0.05  # shares of what is lit
+
+
+def stillness(bench: Bench, burst: Burst, last_white: np.ndarray) -> Check:
+    """White images of the beginning, the middle and the end, block by block, whatever the light as a whole did."""
+    blocks = np.stack([_blocks(image, bench.lit) for image in (bench.white, *burst.white, last_white)])
+    seen = np.isfinite(blocks[0])
+    if not seen.any():
+        return Check("motion", "unknown", "Motion cannot be seen: too little is lit.", "", {})
+    blocks = blocks[:, seen]
+    blocks = np.stack([_with_light_of(image, blocks[0]) for image in blocks])
+    noise = 1.4826 * float(np.median(np.abs(np.diff(blocks[1:-1], axis=0)))) / np.sqrt(2)
+    limit = max(_SIGMAS * np.sqrt(2) * noise, _CHANGE * bench.contrast)
+    moved = (np.abs(blocks[1:] - blocks[0]) > limit).mean(axis=1)
+    share = float(moved.max())
+    figures = {"share_that_moved": round(share, 4), "limit_levels": round(limit, 2)}
+    if share > _SOMETHING:
+        return Check(
+            "motion",
+            "bad" if share > _MUCH else "warning",
+            f"{100 * share:.1f} % of the lit image changed while nothing should have: something moved.",
+            "Let nothing move in front of the rig, stand it firmly, then check again.",
+            figures,
+        )
+    return Check("motion", "good", "Nothing moved.", "", figures)
+
+
+def _with_light_of(image: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Blocks as they would be with the lamp and the room of the other image; most of them see the same scene."""
+    here = np.ones(len(image), bool)
+    fitted = image
+    for _ in range(3):
+        gain, offset = np.polyfit(image[here], other[here], 1)
+        fitted = gain * image + offset
+        rest = np.abs(fitted - other)
+        here = rest <= 3 * np.median(rest) + 1e-6
+    return fitted
+
+
+def _blocks(image: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """(n,) means of square blocks; NaN where not all of a block is lit."""
+    height, width = (size // _BLOCK * _BLOCK for size in image.shape)
+    shape = (height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
+    mean = image[:height, :width].reshape(shape).mean(axis=(1, 3))
+    whole = lit[:height, :width].reshape(shape).all(axis=(1, 3))
+    return np.where(whole, mean, np.nan).ravel()

@@ -1,0 +1,297 @@
+"""How long the main stages take, beside what they cannot beat."""
+
+import resource
+import sys
+import tempfile
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.calibration.observe import Observation, Smoothing, smooth_axes
+from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel, calibrate_pixelwise
+from slviewer.calibration.splined.compiled import CELLS_ACROSS, DEPTHS, Compiled
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.calibration.stereo import StereoModel
+from slviewer.evaluation.render import render
+from slviewer.fringe import kernels_coded, kernels_levels
+from slviewer.fringe.decode import code_rules, decode, grey_scale, ladder_of, shifts_of, steps_of
+from slviewer.fringe.layout import layout
+from slviewer.fringe.noise import measure_noise
+from slviewer.fringe.presets import multifrequency, p18
+from slviewer.fringe.reference import decode_reference
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.threshold import fringe_mean
+from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.feedback import Progress, part, unheard
+from slviewer.pipeline.models import load_model, load_stereo
+from slviewer.pipeline.open_session import opened
+from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.simulate import TARGET, one_axis, simulate
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.onepass import OnePass
+from slviewer.session.ply import write_ply
+from slviewer.simulation.plans import letter_plan
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.validation.bench_floors import beside, fastest, median, megabytes, row, through
+from slviewer.validation.bench_gpu import gpu_rows
+from slviewer.validation.bench_peers import fringes_row, icp_rows, missing
+
+PERIOD_PX = 18.0
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Stages as rows: milliseconds, MB moved, the floor, the ratios and the target. ``missing``: peers not there."""
+
+    rows: list[Row]
+    peak_memory_gb: float | None
+    missing: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """The rows as they are."""
+        return {"stages": self.rows, "peak_memory_gb": self.peak_memory_gb, "missing": list(self.missing)}
+
+    def text(self) -> str:
+        """For people."""
+        lines = [render(self.rows), *self.missing]
+        if self.peak_memory_gb is not None:
+            lines.append(f"peak memory of the whole run {self.peak_memory_gb:.2f} GB")
+        return "\n".join(lines)
+
+
+def bench(*, calibration: bool = False, scale: float = 1.0, progress: Progress = unheard) -> Benchmark:
+    """Time the stages from a rendered pose to a file, with the peers that are installed; with ``calibration``, also the
+    pixel-wise fit of 25 recorded poses, and all of their calibration."""
+    progress(0.0, "rendering a pose")
+    rig = letter(scale)
+    plan = letter_plan(rig, poses=3)
+    sequence = one_axis(p18(rig.projector.size), "x")
+    renderer = Renderer(rig, plan["pose_01"])
+    frames = renderer.capture(sequence)
+    rendering = median(lambda: renderer.capture(sequence), 3) / len(frames)
+    size = f"{frames.shape[2]}x{frames.shape[1]}"
+    rows = [row(f"render one frame, {size}", rendering, frames[0].nbytes / 1e6, target="15 ms")]
+    progress(0.1, "decoding")
+    decoding, kernel = _decoding(sequence, frames)
+    rows += decoding
+    progress(0.2, "measuring")
+    rows += _measuring(sequence, frames)
+    progress(0.3, "live")
+    rows += _live(rig, renderer)
+    progress(0.35, "peers")
+    peers, absent = _peers(rig, renderer, plan, kernel)
+    memory = None
+    if calibration:
+        rows += _calibration(scale, part(progress, 0.4, 1.0))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        memory = peak / (1e9 if sys.platform == "darwin" else 1e6)
+    progress(1.0, "measured")
+    return Benchmark(rows + peers, memory, absent)
+
+
+def _decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:
+    """Phase steps and Gray code; the kernel's seconds are told apart."""
+    coded = frames[:-1]  # without the texture
+    kernel, moved, least = _beside_floor(_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
+    whole = median(lambda: decode(sequence, frames, "x"), 5)
+    defined = median(lambda: decode_reference(sequence, frames, "x"), 1, warm=False)
+    alone = "phase, wrapped phase, modulation, background and reason, in arrays made before"
+    return [
+        row(f"decode {len(coded)} frames, kernel", kernel, moved, least, note=alone),
+        row(f"decode {len(coded)} frames", whole, definition=defined, note="with the noise, spikes and new arrays"),
+        row(f"decode {len(coded)} frames, NumPy definition", defined),
+    ], kernel
+
+
+def _kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
+    """The decoding of axis x into arrays made before, with the noise known, and without a look at neighbours."""
+    found = layout(sequence, "x")
+    scale = grey_scale(found, measure_noise(found, frames, 255.0), 255.0)
+    maps = (*(np.zeros(frames.shape[1:], np.float32) for _ in range(4)), np.zeros(frames.shape[1:], np.uint8))
+    shifts = shifts_of(found)
+    if not found.gray:
+        ladder = ladder_of(found)
+        return lambda: kernels_levels.decode_levels(frames, shifts, ladder, scale, *maps)
+    rules = code_rules(found, fringe_mean(found, frames))
+    steps, gray = steps_of(found.shifts[0], found.sign), np.array(found.gray, np.int64)
+    inverse, extra = np.array(found.inverse, np.int64), -1 if found.complementary is None else found.complementary
+    return lambda: kernels_coded.decode_coded(frames, steps, gray, inverse, extra, scale, rules, *maps)
+
+
+def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
+    """Points from phases, and all in one pass, by both fast models; then a file of them."""
+    rows = []
+    phase = decode(sequence, frames, "x")
+    pixelwise, compiled, rays = _calibrations(frames.shape[1:])
+    fast = {
+        "pixelwise": (13, lambda: pixelwise.points(phase)),  # coefficients of float64 count twice
+        "splined": (6, lambda: compiled.depth(phase.phase, PERIOD_PX / (2 * np.pi), rays, True)),
+    }
+    for name, (numbers, work) in fast.items():
+        seconds, moved, least = _beside_floor(work, frames[:0], numbers, (0, 0, 1))
+        rows.append(row(f"reconstruct from phases, {name}", seconds, moved, least))
+    one = OnePass(sequence, pixelwise, "x")
+    light = one.light(frames)
+    scan = one.run(frames, light)
+    rows.append(_one_pass(one, frames, 7))
+    rows.append(_one_pass(OnePass(sequence, _made_up(compiled, rays), "x"), frames, 5))
+    rows += gpu_rows(sequence, pixelwise, frames)
+    rows.append(row("second pass, over spikes", median(lambda: one.mend(scan), 9), megabytes(scan.phase)))
+    rows.append(row("noise and fringe mean of a capture, sampled", median(lambda: one.light(frames), 5)))
+    rows.append(_file(scan.cloud()))
+    return rows
+
+
+def _one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
+    """The fused kernel, which reads ``numbers`` float32 of calibration a pixel; nothing new is asked for in it."""
+    light = one.light(frames)
+    scan = one.run(frames, light)
+    seconds, moved, least = _beside_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
+    note = "frames to phase, points, depth noise, modulation and texture; spikes not mended"
+    stage = f"one pass over {len(frames)} frames, {one.model.name}"
+    return row(stage, seconds, moved, least, note=note, target="1.5 floors")
+
+
+def _beside_floor(
+    work: Callable[[], object], frames: np.ndarray, numbers: int, written: tuple[int, int, int]
+) -> tuple[float, float, float]:
+    """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as `through` has them."""
+    shape = frames.shape[1:]
+    values = np.zeros((numbers, *shape), np.float32)
+    grey = np.zeros((written[0], *shape), frames.dtype)
+    single, triple = np.zeros((written[1], *shape), np.float32), np.zeros((written[2], *shape, 3), np.float32)
+    seconds, least = beside(work, lambda: through(frames, values, grey, single, triple), 25)
+    return seconds, megabytes(frames, values, grey, single, triple), least
+
+
+def _live(rig: SimulatedRig, renderer: Renderer) -> list[Row]:
+    sequence = one_axis(multifrequency(rig.projector.size, 4), "x")
+    frames = np.ascontiguousarray(renderer.capture(sequence)[: len(sequence.frames)])
+    pixelwise, _, _ = _calibrations(frames.shape[1:])
+    one = OnePass(sequence, pixelwise, "x")
+    scan = one.run(frames)
+    seconds = median(lambda: one.run(frames, scan.light, scan), 15)
+    count = len(frames) - 1
+    return [
+        row(
+            f"live: {count} recorded frames to arrays",
+            seconds,
+            note=f"{1 / seconds:.0f} clouds/s",
+            target="30 clouds/s",
+        )
+    ]
+
+
+def _peers(
+    rig: SimulatedRig, renderer: Renderer, plan: dict[str, Any], coded: float
+) -> tuple[list[Row], tuple[str, ...]]:
+    """Other programs; ``coded`` seconds took our kernel for phase steps and Gray code."""
+    rows: list[Row] = []
+    absent = tuple(text for text in (missing("fringes"), missing("small-gicp")) if text)
+    if not missing("fringes"):
+        sequence = one_axis(multifrequency(rig.projector.size, 6), "x")
+        frames = renderer.capture(sequence)
+        count, size = len(frames) - 1, (frames.shape[2], frames.shape[1])
+        ours, moved, least = _beside_floor(_kernel_alone(sequence, frames), frames[:-1], 0, (1, 4, 0))
+        note = "absolute and wrapped phase, modulation, background and reason, in arrays made before"
+        rows.append(row(f"decode {count} frames of three periods, kernel", ours, moved, least, note=note))
+        whole = median(lambda: decode(sequence, frames, "x"), 5)
+        rows.append(row(f"decode {count} frames of three periods", whole, note="with the noise, spikes and new arrays"))
+        rows += [fringes_row(25, size, coded), fringes_row(count, size, ours)]
+    if not missing("small-gicp"):
+        truth = Renderer(rig, plan["object_r2"]).truth()
+        rows += icp_rows(truth.points[truth.mask])
+    return rows, absent
+
+
+def _calibration(scale: float, progress: Progress) -> list[Row]:
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder) / "session"
+        simulate(session, scale=scale, progress=part(progress, 0.0, 0.5))
+        whole = median(lambda: calibrate(session, TARGET, progress=part(progress, 0.5, 0.9)), 1, warm=False)
+        with opened(session) as store:
+            stereo = load_stereo(store)
+            observations = load_observations(store, list(stereo.poses))
+            shot = store.load_capture(next(iter(stereo.poses)))
+            splined = load_model(store, "splined")
+            assert isinstance(splined, SplinedModel)
+            passed = _one_pass(
+                OnePass(one_axis(shot.sequence, "x"), splined, "x"),
+                shot.stack()[: len(one_axis(shot.sequence, "x").frames)],
+                5,
+            )
+        fit, held = _fit(observations, stereo)
+    note = f"steps 2 to 5, both axes, phases in memory; at most {held:.2f} GB beside them"
+    return [
+        row(f"pixel-wise fit of {len(observations)} poses", fit, note=note, target="5 s, 1.5 GB"),
+        passed,
+        row("calibrate 25 recorded poses, both axes, all default models", whole),
+    ]
+
+
+def _fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, float]:
+    """Seconds of smoothing all poses' phases and fitting the pixels to them, and the GB that this takes at most."""
+    rng = np.random.default_rng(0)
+    measured = {
+        (o.name, axis): (o.smoothed_phase(axis) + rng.normal(0, 0.02, o.region.shape)).astype(np.float32)
+        for o in observations
+        for axis in o.surfaces
+    }
+
+    def work() -> None:
+        smoothed = []
+        for o in observations:
+            pitch = (o.box[2] - o.box[0]) / len(o.points) ** 0.5
+            weight = o.region.astype(float)
+            weighted = {axis: (measured[o.name, axis], weight) for axis in o.surfaces}
+            surfaces = smooth_axes(weighted, o.box, o.size[0], pitch, Smoothing())
+            smoothed.append(replace(o, surfaces=surfaces))
+        calibrate_pixelwise(smoothed, stereo)
+
+    seconds = fastest(work, 2)
+    tracemalloc.start()  # NumPy tells it of its arrays
+    work()
+    held = tracemalloc.get_traced_memory()[1] / 1e9
+    tracemalloc.stop()
+    return seconds, held
+
+
+def _made_up(compiled: Compiled, rays: np.ndarray) -> SplinedModel:
+    """A splined model of which there is only what one pass reads."""
+    model = object.__new__(SplinedModel)
+    vars(model).update(rays=rays, _compiled={"x": compiled})
+    return model
+
+
+def _file(cloud: Cloud) -> Row:
+    """A cloud with texture and noise as a PLY, beside writing as many bytes."""
+    keep = cloud.mask
+    with tempfile.TemporaryDirectory() as folder:
+        path, plain = Path(folder) / "cloud.ply", Path(folder) / "plain"
+        seconds = median(
+            lambda: write_ply(path, cloud.points[keep], colours=cloud.colours(), scalars=cloud.sigmas(keep)), 3
+        )
+        content = path.read_bytes()
+        least = median(lambda: plain.write_bytes(content), 3)
+    return row(f"write {np.count_nonzero(keep) / 1e6:.2f} M points as PLY", seconds, len(content) / 1e6, least)
+
+
+def _calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, Compiled, np.ndarray]:
+    """Coefficients of a plausible rig: their values do not change the time."""
+    height, width = shape
+    v, u = np.mgrid[:height, :width] / width
+    ones = np.ones(shape, np.float32)
+    c = np.stack([300 + 16 * u, 1.3 * ones, -2e-4 * ones, (u - 0.5) / 2, (v - 0.4) / 2])
+    fit = PixelFit(c, np.zeros((3, *shape), np.float32), np.full(shape, 25, np.uint16), 30 * ones, 250 * ones, ones)
+    near, far = 200.0, 1000.0
+    step = max(2, -(-width // CELLS_ACROSS))
+    grid = np.zeros(((height - 1) // step + 2, (width - 1) // step + 2, DEPTHS), np.float32)
+    centred = np.stack([500 + 16 * u, 0.45 * ones, -1e-4 * ones]).astype(np.float32)
+    compiled = Compiled(centred, 455.5, grid, grid, step, near, far)
+    return PixelwiseModel({"x": fit}, {"x": PERIOD_PX}, {}, "x"), compiled, c[3:].astype(np.float32)

@@ -1,0 +1,242 @@
+"""How fast live clouds reach those who look, measured with the wizard itself and with viewers on real connections."""
+
+import contextlib
+import resource
+import socket
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import viser
+import zstandard
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import ClientConnection, connect
+from websockets.sync.connection import Connection
+
+from slviewer.errors import SlviewerError
+from slviewer.gui.app import App
+from slviewer.pipeline.feedback import Progress, unheard
+from slviewer.pipeline.models import save_imported_stereo
+from slviewer.server.secure import SafeServer
+from slviewer.session.store import Session
+from slviewer.simulation.rig import letter
+from slviewer.simulation.truth import rig_record
+from slviewer.wizard.operator import Operator
+
+_LOOKS_FROM = {
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, -500.0],
+    "fov": 0.75,
+    "near": 1.0,
+    "far": 10_000.0,
+    "image_height": 720,
+    "image_width": 1280,
+    "look_at": [0.0, 0.0, 500.0],
+    "up_direction": [0.0, -1.0, 0.0],
+}
+_PATIENCE_S = 120.0  # kernels may have to be compiled first
+_WARM_S = 1.0
+
+
+@dataclass(frozen=True)
+class LiveFigures:
+    """A live scan of `seconds` by a camera of `size` px, with one viewer that draws and, from a third of the time on,
+    one that has stalled.
+
+    Captures a second before and after that; clouds a second decoded, reconstructed and sent to the viewer that draws;
+    `behind_ms`: the median from the first frame's light until a cloud is sent, NaN where none was; `growth_mb`: how
+    much more memory the program used in the last quarter than in the second, None where the system does not tell.
+    """
+
+    size: tuple[int, int]
+    seconds: float
+    captures_per_s: float
+    captures_per_s_stalled: float
+    clouds_per_s: float
+    shown_per_s: float
+    behind_ms: float
+    points: int
+    growth_mb: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name."""
+        return asdict(self)
+
+    def text(self) -> str:
+        """For people."""
+        growth = "unknown" if self.growth_mb is None else f"{self.growth_mb:+.1f} MB"
+        return (
+            f"live at {self.size[0]}x{self.size[1]} for {self.seconds:.0f} s: {self.shown_per_s:.1f} clouds/s sent to "
+            f"a viewer, {self.behind_ms:.0f} ms behind the light ({self.clouds_per_s:.1f}/s made of {self.points:,} "
+            f"points); captures {self.captures_per_s:.1f}/s, beside a stalled viewer "
+            f"{self.captures_per_s_stalled:.1f}/s; memory {growth}"
+        )
+
+
+def live_rate(scale: float = 0.5, seconds: float = 30.0, progress: Progress = unheard) -> LiveFigures:
+    """Scan the demo object live on the simulated rig, its camera 1600x1200 times `scale`, settled at once.
+
+    Clouds are reconstructed by the stereo model of the true lenses. Raises SlviewerError where live scanning fails.
+    """
+    progress(0.0, "preparing the rig")
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder) / "session"
+        true_calibration(session, scale)
+        with Operator(session, {"driver": "simulated", "scale": scale}) as operator, _served(operator) as server:
+            _wait(lambda: operator.snapshot().rig.state == "open", operator)
+            operator.place("object")
+            with _Viewer(server, draws=True):
+                _wait(lambda: len(server.viser.get_clients()) == 1, operator)
+                operator.start_live()
+                _wait(lambda: _shown(operator) > 0, operator)
+                return _measure(operator, server, seconds, progress)
+
+
+def _measure(operator: Operator, server: SafeServer, seconds: float, progress: Progress) -> LiveFigures:
+    time.sleep(_WARM_S)
+    begun, first = time.monotonic(), operator.live_captures
+    memory: list[tuple[float, float]] = []
+    made, shown, behind, points = [], [], [], 0
+    with contextlib.ExitStack() as stack:
+        stalled: _Viewer | None = None
+        halfway, then = 0.0, 0
+        while (passed := time.monotonic() - begun) < seconds or stalled is None:
+            if stalled is None and passed > seconds / 3:
+                halfway, then = passed, operator.live_captures
+                stalled = stack.enter_context(_Viewer(server, draws=False))
+            time.sleep(min(0.25, seconds / 20))
+            live = operator.snapshot().live
+            if live is None:
+                raise SlviewerError(f"the live scan ended: {_told(operator)}")
+            made.append(live.clouds_per_s)
+            shown.append(live.shown_per_s)
+            behind += [] if live.behind_ms is None else [live.behind_ms]
+            points = live.points
+            memory.append((passed / seconds, _memory_mb()))
+            progress(min(passed / seconds, 0.999), f"live: {live.shown_per_s:.1f} clouds/s")
+    taken = operator.live_captures
+    camera = operator.snapshot().rig.camera
+    assert camera is not None
+    quarter, last = ([mb for share, mb in memory if low < share <= low + 0.25] for low in (0.25, 0.75))
+    known = bool(quarter and last) and not np.isnan(memory[0][1])
+    return LiveFigures(
+        size=camera,
+        seconds=seconds,
+        captures_per_s=(then - first) / halfway,
+        captures_per_s_stalled=(taken - then) / (time.monotonic() - begun - halfway),
+        clouds_per_s=statistics.median(made),
+        shown_per_s=statistics.median(shown),
+        behind_ms=statistics.median(behind) if behind else float("nan"),
+        points=points,
+        growth_mb=statistics.median(last) - statistics.median(quarter) if known else None,
+    )
+
+
+class _Viewer:
+    """A browser's connection: one that `draws` takes everything and says so; one that does not, reads nothing."""
+
+    def __init__(self, server: SafeServer, draws: bool) -> None:
+        self._server, self._draws = server, draws
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="viewer", daemon=True)
+
+    def __enter__(self) -> "_Viewer":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join(5.0)
+
+    def _serve(self) -> None:
+        while not self._closing.is_set():
+            with contextlib.suppress(WebSocketException, OSError), self._connect() as connection:
+                connection.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **_LOOKS_FROM}))
+                if self._draws:
+                    self._draw(connection)
+                else:  # until the server gives it up, and once more then
+                    while not self._closing.wait(0.1) and connection.state.name == "OPEN":
+                        pass
+
+    def _draw(self, connection: Connection) -> None:
+        unpack = zstandard.ZstdDecompressor()
+        while not self._closing.is_set():
+            try:
+                raw = connection.recv(timeout=0.2)
+            except TimeoutError:
+                continue
+            assert isinstance(raw, bytes)
+            whole, packed = (int.from_bytes(raw[at : at + 8], "little") for at in (0, 8))
+            for message in msgspec.msgpack.decode(unpack.decompress(raw[16 : 16 + packed], whole))["messages"]:
+                if message["type"] == "LocalStorageGetItemRequestMessage":
+                    answer = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
+                    kind = "LocalStorageGetItemResponseMessage"
+                    connection.send(msgspec.msgpack.encode({"type": kind, **answer}))
+
+    def _connect(self) -> ClientConnection:
+        port, access = self._server.port, self._server.access
+        host = f"127.0.0.1:{port}"
+        return connect(
+            f"ws://{host}/",
+            sock=socket.create_connection(("127.0.0.1", port), timeout=5),
+            additional_headers=[("Cookie", f"{access.cookie_name}={access.view_token}"), ("Origin", f"http://{host}")],
+            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
+            max_size=2**26,
+            ping_interval=None,  # who stalls does not give up by itself
+        )
+
+
+@contextlib.contextmanager
+def _served(operator: Operator) -> Iterator[SafeServer]:
+    app = App(operator, port=0)
+    try:
+        app.shell.go("scan")
+        yield app.server
+    finally:
+        app.close()
+
+
+def true_calibration(folder: Path, scale: float) -> None:
+    """Make a session whose stereo calibration is that of the simulated rig's true lenses, local distortion apart."""
+    rig = letter(scale)
+    record = rig_record(rig)
+    matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+    matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+    with Session.create(folder) as store:
+        save_imported_stereo(
+            store, matrices, source="the simulation's truth", camera=rig.camera.size, projector=rig.projector.size
+        )
+
+
+def _wait(condition: Callable[[], bool], operator: Operator) -> None:
+    end = time.monotonic() + _PATIENCE_S
+    while not condition():
+        if time.monotonic() > end:
+            raise SlviewerError(f"the live scan did not begin within {_PATIENCE_S:.0f} s: {_told(operator)}")
+        time.sleep(0.02)
+
+
+def _shown(operator: Operator) -> float:
+    live = operator.snapshot().live
+    return 0.0 if live is None else live.shown_per_s
+
+
+def _told(operator: Operator) -> str:
+    notices = operator.snapshot().notices
+    return notices[-1].text if notices else "nobody said why"
+
+
+def _memory_mb() -> float:
+    """Of this process, in use; NaN where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return float("nan")
+    return pages * resource.getpagesize() / 1e6

@@ -1,0 +1,236 @@
+"""Captures of a hostile rig, put through the program's own path: files, import, calibration, clouds, fitted shapes."""
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slviewer.errors import SlviewerError
+from slviewer.evaluation.letter import SPHERE_RADIUS_MM
+from slviewer.fringe.description_check import check_description
+from slviewer.fringe.presets import gray_bits, phase_steps
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence
+from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.calibration_verdict import last_verdict
+from slviewer.pipeline.frame_residuals import residuals
+from slviewer.pipeline.import_captures import import_frames
+from slviewer.pipeline.reconstruct import reconstruct
+from slviewer.pipeline.verify import verify
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.session.store import Session
+from slviewer.simulation.boards import printed_board
+from slviewer.simulation.hostile import Fault, Severity, expose_frames, hostile_light, render_light
+from slviewer.simulation.hostile_scenes import MirrorTable
+from slviewer.simulation.plans import planes, spheres, target_poses
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig
+from slviewer.simulation.scenes import Scene
+from slviewer.target.board import Board
+
+BOARD = Board.parse("circles:21x16:9")
+SCANS = ("plane_04", "sphere_3")
+"""Inside the calibrated depths."""
+STEPS, PERIOD_PX, BITS = 8, 16.0, 7
+_SAME_SURFACE_MM = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A scan, point by point.
+
+    ``points`` (n, 3) mm as measured, ``truth`` (n, 3) mm of the same pixels, NaN where they see no surface directly,
+    ``sigma`` (n,) mm predicted for z; ``on_target`` (n,) bool: of the plane or sphere, which has ``expected`` pixels
+    that the projector lights.
+    """
+
+    points: np.ndarray
+    truth: np.ndarray
+    sigma: np.ndarray
+    on_target: np.ndarray
+    expected: int
+
+
+@dataclass(eq=False)
+class Report:
+    """What the program said of a case: its warnings, the causes that it named by word, and the error that ended it."""
+
+    warnings: list[str] = field(default_factory=list)
+    named: list[frozenset[str]] = field(default_factory=list)
+    error: Exception | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class HostileBench:
+    """A rig, its scenes, and their clean light, each rendered when it is first needed.
+
+    ``folder`` takes the sessions and images. ``models`` are fitted by every calibration, the last of them measures.
+    """
+
+    rig: SimulatedRig
+    folder: Path
+    poses: int = 7
+    models: tuple[str, ...] = ("stereo",)
+    seed: int = 0
+    _light: dict[str, tuple[np.ndarray, Renderer]] = field(default_factory=dict, init=False, repr=False)
+
+    @cached_property
+    def sequence(self) -> PatternSequence:
+        """Phase steps, Gray code and complementary bit: as many frames along x as along y; white at the end."""
+        frames: list[Frame] = []
+        axes: tuple[Axis, ...] = ("x", "y")
+        for axis in axes:
+            frames += [*phase_steps(axis, STEPS, PERIOD_PX), *gray_bits(axis, BITS), Frame("complementary", axis)]
+        return PatternSequence(self.rig.projector.size, (*frames, Frame("texture")))
+
+    @cached_property
+    def scenes(self) -> dict[str, Scene]:
+        """Target poses and scans by name, in the order of their numbers."""
+        scenes: dict[str, Scene] = {
+            f"pose_{i:02d}": printed_board(BOARD, pose, seed=self.rig.seed)
+            for i, pose in enumerate(target_poses(self.rig, BOARD, self.poses), 1)
+        }
+        shapes: dict[str, Scene] = {**planes(), **spheres()}
+        return {**scenes, **{name: shapes[name] for name in SCANS}}
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the target poses."""
+        return tuple(name for name in self.scenes if name.startswith("pose_"))
+
+    def capture(
+        self, name: str, fault: Fault | None = None, severity: Severity = "mild"
+    ) -> tuple[np.ndarray, Renderer, Renderer]:
+        """(n, h, w) uint8, and the renderers of the scene as it was and of the clean one."""
+        scene, number = self.scenes[name], list(self.scenes).index(name)
+        if name not in self._light:
+            self._light[name] = render_light(self.rig, scene, self.sequence)
+        light, clean = self._light[name]
+        renderer = clean
+        if fault is not None and fault.is_optical:
+            light, renderer = hostile_light(fault, severity, self.rig, scene, self.sequence, number)
+        room = renderer.room_light()
+        frames = expose_frames(renderer.rig, light, self.sequence, room, number, fault, severity, self.seed)
+        return frames, renderer, clean
+
+    def store(self, session: Path, captures: dict[str, np.ndarray], report: Report) -> None:
+        """Write frames as images with a TOML, and import them as anyone would; poses and scans by their names."""
+        for role in ("calibration", "scan"):
+            names = [name for name in captures if name.startswith("pose_") == (role == "calibration")]
+            if not names:
+                continue
+            source = self.folder / "images"
+            shutil.rmtree(source, ignore_errors=True)
+            for name in names:
+                write_images(source / name, captures[name])
+            toml = source / "sequence.toml"
+            toml.write_text(describe_sequence(self.sequence))
+            try:
+                import_frames(source, session, toml, role=role, force=True, warn=report.warnings.append)  # type: ignore[arg-type]
+            except SlviewerError as error:
+                report.named += named_causes(self.sequence, captures, [*report.warnings, str(error)])
+                raise
+        report.named += named_causes(self.sequence, captures, report.warnings)
+
+    def calibrate(self, session: Path, report: Report) -> None:
+        """Calibrate the session's target poses; the report gets the verdict's causes."""
+        try:
+            calibrate(session, str(BOARD), models=self.models, warn=report.warnings.append)
+        finally:
+            with Session.open(session) as store:
+                verdict = last_verdict(store)
+            report.named += [frozenset({cause}) for cause in verdict.causes] if verdict else []
+
+    def measure(self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: Report) -> Measured:
+        """Reconstruct a stored scan and fit its shape; compare with the ``truth`` that the renderers know."""
+        shape = "plane" if name.startswith("plane") else "sphere"
+        done = reconstruct(
+            session, name, model=self.models[-1], out=self.folder / "cloud.ply", warn=report.warnings.append
+        )  # type: ignore[arg-type]
+        try:
+            radius = SPHERE_RADIUS_MM if shape == "sphere" else None
+            verify(session, [name], shape, models=self.models, radius=radius, warn=report.warnings.append)  # type: ignore[arg-type]
+        except SlviewerError as error:
+            report.warnings.append(str(error))
+        return compare_with_truth(done.cloud, *truth)
+
+
+def compare_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> Measured:
+    """The cloud's points beside those that a perfect instrument would measure, of the scene as it was."""
+    truth = renderer.truth()
+    points = truth.points
+    if isinstance(renderer.scene, MirrorTable):
+        direct = renderer.scene.is_direct(renderer.rig.camera.rays())
+        points = np.where(direct[..., None], points, np.nan)
+    with np.errstate(invalid="ignore"):
+        target = np.abs(points[..., 2] - clean.truth().points[..., 2]) < _SAME_SURFACE_MM
+    measured = cloud.mask
+    return Measured(
+        cloud.points[measured].astype(float),
+        points[measured],
+        cloud.sigma[measured].astype(float),
+        target[measured],
+        int(np.count_nonzero(target & truth.mask)),
+    )
+
+
+def write_images(folder: Path, frames: np.ndarray) -> None:
+    """Frames (n, h, w) uint8 as numbered image files."""
+    folder.mkdir(parents=True)
+    for k, frame in enumerate(frames):
+        cv2.imwrite(str(folder / f"{k:02d}.bmp"), frame)  # written ten times as fast as PNG
+
+
+def describe_sequence(sequence: PatternSequence) -> str:
+    """The TOML that describes numbered images of the sequence."""
+    lines = [
+        f'projector = "{sequence.projector[0]}x{sequence.projector[1]}"',
+        f"gray_origin = {sequence.gray_origin_px}",
+    ]
+    for k, frame in enumerate(sequence.frames):
+        lines += ["[[frame]]", f'file = "{k:02d}.bmp"']
+        lines += [f"{key} = {value!r}".replace("'", '"') for key, value in frame.to_dict().items()]
+    return "\n".join(lines) + "\n"
+
+
+_SUSPECTED: dict[str, frozenset[str]] = {
+    "lag": frozenset({"frame-lag"}),
+    "late": frozenset({"duplicate-frame"}),
+    "early": frozenset({"missing-frame"}),
+    "dropped": frozenset({"missing-frame"}),
+    "swapped": frozenset({"frame-order"}),
+    "light": frozenset({"exposure-drift", "flicker", "room-light"}),
+    "strange": frozenset({"missing-frame", "duplicate-frame", "flicker", "exposure-drift", "motion"}),
+}
+"""What a frame's suspected fault says, in the words of causes; several where it leaves that open."""
+
+
+def named_causes(
+    sequence: PatternSequence, captures: Mapping[str, np.ndarray], messages: Sequence[str]
+) -> list[frozenset[str]]:
+    """The causes that messages about captures name: those of the program's own suspects and contradictions whose
+    sentence is part of a message.
+    """
+    named: dict[frozenset[str], None] = {}
+    for name, frames in captures.items():
+        about = [message for message in messages if name in message]
+        if not about:
+            continue
+        suspects = [suspect for axis in residuals(sequence, frames) for suspect in axis.suspects]
+        known = [(s.sentence, _SUSPECTED.get(s.fault, frozenset({s.fault}))) for s in suspects]
+        known += [(c.message, frozenset({c.cause})) for c in check_description(sequence, frames)]
+        named |= {causes: None for sentence, causes in known if any(sentence in message for message in about)}
+    return list(named)
+
+
+def run_case(work: Callable[[Report], Sequence[Measured]]) -> tuple[Report, Sequence[Measured]]:
+    """Do it, and say what came of it: an error ends the case and goes into the report."""
+    report = Report()
+    try:
+        return report, work(report)
+    except Exception as error:  # a crash is a result here, and others still have to run
+        report.error = error
+        return report, ()

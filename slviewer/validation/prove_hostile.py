@@ -1,0 +1,317 @@
+"""Whether captures of a hostile rig are measured, or refused for the right reason: fault by fault, at each severity.
+
+A fault strikes either the scans, which a sound calibration then measures, or the target poses of a calibration, with
+which sound scans are measured. Errors are those of z against the truth, after the rigid motion that a calibration
+leaves open has been removed: it is fitted to the sound scans.
+"""
+
+import re
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from slviewer.errors import SlviewerError, UsageError
+from slviewer.evaluation.render import render
+from slviewer.pipeline.feedback import Progress, unheard
+from slviewer.simulation.hostile import FAULTS, SEVERITIES, Direction, Fault, Severity
+from slviewer.simulation.rig import letter
+from slviewer.validation.hostile_captures import SCANS, HostileBench, Measured, Report, run_case
+
+WITHIN = 1.5
+"""Times the undisturbed RMS, within which a case is measured."""
+SIGMAS = 3.0
+GROSS = 0.01
+"""Share of points beyond `SIGMAS`, more than of the undisturbed scans, that makes a result wrong."""
+KEPT = 0.9
+"""Share of the undisturbed coverage that a measured case has."""
+LEAST = 0.7
+"""Share of it below which the loss has to be explained."""
+_TRIMMED = 0.99  # of the points count in an RMS; those beyond are counted one by one, by `GROSS`
+
+Outcome = Literal[
+    "measured", "degraded, warned", "noisier as predicted", "refused",
+    "TURNED AWAY", "UNEXPLAINED LOSS", "WRONG REASON", "SILENTLY WRONG", "CRASH",
+]  # fmt: skip
+PASSED: tuple[Outcome, ...] = ("measured", "degraded, warned", "noisier as predicted", "refused")
+
+_WORDS: tuple[tuple[str, frozenset[str]], ...] = (
+    (r"outside the projector", frozenset({"projector-size"})),
+    (r"no pixel carries a readable", frozenset({"unreadable"})),
+    (r"[Cc]ircles were|[Cc]ircles detected|board's columns", frozenset({"board"})),
+    (r"% of the image before", frozenset({"crosstalk"})),
+    (r"are saturated and masked", frozenset({"saturation"})),
+    (r"fringes are weak", frozenset({"dark"})),
+    (r"images were compressed", frozenset({"jpeg"})),
+    (r"axes are exchanged", frozenset({"axes-swapped"})),
+    (r"axis is reversed|turned by 180", frozenset({"axis-reversed"})),
+    (r"calibration is of another rig", frozenset({"other-rig", "moved"})),
+)
+"""What messages without a structured cause name, by their facts."""
+_OPEN: tuple[tuple[str, frozenset[str]], ...] = (
+    (r"sigma was raised", frozenset({"other-rig", "moved", "motion"})),
+    (r"neighbouring pixels scatter", frozenset({"noise"})),
+)
+"""What messages name that leave the cause open: right where it is among them, and never wrong."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """``rms_mm``: of z over the best 99 % of the target's points; ``predicted_mm`` of the same; ``gross``: share of all
+    measured points beyond 3 sigma; ``coverage``: share of the target's lit pixels that were measured.
+    """
+
+    rms_mm: float
+    predicted_mm: float
+    gross: float
+    coverage: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault at one severity, and what came of it."""
+
+    fault: str
+    severity: Severity
+    direction: Direction
+    outcome: Outcome
+    figures: Figures | None
+    floor: Figures
+    named: tuple[str, ...]
+    messages: tuple[str, ...]
+    seconds: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the program may be proud of it."""
+        return self.outcome in PASSED
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What came of all cases."""
+
+    cases: tuple[Case, ...]
+    scale: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether no case was silently wrong, and none was refused or warned of for a wrong reason."""
+        return all(case.passed for case in self.cases)
+
+    def text(self) -> str:
+        """For people: a line a case, and what was said in those that failed."""
+        table: list[dict[str, Any]] = [_row(case) for case in self.cases]
+        failed = [case for case in self.cases if not case.passed]
+        lines = [render(table), f"{len(self.cases) - len(failed)} of {len(self.cases)} hold, at scale {self.scale:g}"]
+        for case in failed:
+            lines.append(f"\n{case.fault}, {case.severity}, {case.direction}: {case.outcome}")
+            lines += [f"  {message}" for message in case.messages] or ["  (no message)"]
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "scale": self.scale,
+            "holds": self.holds,
+            "cases": [
+                {
+                    "fault": case.fault,
+                    "severity": case.severity,
+                    "direction": case.direction,
+                    "outcome": case.outcome,
+                    "passed": case.passed,
+                    "figures": None if case.figures is None else vars(case.figures),
+                    "floor": vars(case.floor),
+                    "named": list(case.named),
+                    "messages": list(case.messages),
+                }
+                for case in self.cases
+            ],
+        }
+
+
+def _row(case: Case) -> dict[str, Any]:
+    figures = case.figures
+    nan = float("nan")
+    return {
+        "fault": case.fault,
+        "severity": case.severity,
+        "in": case.direction,
+        "RMS mm": round(figures.rms_mm, 3) if figures else nan,
+        "predicted": round(figures.predicted_mm, 3) if figures else nan,
+        "floor": round(case.floor.rms_mm, 3),
+        ">3 sigma %": round(100 * figures.gross, 1) if figures else nan,
+        "coverage %": round(100 * figures.coverage, 1) if figures else nan,
+        "named": ", ".join(case.named) or "-",
+        "outcome": case.outcome,
+        "s": round(case.seconds, 1),
+    }
+
+
+def prove_hostile(
+    scale: float = 0.5,
+    *,
+    cases: Sequence[str] = (),
+    splined: bool = True,
+    seed: int = 0,
+    progress: Progress = unheard,
+) -> Proof:
+    """Put every fault at every severity into scans, and into target poses, and judge what the program makes of them.
+
+    ``cases``: some of them, as "flicker", "flicker:mild" or "flicker:mild:scan". ``splined``: measure with the splined
+    model on a rig with local distortion; otherwise with stereo on one without, which takes a fifth of the time.
+    """
+    chosen = choose_cases(cases)
+    rig = letter(scale, seed) if splined else letter(scale, seed, local_distortion_px=0.0)
+    done: list[Case] = []
+    with tempfile.TemporaryDirectory(prefix="slviewer-hostile-") as folder:
+        models = ("stereo", "splined") if splined else ("stereo",)
+        bench = HostileBench(rig, Path(folder), poses=8 if splined else 7, models=models, seed=seed)
+        progress(0.0, "the undisturbed rig")
+        trial = _Trial(bench)
+        for i, (name, severity, direction) in enumerate(chosen):
+            progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
+            done.append(trial.run(name, severity, direction))
+    progress(1.0, "proven")
+    return Proof(tuple(done), scale)
+
+
+def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direction]]:
+    """All cases, or those that begin with one of the ``wanted``, colons between fault, severity and direction."""
+    every = [
+        (name, severity, direction)
+        for direction in get_args(Direction)
+        for name, fault in FAULTS.items()
+        for severity in SEVERITIES
+        if direction in fault.directions
+    ]
+    chosen: list[tuple[str, Severity, Direction]] = []
+    for pattern in wanted or ("",):
+        parts = pattern.split(":")
+        matching = [case for case in every if all(part in ("", word) for part, word in zip(parts, case, strict=False))]
+        if not matching or len(parts) > 3:
+            raise UsageError(
+                f"no hostile case is called {pattern!r}: use {', '.join(FAULTS)}; :mild, :medium or :severe"
+            )
+        chosen += [case for case in matching if case not in chosen]
+    return chosen
+
+
+class _Trial:
+    """The sound session, and each case against it."""
+
+    def __init__(self, bench: HostileBench) -> None:
+        self._bench = bench
+        self._session = bench.folder / "sound"
+        report = Report()
+        bench.store(self._session, {name: bench.capture(name)[0] for name in bench.scenes}, report)
+        bench.calibrate(self._session, report)
+        measured = [bench.measure(self._session, name, bench.capture(name)[1:], report) for name in SCANS]
+        self.gauge = fit_gauge(measured)
+        self.floor = score(measured, self.gauge)
+        self.said = report
+
+    def run(self, name: str, severity: Severity, direction: Direction) -> Case:
+        """One case."""
+        fault, begun = FAULTS[name], perf_counter()
+        if direction == "scan":
+            report, measured = run_case(lambda report: self._scan(fault, severity, report))
+            gauge = self.gauge
+        else:
+            report, measured = run_case(lambda report: self._calibrate(fault, severity, report))
+            gauge = fit_gauge(measured) if measured else self.gauge
+        figures = score(measured, gauge) if measured else None
+        outcome, named = judge(fault, severity, report, figures, self.floor)
+        messages = [*report.warnings, *([f"{type(report.error).__name__}: {report.error}"] if report.error else [])]
+        seconds = perf_counter() - begun
+        return Case(name, severity, direction, outcome, figures, self.floor, named, tuple(messages), seconds)
+
+    def _scan(self, fault: Fault, severity: Severity, report: Report) -> Sequence[Measured]:
+        shots = {name: self._bench.capture(name, fault, severity) for name in SCANS}
+        self._bench.store(self._session, {name: shot[0] for name, shot in shots.items()}, report)
+        return [self._bench.measure(self._session, name, shot[1:], report) for name, shot in shots.items()]
+
+    def _calibrate(self, fault: Fault, severity: Severity, report: Report) -> Sequence[Measured]:
+        bench, session = self._bench, self._bench.folder / "hostile"
+        shutil.rmtree(session, ignore_errors=True)
+        struck = bench.targets[: fault.struck[SEVERITIES.index(severity)]]
+        frames = {n: bench.capture(n, *((fault, severity) if n in struck else ()))[0] for n in bench.targets}
+        bench.store(session, frames, report)
+        bench.calibrate(session, report)
+        bench.store(session, {name: bench.capture(name)[0] for name in SCANS}, report)
+        return [bench.measure(session, name, bench.capture(name)[1:], report) for name in SCANS]
+
+
+def judge(
+    fault: Fault, severity: Severity, report: Report, figures: Figures | None, floor: Figures
+) -> tuple[Outcome, tuple[str, ...]]:
+    """The outcome of a case, and the causes that the program named."""
+    named = list(report.named)
+    texts = [*report.warnings, *([str(report.error)] if report.error and not named else [])]
+    named += [causes for pattern, causes in _WORDS if any(re.search(pattern, text) for text in texts)]
+    maybe = [causes for pattern, causes in _OPEN if any(re.search(pattern, text) for text in texts)]
+    named += [causes for causes in maybe if causes & fault.causes]
+    words = tuple(dict.fromkeys("|".join(sorted(each)) for each in named))
+    right = any(each & fault.causes for each in named)
+    must = fault.must_measure and severity == "mild"
+    if report.error is not None and not isinstance(report.error, SlviewerError):
+        return "CRASH", words
+    if figures is None or report.error is not None:
+        return ("WRONG REASON" if not right else "TURNED AWAY" if must else "refused"), words
+    good = figures.rms_mm <= WITHIN * floor.rms_mm and figures.gross <= floor.gross + GROSS
+    wrong = figures.rms_mm > SIGMAS * figures.predicted_mm or figures.gross > floor.gross + GROSS
+    if named and not right:
+        return "WRONG REASON", words
+    if good and figures.coverage >= KEPT * floor.coverage:
+        return "measured", words
+    if must:
+        return ("SILENTLY WRONG" if wrong and not right else "TURNED AWAY"), words
+    if right:
+        return "degraded, warned", words
+    if wrong:
+        return "SILENTLY WRONG", words
+    return ("noisier as predicted" if figures.coverage >= LEAST * floor.coverage else "UNEXPLAINED LOSS"), words
+
+
+def fit_gauge(measured: Sequence[Measured]) -> tuple[np.ndarray, np.ndarray]:
+    """R (3, 3) and t (3,) mm that carry the measured points of all scans onto their truth.
+
+    Least squares over the better nine tenths of the targets' points.
+    """
+    points = np.concatenate([m.points[m.on_target] for m in measured])
+    truth = np.concatenate([m.truth[m.on_target] for m in measured])
+    R, t = np.eye(3), np.zeros(3)
+    keep = np.ones(len(points), bool)
+    for _ in range(3):
+        if np.count_nonzero(keep) < 10:
+            break
+        a, b = points[keep].mean(0), truth[keep].mean(0)
+        U, _, Vt = np.linalg.svd((points[keep] - a).T @ (truth[keep] - b))
+        R = Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+        t = b - R @ a
+        off = np.linalg.norm(points @ R.T + t - truth, axis=1)
+        keep = off <= np.quantile(off, 0.9)
+    return R, t
+
+
+def score(measured: Sequence[Measured], gauge: tuple[np.ndarray, np.ndarray]) -> Figures:
+    """The figures of scans, errors of z in mm after the motion of ``gauge``."""
+    R, t = gauge
+    errors = np.concatenate([(m.points @ R.T + t - m.truth)[:, 2] for m in measured])
+    sigma = np.concatenate([m.sigma for m in measured])
+    target = np.concatenate([m.on_target for m in measured])
+    expected = sum(m.expected for m in measured)
+    wrong = ~(np.abs(errors) <= SIGMAS * sigma)  # also where nothing is to be seen
+    squares = np.sort(errors[target] ** 2)[: max(1, int(_TRIMMED * np.count_nonzero(target)))]
+    return Figures(
+        float(np.sqrt(squares.mean())) if len(squares) else float("nan"),
+        float(np.sqrt(np.mean(sigma[target] ** 2))) if target.any() else float("nan"),
+        float(wrong.mean()) if len(wrong) else 0.0,
+        float(np.count_nonzero(target) / max(expected, 1)),
+    )

@@ -1,0 +1,115 @@
+"""The Letter's experiments on the simulated rig, its figures remade, and its tables beside ours."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.evaluation import letter
+from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.merge import merge
+from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
+from slviewer.pipeline.verify import Verification, verify
+from slviewer.session.store import Session, is_session
+from slviewer.validation.reproduction import MODELS, Reproduction
+from slviewer.validation.reproduction_report import write_reproduction
+
+QUICK_SCALE = 0.5
+PIXEL = (500, 500)
+"""Where the Letter shows its curves, at full resolution."""
+OBJECTS = ("object_r1", "object_r2", "object_r3")
+
+
+def reproduce(
+    out: Path | str,
+    *,
+    quick: bool = False,
+    seed: int = 0,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> Reproduction:
+    """Simulate, calibrate, verify planes and spheres, merge the object, and write ``report.html`` into ``out``.
+
+    ``quick`` halves the camera's resolution. The session stays in ``out/session``, and serves the next run with
+    the same settings.
+    """
+    out = Path(out)
+    session = out / "session"
+    scale = QUICK_SCALE if quick else 1.0
+    _simulated(session, scale, seed, part(progress, 0.0, 0.4))
+    found = calibrate(session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn)
+    assert found.pixelwise is not None
+    with Session.open(session) as store:
+        names = store.capture_names("scan")
+        observations = load_observations(store, list(found.stereo.poses))
+    planes = verify(
+        session,
+        [n for n in names if n.startswith("plane_")],
+        "plane",
+        models=MODELS,
+        depth_range=letter.DEPTH_RANGE_MM,
+        progress=part(progress, 0.65, 0.75),
+        warn=warn,
+    ).captures
+    round_ones = verify(
+        session,
+        [n for n in names if n.startswith("sphere_")],
+        "sphere",
+        models=MODELS,
+        depth_range=letter.DEPTH_RANGE_MM,
+        radius=letter.SPHERE_RADIUS_MM,
+        progress=part(progress, 0.75, 0.82),
+        warn=warn,
+    )
+    merged = merge(
+        session, OBJECTS, OBJECTS[-1], out / "merged.ply", model="pixelwise", progress=part(progress, 0.82, 0.9)
+    )
+    result = Reproduction(
+        quick=quick,
+        stereo=found.stereo,
+        pixelwise=found.pixelwise,
+        planes=planes,
+        spheres=round_ones.captures,
+        spacings_mm=_spacings(session, round_ones),
+        merged=merged,
+        report=out / "report.html",
+    )
+    progress(0.92, "drawing the report")
+    pixel = (round((PIXEL[0] + 0.5) * scale - 0.5), round((PIXEL[1] + 0.5) * scale - 0.5))
+    write_reproduction(result, observations, pixel, seed)
+    progress(1.0, "reproduced")
+    return result
+
+
+def _simulated(session: Path, scale: float, seed: int, progress: Progress) -> None:
+    """Fills the session, unless it holds this scale and seed already; refuses one that holds anything else."""
+    if is_session(session):
+        made = _truth(session)
+        if (made.get("scale"), made.get("seed")) == (scale, seed):
+            return
+        with Session.open(session) as store:
+            if made or store.capture_names():
+                raise InputError(f"{session} holds another simulation: choose another folder with --out, or delete it")
+        shutil.rmtree(session)  # an interrupted run's, with nothing in it
+    simulate(session, scale=scale, seed=seed, progress=progress)
+
+
+def _truth(session: Path) -> dict[str, Any]:
+    path = session / TRUTH
+    truth: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    return truth
+
+
+def _spacings(session: Path, spheres: Verification) -> dict[str, tuple[float, Mapping[str, float]]]:
+    """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the simulation's truth."""
+    centres = {name: np.array(record["centres"][0]) for name, record in _truth(session)["spheres"].items()}
+    return {
+        f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), found)
+        for (a, b), found in spheres.centre_distances_mm().items()
+    }

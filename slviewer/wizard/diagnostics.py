@@ -1,0 +1,112 @@
+"""What helps to find out why something went wrong elsewhere: versions, settings, logs, small previews.
+
+No frames, and no passwords, which may stand in the addresses of cameras.
+"""
+
+import importlib.metadata
+import json
+import logging
+import os
+import platform
+import re
+import sys
+import zipfile
+from collections import deque
+from dataclasses import asdict
+from datetime import datetime
+from typing import Any
+
+import cv2
+
+from slviewer import __version__
+from slviewer.session.atomic import to_json
+from slviewer.session.store import Session
+from slviewer.wizard.export_files import delivered
+from slviewer.wizard.jobs import Reporter
+from slviewer.wizard.snapshot import PreviewView, Snapshot
+
+LINES = 4000
+_PASSWORD = re.compile(r"(?<=://)[^/\s\"'@]+(?=@)")
+PACKAGES = ("numpy", "opencv-python-headless", "numba", "scipy", "zarr", "open3d-cpu", "open3d", "viser", "trimesh")
+
+
+class LogKeeper(logging.Handler):
+    """The latest lines that slviewer logged, until `close`."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.lines: deque[str] = deque(maxlen=LINES)
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s %(threadName)s: %(message)s"))
+        self._logger = logging.getLogger("slviewer")
+        if self._logger.level == logging.NOTSET:
+            self._logger.setLevel(logging.INFO)
+        self._logger.addHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep one record."""
+        self.lines.append(self.format(record))
+
+    def close(self) -> None:
+        """Listen no longer."""
+        self._logger.removeHandler(self)
+        super().close()
+
+
+def write_bundle(
+    session: Session, snapshot: Snapshot, preview: PreviewView | None, log: LogKeeper, report: Reporter
+) -> str:
+    """Write ``diagnostics_<time>.zip`` into the exports; returns its name."""
+    name = f"diagnostics_{datetime.now():%Y%m%d_%H%M%S}.zip"
+    with delivered(session, name, report) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
+        report(0.1, "versions and settings")
+        bundle.writestr("versions.json", to_json(_versions()))
+        bundle.writestr("state.json", _without_passwords(to_json(_state(snapshot)).decode()))
+        bundle.writestr("log.txt", _without_passwords("\n".join(log.lines) + "\n"))
+        for file in ("session.json", "decisions.json"):
+            if (session.folder / file).is_file():
+                bundle.writestr(f"session/{file}", _without_passwords((session.folder / file).read_text("utf-8")))
+        report(0.4, "captures and results")
+        for capture in session.captures():
+            described = {key: value for key, value in capture.meta.items() if key != "sequence"}
+            bundle.writestr(f"session/captures/{capture.name}.json", to_json(described))
+        for result in session.result_names():
+            bundle.writestr(f"session/results/{result}.json", to_json(session.load_result(result, only=())[0]))
+        report(0.8, "previews")
+        if snapshot.session is not None:
+            thumbnails = {pose.name: pose.thumbnail for pose in snapshot.session.poses}
+            thumbnails |= {scan.name: scan.thumbnail for scan in snapshot.session.scans}
+            for each, jpeg in thumbnails.items():
+                bundle.writestr(f"previews/{each}.jpg", jpeg)
+        if preview is not None:
+            bundle.writestr("previews/now.jpg", bytes(cv2.imencode(".jpg", preview.image)[1]))
+    report(1.0, "collected")
+    return name
+
+
+def _without_passwords(text: str) -> str:
+    return _PASSWORD.sub("…", text)
+
+
+def _versions() -> dict[str, Any]:
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "slviewer": __version__,
+        "python": sys.version,
+        "system": platform.platform(),
+        "processors": os.cpu_count(),
+        "packages": found,
+    }
+
+
+def _state(snapshot: Snapshot) -> dict[str, Any]:
+    """The snapshot's plain part: devices, steps, notices, how much space there is."""
+    rig = asdict(snapshot.rig)
+    notices = [[notice.time.isoformat(), notice.level, notice.text] for notice in snapshot.notices]
+    space = None if snapshot.space is None else asdict(snapshot.space)
+    state = {"rig": rig, "steps": [asdict(step) for step in snapshot.steps], "notices": notices, "space": space}
+    return json.loads(to_json(state))

@@ -1,0 +1,50 @@
+"""Files for other programs, made in the session's `exports` folder."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from slviewer.pipeline.export import What, export, file_name
+from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.models import insisted
+from slviewer.session import atomic
+from slviewer.session.names import safe_name
+from slviewer.session.store import Session
+from slviewer.surface.meshing import MeshingPlan
+from slviewer.wizard.jobs import Reporter
+from slviewer.wizard.snapshot import ExportView
+
+
+@contextmanager
+def delivered(session: Session, name: str, report: Reporter) -> Iterator[Path]:
+    """A path to write `name` to; when the block ends the file appears in the exports, unless the work was cancelled."""
+    target = session.exports / safe_name(name)
+    with atomic.staged_folder(target, 0) as folder:
+        yield folder / name
+        report.saving()
+        os.replace(folder / name, target)
+    atomic.discard(folder)
+
+
+def export_file(
+    session: Session, what: What, name: str, file_format: str, plan: MeshingPlan | None, report: Reporter, warn: Warn
+) -> str:
+    """Write one file, as `pipeline.export.export` does; returns what it is, in words that begin with its name."""
+    with delivered(session, file_name(what, name, file_format), report) as path:
+        insist, progress = insisted(session), report.within(0, 0.98)
+        found = export(session, what, name, out=path, plan=plan, accept_rejected=insist, progress=progress, warn=warn)
+    report(1.0, "exported")
+    return f"{path.name} is ready to download: {found.words}"
+
+
+def listed(session: Session) -> tuple[ExportView, ...]:
+    """What the exports folder holds."""
+    folder = session.folder / "exports"
+    if not folder.is_dir():
+        return ()
+    found = []
+    for entry in sorted(folder.iterdir()):
+        if entry.is_file() and not entry.name.startswith("."):
+            found.append(ExportView(entry.name, entry, entry.stat().st_size))
+    return tuple(found)

@@ -1,0 +1,132 @@
+"""What panels draw from a session beyond the snapshot: clouds, error maps, curves. Nothing here changes anything."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
+from slviewer.errors import InputError
+from slviewer.evaluation.histogram import Histogram, histogram
+from slviewer.fringe.hdr import radiance, toned
+from slviewer.fringe.sequence import Axis
+from slviewer.pipeline.models import load_model, load_residuals, load_stereo
+from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.report import curve_at
+from slviewer.report.data import PixelCurve
+from slviewer.session.capture import Capture
+from slviewer.session.ply import Ply, read_ply
+from slviewer.session.store import Session
+
+THUMBNAIL_PX = 240
+
+
+@dataclass(frozen=True, eq=False)
+class ScanCloud:
+    """A reconstructed capture on the camera's grid: `points` (h, w, 3) float32 mm and `sigma_z`, `phase` (rad),
+    `modulation` (h, w) float32, NaN where invalid; `texture` (h, w) or (h, w, 3) uint8; `errors` as in `error_maps`.
+    `sigma_calibration` (h, w) float32 mm is what the calibration's own uncertainty adds; None where it is not known.
+    """
+
+    name: str
+    model: str
+    axis: Axis
+    points: np.ndarray
+    sigma_z: np.ndarray
+    phase: np.ndarray
+    modulation: np.ndarray
+    texture: np.ndarray
+    errors: Mapping[str, np.ndarray]
+    sigma_calibration: np.ndarray | None = None
+
+    def thinned(self, limit: int) -> tuple[slice, slice]:
+        """The part of the grid to draw: every so many rows and columns, at most about `limit` measured points."""
+        measured = int(np.isfinite(self.points[..., 2]).sum())
+        step = max(1, int(np.ceil(np.sqrt(measured / limit))))
+        return slice(None, None, step), slice(None, None, step)
+
+    def nearest(self, origin: np.ndarray, direction: np.ndarray) -> tuple[int, int] | None:
+        """(u, v) of the measured pixel closest to a ray (camera frame, mm), within 1 % of its depth; None if none."""
+        index = nearest(self.points, origin, direction)
+        return None if index is None else (index[1], index[0])
+
+
+def nearest(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tuple[int, ...] | None:
+    """Index of the point of (..., 3), NaN where none is, that is closest to a ray, within 1 % of its depth, the front
+    before the back; None where there is none."""
+    ways = points - origin
+    along = ways @ (direction / np.linalg.norm(direction))
+    off = np.sqrt(np.maximum((ways**2).sum(-1) - along**2, 0))
+    score = np.where((along > 0) & (off < 0.01 * along), off + 0.02 * along, np.inf)
+    score = np.where(np.isfinite(score), score, np.inf)
+    index = np.unravel_index(int(np.argmin(score)), score.shape)
+    return tuple(int(i) for i in index) if np.isfinite(score[index]) else None
+
+
+def scan_cloud(session: Session, name: str) -> ScanCloud:
+    """The cloud that was reconstructed of a capture. Raises InputError where it was not."""
+    meta, arrays = session.load_result(f"clouds/{name}")
+    errors = error_maps(session, name) if f"verify/{name}" in session.result_names() else {}
+    return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)
+
+
+def error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
+    """{model: (h, w) float32 mm} signed distances from the plane or sphere that was fitted, NaN where not measured."""
+    arrays = session.load_result(f"verify/{name}")[1]
+    return {key.removeprefix("error_"): array for key, array in arrays.items()}
+
+
+def error_histogram(session: Session, name: str) -> Histogram:
+    """The models' errors on one scale."""
+    return histogram(error_maps(session, name))
+
+
+def merged_cloud(session: Session, name: str) -> Ply:
+    """The merged points of a merge."""
+    return read_ply(session.exports / str(session.load_result(f"merge/{name}", only=())[0]["ply"]))
+
+
+def residuals(session: Session, pose: str) -> tuple[np.ndarray, np.ndarray]:
+    """((n, 2) px, (n, 4) px): where a pose's features are in the camera, and their camera and projector residuals."""
+    found = load_residuals(session)
+    observed = load_observations(session, [pose])
+    if pose not in found or not observed:
+        raise InputError(f"the calibration has no residuals of {pose}: calibrate with it first")
+    return observed[0].camera, found[pose]
+
+
+def pixel_fits(session: Session) -> Mapping[Axis, PixelFit]:
+    """The pixel-wise fits by axis: RMS maps, poses, coefficients."""
+    model = load_model(session, "pixelwise")
+    assert isinstance(model, PixelwiseModel)
+    return model.fits
+
+
+def pixel_curve(session: Session, pixel: tuple[int, int], axis: Axis) -> PixelCurve | None:
+    """Data and fit of z-phi, x-z, y-z at a pixel (u, v); None where it was not fitted."""
+    model = load_model(session, "pixelwise")
+    stereo = load_stereo(session)
+    assert isinstance(model, PixelwiseModel)
+    if axis not in model.fits:
+        raise InputError(f"the pixel-wise model has no axis {axis}: choose one of {', '.join(model.fits)}")
+    h, w = model.fits[axis].rms_mm.shape[1:]
+    if not (0 <= pixel[0] < w and 0 <= pixel[1] < h):
+        raise InputError(f"pixel {pixel} lies outside the camera's {w}x{h}: give column and row, counted from 0")
+    return curve_at(pixel, model, stereo, load_observations(session, list(stereo.poses)), axis)
+
+
+def thumbnail(capture: Capture) -> bytes:
+    """A small JPEG of the capture's texture, or of its brightest kind of frame where it has none."""
+    order = ("texture", "white", "phase", "gray")
+    frames = capture.sequence.frames
+    index = min(range(len(frames)), key=lambda k: order.index(frames[k].kind) if frames[k].kind in order else 9)
+    image = capture.stack([index])[0]
+    choice = capture.exposure_choice
+    if choice is not None:
+        image = toned(radiance(image, choice, capture.exposures_ms))
+    scale = THUMBNAIL_PX / max(image.shape)
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    if small.dtype != np.uint8:
+        small = cv2.convertScaleAbs(small, alpha=255 / max(int(small.max()), 1))
+    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1])

@@ -1,0 +1,75 @@
+"""The surfaces that the wizard measures on: reconstructed scans and merges, read from what the session keeps."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.pipeline.measured_surface import MERGED, Place, Surface, merged_surface, surface_of
+from slviewer.pipeline.models import load_model
+from slviewer.pipeline.scale import scale_factor
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.session.store import Session
+from slviewer.wizard.result_views import nearest
+
+NOMINALS = "nominal"
+"""The session's folder of nominal models."""
+
+
+class Surfaces:
+    """Keeps the surface that was asked for last: each click asks for the same one. For any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._key: tuple[str, str, str] | None = None
+        self._kept: Surface | None = None
+
+    def of(self, store: Session, name: str) -> Surface:
+        """A capture's cloud as it was reconstructed, or a merge (``merge/<number>``).
+
+        Raises InputError where there is none, or where what it was made from has changed since.
+        """
+        result = name if name.startswith(MERGED) else f"clouds/{name}"
+        if not store.has_result(result):
+            raise InputError(f"{name} is not reconstructed: reconstruct it in the step Scan first")
+        meta = store.load_result(result, only=())[0]
+        again = "merge again" if result == name else "reconstruct it again in the step Scan"
+        scaled = all(scale_factor(store, model) == factor for model, factor in meta.get("scales", {}).items())
+        if store.state_of(result) == "stale" or not scaled:
+            raise InputError(f"{name} was made with what has changed since: {again}, and measure then")
+        key = (str(store.folder), result, str(meta["hash"]))
+        with self._lock:
+            if self._key != key or self._kept is None:
+                self._kept = merged_surface(store, name) if result == name else _scanned(store, name)
+                self._key = key
+            return self._kept
+
+
+def _scanned(store: Session, name: str) -> Surface:
+    meta, arrays = store.load_result(f"clouds/{name}")
+    left = arrays.get("sigma_calibration")
+    points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
+    cloud = Cloud(points, meta["axis"], meta["model"], sigma, texture, left)
+    return surface_of(store, name, cloud, load_model(store, meta["model"]))
+
+
+def place_at(on: Surface, origin: np.ndarray, direction: np.ndarray) -> Place | None:
+    """The measured point closest to a ray from origin (3,) mm along direction (3,), in the surface's frame; None where
+    the ray passes it by."""
+    index = nearest(on.points, origin, direction)
+    if index is None:
+        return None
+    return (index[1], index[0]) if on.organised else index[0]
+
+
+def point_at(on: Surface, place: Place) -> np.ndarray:
+    """(3,) mm: the point of a place."""
+    index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
+    return np.asarray(on.points[index], np.float64)
+
+
+def nominals(folder: Path) -> tuple[str, ...]:
+    """Names of the nominal models in a session's folder."""
+    held = folder / NOMINALS
+    return tuple(sorted(entry.name for entry in held.iterdir() if entry.name[0] != ".")) if held.is_dir() else ()

@@ -1,0 +1,197 @@
+"""What the worker computes, and what it leaves in the session: one function a job.
+
+=====================  ============================================================================================
+`poses/<capture>`      what a target pose says (`pipeline.poses`)
+`clouds/<capture>`     the organised cloud, with phase and modulation at each pixel
+`verify/<capture>`     error maps and figures of a plane or a sphere, model by model
+`merge/<number>`       how scans lie on their reference; the points are in `exports/merged_<number>.ply`
+=====================  ============================================================================================
+
+All of them name their inputs, so that what has become stale is seen.
+"""
+
+import numpy as np
+
+from slviewer.calibration.observe import Smoothing
+from slviewer.evaluation.crossvalidation import CrossValidation
+from slviewer.evaluation.plane import PlaneResult
+from slviewer.evaluation.sphere import SphereResult
+from slviewer.pipeline.calibrate import CalibrationResult, calibrate
+from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record, next_merge
+from slviewer.pipeline.models import POSES_FOR_PIXELWISE, available, best, insisted
+from slviewer.pipeline.poses import Judged, judge_all
+from slviewer.pipeline.reconstruct import reconstruct
+from slviewer.pipeline.scale import scale_factor
+from slviewer.pipeline.validate import validate
+from slviewer.pipeline.verify import Shape, verify
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.wizard.export_files import delivered
+from slviewer.wizard.jobs import Reporter
+from slviewer.wizard.snapshot import Level
+
+SMOOTHING = Smoothing()
+
+
+def judge_pose(session: Session, name: str, board: Board, report: Reporter) -> Judged:
+    """Decode a target pose, find its board, and keep what it says."""
+    report(0.0, f"looking at {name}")
+    return next(judge_all(session.guarded(report.saving), [name], board, SMOOTHING))
+
+
+def make_calibration(session: Session, target: str, report: Reporter, warn: Warn) -> CalibrationResult:
+    """Calibrate every model that the poses which are not excluded allow; models of before do not outlive it."""
+    guarded = session.guarded(report.saving)
+    models = ["stereo", "pixelwise", *(name for name in available(session) if name == "anchored")]
+    if lacking := lacking_for_splined(session):
+        warn(f"no splined model: {lacking}")
+    else:
+        models.append("splined")
+    made = calibrate(guarded, target, models=models, progress=report, warn=warn)
+    for name in available(session):
+        if getattr(made, name) is None:
+            guarded.trash_result(f"calibration/{name}")
+    return made
+
+
+def told_calibration(made: CalibrationResult) -> tuple[Level, str]:
+    """How it went, in a sentence."""
+    rms = made.stereo.reprojection_rms_px["stereo"]
+    said = f"calibrated from {len(made.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
+    return ("good", said) if made.verdict.level == "good" else ("warning", f"{said}; doubtful: {made.verdict.reason}")
+
+
+def lacking_for_splined(session: Session) -> str:
+    """What the poses lack for the splined model, in words; empty where they allow it."""
+    excluded = session.excluded()
+    poses = [capture for capture in session.captures("calibration") if capture.name not in excluded]
+    both = sum(len(capture.sequence.axes) == 2 for capture in poses)
+    if both >= POSES_FOR_PIXELWISE:
+        return ""
+    needed = f"it needs {POSES_FOR_PIXELWISE} target poses with patterns along both axes"
+    if len(poses) < POSES_FOR_PIXELWISE:
+        return f"{needed}, and there are {both}: capture more"
+    return f"{needed}, and only {both} of {len(poses)} have them: choose patterns of both axes, and capture more"
+
+
+def compare_models(session: Session, report: Reporter, warn: Warn) -> CrossValidation:
+    """Measure each pose by calibrations made without it, model by model, and keep how they compare."""
+    return validate(session.guarded(report.saving), progress=report, warn=warn)
+
+
+def told_comparison(found: CrossValidation) -> str:
+    """How it went, in a sentence."""
+    figures = ", ".join(f"{model} {found.rms(model, 'board_mm'):.3f} mm" for model in found.models)
+    return f"boards that were left out come out wrong by {figures}: {found.recommended} is recommended"
+
+
+def make_cloud(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
+    """Reconstruct a capture, keep its cloud, and put its PLY into the exports; returns how many points it has."""
+    insist = insisted(session)
+    model = model or best(session, insist)
+    with delivered(session, f"{name}_{model}.ply", report) as ply:
+        progress = report.within(0, 0.9)
+        found = reconstruct(session, name, model=model, out=ply, accept_rejected=insist, progress=progress, warn=warn)
+        cloud, phase = found.cloud, found.phases[found.cloud.axis]
+        z = cloud.points[..., 2][cloud.mask]
+        near, far = np.percentile(z, [1, 99])
+        calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
+        meta = {
+            "model": model,
+            "axis": cloud.axis,
+            "points": found.points,
+            "depth_mm": [float(near), float(far)],
+            "noise_mm": float(np.median(cloud.sigma_z[cloud.mask])),
+            "masked": found.masked,
+            "scale": found.scale,
+            "scales": {model: scale_factor(session, model)},
+            "inputs": session.input_hashes(name, *calibrations),
+        }
+        assert cloud.texture is not None
+        arrays = {
+            "points": cloud.points,
+            "sigma_z": cloud.sigma_z,
+            "phase": phase.phase,
+            "modulation": phase.modulation,
+            "texture": cloud.texture,
+        }
+        if cloud.sigma_calibration is not None:
+            meta["sigma_calibration_mm"] = float(np.median(cloud.sigma_calibration[cloud.mask]))
+            arrays["sigma_calibration"] = cloud.sigma_calibration
+        report(0.95, "saving")
+        session.guarded(report.saving).save_result(f"clouds/{name}", meta, arrays)
+    report(1.0, "reconstructed")
+    return found.points
+
+
+def measure(
+    session: Session, names: list[str], shape: Shape, radius: float | None, report: Reporter, warn: Warn
+) -> dict[str, dict[str, float]]:
+    """Compare the models on captures of a plane or a sphere, keep error maps and clouds; {capture: {model: RMS mm}}."""
+    rms = {}
+    for i, name in enumerate(names):
+        span = report.within(i / len(names), (i + 1) / len(names))
+        measured = verify(
+            session,
+            [name],
+            shape,
+            radius=radius,
+            accept_rejected=insisted(session),
+            progress=span.within(0, 0.5),
+            warn=warn,
+        )
+        found = measured.captures[name]
+        models = available(session)
+        meta = {
+            **found.to_dict(),
+            "centres_mm": {m: r.sphere.centre for m, r in found.results.items() if isinstance(r, SphereResult)},
+            "masked": dict(measured.masked[name]),
+            "scales": {model: scale_factor(session, model) for model in models},
+            "normals": {m: r.plane.normal for m, r in found.results.items() if isinstance(r, PlaneResult)},
+            "inputs": session.input_hashes(name, *(f"calibration/{model}" for model in models)),
+        }
+        arrays = {f"error_{model}": result.error_map for model, result in found.results.items()}
+        span(0.5, "saving")
+        session.guarded(report.saving).save_result(f"verify/{name}", meta, arrays)
+        make_cloud(session, name, None, span.within(0.5, 1), warn)
+        rms[name] = {model: result.rms_mm for model, result in found.results.items()}
+    report(1.0, "measured")
+    return rms
+
+
+def told_measures(rms: dict[str, dict[str, float]]) -> str:
+    """What was measured, in a sentence."""
+    figures = {name: ", ".join(f"{m} {mm:.3f} mm" for m, mm in models.items()) for name, models in rms.items()}
+    return "; ".join(f"{name}: RMS {said}" for name, said in figures.items())
+
+
+def merge_scans(
+    session: Session,
+    names: list[str],
+    reference: str,
+    report: Reporter,
+    warn: Warn,
+    *,
+    start: StartKind = "features",
+    angle: float | None = None,
+    picked: Picked | None = None,
+) -> Merge:
+    """Register scans to a reference, and keep how they lie; the merged PLY goes into the exports."""
+    number = next_merge(session)
+    insist = insisted(session)
+    model = best(session, insist)
+    with delivered(session, f"merged_{number}.ply", report) as ply:
+        found = merge(
+            session, names, reference, ply, model=model, start=start, angle=angle, picked=picked,
+            accept_rejected=insist, progress=report.within(0, 0.97), warn=warn,
+        )  # fmt: skip
+        session.guarded(report.saving).save_result(f"merge/{number}", merge_record(session, found, model), {})
+    report(1.0, "merged")
+    return found
+
+
+def told_merge(reference: str, found: Merge) -> str:
+    """How well the scans lie on each other, in a sentence."""
+    pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in found.pairs.items())
+    return f"merged on {reference}: {'; '.join(pairs)}"

@@ -1,0 +1,217 @@
+"""Every command of the command line, on a small simulated rig: from nothing to a merged cloud."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from slviewer.session.exporters import write_calibration
+from slviewer.session.store import Session
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def session(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of what `simulate` and `calibrate` made."""
+    return Path(shutil.copytree(recorded / "session", tmp_path_factory.mktemp("commands") / "session"))
+
+
+@pytest.fixture(scope="module")
+def calibrated(recorded: Path) -> dict:
+    return json.loads((recorded / "calibration.json").read_text())
+
+
+def test_calibrate_reports_what_its_contract_says(calibrated: dict) -> None:
+    stereo = calibrated["models"]["stereo"]
+    assert set(stereo) >= {"reprojection_rms_px", "K_camera", "D_camera", "K_projector", "D_projector", "R", "T"}
+    assert 0.01 < stereo["reprojection_rms_px"]["stereo"] < 0.3
+    assert np.linalg.norm(stereo["T"]) == pytest.approx(180, abs=1.5)
+    assert stereo["K_projector"][1][1] / stereo["K_projector"][0][0] == pytest.approx(2, abs=0.02)
+    assert set(calibrated["models"]["pixelwise"]["fit_rms_mm"]) == {"z", "x", "y"}
+    assert len(calibrated["poses_used"]) == 8 and calibrated["poses_left_out"] == {}
+
+
+def test_verify_a_plane_inside_and_a_sphere(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "planes.json"
+    status, text, _ = run(
+        "verify", session, "plane_03", "plane_07", "--shape", "plane", "--range", 500, 700, "--json", out
+    )
+    assert status == 0 and "plane_03" in text
+    captures = json.loads(out.read_text())["captures"]
+    inside = captures["plane_03"]
+    assert inside["incidence"]["R2"] == pytest.approx(100)
+    assert captures["plane_07"]["incidence"]["R3"] == pytest.approx(100)
+    stereo, pixelwise = inside["models"]["stereo"], inside["models"]["pixelwise"]
+    assert pixelwise["noise_floor_mm"] < pixelwise["rms_mm"] < stereo["rms_mm"] < 0.5
+    assert stereo["coverage"] > 0.97 and stereo["set_aside"] < 0.02 * stereo["points"]
+    status, text, _ = run("verify", session, "sphere_3", "--shape", "sphere", "--model", "stereo", "--json", out)
+    sphere = json.loads(out.read_text())["captures"]["sphere_3"]["models"]
+    assert list(sphere) == ["stereo"] and 97.0 < sphere["stereo"]["radius_mm"] < 99.0
+
+
+def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    ply, grid = tmp_path / "board.ply", tmp_path / "board.npy"
+    status, text, _ = run("reconstruct", session, "pose_01", "--out", ply, "--grid", grid)
+    assert status == 0 and "axis x" in text and "coverage" in text and "stereo" in text and "pixelwise" in text
+    points = np.load(grid)
+    assert points.shape == (300, 400, 3) and points.dtype == np.float32
+    cloud = trimesh.load(ply)
+    assert 1000 < len(cloud.vertices) <= np.isfinite(points[..., 2]).sum()
+    status, text, _ = run("reconstruct", session, "object_r2", "--model", "stereo", "--axis", "x")
+    assert status == 0 and (session / "exports" / "object_r2_stereo.ply").exists()
+    status, _, error = run("reconstruct", session, "object_r2", "--axis", "y")
+    assert status == 1 and "axis" in error
+
+
+def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    ply, out = session / "exports" / "merged_1.ply", tmp_path / "merge.json"
+    status, text, _ = run("merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--json", out)
+    assert status == 0 and "the session keeps it as merge/1" in text
+    pairs = json.loads(out.read_text())["pairs"]
+    assert set(pairs) == {"object_r1", "object_r2"}
+    for pair in pairs.values():
+        assert 0.01 < pair["rms_mm"] < 0.5 and 0.5 < pair["overlap"] <= 1
+        assert np.shape(pair["T_reference_scan"]) == (4, 4)
+    assert len(trimesh.load(ply).vertices) > 10_000
+    status, text, _ = run("measure", session, "merge/1", "distance", "--at", 0, 5000)
+    assert status == 0 and "distance on merge/1" in text
+    status, text, _ = run("export", session, "merge", "--out", tmp_path / "all.xyz")
+    assert status == 0 and len(np.loadtxt(tmp_path / "all.xyz")) == json.loads(out.read_text())["points"]
+
+
+def test_mesh_of_one_scan_and_of_scans_merged_on_the_way(
+    calibrated: dict, session: Path, run: Run, tmp_path: Path
+) -> None:
+    stl, out = tmp_path / "object.stl", tmp_path / "mesh.json"
+    thinned = ("--method", "volume", "--triangles", 20_000, "--smooth", 2)
+    status, text, _ = run("mesh", session, "object_r3", "object_r2", *thinned, "--out", stl, "--json", out)
+    assert status == 0 and "smoothing moved the surface by" in text and "not watertight: " in text
+    found = json.loads(out.read_text())
+    assert (
+        found["method"] == "volume" and 0.1 < found["cell_mm"] < 1.0 and set(found["merge"]["pairs"]) == {"object_r2"}
+    )
+    assert 0 < found["smoothed"]["rms_mm"] < found["smoothed"]["max_mm"] < 2.0
+    assert 19_000 < found["triangles"] <= 20_000 and len(trimesh.load(stl).faces) == found["triangles"]
+    assert trimesh.load(tmp_path / "object_points.ply").vertices.shape[0] > 10_000
+    status, text, _ = run("mesh", session, "object_r3")
+    assert status == 0 and "triangles by grid" in text
+    assert len(trimesh.load(session / "exports" / "object_r3_mesh.ply").faces) > 10_000
+    status, _, error = run("mesh", session, "object_r3", "--watertight")
+    assert status == 1 and "would be imagined, not measured" in error
+    status, _, error = run("mesh", session, "merge/9")
+    assert status == 1 and "there is no merge" in error
+    assert run("mesh", session, "object_r3", "object_r2", "--method", "grid")[0] == 2
+    assert run("mesh", session, "merge/1", "object_r1")[0] == 2
+
+
+def test_report_and_inspect(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    assert run("report", session, "--out", page)[0] == 0
+    html = page.read_text()
+    assert "pose_01" in html and 'src="http' not in html
+    status, text, _ = run("inspect", session)
+    assert status == 0 and "44" not in text.splitlines()[0] and "calibration pixelwise: from 8 poses, fresh" in text
+
+
+def test_reproduce_remakes_the_letters_tables_and_figures(
+    session: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("slviewer.validation.reproduce.QUICK_SCALE", 0.25)
+    out = session.parent  # whose session is what reproduce would simulate, but for fewer poses
+    status, text, _ = run("reproduce", "--quick", "--out", out, "--json", tmp_path / "figures.json")
+    assert status == 0
+    found = json.loads((tmp_path / "figures.json").read_text())
+    assert len(found["planes"]) == 10 and len(found["spheres"]) == 6
+    assert 1.3 < found["in_range_ratio"] < 10
+    assert 0.001 < found["spacing_rms_mm"]["pixelwise"] < 1.0
+    assert "0.184" in text and "0.087" in text and "2.13" in text  # the Letter's own means
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64") >= 14 and "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_an_excluded_pose_is_left_out_and_named(calibrated: dict, session: Path, run: Run) -> None:
+    with Session.open(session, write=True) as store:
+        store.exclude("pose_02", "blurred")
+    try:
+        status, text, _ = run("calibrate", session, "--target", "circles:21x16:9", "--models", "stereo")
+        assert status == 0 and "pose_02: excluded by the operator: blurred" in text
+    finally:
+        with Session.open(session, write=True) as store:
+            store.include("pose_02")
+        run("calibrate", session, "--target", "circles:21x16:9", "--models", "stereo", "pixelwise")
+
+
+def test_a_calibration_made_elsewhere_reconstructs_the_same(
+    calibrated: dict, session: Path, run: Run, tmp_path: Path
+) -> None:
+    stereo = calibrated["models"]["stereo"]
+    names = ["K_camera", "D_camera", "K_projector", "D_projector", "R", "T"]
+    write_calibration(tmp_path / "rig.yml", {f"my_{name}": np.array(stereo[name]) for name in names})
+    frames = Session.open(session).load_capture("object_r2").frames
+    with Session.create(tmp_path / "other") as other:
+        sequence = Session.open(session).load_capture("object_r2").sequence
+        other.save_capture("part", "scan", sequence, frames, source="test")
+    keys = [f"my_{name}" for name in names]
+    status, _, error = run("import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *keys)
+    assert (status, error) == (0, "")
+    assert run("reconstruct", tmp_path / "other", "part", "--grid", tmp_path / "other.npy")[0] == 0
+    assert run("reconstruct", session, "object_r2", "--model", "stereo", "--grid", tmp_path / "own.npy")[0] == 0
+    difference = np.abs(np.load(tmp_path / "other.npy") - np.load(tmp_path / "own.npy"))
+    assert np.nanmax(difference) < 1e-3 and np.isfinite(difference[..., 2]).sum() > 10_000
+    status, _, error = run("import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *names)
+    assert status == 1 and "my_K_camera" in error
+
+
+def test_patterns_come_back_as_the_columns_themselves(run: Run, tmp_path: Path) -> None:
+    folder, session = tmp_path / "patterns", tmp_path / "session"
+    assert run("patterns", "--preset", "p18", "--projector", "160x120", "--out", folder)[0] == 0
+    toml = next(folder.glob("*.toml"))
+    assert run("import", "frames", folder, session, "--sequence", toml, "--role", "scan")[0] == 0
+    with Session.open(session) as store:
+        from slviewer.pipeline.capture_phases import decode_capture
+
+        phases = decode_capture(store.load_capture("patterns"))
+    assert np.nanmax(np.abs(phases["x"].coordinate - np.arange(160))) < 0.05
+    assert np.nanmax(np.abs(phases["y"].coordinate - np.arange(120)[:, None])) < 0.05
+
+
+def test_target_draws_a_sheet(run: Run, tmp_path: Path) -> None:
+    assert run("target", "circles:21x16:9", "--out", tmp_path / "board.pdf")[0] == 0
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+    status, _, error = run("target", "circles:21by16", "--out", tmp_path / "board.pdf")
+    assert status == 1 and "circles:21x16:9" in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "says"),
+    [
+        (["calibrate", "nowhere", "--target", "circles:21x16:9"], 1, "session"),
+        (["calibrate"], 2, ""),
+        (["reconstruct", "SESSION", "pose_99"], 1, "pose_99"),
+        (["verify", "SESSION", "--shape", "plane"], 2, "capture"),
+        (["calibrate", "ONE", "--target", "chessboard:9x7:30"], 3, "usable pose"),
+        (["simulate", "SESSION"], 1, "session already"),
+        (["import", "p18", "SESSION", "SESSION"], 1, "captures"),
+    ],
+)
+def test_bad_input_ends_in_one_sentence(
+    session: Path,
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    status: int,
+    says: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = sorted(p.name for p in (session / "captures").iterdir())
+    if "ONE" in arguments:  # a board that no pose shows is looked for in one only
+        shutil.copytree(session, "ONE", ignore=shutil.ignore_patterns("pose_0[2-8]", "results"))
+    got, out, error = run(*[session if a == "SESSION" else a for a in arguments])
+    assert got == status and says in error and "Traceback" not in error and out == ""
+    assert sorted(p.name for p in (session / "captures").iterdir()) == before

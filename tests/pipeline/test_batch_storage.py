@@ -1,0 +1,33 @@
+"""Where workers of a batch deliver: many into the same exports at once, some of which die on the way."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from slviewer.pipeline.batch_storage import delivered, swept
+
+BATCH = "0a1b2c3d"
+WORKERS, EACH = 4, 150
+
+
+def test_workers_that_deliver_at_once_do_not_trip_each_other(tmp_path: Path) -> None:
+    def worker(w: int) -> None:
+        for k in range(EACH):
+            with delivered(str(tmp_path), BATCH) as made:
+                (made / f"{w}_{k}.ply").write_bytes(bytes([w]))
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        list(pool.map(worker, range(WORKERS)))
+    found = {path.name: path.read_bytes() for path in (tmp_path / "exports").iterdir()}
+    assert found == {f"{w}_{k}.ply": bytes([w]) for w in range(WORKERS) for k in range(EACH)}
+
+
+def test_what_a_killed_worker_leaves_goes_with_its_batch_alone(tmp_path: Path) -> None:
+    for batch in (BATCH, "another"):
+        killed = delivered(str(tmp_path), batch)
+        (killed.__enter__() / "half.ply").write_bytes(b"ply")
+        del killed  # closing it raises GeneratorExit in it, as little of it runs as of a killed worker
+    left = {path.name for path in (tmp_path / "exports").iterdir()}
+    assert len(left) == 2 and all(name.startswith(".batch-") for name in left)
+    swept(str(tmp_path), BATCH)
+    (other,) = (tmp_path / "exports").iterdir()
+    assert other.name.startswith(".batch-another")

@@ -1,0 +1,146 @@
+"""The verdict in a session: kept with the calibration, and asked before it is used."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.calibration.observe import Smoothing
+from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.calibration_verdict import last_verdict
+from slviewer.pipeline.models import available, rejection
+from slviewer.pipeline.poses import known
+from slviewer.session.store import Session
+from slviewer.simulation.rig import letter
+from slviewer.validation.faulty_captures import BOARD, Bench
+
+Run = Callable[..., tuple[int, str, str]]
+POSES = 7
+
+
+@pytest.fixture(scope="module")
+def bench() -> Bench:
+    return Bench(letter(0.2, 3), count=POSES, steps=6)
+
+
+def fill(folder: Path, bench: Bench, period_px: float = 18.0, force: bool = False) -> None:
+    """Save the poses, their fringes described as of this period."""
+    frames = tuple(replace(f, period_px=period_px) if f.kind == "phase" else f for f in bench.sequence.frames)
+    sequence = replace(bench.sequence, frames=frames)
+    with Session.open_or_create(folder) as store:
+        for i in range(POSES):
+            name = f"pose_{i:02d}"
+            store.save_capture(name, "calibration", sequence, bench.frames(i), source="test", board=BOARD, force=force)
+
+
+@pytest.fixture(scope="module")
+def good(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session with a sound calibration, to be copied before it is changed."""
+    session = tmp_path_factory.mktemp("good") / "session"
+    fill(session, bench)
+    calibrate(session, str(BOARD), models=("stereo", "pixelwise"))
+    return session
+
+
+@pytest.fixture
+def session(good: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(good, tmp_path / "session"))
+
+
+def test_a_verdict_is_told_and_kept(session: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "found.json"
+    status, text, _ = run("calibrate", session, "--target", BOARD, "--models", "stereo", "--json", out)
+    assert status == 0 and "verdict: good" in text
+    assert json.loads(out.read_text())["verdict"] == {"level": "good", "findings": []}
+    assert "verdict: good" in run("inspect", session)[1]
+    with Session.open(session) as store:
+        assert store.state_of("calibration/verdict") == "fresh" and store.state_of("evidence/pose_00") == "fresh"
+        assert rejection(store) == ""
+
+
+def test_a_rejected_calibration_is_kept_and_refused(bench: Bench, session: Path, tmp_path: Path, run: Run) -> None:
+    ply = tmp_path / "cloud.ply"
+    fill(session, bench, period_px=16.0, force=True)
+    status, _, error = run("calibrate", session, "--target", BOARD)
+    assert status == 3 and "px seen, 16 px described" in error and "kept to look into" in error
+    with Session.open(session) as store:
+        verdict = last_verdict(store)
+        assert verdict is not None and verdict.level == "rejected" and verdict.causes[0] == "fringe-period"
+        assert available(store) == ("stereo",)  # those of the poses before do not belong to it
+        assert "period_px" in rejection(store)
+    pose = ("pose_00", "--out", ply)
+    for command in (
+        ("reconstruct", session, *pose),
+        ("reconstruct", session, *pose, "--model", "stereo"),
+        ("verify", session, "pose_00", "--shape", "plane"),
+        ("merge", session, "pose_00", "pose_01", "--reference", "pose_00", "--out", ply),
+    ):
+        status, _, error = run(*command)
+        assert status == 3 and "was rejected" in error and "--accept-rejected" in error and "period_px" in error
+    assert not ply.exists()
+    status, _, error = run("reconstruct", session, *pose, "--accept-rejected")
+    assert "was rejected" not in error
+    # an attempt of which nothing comes does not make it any better
+    assert run("calibrate", session, "--target", "circles:20x16:9")[0] == 3
+    assert run("reconstruct", session, *pose)[0] == 3
+    fill(session, bench, force=True)
+    assert run("calibrate", session, "--target", BOARD, "--models", "stereo")[0] == 0
+    assert run("reconstruct", session, *pose)[0] == 0 and ply.exists()
+
+
+def test_where_nothing_came_of_it_the_session_keeps_what_it_had(session: Path, tmp_path: Path, run: Run) -> None:
+    status, _, error = run("calibrate", session, "--target", "circles:20x16:9")
+    assert status == 3 and "21x16 circles, and 20x16 was given" in error
+    with Session.open(session) as store:
+        assert available(store) == ("stereo", "pixelwise")
+        verdict = last_verdict(store)
+        assert verdict is not None and verdict.causes[0] == "board-size"
+        again = known(store, "pose_00", BOARD, Smoothing())
+        assert again is None  # the pose was read for the other board
+    assert run("reconstruct", session, "pose_00", "--out", tmp_path / "cloud.ply")[0] == 0
+
+
+def test_a_description_that_contradicts_itself(bench: Bench, tmp_path: Path, run: Run) -> None:
+    session = tmp_path / "session"
+    fill(session, bench, period_px=6.0)
+    status, _, error = run("calibrate", session, "--target", BOARD)
+    assert status == 3 and "Gray bits number 128 periods" in error and "fringe period" in error
+    with Session.open(session) as store:
+        verdict = last_verdict(store)
+        assert verdict is not None and verdict.causes == ("fringe-period",)
+
+
+def test_a_pose_that_moved_is_left_out_with_its_reason(bench: Bench, session: Path, run: Run) -> None:
+    frames = bench.frames(2).copy()
+    pose = bench.poses[2]
+    half = len(frames) // 2
+    frames[half:] = bench.rendered(replace(pose, t=pose.t + np.array([0.6, 0.2, 0.0])), 2)[half:]
+    with Session.open(session, write=True) as store:
+        store.save_capture("pose_02", "calibration", bench.sequence, frames, source="test", board=BOARD, force=True)
+    status, text, error = run("calibrate", session, "--target", BOARD, "--models", "stereo")
+    assert status == 0 and "pose_02 is left out: the board moved by" in error
+    assert "verdict: good" in text and "note: pose_02: the board moved by" in text
+
+
+def test_gamma_below_five_steps_is_named_and_not_taken_for_another_period() -> None:
+    three = Bench(letter(0.2, 3), count=6, steps=3)
+    curve = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
+    sound = three.attempt([three.looked(i) for i in range(6)])
+    bent = three.attempt([three.look(i, curve[three.frames(i)]) for i in range(6)])
+    assert "gamma" not in sound.verdict.causes
+    assert bent.verdict.level == "doubtful" and "gamma" in bent.verdict.causes
+    assert "fringe-period" not in bent.verdict.causes
+
+
+def test_calibrate_from_some_poses(session: Path, run: Run) -> None:
+    chosen = ("--models", "stereo", "--poses", "pose_0[0-5]", "--exclude", "pose_05")
+    status, text, error = run("calibrate", session, "--target", BOARD, *chosen)
+    assert status == 0 and "poses: 5 of 7 used" in text and error.count("left out") == 0
+    assert "pose_05: excluded for this calibration" in text and "pose_06: not among the poses" in text
+    status, _, error = run("calibrate", session, "--target", BOARD, "--exclude", "pose_9")
+    assert status == 2 and "'pose_9'" in error and "pose_06" in error

@@ -1,0 +1,65 @@
+"""A capture is measured, or refused for what contradicts it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slviewer.errors import InputError
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.presets import p18
+from slviewer.pipeline import capture_phases
+from slviewer.pipeline.capture_phases import check_capture, decode_frames
+from slviewer.pipeline.frame_residuals import capture_warnings
+from slviewer.simulation.boards import Pose, blank_board
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+
+PROJECTOR = (912, 1140)
+SEQUENCE = p18(PROJECTOR)
+
+
+@pytest.fixture(scope="module")
+def frames() -> np.ndarray:
+    plate = blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0])))
+    return Renderer(letter(0.15), plate).capture(SEQUENCE)
+
+
+def test_a_sound_capture_passes(frames: np.ndarray) -> None:
+    check_capture("pose_01", SEQUENCE, frames, decode_frames("pose_01", SEQUENCE, frames))
+    assert capture_warnings(SEQUENCE, frames) == []
+
+
+def test_the_most_probable_contradiction_is_the_reason(frames: np.ndarray) -> None:
+    wrong = replace(SEQUENCE, gray_origin_px=8.5)
+    with pytest.raises(InputError, match=r"pose_01: .*gray_origin = -0\.[45]\d*; or .*phase_offset = -?3\.1\d"):
+        check_capture("pose_01", wrong, frames, decode_frames("pose_01", wrong, frames))
+    assert any("gray_origin" in message for message in capture_warnings(wrong, frames))
+
+
+def seen(decoded: float, otherwise: Reason) -> PhaseMap:
+    flat = np.zeros((100, 100), np.float32)
+    reason = np.full(flat.shape, otherwise, np.uint8)
+    reason.flat[: round(decoded * reason.size)] = Reason.VALID
+    return PhaseMap("x", 18.0, flat, flat, flat, flat, reason, (1.0, 0.0), 18)
+
+
+@pytest.mark.parametrize(
+    ("decoded", "otherwise", "facts"),
+    [
+        (0.0002, Reason.INCONSISTENT, r"2 of 10000 .*100 % contradict"),
+        (0.03, Reason.SATURATED, r"300 of 10000 .*97 % lie where the camera saturates: lower the exposure"),
+        (0.0, Reason.DARK, r"no pixel carries a readable x pattern .*raise the exposure"),
+        (0.3, Reason.INCONSISTENT, ""),
+    ],
+)
+def test_a_capture_of_which_next_to_nothing_decodes_is_refused(
+    decoded: float, otherwise: Reason, facts: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capture_phases, "check_description", lambda sequence, frames: ())
+    phases = {"x": seen(decoded, otherwise)}
+    if not facts:
+        check_capture("scan", SEQUENCE, np.zeros((0, 1, 1)), phases)
+        return
+    with pytest.raises(InputError, match=facts):
+        check_capture("scan", SEQUENCE, np.zeros((0, 1, 1)), phases)

@@ -1,0 +1,99 @@
+"""Commands refuse a capture that does not belong to the session's calibration, whichever command it is."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.fringe.presets import multifrequency
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.models import save_imported_stereo
+from slviewer.session.ply import read_ply
+from slviewer.session.store import Session
+from slviewer.simulation.boards import FLAT, BoardScene, Pose
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.truth import rig_record
+
+Run = Callable[..., tuple[int, str, str]]
+RIG = letter(0.1, 3, local_distortion_px=0.0)
+RECORD = rig_record(RIG)
+MATRICES = {f"{m}_{d}": np.array(RECORD[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+MATRICES |= {"R": RIG.R, "T": RIG.t}
+
+
+def calibrate(store: Session, **other: np.ndarray) -> None:
+    """Make the true rig, or matrices that differ from it, the session's calibration."""
+    save_imported_stereo(store, MATRICES | other, source="truth", camera=RIG.camera.size, projector=RIG.projector.size)
+
+
+@pytest.fixture(scope="module")
+def captured() -> tuple[PatternSequence, np.ndarray]:
+    """A plate at 600 mm, both axes."""
+    sequence = multifrequency(RIG.projector.size, 4)
+    plate = BoardScene(
+        Pose(np.eye(3), np.array([-60.0, -50.0, 600.0])), None, (0, 0), (120, 100), FLAT, np.zeros((0, 2))
+    )
+    renderer = Renderer(RIG, plate)
+    return sequence, renderer.capture(sequence, 1)
+
+
+@pytest.fixture
+def session(tmp_path: Path, captured: tuple[PatternSequence, np.ndarray]) -> Path:
+    """The plate as it is, as a scan of a projector twice the size, and by a camera that was cropped."""
+    sequence, frames = captured
+    with Session.create(tmp_path / "session") as store:
+        calibrate(store)
+        store.save_capture("sound", "scan", sequence, frames, source="test")
+        large = replace(sequence, projector_size=tuple(2 * n for n in RIG.projector.size))
+        store.save_capture("large", "scan", large, frames, source="test")
+        store.save_capture("cropped", "scan", sequence, np.ascontiguousarray(frames[:, :-4]), source="test")
+    return tmp_path / "session"
+
+
+def test_every_command_refuses_other_sizes_and_names_both(session: Path, run: Run) -> None:
+    for command in (
+        ("reconstruct", session, "large"),
+        ("verify", session, "large", "--shape", "plane"),
+        ("mesh", session, "large"),
+        ("merge", session, "sound", "--reference", "large"),
+        ("measure", session, "large", "distance", "--at", 60, 60, "--at", 70, 60),
+        ("export", session, "cloud", "large"),
+    ):
+        status, _, error = run(*command)
+        assert status == 1 and "1824x2280" in error and "912x1140" in error, command
+    status, _, error = run("reconstruct", session, "cropped")
+    assert status == 1 and "160x116" in error and "160x120" in error
+
+
+def test_a_sound_capture_is_measured_without_a_word(session: Path, run: Run) -> None:
+    status, text, error = run("reconstruct", session, "sound")
+    assert (status, error) == (0, "") and "z 600-600 mm" in text
+
+
+def test_an_inverted_calibration_is_refused_and_may_be_insisted_on(session: Path, run: Run) -> None:
+    with Session.open(session, write=True) as store:
+        calibrate(store, R=RIG.R.T, T=-RIG.R.T @ RIG.t)
+    for command in (
+        ("reconstruct", session, "sound"),
+        ("mesh", session, "sound"),
+        ("export", session, "cloud", "sound"),
+    ):
+        status, _, error = run(*command)
+        assert status == 1 and "R and T are inverted" in error
+    _, _, error = run("reconstruct", session, "sound", "--accept-rejected")
+    assert "R and T are inverted" in error
+
+
+def test_sigma_is_raised_where_the_axes_miss_each_other(session: Path, run: Run, tmp_path: Path) -> None:
+    assert run("reconstruct", session, "sound", "--out", tmp_path / "sound.ply")[0] == 0
+    nod = np.array([[1, 0, 0], [0, 1, -2e-4], [0, 2e-4, 1]])
+    turn = np.linalg.svd(nod)
+    with Session.open(session, write=True) as store:
+        calibrate(store, R=turn.U @ turn.Vh @ RIG.R, T=turn.U @ turn.Vh @ RIG.t)
+    status, _, error = run("reconstruct", session, "sound", "--out", tmp_path / "bumped.ply")
+    assert status == 0 and "sigma was raised by a factor of" in error
+    sound, bumped = (read_ply(tmp_path / f"{name}.ply").scalars["sigma_noise"] for name in ("sound", "bumped"))
+    assert np.median(bumped) > 5 * np.median(sound)

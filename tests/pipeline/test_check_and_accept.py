@@ -1,0 +1,152 @@
+"""The drift check and the acceptance test on sessions: what is kept, told and applied."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.errors import InputError
+from slviewer.evaluation.acceptance.places import bar_places
+from slviewer.fringe.presets import p18
+from slviewer.pipeline.accept import accept
+from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.check import REFERENCE, check, history
+from slviewer.pipeline.models import load_stereo, save_imported_stereo
+from slviewer.pipeline.scale import scale_factor
+from slviewer.pipeline.simulate import one_axis
+from slviewer.session.store import Session
+from slviewer.simulation.boards import printed_board
+from slviewer.simulation.plans import rotation, target_poses
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.scenes import Spheres
+from slviewer.simulation.truth import rig_record
+from slviewer.target.board import Board
+
+BOARD = Board.parse("circles:21x16:9")
+ARTEFACT = """
+kind = "ball-bar"
+name = "bar"
+certificate = "K 1"
+[calibrated]
+spacing_mm = {spacing}
+spacing_U_mm = 0.001
+diameter_mm = 38.1
+diameter_U_mm = 0.001
+expansion_ppm_K = 11.5
+expansion_U_ppm_K = 1.0
+[measured]
+temperature_C = 20.0
+temperature_U_K = 0.1
+captures = ["bar_*"]
+[limits]
+spacing_mm = {limit}
+"""
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory) -> Path:
+    """A session whose imported calibration is the truth, with seven bars and four captures of the first one."""
+    folder = tmp_path_factory.mktemp("accept") / "session"
+    rig = letter(0.25, seed=2, local_distortion_px=0)
+    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    with Session.create(folder) as store:
+        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        for i, place in enumerate(bar_places(load_stereo(store).rig, (500.0, 700.0), 100.0, 38.1)):
+            T = place.T_camera_artefact
+            renderer = Renderer(rig, Spheres(T[:3, 3] + np.array([[-50.0], [50.0]]) * T[:3, 0], 19.05))
+            store.save_capture(f"bar_{i}", "scan", sequence, renderer.capture(sequence, i), source="simulated")
+            for k in range(4 if i == 0 else 0):
+                frames = renderer.capture(sequence, 100 + k)
+                store.save_capture(f"still_{k}", "scan", sequence, frames, source="simulated")
+    return folder
+
+
+def artefact(folder: Path, spacing: float = 100.0, limit: float = 0.1) -> Path:
+    path = folder / "bar.toml"
+    path.write_text(ARTEFACT.format(spacing=spacing, limit=limit))
+    return path
+
+
+def test_accept_finds_a_scale_and_applies_it_on_request(measured, tmp_path):
+    short = artefact(tmp_path, 100.0 / (1 + 500e-6))  # against a certificate that says 500 ppm less
+    first = accept(measured, short, still=[f"still_{k}" for k in range(4)])
+    scale = first.acceptance.scale
+    assert scale.ppm == pytest.approx(500, abs=scale.U_ppm) and scale.U_ppm < 200
+    assert first.applied is None and "--apply-scale" in first.text()
+    assert first.repeatability.sigma_mm == pytest.approx(first.repeatability.predicted_mm, rel=0.15)
+    assert first.budget.unknown == ("drift",) and first.budget.U_mm > 2e-6 * 500 * 100
+    applied = accept(measured, short, apply_scale_found=True)
+    assert applied.applied == pytest.approx(1 / (1 + 1e-6 * scale.ppm), abs=1e-9)
+    again = accept(measured, short)
+    assert again.factor == applied.applied and abs(again.acceptance.scale.ppm) < 1
+    assert again.budget.U_mm < first.budget.U_mm
+    with Session.open(measured) as store:
+        assert scale_factor(store, "stereo") == applied.applied
+        kept = store.load_result("scale/stereo")[0]
+        assert kept["certificate"] == "K 1" and kept["captures"] == [f"bar_{i}" for i in range(7)]
+        assert len([n for n in store.result_names() if n.startswith("acceptance/")]) == 3
+    assert json.loads(json.dumps(again.to_json()))["decision"] in ("pass", "undecided", "fail")
+
+
+@pytest.mark.parametrize(("spacing", "decision"), [(100.0, "pass"), (101.0, "fail")])
+def test_accept_decides(measured, tmp_path, spacing, decision):
+    assert accept(measured, artefact(tmp_path, spacing, 0.2)).acceptance.decision == decision
+
+
+def test_accept_names_what_is_missing(measured, tmp_path):
+    path = artefact(tmp_path)
+    path.write_text(path.read_text().replace("bar_*", "beam_*"))
+    with pytest.raises(InputError, match=r"no capture is called 'beam_\*'"):
+        accept(measured, path)
+    path.write_text("kind = ")
+    with pytest.raises(InputError, match="no TOML file"):
+        accept(measured, path)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory) -> Path:
+    """Ten poses, calibrated; later the board with the rig as it was, turned by 0.2 mrad, and along one axis alone."""
+    folder = tmp_path_factory.mktemp("drift") / "session"
+    rig = letter(0.2, seed=5)
+    turn = rotation(np.array([0.0, 2e-4, 0.0]))
+    panned = replace(rig, R=turn @ rig.R, t=turn @ rig.t)
+    both = p18(rig.projector.size)
+    poses, later = target_poses(rig, BOARD, 10), target_poses(replace(rig, seed=6), BOARD, 3)
+    with Session.create(folder) as store:
+        for i, pose in enumerate(poses):
+            frames = Renderer(rig, printed_board(BOARD, pose)).capture(both, i)
+            store.save_capture(f"pose_{i}", "calibration", both, frames, source="simulated", board=BOARD)
+        for name, moved, sequence in (
+            ("same", rig, both),
+            ("panned", panned, both),
+            ("one_axis", rig, one_axis(both, "x")),
+        ):
+            frames = Renderer(moved, printed_board(BOARD, later[0])).capture(sequence, 50)
+            store.save_capture(name, "scan", sequence, frames, source="simulated")
+    calibrate(folder, str(BOARD), models=("stereo",))
+    return folder
+
+
+def test_check_answers_and_remembers(calibrated):
+    same = check(calibrated, "same")
+    assert same.drift.verdict == "still good" and same.before == ()
+    panned = check(calibrated, "panned")
+    assert panned.drift.verdict == "recalibrate" and "pan" in panned.drift.reasons[0]
+    assert "earlier checks" in panned.text() and "same: still good" in panned.text()
+    single = check(calibrated, "one_axis")
+    assert single.drift.verdict == "still good" and any("axis x alone" in s for s in single.drift.unseen)
+    with Session.open(calibrated) as store:
+        assert [c.drift.capture for c in history(store)] == ["same", "panned", "one_axis"]
+        assert history(store)[1] == panned.found
+        assert store.state_of(REFERENCE) == "fresh"
+    assert json.loads(json.dumps(single.to_json()))["before"][1]["verdict"] == "recalibrate"
+
+
+def test_a_calibration_from_elsewhere_has_no_floor(measured):
+    with pytest.raises(InputError, match="made elsewhere"):
+        check(measured, "bar_0")

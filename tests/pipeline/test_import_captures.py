@@ -1,0 +1,157 @@
+"""Folders that other tools made, through the command line: what is kept, what is skipped, and what is said of it."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.fringe.patterns import render
+from slviewer.fringe.presets import gray, phase_steps
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.capture_phases import decode_capture
+from slviewer.session.store import Session
+
+Run = Callable[..., tuple[int, str, str]]
+PROJECTOR = (120, 90)
+
+
+def photographed(sequence: PatternSequence, seed: int) -> list[np.ndarray]:
+    """What a camera with the projector's own pixels records: 8 bits, noise of one grey level, ambient light."""
+    rng = np.random.default_rng(seed)
+    return [
+        np.clip(render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1]), 0, 255).round().astype(np.uint8)
+        for i in range(len(sequence.frames))
+    ]
+
+
+def write_captures(source: Path, count: int) -> list[Path]:
+    """Folders of the procam-calibration layout."""
+    sequence = gray(PROJECTOR)
+    folders = [source / f"capture_{n}" for n in range(count)]
+    for seed, folder in enumerate(folders):
+        folder.mkdir(parents=True)
+        for number, frame in enumerate(photographed(sequence, seed)):
+            assert cv2.imwrite(str(folder / f"graycode_{number:02d}.png"), frame)
+    return folders
+
+
+@pytest.fixture
+def faulty(tmp_path: Path) -> Path:
+    """Five captures: one with a file cut short, one with a missing file, one in the dark, two sound."""
+    folders = write_captures(tmp_path / "source", 5)
+    cut = folders[1] / "graycode_03.png"
+    cut.write_bytes(cut.read_bytes()[:200])
+    (folders[2] / "graycode_07.png").unlink()
+    dark = np.full(PROJECTOR[::-1], 3, np.uint8)
+    for file in folders[3].iterdir():
+        cv2.imwrite(str(file), dark)
+    return tmp_path / "source"
+
+
+def test_readable_captures_are_imported_and_the_others_named(faulty: Path, run: Run, tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    status, out, err = run("import", "procam-calibration", faulty, session, "--projector", "120x90")
+    assert status == 0 and "2 captures imported: capture_0, capture_4" in out
+    warnings = [line for line in err.splitlines() if line.startswith("warning: not imported")]
+    assert len(warnings) == 3
+    for name, fact in (("capture_1", "graycode_03.png"), ("capture_2", "graycode_07"), ("capture_3", "modulation")):
+        assert any(name in line and fact in line for line in warnings), (name, warnings)
+    with Session.open(session) as store:
+        assert store.capture_names() == ["capture_0", "capture_4"]
+
+
+def test_strict_refuses_the_folder(faulty: Path, run: Run, tmp_path: Path) -> None:
+    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90", "--strict")
+    assert status == 1 and "capture_2" in err and "graycode_07" in err
+    (faulty / "capture_2" / "graycode_07.png").write_bytes((faulty / "capture_0" / "graycode_07.png").read_bytes())
+    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90", "--strict")
+    assert status == 1 and "capture_1" in err and "graycode_03.png" in err
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_folder_without_a_readable_capture_is_an_error(faulty: Path, run: Run, tmp_path: Path) -> None:
+    for name in ("capture_0", "capture_4"):
+        for file in (faulty / name).iterdir():
+            file.unlink()
+        (faulty / name).rmdir()
+    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90")
+    assert status == 1 and "none of the 3 captures" in err
+    assert "graycode_03.png" in err and "graycode_07" in err and "modulation" in err
+    assert not (tmp_path / "s").exists()
+
+
+def write_colour(source: Path, exposures: tuple[float, ...] = ()) -> Path:
+    """Four steps of a fringe along both axes, in red light on a colour camera, described by a TOML in the folder."""
+    lines = ['order = "name"'] if not exposures else []
+    sequence = PatternSequence(PROJECTOR, (*phase_steps("x", 4, 132.0), *phase_steps("y", 4, 99.0)))
+    for exposure in exposures or (1.0,):
+        for axis, period in (("x", 132.0), ("y", 99.0)):
+            lines += ["[[frames]]", 'kind = "phase"', f'axis = "{axis}"', "steps = 4", f"period_px = {period}"]
+            if exposures:
+                lines += [f"exposure_ms = {exposure}", f'files = "{exposure:g}ms/{axis}*.png"']
+        for i, frame in enumerate(photographed(sequence, 7)):
+            light = np.clip(frame * exposure, 0, 255)
+            image = np.dstack([0.1 * light, 0.3 * light, light]).round().astype(np.uint8)
+            folder = source / "scan" / (f"{exposure:g}ms" if exposures else "")
+            folder.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(folder / f"{sequence.frames[i].axis}{i}.png"), image)
+    (source / "frames.toml").write_text("\n".join(lines) + "\n")
+    return source
+
+
+def test_the_default_channel_of_colour_frames_is_stated_once(run: Run, tmp_path: Path) -> None:
+    source, session = write_colour(tmp_path / "source"), tmp_path / "session"
+    shutil.copytree(source / "scan", source / "scan_2")
+    status, out, err = run("import", "auto", source, session, "--projector", "120x90", "--role", "scan")
+    assert status == 0 and "layout frames" in out and err.count("green channel") == 1
+    status, _, err = run(
+        "import", "frames", source, session, "--projector", "120x90", "--channel", "red", "--prefix", "red"
+    )
+    assert status == 0 and "channel" not in err
+    with Session.open(session) as store:
+        green, red = store.load_capture("scan"), store.load_capture("red_scan")
+        assert red.frames.max() > 2 * green.frames.max()
+        assert green.meta["settings"]["channel"] == "green" and red.meta["settings"]["channel"] == "red"
+
+
+def test_exposures_of_a_toml_become_those_of_the_session(run: Run, tmp_path: Path) -> None:
+    source, session = write_colour(tmp_path / "source", (4.0, 1.0)), tmp_path / "session"
+    status, _, err = run(
+        "import", "auto", source, session, "--projector", "120x90", "--channel", "red", "--role", "scan"
+    )
+    assert status == 0, err
+    with Session.open(session) as store:
+        capture = store.load_capture("scan")
+        assert capture.exposures_ms == (4.0, 1.0) and len(capture.frames) == 8
+        phase = decode_capture(capture)["x"]
+    error = (phase.coordinate - np.arange(120.0))[phase.mask]
+    assert phase.mask.mean() > 0.95 and np.sqrt(np.mean(error**2)) < 2.0
+
+
+def test_a_projector_size_that_is_not_stated_is_said(run: Run, tmp_path: Path) -> None:
+    source, session = write_colour(tmp_path / "source"), tmp_path / "session"
+    status, _, err = run("import", "auto", source, session, "--role", "scan")
+    assert status == 0 and "projector" in err and "not stated" in err
+    status, out, _ = run("inspect", session)
+    assert status == 0 and "unknown size" in out
+
+
+@pytest.mark.parametrize(("gain", "word"), [(0.2, "exposure"), (1.9, "saturates"), (1.0, "")])
+def test_a_wrong_exposure_is_reported(tmp_path: Path, run: Run, gain: float, word: str) -> None:
+    steps = phase_steps("x", 4, float(PROJECTOR[0]))
+    sequence = PatternSequence(PROJECTOR, tuple(steps))
+    (folder := tmp_path / "source").mkdir()
+    for number, frame in enumerate(photographed(sequence, 0)):
+        bright = np.clip(np.rint(frame * gain), 0, 255).astype(np.uint8)
+        assert cv2.imwrite(str(folder / f"{number}.png"), bright)
+    lines = [f'[[frame]]\nfile = "{k}.png"\n' + _toml(frame.to_dict()) for k, frame in enumerate(steps)]
+    (tmp_path / "frames.toml").write_text('projector = "120x90"\n' + "\n".join(lines))
+    status, _, err = run("import", "frames", folder, tmp_path / "session", "--sequence", tmp_path / "frames.toml")
+    assert status == (gain > 1) and (word in err if word else "warning" not in err), err
+
+
+def _toml(values: dict) -> str:
+    return "\n".join(f'{k} = "{v}"' if isinstance(v, str) else f"{k} = {v}" for k, v in values.items())

@@ -1,0 +1,250 @@
+"""Measurements of a session, and a scan against its nominal model, from the command line too."""
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from trimesh.creation import box
+
+from slviewer.errors import InputError, SessionError
+from slviewer.evaluation.region import find_spheres
+from slviewer.fringe.presets import p18
+from slviewer.inspection.regions import Region
+from slviewer.pipeline import measurements
+from slviewer.pipeline.measured_surface import Surface, surface
+from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.report import report
+from slviewer.pipeline.simulate import one_axis
+from slviewer.session.ply import read_ply, write_ply
+from slviewer.session.store import Session
+from slviewer.simulation.assets import asset
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.mesh import demo_object
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.scenes import Spheres
+from slviewer.simulation.truth import rig_record
+
+Run = Callable[..., tuple[int, str, str]]
+CENTRES = np.array([[-38.0, 0.0, 560.0], [42.0, 6.0, 570.0]])
+RADIUS = 25.0
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A session whose imported calibration is the truth, with a scan of the demo object and one of two balls."""
+    folder = tmp_path_factory.mktemp("measuring") / "session"
+    rig = letter(0.2, seed=2, local_distortion_px=0)
+    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    scenes = {
+        "object": demo_object(Pose(np.eye(3), np.array([0.0, 0.0, 520.0]))),
+        "balls": Spheres(CENTRES, RADIUS),
+    }
+    with Session.create(folder) as store:
+        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        for i, (name, scene) in enumerate(scenes.items()):
+            frames = Renderer(rig, scene).capture(sequence, i)
+            store.save_capture(name, "scan", sequence, frames, source="simulated")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def balls(made) -> Surface:
+    return surface(made, "balls")
+
+
+@pytest.fixture
+def folder(made, tmp_path) -> Path:
+    shutil.copytree(made, tmp_path / "session", symlinks=True)
+    return tmp_path / "session"
+
+
+@pytest.fixture(scope="module")
+def regions(balls) -> list[np.ndarray]:
+    """The pixels of each ball, from left to right."""
+    return [region for _, region in find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)]
+
+
+@pytest.fixture(scope="module")
+def tops(balls, regions) -> list[tuple[int, int]]:
+    """The pixel of each ball that is nearest to the camera."""
+    on, found = balls, []
+    for region in regions:
+        z = np.where(region & on.measured, on.points[..., 2], np.inf)
+        v, u = np.unravel_index(np.argmin(z), z.shape)
+        found.append((int(u), int(v)))
+    return found
+
+
+def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_path, regions, tops) -> None:
+    a, b = tops
+    first, second = (
+        measurements.add_fit(folder, balls, "sphere", Region.of_mask(r), n) for r, n in zip(regions, "LR", strict=True)
+    )
+    apart = measurements.add_relation(folder, first.id, second.id)
+    width = measurements.add_distance(folder, balls, a, b, "width")
+    cut = measurements.add_section(folder, balls, a, b)
+    point = measurements.add_point(folder, balls, a)
+    over = measurements.add_relation(folder, point.id, first.id)
+
+    radius = measurements.quantities_of(first)[0]
+    assert abs(radius.value - RADIUS) < max(3 * radius.sigma, 0.02) and 0 < radius.sigma < 0.1 and not radius.whole
+    true = np.linalg.norm(CENTRES[1] - CENTRES[0])
+    distance = measurements.quantities_of(apart)[0]
+    assert abs(distance.value - true) < max(3 * distance.sigma, 0.02) and apart.of == (first.id, second.id)
+    assert abs(measurements.quantities_of(width)[0].value - true) < 3 and measurements.quantities_of(width)[0].sigma > 0
+    assert abs(measurements.quantities_of(over)[1].value) < 0.3  # the point lies on the ball's surface
+    plane, lines = measurements.section_lines(folder, cut.id)
+    assert len(lines) >= 2 and max(np.ptp(line[:, 0]) for line in lines) < 2 * RADIUS
+    assert np.allclose(plane.drawn(balls.points[a[1], a[0]][None].astype(float)), 0, atol=1e-3)
+
+    listed = measurements.measurements(folder)
+    assert [each.id for each in listed] == ["m1", "m2", "m3", "m4", "m5", "m6", "m7"]
+    assert not any(each.stale for each in listed) and listed[2].name == "L – R"
+    status, said, _ = run("inspect", folder)
+    assert status == 0 and "7 measurements:" in said and "L (sphere on balls): radius 25.0" in said
+    assert measurements.export_measurements(folder, tmp_path / "m.csv") == 7
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "m.csv").read_text("utf-8-sig"))))
+    assert rows[0]["name"] == "L" and rows[0]["unit"] == "mm" and rows[0]["calibration in U"] == "no"
+    assert float(rows[0]["U (k = 2)"]) == pytest.approx(2 * radius.sigma, rel=1e-4)
+
+
+def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) -> None:
+    a, b = tops
+    one = measurements.add_distance(folder, balls, a, b)
+    assert one.name == "distance 1"
+    assert measurements.rename(folder, one.id, "=width").name == "=width"
+    assert ",'=width," in measurements.measurements_csv(folder).replace("m1,'", "m1,'")  # no formula for a spreadsheet
+    assert measurements.rename(folder, one.id, "").name == "distance 1"
+    two = measurements.add_distance(folder, balls, b, a, "back")
+    measurements.remove(folder, two.id)
+    three = measurements.add_distance(folder, balls, a, b)
+    assert three.id == "m3"  # an id that was deleted can come back
+    assert measurements.restore(folder).name == "back"
+    assert [each.id for each in measurements.measurements(folder)] == ["m1", "m2", "m3"]
+    with pytest.raises(InputError, match="none to bring back"):
+        measurements.restore(folder)
+    with pytest.raises(InputError, match="no measurement 'm9': there are m1, m2, m3"):
+        measurements.rename(folder, "m9", "x")
+
+
+def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls, regions) -> None:
+    fits = [measurements.add_fit(folder, balls, "sphere", Region.of_mask(region)) for region in regions]
+    measurements.add_relation(folder, fits[0].id, fits[1].id)
+    measurements.remove(folder, fits[1].id)
+    assert [each.stale for each in measurements.measurements(folder)] == [False, True]
+    measurements.restore(folder, fits[1].id)
+    assert not any(each.stale for each in measurements.measurements(folder))
+    with Session.open(folder, write=True) as store:
+        other = store.load_capture("object")
+        store.save_capture("balls", "scan", other.sequence, other.frames[::1], source="again", force=True)
+    assert all(each.stale for each in measurements.measurements(folder))
+    assert "[stale" in measurements.in_words(measurements.measurements(folder)[0])
+    with pytest.raises(InputError, match="is stale"):
+        measurements.add_relation(folder, fits[0].id, fits[1].id)
+
+
+def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls, regions, tops) -> None:
+    with pytest.raises(InputError, match="nothing was measured at"):
+        measurements.add_distance(folder, balls, (0, 0), tops[0])
+    with pytest.raises(InputError, match="lies outside balls"):
+        measurements.add_point(folder, balls, (-1, 5))
+    with pytest.raises(InputError, match="is no place on balls"):
+        measurements.add_point(folder, balls, 7)
+    with pytest.raises(InputError, match="bends"):
+        measurements.add_fit(folder, balls, "plane", Region.of_mask(regions[0]))
+    with pytest.raises(InputError, match="0 measured points"):
+        measurements.add_fit(folder, balls, "sphere", Region.ball([0, 0, 0], 5.0))
+    one = measurements.add_distance(folder, balls, *tops)
+    with pytest.raises(InputError, match="choose a point, plane, sphere"):
+        point = measurements.add_point(folder, balls, tops[0])
+        measurements.add_relation(folder, one.id, point.id)
+    assert len(measurements.measurements(folder)) == 2
+
+
+def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: Run, tmp_path, balls, tops) -> None:
+    ammonite = asset("objects/ammonite.ply")
+    arguments = ("compare", folder, "object", ammonite, "--tolerance", 1.5, "--json", tmp_path / "c.json")
+    status, said, wrong = run(*arguments, "--out", tmp_path / "d.ply")
+    assert status == 0, wrong
+    assert "PASS: decided with a guard band" in said and "of the nominal's area was measured" in said
+    found = json.loads((tmp_path / "c.json").read_text())
+    assert found["noise_mm"] < found["statistics_mm"]["rms"] < 2.5 * found["noise_mm"]
+    assert found["tolerance"]["decision"] == "pass" and 0.3 < found["coverage"] < 0.7
+    written = read_ply(tmp_path / "d.ply")
+    assert written.faces is not None and len(written.faces) and written.colours is not None
+    assert len(written.points) == found["statistics_mm"]["points"]
+    assert np.sqrt(np.mean(written.scalars["deviation"] ** 2)) == pytest.approx(found["statistics_mm"]["rms"], rel=1e-3)
+
+    measurements.add_section(folder, balls, *tops, "across")
+    measurements.add_distance(folder, balls, *tops)
+    status, said, _ = run("inspect", folder)
+    assert "object against ammonite.ply (deviation on object): mean" in said
+    report(folder, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert "Measurements" in page and "without the calibration" in page and "Section across" in page
+    assert "Deviation from nominal" in page and "coloured by its deviation from ammonite.ply" in page
+
+    box((5.6, 5.0, 1.6)).export(tmp_path / "inch.stl")
+    status, _, wrong = run("compare", folder, "object", tmp_path / "inch.stl")
+    assert status == 1 and "--units inch" in wrong and "Traceback" not in wrong
+    (tmp_path / "broken.stl").write_bytes(b"\0" * 300)
+    status, _, wrong = run("compare", folder, "object", tmp_path / "broken.stl")
+    assert status == 1 and "broken.stl" in wrong
+    assert len(measurements.measurements(folder)) == 3
+
+
+def test_a_damaged_measurement_is_told_not_guessed(folder, balls, tops) -> None:
+    one = measurements.add_section(folder, balls, *tops)
+    next((folder / "results" / "measurements" / one.id).rglob("lines.npy")).write_bytes(b"x")
+    with pytest.raises(SessionError, match="missing or damaged"):
+        measurements.section_lines(folder, one.id)
+
+
+def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, run: Run, tmp_path, tops) -> None:
+    (u, v), (x, y) = tops
+    for centre, name in zip(CENTRES, ("left", "right"), strict=True):
+        top = centre - [0, 0, RADIUS]
+        status, said, wrong = run("measure", folder, "balls", "sphere", "--ball", *top, 14, "--name", name)
+        assert status == 0 and f"{name} (sphere on balls): radius 2" in said, wrong
+    status, said, _ = run("measure", folder, "balls", "distance", "--at", u, v, x, y)
+    assert status == 0 and said.startswith("m3 ") and "distance 8" in said
+    status, said, _ = run(
+        "measurements", folder, "--relate", "m1", "m2", "--name", "m3", "tops", "--csv", tmp_path / "m.csv"
+    )
+    assert status == 0 and "left – right" in said and "tops (distance" in said and "4 measurements ->" in said
+    assert (tmp_path / "m.csv").read_text("utf-8-sig").startswith("id,name,kind")
+    assert "m4" not in run("measurements", folder, "--delete", "m4")[1]
+    assert "m4" in run("measurements", folder, "--bring-back")[1]
+    for wrong_use in (("plane",), ("plane", "--ball", 1, 2), ("distance", "--at", 3, 4), ("point",)):
+        status, _, wrong = run("measure", folder, "balls", *wrong_use)
+        assert status == 2 and "needs" in wrong
+
+
+def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
+    chosen = balls.measured
+    with Session.open(folder, write=True) as store:
+        points = balls.points[chosen]
+        sigma = np.full(len(points), 0.05, np.float32)
+        write_ply(store.exports / "merged_1.ply", points, normals=balls.normals[chosen], scalars={"sigma": sigma})
+        meta = {"ply": "merged_1.ply", "model": "stereo", "inputs": store.input_hashes("balls")}
+        store.save_result("merge/1", meta, {})
+    on = surface(folder, "merge/1")
+    region = regions[0]
+    one = measurements.add_fit(folder, on, "sphere", Region.of_mask(region[chosen]))
+    assert abs(measurements.quantities_of(one)[0].value - RADIUS) < 0.05 and one.source == "merge/1"
+    assert measurements.quantities_of(measurements.add_distance(folder, on, 0, 5))[0].sigma > 0
+    with pytest.raises(InputError, match="mesh it first"):
+        measurements.add_section(folder, on, 0, 5000)
+    with pytest.raises(InputError, match="give an index"):
+        measurements.add_point(folder, on, (3, 4))
+    other = measurements.add_fit(folder, balls, "sphere", Region.of_mask(region))
+    with pytest.raises(InputError, match="not lie in one frame"):
+        measurements.add_relation(folder, one.id, other.id)

@@ -1,0 +1,48 @@
+"""Calibrations that a session holds, read back."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.errors import SessionError
+from slviewer.pipeline.models import load_model, warn_if_stale
+from slviewer.session.store import Session
+from slviewer.wizard.operator import Operator
+
+
+@pytest.mark.parametrize("name", ["pixelwise", "anchored", "splined"])
+def test_a_calibration_of_another_layout_is_refused_with_what_to_do(tmp_path: Path, name: str) -> None:
+    with Session.create(tmp_path / "session") as store:
+        store.save_result(f"calibration/{name}", {"model": {"axes": ["x"], "periods_px": {"x": 18}}}, {"z": np.eye(2)})
+        with pytest.raises(SessionError, match=f"the {name} calibration .* run `slviewer calibrate` again"):
+            load_model(store, name)
+
+
+def test_what_is_stale_is_told_in_one_sentence(tmp_path: Path) -> None:
+    said: list[str] = []
+    with Session.create(tmp_path / "session") as store:
+        for name in ("stereo", "splined"):
+            store.save_result(f"calibration/{name}", {"inputs": {}}, {"z": np.eye(2)})
+        warn_if_stale(store, said.append)
+        assert not said
+        for name in ("stereo", "splined"):
+            store.save_result(f"calibration/{name}", {"inputs": {"pose_01": "gone"}}, {"z": np.eye(2)})
+        warn_if_stale(store, said.append)
+    (sentence,) = said
+    assert sentence.startswith("the stereo and splined calibrations were made from target poses that have since")
+
+
+def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recorded: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    shutil.rmtree(folder / "results" / "calibration" / "splined")
+    with Session.open(folder, write=True) as store:
+        meta = store.load_result("calibration/pixelwise", only=())[0]
+        kept = {key: meta[key] for key in ("model", "inputs", "settings")}
+        store.save_result("calibration/pixelwise", kept, {"coefficients": np.zeros((2, 2))})
+    with Operator(folder) as operator:
+        shown = operator.wait_for(lambda s: s.session is not None and s.session.calibration is not None, 20.0)
+        assert shown is not None and shown.session is not None and shown.session.calibration is not None
+        assert shown.session.calibration.stale == "it was saved by another version of slviewer: calibrate again"
+        assert shown.session.calibration.reprojection_px

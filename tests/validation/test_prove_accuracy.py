@@ -1,0 +1,120 @@
+"""Accuracy proved: a small rig from images to figures, and that bad figures do not pass."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slviewer.calibration.splined import fields
+from slviewer.fringe.decode import decode
+from slviewer.fringe.presets import AXES, gray_bits, p18, phase_steps
+from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.simulation.perfect import PerfectModel
+from slviewer.simulation.plans import letter_plan, planes
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.scenes import Scene
+from slviewer.validation import prove_rigs
+from slviewer.validation.prove_accuracy import AccuracyProof, prove_accuracy
+from slviewer.validation.prove_rigs import FLOOR, PlaneFigures, RigFigures, cases
+
+SHAPES = ("plane_03", "sphere_3", "sphere_4")
+"""Inside the calibrated depths, where a few poses already suffice."""
+
+
+def few(*settings: Any) -> dict[str, Scene]:
+    """The Letter's plan with these shapes alone."""
+    plan = letter_plan(*settings)
+    return {name: scene for name, scene in plan.items() if name.startswith("pose_") or name in SHAPES}
+
+
+def quick(projector: tuple[int, int]) -> PatternSequence:
+    """A third of the usual phase steps."""
+    frames = [f for a in AXES for f in (*phase_steps(a, 6, 18.0), *gray_bits(a, 7), Frame("texture"))]
+    return PatternSequence(projector, tuple(frames))
+
+
+@pytest.fixture(scope="module")
+def proof() -> Iterator[AccuracyProof]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fields, "CELLS_ACROSS", 8)
+        patch.setattr(prove_rigs, "TARGET", "circles:14x11:13")
+        patch.setattr(prove_rigs, "letter_plan", few)
+        patch.setattr(prove_rigs, "p18", quick)
+        yield prove_accuracy(0.15, rigs=cases()[:1], poses=8)
+
+
+def test_a_rig_is_measured_from_its_images(proof: AccuracyProof) -> None:
+    (rig,) = proof.rigs
+    (plane,) = rig.planes.values()
+    assert plane.region == "R2" and plane.pixels > 8_000 and 0.9 < plane.kept <= 1
+    assert 0.03 < plane.rms_mm[FLOOR] < 0.09
+    assert 0.97 < plane.rms_mm["splined"] / plane.rms_mm[FLOOR] < 1.15
+    assert plane.rms_mm["stereo"] > 2 * plane.rms_mm["splined"]
+    assert plane.predicted_mm == pytest.approx(plane.rms_mm[FLOOR], rel=0.05)
+    assert set(plane.rms_mm) == {"stereo", "pixelwise", "anchored", "splined", FLOOR}
+    errors = rig.radius_mm[FLOOR]
+    assert set(errors) == {"sphere_3", "sphere_4"} and 0 < max(map(abs, errors.values())) < 0.05
+    assert 0 < abs(rig.spacing_mm[FLOOR]["sphere_3 - sphere_4"]) < 0.05
+    assert json.loads(json.dumps(proof.to_json()))["rigs"][0]["planes"]["plane_03"]["region"] == "R2"
+
+
+def test_the_perfect_instrument_errs_by_noise_alone() -> None:
+    rig = letter(0.15, seed=3)
+    scene = planes()["plane_05"]
+    renderer = Renderer(rig, scene)
+    sequence = p18(rig.projector.size)
+    frames, truth = renderer.capture(sequence), renderer.truth()
+    phases = {axis: decode(sequence, frames, axis) for axis in ("x", "y")}
+    model = PerfectModel(rig)
+    inside = truth.mask.copy()
+    inside[1:-1, 1:-1] &= truth.mask[:-2, 1:-1] & truth.mask[2:, 1:-1] & truth.mask[1:-1, :-2] & truth.mask[1:-1, 2:]
+    points = model.points(phases["x"])
+    error = (points - truth.points)[..., 2] / model.sigma_z(phases["x"], points)
+    scored = inside & np.isfinite(error) & (np.abs(error) < 6)
+    assert np.count_nonzero(scored) > 0.97 * np.count_nonzero(inside)
+    assert np.std(error[scored]) == pytest.approx(1, abs=0.1) and abs(np.mean(error[scored])) < 0.1
+    # what a model without noise measures is the truth itself
+    exact = replace(phases["x"], phase=(truth.projector[..., 0] * 2 * np.pi / 18).astype(np.float32))
+    found = model.points(exact)[inside & exact.mask]
+    assert np.max(np.abs(found - truth.points[inside & exact.mask])) < 0.01
+
+
+def figures(splined=1.0, predicted=1.0, radius=0.004, spacing=0.01, kept=1.0, local=None) -> RigFigures:
+    """A rig whose planes come out so many times the floor."""
+    rms = {"stereo": 0.2, "pixelwise": 0.08, "anchored": 0.06, "splined": 0.04 * splined, FLOOR: 0.04}
+    planes = {
+        f"plane_{i}": PlaneFigures(region, rms, 0.04 * predicted, 50_000, kept)
+        for i, region in enumerate(("R1", "R2", "R3"))
+    }
+    return RigFigures(
+        replace(cases()[0], local_distortion_px=local),
+        planes,
+        {"splined": {"sphere_1": 0.001, "sphere_2": -radius}},
+        {"splined": {"sphere_1 - sphere_2": -spacing}},
+        {"in all": 1.0},
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "missed"),
+    [
+        ({}, ""),
+        ({"splined": 1.15}, "in R2"),
+        ({"splined": 0.8}, "in R1"),
+        ({"predicted": 0.85}, "predicted floor"),
+        ({"radius": 0.02}, "radius"),
+        ({"radius": float("nan")}, "radius"),
+        ({"spacing": 0.05}, "spacing"),
+        ({"kept": 0.8}, "share of the pixels"),
+        ({"local": 0.0, "splined": 5.3}, "over stereo"),
+    ],
+)
+def test_what_misses_its_band_is_said(change: dict, missed: str) -> None:
+    proof = AccuracyProof((figures(**change),), 0.25)
+    assert proof.holds == (not missed) and missed in proof.text()
+    assert json.loads(json.dumps(proof.to_json()))["holds"] == proof.holds
+    assert not [check.what for check in proof.checks if not check.holds and not missed]

@@ -1,0 +1,225 @@
+"""The whole wizard, flown once on a small rig; then everything that can be looked at, exported and undone."""
+
+import importlib
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from slviewer.calibration.guidance import choosing
+from slviewer.errors import Cancelled
+from slviewer.pipeline.measurements import quantities_of
+from slviewer.session.ply import read_ply
+from slviewer.session.store import Session
+from slviewer.wizard import acquisition, result_views, tasks
+from slviewer.wizard.autopilot import TARGET, Autopilot
+from slviewer.wizard.jobs import Reporter
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import SessionView, Snapshot
+
+RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
+
+
+@pytest.fixture(scope="module")
+def acts() -> list[str]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def operator(tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
+    folder = tmp_path_factory.mktemp("flight") / "session"
+    with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG) as operator:
+        patch.setattr(choosing, "TRIALS", 20)  # the best of fewer poses does
+        patch.setattr(acquisition, "PREVIEWS_PER_S", 2.0)  # nobody looks
+        Autopilot(operator, poses=8, before=acts.append).run()
+        yield operator
+
+
+def session_of(snapshot: Snapshot) -> SessionView:
+    assert snapshot.session is not None
+    return snapshot.session
+
+
+def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
+    snapshot = operator.snapshot()
+    session = session_of(snapshot)
+    assert [step.state for step in snapshot.steps] == ["done"] * 9
+    assert not [notice.text for notice in snapshot.notices if notice.level == "error"]
+    assert "Capturing pose 8 of 8" in acts and acts[-1] == "Writing the report"
+    assert {pose.state for pose in session.poses} == {"used"}
+    assert all(pose.rms_px and 0.01 < max(pose.rms_px) < 0.4 for pose in session.poses)
+    assert session.coverage is not None and session.coverage.share > 0.6
+    assert session.enough and session.foreseen is not None and 0.005 < session.foreseen.sigma_mm < 0.024  # type: ignore[operator]
+    calibration = session.calibration
+    assert calibration is not None and calibration.best == "splined" and abs(calibration.baseline_mm - 180) < 2
+    assert session.verdict is not None and session.verdict_of_calibration and not calibration.refused
+    splined = calibration.splined
+    assert splined is not None and splined.noise_px["x"] < 0.03 and splined.lit["camera"] > 0.8
+    assert set(splined.trust) == set(calibration.poses) and not splined.left_out
+    rows = {(row.capture, row.model): row for row in session.verifications}
+    assert rows["plane_01", "splined"].rms_mm < rows["plane_01", "pixelwise"].rms_mm
+    assert rows["plane_01", "splined"].masked is not None and rows["plane_01", "stereo"].masked is None
+    assert rows["plane_01", "pixelwise"].rms_mm < rows["plane_01", "stereo"].rms_mm < 0.5
+    assert rows["plane_01", "pixelwise"].noise_floor_mm < rows["plane_01", "pixelwise"].rms_mm  # type: ignore[operator]
+    assert rows["sphere_01", "pixelwise"].radius_mm == pytest.approx(98, abs=0.5)
+    merge = session.merge
+    assert merge is not None and set(merge.pairs) == {"scan_01", "scan_02"} and merge.reference == "scan_03"
+    assert all(0.01 < rms < 0.5 and overlap > 0.5 for rms, overlap, _ in merge.pairs.values())
+    merged = read_ply(next(e.path for e in session.exports if e.name == "merged_1.ply"))
+    assert len(merged.points) == merge.points > 30_000
+    assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
+    sphere, width = session.measurements
+    radius = quantities_of(sphere)[0]
+    assert radius.U is not None and abs(radius.value - 98) < 2 * radius.U < 0.2  # the simulated sphere's
+    assert 130 < quantities_of(width)[0].value < 150  # the ammonite's
+
+
+def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:
+    assert operator.want_sigma(0.0001) and operator.set_hands_free(True)
+    snapshot = operator.settle()
+    foreseen = session_of(snapshot).foreseen
+    assert foreseen is not None and foreseen.wanted_mm == 0.0001 and not foreseen.enough
+    assert foreseen.next_mm is not None and foreseen.sigma_mm is not None and foreseen.next_mm < foreseen.sigma_mm
+    assert snapshot.hands_free
+    assert operator.want_sigma(None) and not operator.want_sigma(-1.0)
+    snapshot = operator.settle()
+    assert session_of(snapshot).enough and not snapshot.hands_free
+    assert "enough" in snapshot.step("poses").now
+
+
+def test_panels_find_what_they_draw(operator: Operator) -> None:
+    store = operator.session
+    assert store is not None
+    cloud = result_views.scan_cloud(store, "plane_01")
+    assert cloud.points.shape == (300, 400, 3) and set(cloud.errors) == {"stereo", "pixelwise", "splined"}
+    measured = np.isfinite(cloud.points).all(-1)
+    assert np.isfinite(cloud.phase[measured]).all() and cloud.modulation[measured].min() > 1
+    v, u = 150, 200
+    assert cloud.nearest(np.zeros(3), cloud.points[v, u]) == (u, v)
+    assert cloud.nearest(np.zeros(3), np.array([0, 1.0, 0])) is None
+    assert np.isfinite(cloud.points[cloud.thinned(2000)][..., 2]).sum() <= 2500
+    assert set(result_views.error_histogram(store, "plane_01").counts) == {"stereo", "pixelwise", "splined"}
+    pixels, residuals = result_views.residuals(store, "pose_03")
+    assert pixels.shape == (336, 2) and residuals.shape == (336, 4)
+    curve = result_views.pixel_curve(store, (200, 150), "x")
+    assert curve is not None and len(curve.phase) >= 4
+    assert result_views.pixel_fits(store)["x"].rms_mm.shape == (3, 300, 400)
+    assert result_views.merged_cloud(store, "1").normals is not None
+
+
+@pytest.mark.parametrize(
+    ("where", "make"),
+    [
+        ("calibrate.calibrate_pixelwise", lambda store, r: tasks.make_calibration(store, TARGET, r, print)),
+        ("poses.observe", lambda store, r: tasks.make_calibration(store, TARGET, r, print)),
+        ("capture_clouds.reconstruct", lambda store, r: tasks.make_cloud(store, "scan_01", None, r, print)),
+        ("merge.fuse", lambda store, r: tasks.merge_scans(store, ["scan_01"], "scan_02", r, print)),
+        ("verify.compare", lambda store, r: tasks.measure(store, ["plane_01"], "plane", None, r, print)),
+    ],
+)
+def test_work_given_up_inside_a_long_call_saves_nothing(
+    operator: Operator, monkeypatch: pytest.MonkeyPatch, where: str, make: Callable[[Session, Reporter], object]
+) -> None:
+    store, report = operator.session, Reporter(lambda: None)
+    assert store is not None
+    module = importlib.import_module(f"slviewer.pipeline.{where.split('.')[0]}")
+    long_call = getattr(module, where.split(".")[1])
+
+    def given_up(*args: object, **options: object) -> object:
+        report.cancel()
+        return long_call(*args, **options)
+
+    monkeypatch.setattr(module, where.split(".")[1], given_up)
+    if where == "poses.observe":
+        store.trash_result("poses/pose_05")
+
+    def files() -> dict[str, int]:
+        kept = (store.folder / folder for folder in ("results", "exports"))
+        return {str(p): p.stat().st_mtime_ns for folder in kept for p in folder.rglob("*") if p.is_file()}
+
+    before = files()
+    with pytest.raises(Cancelled):
+        make(store, report)
+    assert files() == before
+    if where == "poses.observe":
+        assert store.state_of("poses/pose_05") == "absent"
+
+
+def test_files_for_other_programs(operator: Operator) -> None:
+    assert operator.export("mesh", "scan_01", "stl") and operator.export("mesh", "scan_01", "glb")
+    assert operator.export("cloud", "scan_02") and operator.export("calibration") and operator.export("table")
+    assert operator.export("merged-mesh") and operator.diagnostic_bundle()
+    session = session_of(operator.settle())
+    files = {export.name: export for export in session.exports}
+    assert all(export.bytes > 100 for export in files.values())
+    assert len(trimesh.load(files["scan_01_mesh.stl"].path).faces) > 10_000
+    assert "vertex" in read_head(files["merged_1_mesh.ply"].path)
+    surface = trimesh.load(files["merged_1_mesh.ply"].path)
+    cloud = read_ply(files["merged_1.ply"].path)
+    gaps = cKDTree(surface.vertices).query(cloud.points[::200])[0]
+    assert len(surface.faces) > 5_000 and np.median(gaps) < 1.0
+    table = files["verifications.csv"].path.read_text().splitlines()
+    assert len(table) == 7 and table[1].startswith("plane_01,A flat plate,plane,stereo,")
+    bundle = next(export for export in files.values() if export.name.startswith("diagnostics_"))
+    with zipfile.ZipFile(bundle.path) as inside:
+        names = inside.namelist()
+        assert {"versions.json", "state.json", "log.txt", "session/decisions.json"} <= set(names)
+        assert "previews/pose_01.jpg" in names and not [n for n in names if "frames" in n or n.endswith(".npy")]
+        assert b"calibrated from 8 poses" in inside.read("log.txt")
+    assert bundle.bytes < 1_000_000
+    assert not operator.export("mesh", "scan_01", "doc") and not operator.export("cloud", "../x")
+    assert not [path for path in (operator.session.folder / "exports").iterdir() if path.name.startswith(".")]  # type: ignore[union-attr]
+
+
+def read_head(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.read(1000).decode("ascii", "replace")
+
+
+def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(operator: Operator) -> None:
+    store = operator.session
+    assert store is not None
+    before = result_views.scan_cloud(store, "scan_02").points
+    inputs = store.input_hashes("calibration/splined")
+    store.save_result("scale/splined", {"factor": 1.001, "certificate": "lab 7", "inputs": inputs}, {})
+    assert operator.choose_model("splined")
+    session = session_of(operator.settle())
+    assert session.calibration is not None and session.calibration.chosen == "splined"
+    assert session.calibration.scales == {"splined": "scale corrected by +1000 ppm, by certificate lab 7"}
+    assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
+    assert operator.reconstruct("scan_02")
+    scan = operator.settle().scan("scan_02")
+    assert scan is not None and scan.cloud == "fresh" and scan.scale.startswith("scale corrected by +1000 ppm")
+    after = result_views.scan_cloud(store, "scan_02").points
+    both = np.isfinite(before[..., 2]) & np.isfinite(after[..., 2])
+    np.testing.assert_allclose(after[both], before[both] * np.float32(1.001), rtol=1e-6)
+    store.trash_result("scale/splined")
+    assert operator.choose_model("") and not operator.choose_model("anchored")
+
+
+def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
+    assert operator.exclude("pose_02")
+    stale = operator.settle()
+    assert session_of(stale).calibration.stale.startswith("pose_02 was excluded")  # type: ignore[union-attr]
+    assert stale.step("calibrate").state == "ready" and stale.step("scan").state == "done"
+    assert operator.calibrate()
+    again = operator.settle()
+    session = session_of(again)
+    assert session.calibration is not None and session.calibration.stale == "" and len(session.calibration.poses) == 7
+    assert session.calibration.models == ("stereo", "pixelwise")  # what was made of other poses is gone
+    assert any("it needs 8 target poses" in notice.text for notice in again.notices)
+    assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
+    assert session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
+    assert again.pose("pose_02").state == "excluded"  # type: ignore[union-attr]
+    assert operator.reconstruct("scan_01")
+    assert again.scan("scan_01") is not None and operator.settle().scan("scan_01").cloud == "fresh"  # type: ignore[union-attr]
+    assert operator.undo_merge()
+    undone = session_of(operator.settle())
+    assert undone.merge is None and "merged_1.ply" not in {export.name for export in undone.exports}
+    assert not operator.undo_merge()
+    assert operator.delete("scan_02")
+    assert operator.settle().scan("scan_02") is None

@@ -1,0 +1,108 @@
+"""Importing as an operator asks for it: a folder of the computer, or a zip that was uploaded."""
+
+import io
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.fringe.patterns import render
+from slviewer.fringe.presets import gray
+from slviewer.pipeline.import_calibration import import_opencv_calibration
+from slviewer.session.exporters import write_calibration
+from slviewer.wizard.operator import Operator
+
+PROJECTOR = (120, 90)
+
+
+@pytest.fixture
+def operator(tmp_path: Path) -> Iterator[Operator]:
+    with Operator(tmp_path / "session") as engine:
+        yield engine
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """Two captures of the procam-calibration layout, and one with a missing image."""
+    sequence = gray(PROJECTOR)
+    for n in range(3):
+        folder = tmp_path / "source" / f"capture_{n}"
+        folder.mkdir(parents=True)
+        rng = np.random.default_rng(n)
+        for i in range(len(sequence.frames)):
+            frame = render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1])
+            cv2.imwrite(str(folder / f"graycode_{i:02d}.png"), frame.round().astype(np.uint8))
+    (tmp_path / "source" / "capture_1" / "graycode_05.png").unlink()
+    return tmp_path / "source"
+
+
+def archived(source: Path) -> bytes:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as out:
+        for file in sorted(source.rglob("*.png")):
+            out.write(file, file.relative_to(source.parent))
+        out.writestr("source/notes.txt", "x")
+    return data.getvalue()
+
+
+def texts(operator: Operator, level: str) -> list[str]:
+    return [notice.text for notice in operator.snapshot().notices if notice.level == level]
+
+
+def test_a_folder_becomes_poses_and_what_is_skipped_is_said(operator: Operator, source: Path) -> None:
+    assert operator.import_folder(f" {source} ", projector="120x90")
+    view = operator.settle(60).session
+    assert view is not None and [pose.name for pose in view.poses] == ["capture_0", "capture_2"]
+    assert any("2 captures imported" in text for text in texts(operator, "good"))
+    assert any("capture_1" in text and "graycode_05" in text for text in texts(operator, "warning"))
+
+
+def test_a_zip_becomes_scans_and_leaves_nothing_behind(operator: Operator, source: Path) -> None:
+    assert operator.import_zip("my scans.zip", archived(source), role="scan", projector="120x90")
+    view = operator.settle(60).session
+    assert view is not None and [scan.name for scan in view.scans] == ["capture_0", "capture_2"]
+    assert any("notes.txt" in text for text in texts(operator, "warning"))
+    assert operator.session is not None
+    assert operator.session.load_capture("capture_0").meta["source"] == "my scans.zip"
+    assert not [path for path in operator.session.folder.iterdir() if "import" in path.name]
+    assert operator.import_zip("one.zip", archived(source / "capture_0"), role="scan", projector="120x90")
+    operator.settle(60)
+    assert any("capture_0" in text and "already" in text for text in texts(operator, "error"))
+
+
+def test_what_cannot_be_imported_is_said_in_words(operator: Operator, source: Path, tmp_path: Path) -> None:
+    assert not operator.import_folder("  ")
+    for path, fact in ((tmp_path / "absent", "absent"), (tmp_path, "none of the known layouts")):
+        assert operator.import_folder(path)
+        operator.settle(60)
+        assert any(fact in text for text in texts(operator, "error")), fact
+    assert operator.import_zip("a.zip", b"no zip")
+    operator.settle(60)
+    assert any("no zip" in text for text in texts(operator, "error"))
+    assert operator.import_folder(source, projector="wide")
+    operator.settle(60)
+    assert any("'wide'" in text for text in texts(operator, "error"))
+    assert operator.session is not None and operator.session.capture_names() == []
+
+
+def test_a_cancelled_import_saves_nothing(operator: Operator, source: Path) -> None:
+    assert operator.import_folder(source, projector="120x90")
+    operator.cancel()
+    operator.settle(60)
+    assert operator.session is not None and operator.session.capture_names() == []
+
+
+def test_an_imported_calibration_without_sizes_waits_for_captures(source: Path, tmp_path: Path) -> None:
+    K, R = np.array([[400.0, 0, 60], [0, 400.0, 45], [0, 0, 1]]), np.eye(3)
+    matrices = {"K_camera": K, "D_camera": np.zeros(5), "K_projector": K, "D_projector": np.zeros(5)}
+    write_calibration(tmp_path / "rig.yml", {**matrices, "R": R, "T": np.array([100.0, 0, 0])})
+    import_opencv_calibration(tmp_path / "rig.yml", tmp_path / "session")
+    with Operator(tmp_path / "session") as operator:
+        view = operator.settle(60).session
+        assert view is not None and view.calibration is None
+        assert operator.import_folder(source, projector="120x90")
+        view = operator.settle(60).session
+        assert view is not None and view.calibration is not None and view.calibration.baseline_mm == 100

@@ -1,0 +1,232 @@
+"""Scanning live on a small simulated rig: clouds as a capture gives them, the newest first, and an end in any case."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
+from slviewer.devices.faults import Faults, breakable
+from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.world import SimulatedWorld
+from slviewer.fringe.decode import decode
+from slviewer.fringe.presets import short
+from slviewer.pipeline.capture_phases import decode_capture
+from slviewer.pipeline.models import load_stereo, save_imported_stereo
+from slviewer.pipeline.rig_choice import Bench, Choice, set_up
+from slviewer.session.store import Session
+from slviewer.simulation.rig import letter
+from slviewer.simulation.truth import rig_record
+from slviewer.target.board import Board
+from slviewer.wizard import acquisition
+from slviewer.wizard.live_frames import Stream
+from slviewer.wizard.live_measuring import Measuring
+from slviewer.wizard.live_scan import LiveCloud
+from slviewer.wizard.operator import Operator
+
+SCALE = 0.15
+RIG = {"driver": "simulated", "scale": SCALE, "settle_ms": 4}  # what waits beside it needs the cores too
+SETTINGS = CameraSettings(1.0, 1.0)
+
+
+class Wizard:
+    """A wizard over a session that is calibrated with the truth, and the live clouds that it made."""
+
+    faults: Faults
+
+    def __init__(self, folder: Path) -> None:
+        record = rig_record(rig := letter(SCALE))
+        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+        with Session.create(folder) as store:
+            save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        self.clouds: list[LiveCloud] = []
+        self.operator = Operator(folder, RIG, set_up=self._set_up)
+        self.operator.on_live(self.clouds.append)
+        assert self.operator.wait_for(lambda s: s.rig.state == "open", 10)
+        self.operator.place("object")
+
+    def _set_up(self, choice: Choice, board: Board | None) -> Bench:
+        bench = set_up(choice, board)
+        rig, self.faults = breakable(bench.rig)
+        return Bench(rig, bench.world, bench.focal_px)
+
+    def goes_on(self, more: int = 3) -> None:
+        seen = len(self.clouds)
+        until(lambda: len(self.clouds) >= seen + more)
+
+    def ends(self) -> None:
+        assert self.operator.wait_for(lambda s: s.live is None, 10)
+
+    def told(self, words: str) -> bool:
+        return self.operator.wait_for(lambda s: any(words in notice.text for notice in s.notices), 10) is not None
+
+
+def until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def wizard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wizard]:
+    monkeypatch.setattr(acquisition, "RETRY_S", 0.1)
+    wizard = Wizard(tmp_path / "session")
+    yield wizard
+    wizard.operator.close()
+
+
+def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> None:
+    operator = wizard.operator
+    assert not operator.keep_live() and wizard.told("press Live first")
+    assert operator.start_live()
+    wizard.goes_on()
+    for cloud in wizard.clouds:
+        operator.live_shown(cloud)
+    live = operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, 10)
+    assert live is not None and live.live is not None
+    assert live.live.points > 3000 and live.live.clouds_per_s > 0
+    assert live.live.behind_ms is not None and live.live.behind_ms > 1
+    numbers = [cloud.number for cloud in wizard.clouds]
+    assert numbers == sorted(set(numbers))
+
+    assert operator.keep_live("a <b>face</b>")  # saved when this returns, and it goes on
+    store = operator.session
+    assert store is not None and store.capture_names() == ["scan_01"]
+    wizard.goes_on()
+    kept = store.load_capture("scan_01")
+    assert len(kept.sequence.frames) == 11 and kept.sequence.axes == ("x",)
+    model = load_stereo(store)
+    normal = model.points(decode_capture(kept)["x"])
+    points, _ = Measuring(kept.sequence, "x", model).cloud(kept.stack())
+    both = np.isfinite(points[..., 2])
+    np.testing.assert_array_equal(points[both], normal[both])
+    assert both.sum() > 0.97 * np.isfinite(normal[..., 2]).sum()  # nothing moved
+    assert not np.isfinite(points[~np.isfinite(normal[..., 2])]).any()
+    difference = wizard.clouds[-1].points[..., 2] - normal[..., 2]
+    assert np.nanmedian(np.abs(difference)) < 1.0  # the same object, in light of its own
+
+    assert operator.capture_scan()
+    wizard.ends()
+    after = operator.settle()
+    assert after.session is not None and after.rig.state == "open"
+    assert [(s.label, s.cloud) for s in after.session.scans] == [("a <b>face</b>", "fresh"), ("scan_02", "fresh")]
+
+
+def test_stopping_frees_the_devices_and_starting_again_goes_on(wizard: Wizard) -> None:
+    operator = wizard.operator
+    for _ in range(2):
+        assert operator.start_live()
+        wizard.goes_on()
+        assert operator.stop_live()
+        wizard.ends()
+    seen = len(wizard.clouds)
+    number = operator.preview().number  # type: ignore[union-attr]
+    until(lambda: operator.preview().number > number + 1)  # type: ignore[union-attr]
+    assert len(wizard.clouds) == seen and operator.snapshot().rig.state == "open"
+    assert operator.stop_live()  # twice does no harm
+    until(lambda: "slviewer live" not in {thread.name for thread in threading.enumerate()})
+
+
+def test_a_fault_ends_it_with_a_sentence_and_what_was_kept_stays(wizard: Wizard) -> None:
+    operator = wizard.operator
+    assert operator.start_live()
+    wizard.goes_on()
+    assert operator.keep_live()
+    wizard.faults.plan("unplugged", 4)
+    assert wizard.told("the camera does not answer")
+    wizard.ends()
+    assert wizard.told("the rig answers again")
+    assert operator.wait_for(lambda s: s.rig.state == "open", 10)
+    assert operator.session is not None and operator.session.capture_names() == ["scan_01"]
+    assert operator.start_live()
+    wizard.goes_on(1)
+
+
+def test_whoever_reads_late_gets_the_newest_and_slows_nobody() -> None:
+    world = SimulatedWorld(letter(0.1))
+    sequence = short(world.rig.projector.size, "x")
+    ended: list[int] = []
+    stream = Stream(sequence, lambda: ended.append(1))
+    with simulated_rig(world).opened() as rig:
+        rig.projector.load(sequence)
+        first = stream.take(rig, SETTINGS, lambda: False)
+        assert first is not None and first.shape == (120, 160)
+        read = stream.next()
+        assert read is not None
+        before = read.frames.copy()
+        buffers = set()
+        for _ in range(6):  # nobody reads meanwhile
+            assert stream.take(rig, SETTINGS, lambda: False) is not None
+            assert stream._waiting is not None
+            buffers.add(id(stream._waiting.frames))
+        np.testing.assert_array_equal(read.frames, before)
+        assert len(buffers) == 2 and id(read.frames) not in buffers and stream.taken == 7
+        waited = stream._waiting
+        assert stream.next() is waited
+        frames = iter([False] * 4 + [True])
+        assert stream.take(rig, SETTINGS, lambda: next(frames)) is None and stream.taken == 7
+    kept = stream.kept()
+    assert kept is not None and waited is not None
+    np.testing.assert_array_equal(kept.frames, waited.frames)
+    stream.ended()
+    stream.ended()
+    assert stream.next() is None and ended == [1]
+
+
+def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
+    world = SimulatedWorld(letter(0.2))
+    world.place("sphere")
+    sequence = short(world.rig.projector.size, "x")
+    frames = world.renderer(False).capture(sequence)
+    late = frames.copy()
+    moving = (slice(None), slice(60, 180), slice(120, 200))
+    late[9][moving[1:]] = np.roll(frames[9], 4, axis=1)[moving[1:]]  # one of the finest steps, four columns further
+    phases = [decode(sequence, each, "x") for each in (frames, late)]
+
+    class Depth:
+        """What is measured is the phase itself."""
+
+        name, axes = "depth", ("x",)
+
+        def points(self, phase):
+            return np.repeat(phase.phase[..., None], 3, axis=2)
+
+        def sigma_z(self, phase, points):
+            return points[..., 2]
+
+    still, moved = (Measuring(sequence, "x", Depth()).cloud(each)[0][..., 2] for each in (frames, late))
+    assert np.isfinite(still).sum() > 0.95 * phases[0].mask.sum() > 1000
+    wrong = np.abs(phases[1].phase - phases[0].phase) > 0.5
+    assert wrong[moving[1:]].sum() > 200
+    assert np.isfinite(moved[wrong]).mean() < 0.1
+
+
+def test_one_pass_gives_what_decoding_and_reconstructing_give() -> None:
+    world = SimulatedWorld(letter(0.15))
+    world.place("object")
+    sequence = short(world.rig.projector.size, "x")
+    renderer, shape = world.renderer(False), (180, 240)
+    low, high, ones = np.zeros(shape, np.float32), np.full(shape, 400, np.float32), np.ones(shape, np.float32)
+    terms = [np.full(shape, value) for value in (900.0, -1.0, -9e-4, 0.1, 0.05)]
+    fit = PixelFit(np.stack(terms), np.stack([ones] * 3), np.full(shape, 20, np.uint16), low, high, ones)
+    model = PixelwiseModel({"x": fit}, {"x": 18.0}, {}, "x")
+    measuring = Measuring(sequence, "x", model, factor=1.5)
+    clouds = []
+    for seed in (1, 2):
+        frames = renderer.capture(sequence, seed)
+        normal = 1.5 * model.points(decode(sequence, frames, "x"))
+        points, texture = measuring.cloud(frames)
+        clouds.append((points, points.copy(), texture))
+        both = np.isfinite(points[..., 2])
+        assert both.sum() > 0.95 * np.isfinite(normal[..., 2]).sum() > 3000
+        assert not np.isfinite(points[~np.isfinite(normal[..., 2])]).any()
+        np.testing.assert_allclose(points[both], normal[both], rtol=1e-5)
+        np.testing.assert_array_equal(texture, frames[-1])
+    assert clouds[0][0] is not clouds[1][0]
+    np.testing.assert_array_equal(clouds[0][0], clouds[0][1])  # the second was written elsewhere

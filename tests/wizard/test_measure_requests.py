@@ -1,0 +1,144 @@
+"""Measuring as an operator asks for it: by the worker, kept, listed, refused in words."""
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from slviewer.errors import InputError
+from slviewer.fringe.presets import p18
+from slviewer.inspection.regions import Region
+from slviewer.pipeline.measurements import measurements, quantities_of
+from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.simulate import one_axis
+from slviewer.session.store import Session
+from slviewer.simulation.assets import asset
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.mesh import demo_object
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.scenes import Spheres
+from slviewer.simulation.truth import rig_record
+from slviewer.wizard.measure_requests import plain_name
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import SessionView
+from slviewer.wizard.surfaces import Surfaces, nominals, place_at, point_at
+
+CENTRES = np.array([[-38.0, 0.0, 560.0], [42.0, 6.0, 570.0]])
+RADIUS = 25.0
+
+
+@pytest.fixture(scope="module")
+def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
+    """Over a session whose calibration is the truth, with two balls and the demo object reconstructed."""
+    folder = tmp_path_factory.mktemp("measuring") / "session"
+    rig = letter(0.2, seed=2, local_distortion_px=0)
+    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    scenes = {"balls": Spheres(CENTRES, RADIUS), "object": demo_object(Pose(np.eye(3), np.array([0.0, 0.0, 520.0])))}
+    with Session.create(folder) as store:
+        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        for i, (name, scene) in enumerate(scenes.items()):
+            store.save_capture(name, "scan", sequence, Renderer(rig, scene).capture(sequence, i), source="simulated")
+    with Operator(folder) as engine:
+        for name in scenes:
+            assert engine.reconstruct(name)
+        engine.settle(60)
+        yield engine
+
+
+def now(operator: Operator) -> SessionView:
+    """The session, once all is done; what it says of measurements is what `measurements` says."""
+    session = operator.settle(60).session
+    assert session is not None and operator.session is not None
+    assert list(session.measurements) == measurements(operator.session)
+    return session
+
+
+def last(operator: Operator) -> str:
+    operator.settle(60)
+    return operator.snapshot().notices[-1].text
+
+
+def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
+    assert operator.snapshot().step("measure").state == "ready"
+    on = operator.surface("balls")
+    assert operator.surface("balls") is on  # it is not read with every click
+    tops = [place_at(on, np.zeros(3), centre - [0, 0, RADIUS]) for centre in CENTRES]
+    a, b = (place for place in tops if place is not None)
+    np.testing.assert_allclose(point_at(on, a), CENTRES[0] - [0, 0, RADIUS], atol=1.0)
+    assert place_at(on, np.zeros(3), np.array([0.0, 1.0, 0.1])) is None
+    for place in (a, b):
+        assert operator.measure_shape("balls", "sphere", Region.ball(point_at(on, place), 15.0))
+    assert operator.measure_distance("balls", a, b) and operator.measure_section("balls", a, b)
+    assert operator.measure_point("balls", a)
+    left, right, width, cut, point = now(operator).measurements
+    assert operator.measure_between(left.id, right.id)
+    apart = now(operator).measurements[-1]
+    radius, true = quantities_of(left)[0], float(np.linalg.norm(CENTRES[1] - CENTRES[0]))
+    assert abs(radius.value - RADIUS) < max(3 * (radius.sigma or 0), 0.05)
+    assert quantities_of(apart)[0].value == pytest.approx(true, abs=0.1)
+    assert quantities_of(width)[0].value == pytest.approx(true, abs=2.0)
+    assert [each.kind for each in (cut, point, apart)] == ["section", "point", "relation"]
+    assert operator.snapshot().step("measure").state == "done"
+
+    assert operator.rename_measurement(width.id, "Width <b>") and operator.delete_measurement(right.id)
+    session = now(operator)
+    assert [each.stale for each in session.measurements if each.id == apart.id] == [True]
+    assert session.deleted_measurements == 1 and "measure again" in operator.snapshot().step("measure").wrong[0]
+    assert operator.restore_measurement() and not any(each.stale for each in now(operator).measurements)
+    assert operator.write_measurements()
+    made = next(each for each in now(operator).exports if each.name == "measurements.csv")
+    rows = list(csv.DictReader(made.path.read_text("utf-8-sig").splitlines()))
+    assert {row["name"] for row in rows} >= {"Width <b>", left.name}
+
+
+def test_what_cannot_be_measured_is_said_and_nothing_kept(operator: Operator) -> None:
+    before = now(operator).measurements
+    assert operator.measure_shape("balls", "plane", Region.ball(CENTRES[0] - [0, 0, RADIUS], 15.0))
+    assert "bends" in last(operator)
+    assert operator.measure_distance("balls", (0, 0), (1, 1)) and "nothing was measured at" in last(operator)
+    assert operator.measure_point("nothing", (0, 0)) and "not reconstructed" in last(operator)
+    assert operator.measure_between("m1", "m1") and "chosen twice" in last(operator)
+    assert not operator.delete_measurement("m77") and not operator.compare_nominal("object", "../../etc/passwd")
+    assert now(operator).measurements == before
+
+
+def test_a_surface_of_what_has_changed_is_not_measured(operator: Operator) -> None:
+    store, surfaces = operator.session, Surfaces()
+    assert store is not None
+    meta, arrays = store.load_result("clouds/balls")
+    kept = {key: value for key, value in meta.items() if key not in ("hash", "arrays")}
+    store.save_result("clouds/balls", {**kept, "inputs": {**kept["inputs"], "balls": "other"}}, arrays)
+    with pytest.raises(InputError, match="reconstruct it again"):
+        surfaces.of(store, "balls")
+    store.save_result("clouds/balls", kept, arrays)
+    assert surfaces.of(store, "balls").organised
+
+
+def test_a_nominal_model_is_looked_at_kept_and_compared_with(operator: Operator, tmp_path: Path) -> None:
+    content = asset("objects/ammonite.ply").read_bytes()
+    assert operator.take_nominal("../My ammonite.ply", content) and "triangles" in last(operator)
+    assert operator.take_nominal("broken.stl", b"\0" * 300) and "broken.stl" in last(operator)
+    trimesh.creation.box((5.6, 5.0, 1.6)).export(tmp_path / "inch.stl")
+    assert operator.take_nominal("inch.stl", (tmp_path / "inch.stl").read_bytes())
+    session = now(operator)
+    assert session.nominals == ("My_ammonite.ply", "inch.stl") == nominals(session.folder)
+    assert sorted(each.name for each in (session.folder / "nominal").iterdir()) == list(session.nominals)
+    assert operator.compare_nominal("object", "inch.stl")
+    assert "choose its units, inch if it is so, else mm" in last(operator)
+
+    assert operator.compare_nominal("object", "My_ammonite.ply", tolerance_mm=1.5)
+    assert "tolerance ± 1.5 mm: pass" in last(operator)
+    session = now(operator)
+    assert session.measurements[-1].kind == "deviation"
+    assert "object_My_ammonite_deviation.ply" in [each.name for each in session.exports]
+
+
+def test_names_of_uploaded_files_are_harmless() -> None:
+    assert plain_name("../../a b<c>.stl") == "a_b_c_.stl" and plain_name("...") == "nominal"
+    assert len(plain_name("x" * 500 + ".stl")) == 100 and plain_name("é.stl") == "_.stl"

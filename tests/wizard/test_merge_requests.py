@@ -1,0 +1,153 @@
+"""Merging as an operator asks for it: from each start, and refused in words that stay."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slviewer.fringe.presets import p18
+from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.simulate import one_axis
+from slviewer.session.ply import read_ply
+from slviewer.session.store import Session
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.mesh import demo_object
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.simulation.scenes import Spheres
+from slviewer.simulation.truth import rig_record
+from slviewer.wizard import result_views
+from slviewer.wizard.merge_reading import merge_view
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import MergeView, Snapshot
+
+STEP_DEG = 12.0
+MIDDLE = np.array([0.0, 0.0, 520.0])
+NAMES = ("first", "second", "third")
+
+
+def turned(k: int) -> Pose:
+    """The object on a table that stands upright, after so many steps."""
+    R = Rotation.from_euler("y", k * STEP_DEG, degrees=True).as_matrix()
+    return Pose(R, MIDDLE)
+
+
+@pytest.fixture(scope="module")
+def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
+    """Over a session whose calibration is the truth, with three turned scans of the demo object, and two of a ball."""
+    folder = tmp_path_factory.mktemp("merging") / "session"
+    rig = letter(0.2, seed=2, local_distortion_px=0)
+    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    balls = {f"ball_{k}": Spheres(MIDDLE[None] + [[8.0 * k, 0, 0]], 60.0) for k in range(2)}
+    scenes = {name: demo_object(turned(k)) for k, name in enumerate(NAMES)} | balls
+    with Session.create(folder) as store:
+        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        for i, (name, scene) in enumerate(scenes.items()):
+            store.save_capture(name, "scan", sequence, Renderer(rig, scene).capture(sequence, i), source="simulated")
+    with Operator(folder) as engine:
+        yield engine
+
+
+def settled(operator: Operator) -> tuple[Snapshot, MergeView | None]:
+    snapshot = operator.settle(60)
+    assert snapshot.session is not None
+    return snapshot, snapshot.session.merge
+
+
+def truth(name: str) -> np.ndarray:
+    """T_first_scan."""
+    first, scan = np.eye(4), np.eye(4)
+    first[:3, :3], first[:3, 3] = turned(0).R, turned(0).t
+    scan[:3, :3], scan[:3, 3] = turned(NAMES.index(name)).R, turned(NAMES.index(name)).t
+    return np.asarray(first @ np.linalg.inv(scan))
+
+
+def off_mm(merge: MergeView, name: str) -> float:
+    """How far the object's middle lies from where it should."""
+    D = merge.pairs[name][2] @ np.linalg.inv(truth(name))
+    return float(np.linalg.norm(D[:3, :3] @ MIDDLE + D[:3, 3] - MIDDLE))
+
+
+def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) -> None:
+    assert operator.merge(NAMES, "first")
+    snapshot, merge = settled(operator)
+    assert merge is not None and snapshot.not_merged == "" and merge.reference == "first"
+    assert {(pair.scan, pair.onto) for pair in merge.registered} == {
+        ("second", "first"), ("third", "first"), ("third", "second"),
+    }  # fmt: skip
+    for pair in merge.registered:
+        assert 0.01 < pair.rms_mm < 0.5 and 0.4 < pair.overlap <= 1 and pair.point_mm > pair.rms_mm  # type: ignore[operator]
+        assert 0 < pair.sigma_mm < 0.05 and 0 < pair.sigma_deg < 0.1  # type: ignore[operator]
+        steps = NAMES.index(pair.scan) - NAMES.index(pair.onto)
+        assert pair.turned_deg == pytest.approx(steps * STEP_DEG, abs=0.1)
+        assert 0.5 < pair.moved_mm < 30  # type: ignore[operator]  # the middle of what both see, not the camera's
+    (loop,) = merge.loops
+    assert loop.error_mm < 0.3 and loop.left_mm <= loop.error_mm and set(loop.scans) == set(NAMES)
+    assert merge.dropped == merge.refused == () and 0.5 < merge.shared <= 1 and sum(merge.stray.values()) > 0  # type: ignore[operator]
+    assert all(off_mm(merge, name) < 0.1 for name in NAMES[1:])
+    assert operator.session is not None
+    kept = read_ply(operator.session.exports / f"merged_{merge.name}.ply")
+    assert set(np.unique(kept.scalars["source"])) == {0, 1, 2} and len(kept.points) == merge.points
+    assert not [notice for notice in snapshot.notices if notice.level == "error"]
+
+
+def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_next_try(operator: Operator) -> None:
+    before = settled(operator)[1]
+    assert operator.merge(NAMES[:2], "first", start="turntable", angle=40.0)
+    snapshot, merge = settled(operator)
+    assert merge is not None and before is not None and merge.name == before.name
+    assert "12.0 degrees apart and the turntable is said to step by 40" in snapshot.not_merged
+    assert snapshot.notices[-1].text == snapshot.not_merged
+    assert operator.merge(NAMES[:2], "first", start="turntable", angle=STEP_DEG)
+    snapshot, merge = settled(operator)
+    assert merge is not None and snapshot.not_merged == "" and merge.name != before.name
+    assert off_mm(merge, "second") < 0.1
+
+
+def test_picked_pairs_start_a_merge(operator: Operator) -> None:
+    assert operator.reconstruct("third") and operator.session is not None
+    operator.settle(60)
+    cloud = result_views.scan_cloud(operator.session, "third")
+    v, u = np.nonzero(np.isfinite(cloud.points[..., 2]))
+    chosen = [int(np.argmin(u)), int(np.argmax(u)), int(np.argmin(v)), int(np.argmax(v))]
+    there = cloud.points[v[chosen], u[chosen]].astype(float)
+    T = truth("third")
+    here = there @ T[:3, :3].T + T[:3, 3] + np.random.default_rng(0).normal(0, 1.5, there.shape)
+    assert operator.merge(["first", "third"], "first", picked={("third", "first"): (there, here)})
+    snapshot, merge = settled(operator)
+    assert merge is not None and merge.scans == ("first", "third") and off_mm(merge, "third") < 0.1
+    assert any("the picked points come within" in notice.text for notice in snapshot.notices)
+    line = np.outer([0, 1, 2], [10.0, 0, 0]) + MIDDLE
+    assert operator.merge(["first", "third"], "first", picked={("third", "first"): (line, line)})
+    assert "lie on one line" in settled(operator)[0].not_merged
+
+
+def test_scans_as_they_lie_need_no_search_and_a_ball_holds_nothing(operator: Operator) -> None:
+    assert operator.merge(["first", "first"], "second", start="identity")
+    merge = settled(operator)[1]
+    assert merge is not None and off_mm_between(merge) < 0.1
+    assert operator.merge(["ball_0", "ball_1"], "ball_0", start="identity")
+    snapshot, after = settled(operator)
+    assert after is not None and after.name == merge.name
+    assert "round like a sphere: it turns about any axis" in snapshot.not_merged
+    assert "put something with relief beside the object" in snapshot.not_merged
+
+
+def off_mm_between(merge: MergeView) -> float:
+    """How far the middle of the first scan's object lies from where it should on the second."""
+    D = merge.pairs["first"][2] @ truth("second")
+    return float(np.linalg.norm(D[:3, :3] @ MIDDLE + D[:3, 3] - MIDDLE))
+
+
+def test_a_merge_of_before_that_kept_less_is_shown(tmp_path: Path) -> None:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("y", 5, degrees=True).as_matrix()
+    pair = {"rms_mm": 0.2, "overlap": 0.8, "T_reference_scan": T.tolist()}
+    view = merge_view("3", {"reference": "a", "scans": ["a", "b"], "points": 10, "pairs": {"b": pair}}, stale=True)
+    (shown,) = view.registered
+    assert (shown.scan, shown.onto, shown.sigma_mm, shown.moved_mm) == ("b", "a", None, None)
+    assert shown.turned_deg == pytest.approx(5) and view.loops == () and view.shared is None and view.stale

@@ -1,0 +1,120 @@
+"""What a preview shows: the board where it is, how bright, how still; and when hands-free captures."""
+
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from slviewer.calibration.next_pose import nominal_lens
+from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.simulation.boards import Pose, printed_board
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import letter
+from slviewer.target.board import Board
+from slviewer.wizard.preview_watcher import HandsFree, Stillness, Watch, Watcher, brightness, reduced
+from slviewer.wizard.snapshot import BoardSeen, PreviewView
+
+BOARD = Board.parse("circles:9x7:20")
+
+
+def seen(still_s: float, shift: float = 0.0, taken: float = math.inf) -> BoardSeen:
+    outline = np.array([[10.0, 10], [90, 10], [90, 70], [10, 70]]) + shift
+    return BoardSeen(outline, outline, still_s, None, taken)
+
+
+def test_the_board_is_found_in_the_cameras_pixels() -> None:
+    rig = letter(0.6, local_distortion_px=0)
+    middle = (BOARD.points.min(0) + BOARD.points.max(0)) / 2
+    scene = printed_board(BOARD, Pose(np.eye(3), np.array([0, 0, 620.0]) - middle))
+    white = PatternSequence(rig.projector.size, (Frame("white"),))
+    frame = Renderer(rig, scene).capture(white)[0]
+    assert reduced(frame)[1] < 1
+    found: list[PreviewView] = []
+    arrived = threading.Event()
+
+    def see(view: PreviewView) -> None:
+        if view.board is not None:
+            found.append(view)
+            arrived.set()
+
+    watcher = Watcher(see)
+    watcher.look_for(Watch(BOARD, nominal_lens(rig.camera.size, 3555.6 * 0.6)))
+    for _ in range(400):
+        watcher.offer(frame)
+        if arrived.wait(0.05):
+            break
+    watcher.close()
+    board = found[0].board
+    assert board is not None
+    truth = rig.camera.project(scene.pose.to_camera(BOARD.points))
+    assert 0.001 < np.abs(board.pixels - truth).max() < 0.5
+    assert board.T_camera_board is not None
+    np.testing.assert_allclose(board.T_camera_board[:3, 3], scene.pose.t, atol=6)
+    assert found[0].image.shape[1] == 800 and 0.7 < found[0].brightest < 0.95 and found[0].saturated == 0
+
+
+def test_only_the_latest_frame_is_looked_at() -> None:
+    begun, go_on, views = threading.Event(), threading.Event(), []
+
+    def slow(view: PreviewView) -> None:
+        views.append(view)
+        begun.set()
+        go_on.wait(5)
+
+    watcher = Watcher(slow)
+    watcher.offer(np.zeros((60, 80), np.uint8))
+    assert begun.wait(5)
+    for level in range(1, 100):
+        watcher.offer(np.full((60, 80), level, np.uint8))
+    go_on.set()
+    end = time.monotonic() + 5
+    while len(views) < 2 and time.monotonic() < end:
+        time.sleep(0.01)
+    watcher.close()
+    assert [view.image[0, 0] for view in views] == [0, 99]
+
+
+@pytest.mark.parametrize(("dtype", "white"), [(np.uint8, 255), (np.uint16, 4095)])
+def test_brightness_goes_by_the_cameras_range(dtype: type, white: int) -> None:
+    frame = np.full((300, 400), white // 2, dtype)
+    frame[:30] = white
+    saturated, brightest, histogram = brightness(frame)
+    assert saturated == pytest.approx(0.1, abs=0.005) and brightest == 1 and histogram.sum() == pytest.approx(1)
+    assert histogram.argmax() == 31 and histogram[-1] == pytest.approx(0.1, abs=0.005)
+    assert reduced(frame)[0].dtype == np.uint8
+
+
+def test_stillness_starts_anew_with_every_movement() -> None:
+    still, pixels = Stillness(), np.zeros((5, 2))
+    assert still.of(pixels, 1.0, 10.0) == 0
+    assert still.of(pixels + 0.5, 1.0, 11.0) == 1
+    assert still.of(pixels + 2, 1.0, 12.0) == 0
+    assert still.of(pixels + 2, 1.0, 12.7) == pytest.approx(0.7)
+    still.lose()
+    assert still.of(pixels + 2, 1.0, 13.0) == 0
+    # a slow drift is movement too
+    drift = Stillness()
+    assert max(drift.of(pixels + 0.3 * k, 1.0, float(k)) for k in range(10)) <= 3
+
+
+def test_hands_free_counts_down_once_a_place() -> None:
+    hands_free = HandsFree()
+    assert hands_free.countdown(seen(7), False, 0) is None
+    hands_free.on = True
+    assert hands_free.countdown(None, False, 0) is None and hands_free.countdown(seen(0.5), False, 0) is None
+    assert hands_free.countdown(seen(7), False, 1.0) == 1.0  # a slow look skips no countdown
+    assert hands_free.countdown(seen(7.25), False, 1.25) == pytest.approx(0.75)
+    assert hands_free.countdown(seen(0.1), False, 1.5) is None  # moved: it begins anew
+    assert hands_free.countdown(seen(1.25), False, 3.0) == 1.0
+    assert hands_free.countdown(seen(1.25), True, 3.5) is None
+    assert hands_free.countdown(seen(1.5), False, 4.0) == 1.0
+    last = hands_free.countdown(seen(2.6), False, 5.1)
+    assert last is not None and last < 0
+    hands_free.took()
+    assert hands_free.countdown(seen(2.6), True, 6.0) is None
+    # what is still known from before the capture is of the place before, perhaps
+    assert hands_free.countdown(seen(9, shift=-30, taken=0.0), False, 6.5) is None
+    assert hands_free.countdown(seen(5), False, 7.0) is None
+    assert hands_free.countdown(seen(1.5, shift=30), False, 8.0) == 1.0

@@ -1,0 +1,133 @@
+"""What the operator decides of a rig: several exposures, a name, and what its choice says of its camera."""
+
+import logging
+import zipfile
+from pathlib import Path
+
+import pytest
+from test_operator import TARGET, last, opened, states
+
+from slviewer.pipeline.capture import capture
+from slviewer.pipeline.rig_presets import load_rig
+from slviewer.session.store import Session
+from slviewer.wizard.operator import Operator
+
+RIG = {"driver": "simulated", "scale": 0.25, "seed": 0, "exposure_ms": 0.8}
+
+
+@pytest.fixture
+def operator(tmp_path: Path):
+    with Operator(tmp_path / "session", RIG) as operator:
+        operator.choose_target(TARGET)
+        opened(operator)
+        yield operator
+
+
+def test_poses_in_several_exposures_are_judged_as_others_are(operator: Operator) -> None:
+    once = operator.settle()
+    assert once.rig.exposure_ms == 0.8 and once.session is not None and once.session.exposures_ms == ()
+    assert operator.set_exposures((4.0, 0.5))
+    before = operator.settle()
+    assert before.session is not None and before.session.exposures_ms == (0.5, 4.0)
+    assert before.space is not None and once.space is not None and once.space.capture_bytes is not None
+    assert before.space.capture_bytes == 2 * once.space.capture_bytes
+    assert operator.capture_pose()
+    after = operator.settle()
+    assert states(after) == {"pose_01": "good"} and after.session is not None and after.session.poses[0].thumbnail
+    assert operator.session is not None and operator.session.load_capture("pose_01").exposures_ms == (0.5, 4.0)
+    assert operator.settle().rig.exposure_ms == 0.8
+    assert operator.set_exposures((4.0, 4.0)) is False and "each once" in last(operator.settle())
+    assert operator.set_exposures(())
+    assert operator.capture_pose()
+    operator.settle()
+    assert operator.session.load_capture("pose_02").exposures_ms == ()
+
+
+def test_a_rig_is_kept_under_a_name_with_its_exposure(operator: Operator) -> None:
+    assert operator.set_exposure(2.5)
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 2.5, 5.0)
+    assert operator.set_exposures((1.0, 8.0))
+    assert operator.save_rig("mine", "With a longer exposure.")
+    assert operator.session is not None
+    assert load_rig("mine", operator.session) == {**RIG, "exposure_ms": 2.5, "gain": 1.0}
+    assert operator.save_rig("../mine") is False and "cannot be a name" in last(operator.settle())
+    assert operator.choose_rig({**RIG, "exposure_ms": 1.5})
+    now = operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, 5.0)
+    assert now is not None and now.session is not None and now.session.exposures_ms == ()
+
+
+def test_several_exposures_follow_the_one_that_they_were_chosen_by(operator: Operator) -> None:
+    assert operator.session is not None
+    assert operator.set_exposures((0.8, 3.2))
+    assert operator.set_exposure(1.6) and operator.set_exposure(0.4)  # both before the camera has said anything
+    assert operator.session.decision("exposures") == pytest.approx([0.4, 1.6])
+
+
+def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operator) -> None:
+    session = operator.session
+    assert session is not None and operator.set_exposure(2.0)
+    operator._engine.set_delay(37.0)
+    assert operator.choose_rig(RIG)
+    assert session.decision("rig") == {**RIG, "settle_ms": 37.0} and session.decision("exposure")["exposure_ms"] == 2.0
+    assert operator.choose_rig({**RIG, "settle_ms": 5.0})  # said by whoever chose it
+    assert session.decision("rig")["settle_ms"] == 5.0 and session.decision("exposure")["exposure_ms"] == 2.0
+    assert operator.choose_rig({**RIG, "scale": 0.2})
+    assert "settle_ms" not in session.decision("rig") and session.decision("exposure") is None
+
+
+def test_what_a_check_finds_belongs_to_the_rig_that_was_checked(operator: Operator) -> None:
+    assert operator.check_rig()
+    assert operator.wait_for(lambda s: s.rig.capture is not None and s.rig.capture.frame > 0, 10.0)
+    other = {**RIG, "scale": 0.2}
+    assert operator.choose_rig(other)
+    assert operator.wait_for(lambda s: s.rig.state == "open" and s.rig.choice == other, 10.0)
+    after = operator.settle()
+    assert after.preflight is None and after.rig.choice == other and last(after) == "Checking the rig: cancelled"
+
+
+def test_a_session_opens_without_the_rig_that_it_remembers(operator: Operator, tmp_path: Path) -> None:
+    missing = {
+        "camera": {"driver": "opencv", "source": str(tmp_path / "no.avi")},
+        "projector": {"driver": "browser", "size": [640, 480]},
+    }
+    with Session.create(tmp_path / "other") as store:
+        store.decide("rig", missing)
+        store.decide("exposure", {"exposure_ms": 3.0, "gain": None})
+    assert operator.open_session(tmp_path / "other") and operator.session is not None
+    view = operator.settle()
+    assert view.rig.state == "lost" and "no.avi does not exist" in view.rig.fault and view.rig.choice == missing
+    assert "Try it again" in view.step("rig").wrong[0]
+    assert not operator.choose_rig(missing)  # as the button "Try this rig again" asks
+    assert operator.session.decision("rig") == missing and operator.session.decision("exposure")["exposure_ms"] == 3.0
+    assert operator.choose_rig(RIG) and operator.wait_for(lambda s: s.rig.state == "open", 10.0)
+
+
+def test_sessions_of_one_rig_have_exposures_of_their_own(operator: Operator, tmp_path: Path) -> None:
+    with Session.create(tmp_path / "other") as store:
+        store.decide("rig", RIG)
+        store.decide("exposure", {"exposure_ms": 3.0, "gain": 1.0})
+    assert operator.open_session(tmp_path / "other")
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 3.0, 5.0)
+
+
+def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(operator: Operator, tmp_path: Path) -> None:
+    capture(tmp_path / "recorded", "a", RIG, patterns="p18")
+    assert operator.shine("pattern") and operator.wait_for(lambda s: s.rig.light == "pattern", 5.0)
+    assert operator.choose_rig({"driver": "replay", "source": str(tmp_path / "recorded")})
+    now = operator.wait_for(lambda s: s.rig.name == "replay" and s.rig.state != "opening", 10.0)
+    assert now is not None and now.rig.state == "open", now and now.rig.fault
+    assert not operator.shine("dark") and "no dark frame" in last(operator.settle())
+
+
+def test_a_diagnostic_bundle_tells_no_password(tmp_path: Path) -> None:
+    with Operator(tmp_path / "session") as operator:
+        assert operator.session is not None
+        camera = {"driver": "opencv", "source": "rtsp://somebody:s3cret@camera.local/1", "size": [8, 8]}
+        operator.session.decide("rig", {"camera": camera, "projector": {"driver": "browser", "size": [8, 8]}})
+        logging.getLogger("slviewer").info("rtsp://somebody:s3cret@camera.local/1 is slow")
+        assert operator.diagnostic_bundle()
+        operator.settle()
+        with zipfile.ZipFile(next(operator.session.exports.glob("*.zip"))) as bundle:
+            texts = {name: bundle.read(name).decode() for name in bundle.namelist() if name.endswith(("json", "txt"))}
+    assert not any("s3cret" in text for text in texts.values())
+    assert "rtsp://…@camera.local/1" in texts["log.txt"] and "camera.local" in texts["session/decisions.json"]

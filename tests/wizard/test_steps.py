@@ -1,0 +1,86 @@
+"""What each step waits for, follows from the session and the rig alone."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.calibration.next_pose import Coverage
+from slviewer.wizard.snapshot import CalibrationView, Foreseen, PoseView, RigView, SessionView, Space
+from slviewer.wizard.steps import Facts, views
+
+OPEN = RigView(state="open", name="bench", camera=(400, 300), projector=(912, 1140))
+EMPTY = SessionView(Path("s"), "", "complementary")
+COVERED = Coverage(np.full((3, 4), 4), np.full(3, 3), np.full(5, 2), (400.0, 700.0))
+
+
+def poses(n: int, state="good", why: str = "") -> tuple[PoseView, ...]:
+    return tuple(PoseView(f"pose_{i}", state, why, "", None, False, None, None, b"") for i in range(n))
+
+
+def calibration(stale: str = "") -> CalibrationView:
+    one = np.eye(3)
+    return CalibrationView(
+        ("stereo",), "stereo", stale, "circles:9x7:20", ("pose_0",), {}, {"stereo": 0.1}, {}, (400.0, 600.0), 180.0,
+        one, np.zeros(5), one, np.zeros(5), one, np.array([180.0, 0, 0]), {}, {},
+    )  # fmt: skip
+
+
+def states(facts: Facts) -> dict[str, str]:
+    return {view.key: view.state for view in views(facts)}
+
+
+def test_the_way_through_the_wizard() -> None:
+    blocked = dict.fromkeys(("calibrate", "verify", "scan", "merge", "measure", "export"), "blocked")
+    assert states(Facts(None, RigView(), None)) == {"rig": "ready", "target": "blocked", "poses": "blocked", **blocked}
+    assert states(Facts(EMPTY, OPEN, None)) == {"rig": "done", "target": "ready", "poses": "blocked", **blocked}
+    aimed = replace(EMPTY, target="circles:9x7:20")
+    assert states(Facts(aimed, OPEN, None)) == {"rig": "done", "target": "done", "poses": "ready", **blocked}
+    few = replace(aimed, poses=poses(2))
+    assert "2 good poses so far" in next(v for v in views(Facts(few, OPEN, None)) if v.key == "calibrate").because
+    enough = replace(aimed, poses=poses(10), coverage=COVERED)
+    reached = states(Facts(enough, OPEN, None))
+    assert (reached["poses"], reached["calibrate"], reached["verify"]) == ("done", "ready", "blocked")
+    done = states(Facts(replace(enough, calibration=calibration()), OPEN, None))
+    assert done["calibrate"] == "done" and done["verify"] == done["scan"] == done["export"] == "ready"
+    assert done["merge"] == done["measure"] == "blocked"
+    stale = Facts(replace(enough, calibration=calibration("pose_1 was excluded since: calibrate again")), OPEN, None)
+    assert states(stale)["calibrate"] == "ready"
+    assert "pose_1 was excluded" in next(v for v in views(stale) if v.key == "calibrate").wrong[0]
+
+
+def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:
+    rejected = replace(calibration(), rejected="pose_3 moved by 0.9 px: take the pose again")
+    facts = Facts(replace(EMPTY, target="circles:9x7:20", poses=poses(10), calibration=rejected), OPEN, None)
+    found = {view.key: view for view in views(facts)}
+    assert {found[key].state for key in ("verify", "scan", "merge")} == {"blocked"}
+    assert "pose_3 moved by 0.9 px" in found["scan"].because and "insist" in found["verify"].because
+    assert found["calibrate"].state == "ready" and "rejected" in found["calibrate"].now
+    insisted = replace(facts, session=replace(facts.session, calibration=replace(rejected, insisted=True)))  # type: ignore[type-var]
+    assert states(insisted)["scan"] == "ready" and states(insisted)["calibrate"] == "done"
+
+
+def test_a_recorded_session_needs_no_rig() -> None:
+    recorded = replace(EMPTY, target="circles:9x7:20", poses=poses(9))
+    assert states(Facts(recorded, RigView(), None))["poses"] == "done"
+    assert states(Facts(recorded, RigView(), None))["calibrate"] == "ready"
+
+
+def test_every_step_says_in_one_sentence_what_to_do_and_what_is_wrong() -> None:
+    session = replace(EMPTY, target="t", poses=poses(4, "refused", "12 of 336 circles found: lower the exposure"))
+    lost = replace(OPEN, state="lost", fault="the camera is gone: plug it in")
+    facts = Facts(session, lost, Space(1_000_000, 10_000_000), "saturated")
+    for view in views(facts):
+        assert view.now and view.now[0].isupper() and view.now.endswith(".") and "\n" not in view.now
+        assert all(len(sentence) > 20 and "\n" not in sentence for sentence in view.wrong)
+    wrong = " ".join(next(v for v in views(facts) if v.key == "poses").wrong)
+    assert "plug it in" in wrong and "free some space" in wrong and "saturated" in wrong and "12 of 336" in wrong
+
+
+def test_poses_that_cover_the_view_may_still_lack_accuracy() -> None:
+    covering = replace(EMPTY, target="circles:9x7:20", poses=poses(10), coverage=COVERED)
+    assert "cover the view: calibrate" in views(Facts(covering, OPEN, None))[2].now
+    lacking = replace(covering, foreseen=Foreseen(0.03, 0.02, 0.024, False))
+    assert "0.030 mm is predicted, and 0.024 mm wanted: add more" in views(Facts(lacking, OPEN, None))[2].now
+    few = replace(lacking, poses=poses(3), coverage=None)
+    assert "Choosing where the board tells most" in views(Facts(replace(few, planning=True), OPEN, None))[2].now
