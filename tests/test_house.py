@@ -1,14 +1,16 @@
-"""The house's rules: imports run one way, files stay readable, ruff and mypy agree, CI runs what the README says."""
+"""The rules of the code: imports run one way, files stay readable, ruff and mypy agree, CI and README agree."""
 
 import ast
 import subprocess
 import sys
+from collections import Counter
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-ROOMS = [
+PACKAGES = [
     "errors",
     "geometry",
     "fringe",
@@ -33,7 +35,7 @@ ROOMS = [
     "commands",
     "cli",
 ]
-STRANGERS = [
+FORBIDDEN = [
     # the renderer's lenses must not hide an error of the calibration's, nor the other way round
     ("simulation", "slviewer.calibration"),
     ("simulation", "slviewer.geometry.lens"),
@@ -43,8 +45,11 @@ STRANGERS = [
     # replay takes frames, and the pipeline opens the session
     ("session", "slviewer.devices"),
 ]
-NUMERIC = ROOMS[1 : ROOMS.index("simulation")]
+NUMERIC = PACKAGES[1 : PACKAGES.index("simulation")]
 SOURCES = sorted((ROOT / "slviewer").rglob("*.py"))
+MOST_LINES = 500
+MOST_SHARE = 0.15
+"""Of the code in one package; a larger one holds more than one idea."""
 
 
 def imports_of(path: Path) -> set[str]:
@@ -58,9 +63,9 @@ def imports_of(path: Path) -> set[str]:
     return names
 
 
-def room_of(module: str) -> str | None:
+def package_of(module: str) -> str | None:
     parts = module.split(".")
-    return parts[1] if parts[0] == "slviewer" and len(parts) > 1 and parts[1] in ROOMS else None
+    return parts[1] if parts[0] == "slviewer" and len(parts) > 1 and parts[1] in PACKAGES else None
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
@@ -70,21 +75,49 @@ def test_imports_run_one_way(path: Path) -> None:
         assert imports_of(path) == set()
         return
     for name in imports_of(path):
-        room = room_of(name)
-        if room is not None:
-            assert ROOMS.index(room) <= ROOMS.index(place), f"{path} imports {name}: against the flow"
-        for here, stranger in STRANGERS:
-            assert not (place == here and name.startswith(stranger)), f"{path} must not import {name}"
+        package = package_of(name)
+        if package is not None:
+            assert PACKAGES.index(package) <= PACKAGES.index(place), f"{path} imports {name}: against the flow"
+        for importer, imported in FORBIDDEN:
+            assert not (place == importer and name.startswith(imported)), f"{path} must not import {name}"
+
+
+def module_graph() -> dict[str, set[str]]:
+    """{module: modules that it imports}, also inside functions and for type checking alone."""
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in SOURCES}
+    graph = {}
+    for module, path in names.items():
+        imported = imports_of(path)
+        parents = {name.rpartition(".")[0] for name in imported}
+        graph[module] = (imported | parents) & names.keys() - {module}
+    return graph
+
+
+def test_no_modules_import_each_other() -> None:
+    order = TopologicalSorter(module_graph())
+    try:
+        order.prepare()
+    except CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
+
+
+def test_every_package_has_its_layer_and_none_outgrows_the_others() -> None:
+    lines = Counter[str]()
+    for path in SOURCES:
+        lines[path.relative_to(ROOT / "slviewer").with_suffix("").parts[0]] += len(path.read_text().splitlines())
+    assert set(lines) - {"__init__"} == set(PACKAGES)
+    shares = {package: n / lines.total() for package, n in lines.items()}
+    assert max(shares.values()) <= MOST_SHARE, shares
 
 
 @pytest.mark.parametrize("path", [p for p in SOURCES if p.relative_to(ROOT / "slviewer").parts[0] in NUMERIC], ids=str)
-def test_numeric_rooms_know_no_device_and_no_browser(path: Path) -> None:
+def test_numeric_packages_know_no_device_and_no_browser(path: Path) -> None:
     banned = {"viser", "zarr", "tyro", "websockets", "jinja2", "matplotlib"}
     assert not banned & {name.split(".")[0] for name in imports_of(path)}
 
 
 def test_files_can_be_read_in_one_sitting() -> None:
-    long = {str(p.relative_to(ROOT)): n for p in SOURCES if (n := len(p.read_text().splitlines())) > 500}
+    long = {str(p.relative_to(ROOT)): n for p in SOURCES if (n := len(p.read_text().splitlines())) > MOST_LINES}
     assert not long
 
 

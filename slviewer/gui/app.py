@@ -18,7 +18,7 @@ from slviewer.gui import shell as frame
 from slviewer.gui.panel import Stage
 from slviewer.gui.scene import Scene
 from slviewer.gui.shell import Shell
-from slviewer.gui.views import FIELD_OF_VIEW, OVERVIEW, Eyes
+from slviewer.gui.viewpoints import FIELD_OF_VIEW, OVERVIEW, Viewpoints
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import load_rig
 from slviewer.server.projector_page import serve_projector
@@ -88,7 +88,7 @@ class App:
         self._stage = Stage(
             page.gui,
             Scene(page.scene),
-            Eyes(lambda: page.get_clients().values()),
+            Viewpoints(lambda: page.get_clients().values()),
             operator,
             self._offer,
             self._tell,

@@ -83,7 +83,7 @@ class LiveScreen:
             self._drawn[client.client_id] = cloud.number
         if not self._looked:
             self._looked = True
-            self._stage.eyes.at(f"{LAYER} {cloud.begun}", points)
+            self._stage.viewpoints.at(f"{LAYER} {cloud.begun}", points)
         if cloud.number != self._told:
             self._told = cloud.number
             self._stage.operator.live_shown(cloud)

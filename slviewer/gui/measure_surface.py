@@ -11,7 +11,6 @@ from slviewer.gui.measure_words import deviation_bar
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened, spread
 from slviewer.gui.steps.scan import ordered
-from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, colour_bar, colours
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
 from slviewer.pipeline.measured_surface import MERGED, Place, Surface
@@ -43,7 +42,7 @@ class SurfaceBox:
         self._colour = gui.add_dropdown("Colour by", COLOURS)
         self._colour.on_update(safely(self.ask))
         self._legend = Words(gui)
-        bring_button(self._stage, lambda: None if self.on is None else self.on.points)
+        self._stage.bring_button(lambda: None if self.on is None else self.on.points)
 
     @property
     def name(self) -> str:
@@ -135,7 +134,7 @@ class SurfaceBox:
 
     def _look(self) -> None:
         if self._visible and self.on is not None:
-            self._stage.eyes.at(f"{self._layer} {self.on.source}", self.on.points)
+            self._stage.viewpoints.at(f"{self._layer} {self.on.source}", self.on.points)
 
 
 def painting(on: Surface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:

@@ -15,7 +15,7 @@ from slviewer.gui.inputs import Choice, change
 from slviewer.gui.merge_views import SCAN_COLOURS, patch
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
-from slviewer.gui.views import ASIDE
+from slviewer.gui.viewpoints import ASIDE
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, table, toned
 from slviewer.registration.multiway import Pair
 from slviewer.registration.picked import LEAST_PICKS, picked_start
@@ -193,7 +193,7 @@ class PickBox:
     def _look(self) -> None:
         shown = self._shown
         if self._on and shown is not None and shown.pair == self._pair:
-            self._stage.eyes.at(f"{LAYER} {shown.pair}", self.seen)
+            self._stage.viewpoints.at(f"{LAYER} {shown.pair}", self.seen)
 
     def _mark(self) -> None:
         """The numbered places, on both clouds."""

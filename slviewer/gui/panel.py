@@ -5,33 +5,33 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
+import numpy as np
 import viser
 
 from slviewer.devices.channel import Standing
 from slviewer.gui.scene import Scene
+from slviewer.gui.viewpoints import Viewpoints, bring
 from slviewer.server.viewers import Viewers
 from slviewer.wizard.snapshot import Level, PreviewView, Snapshot
-
-if TYPE_CHECKING:
-    from slviewer.gui.views import Eyes
 
 
 @dataclass(frozen=True)
 class Stage:
     """What a panel works with.
 
-    `gui` builds inputs, `scene` draws in 3D, `eyes` turns the browsers' views, `operator` takes requests. `offer(path)`
-    gives the address at which a file of the session is downloaded; `tell(level, text)` shows a notification in every
-    browser; `escape(text)` makes text that was typed or read harmless inside HTML and Markdown. `go(key)` brings
-    another step to the front. `turns` does one callback after the other. `projector_page()` says where the projector
-    page stands; None where none is served. `viewers(answered)` tells which browsers have drawn what they were sent.
+    `gui` builds inputs, `scene` draws in 3D, `viewpoints` turns the browsers' views, `operator` takes requests.
+    `offer(path)` gives the address at which a file of the session is downloaded; `tell(level, text)` shows a
+    notification in every browser; `escape(text)` makes text that was typed or read harmless inside HTML and
+    Markdown. `go(key)` brings another step to the front. `turns` does one callback after the other.
+    `projector_page()` says where the projector page stands; None where none is served. `viewers(answered)` tells
+    which browsers have drawn what they were sent.
     """
 
     gui: viser.GuiApi
     scene: Scene
-    eyes: "Eyes"
+    viewpoints: Viewpoints
     operator: Any
     offer: Callable[[Path], str]
     tell: Callable[[Level, str], None]
@@ -62,9 +62,20 @@ class Stage:
         """The same for a callback that needs viser's event, as those of gizmos and of the scene do."""
         return lambda event: self.safely(lambda: do(event))(event)
 
+    def bring_button(self, points: Callable[[], np.ndarray | None]) -> viser.GuiButtonHandle:
+        """A button that turns the view of whoever clicks it to the points (..., 3) mm that it is given then, if any."""
+        button = self.gui.add_button("Bring into view", icon=viser.Icon.FOCUS_2, color="gray")
+        button.on_click(self.safely_with(lambda event: _bring(event, points())))
+        return button
+
     def _queue(self, call: Callable[[], None]) -> None:
         with suppress(RuntimeError):  # the wizard ends
             self.turns.submit(call)
+
+
+def _bring(event: Any, points: np.ndarray | None) -> None:
+    if event.client is not None and points is not None:
+        bring(event.client, points)
 
 
 class Panel(Protocol):

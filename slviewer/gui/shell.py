@@ -13,6 +13,7 @@ from slviewer.gui.devices import Devices
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import Panel, Stage
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, meter, toned
+from slviewer.wizard.autopilot import Autopilot
 from slviewer.wizard.snapshot import Notice, PreviewView, Snapshot, StepView
 
 STEPS_PX, STEP_PX = 236, 452
@@ -146,7 +147,7 @@ class Shell:
             self._panels[self._shown_key].shown(False)
         self._shown_key = key
         if key in _ROUND_THE_RIG:
-            self._stage.eyes.overview()
+            self._stage.viewpoints.overview()
         self._panels[key].shown(True)
         self._folders[key].visible = True
 
@@ -224,7 +225,7 @@ class Shell:
         if operator.snapshot().autopilot:
             operator.cancel()
         else:
-            operator.start_autopilot()
+            operator.start_autopilot(Autopilot(operator, pause_s=0.5))
 
 
 def flown_step(snapshot: Snapshot) -> str:

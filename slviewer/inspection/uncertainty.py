@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.calibration.splined.found import Bundle
+from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.uncertainty import beyond
 from slviewer.calibration.splined.volume import BestMotion, Volume, looked, working_volume
 from slviewer.fringe.sequence import Axis

@@ -59,7 +59,7 @@ class CalibrationResult:
         if self.anchored is not None:
             models["anchored"] = {"axes": {axis: self.anchored.median_rms_px(axis) for axis in self.anchored.axes}}
         if self.splined is not None:
-            models["splined"] = self.splined.bundle.summary()
+            models["splined"] = self.splined.summary()
         return {
             "models": models,
             "poses_used": list(self.stereo.poses),
@@ -102,7 +102,7 @@ class CalibrationResult:
                 for axis, c in self.anchored.corrections.items()
             ]
         if self.splined is not None:
-            lines.append(self.splined.bundle.text())
+            lines.append(self.splined.text())
         lines.append(self.verdict.text())
         return "\n".join(lines)
 

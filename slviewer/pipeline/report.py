@@ -114,7 +114,7 @@ def _models(store: Session) -> ModelsView | None:
         used=preferred(store),
         recommended=recommended(store),
         comparison=validation(store),
-        splined=None if splined is None else splined.bundle.summary(),
+        splined=None if splined is None else splined.summary(),
         scales={name: words for name in there if (words := told_scale(store, name))},
     )
 

@@ -16,6 +16,7 @@ from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.reference_spikes import is_plain
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
+from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction import onepass_kernels as kernels
 from slviewer.reconstruction import onepass_spikes as spikes
 from slviewer.reconstruction.cloud import Cloud
@@ -54,6 +55,18 @@ class Scan:
     def cloud(self) -> Cloud:
         """The organised cloud; it shares this scan's arrays."""
         return Cloud(self.points, self.axis, self.model, self.sigma_z, self.texture)
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What a device is made ready for: frames of a camera, what they mean, and how depth comes of their phase."""
+
+    shape: tuple[int, int]
+    axis: Axis
+    layout: Layout
+    order: kernels.Order
+    ladder: Ladder
+    depths: kernels.Depths | StereoRig
 
 
 @dataclass(eq=False)

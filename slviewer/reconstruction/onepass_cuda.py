@@ -10,13 +10,10 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, ladder_of, texture
-from slviewer.fringe.kernels_levels import Ladder
-from slviewer.fringe.layout import Layout, clip_level
+from slviewer.fringe.layout import clip_level
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry import cuda_device
-from slviewer.geometry.rig import StereoRig
-from slviewer.reconstruction.onepass import Light, OnePass, Scan, _order, one_pass_layout
-from slviewer.reconstruction.onepass_kernels import Depths, Order
+from slviewer.reconstruction.onepass import Job, Light, OnePass, Scan, _order, one_pass_layout
 
 if TYPE_CHECKING:  # it imports CUDA
     from slviewer.reconstruction.onepass_cuda_card import Card
@@ -39,18 +36,6 @@ def has_pass(model: object) -> TypeGuard[Fast]:
     if isinstance(model, StereoModel):
         return cuda_device.device() is not None
     return isinstance(model, PixelwiseModel | SplinedModel)
-
-
-@dataclass(frozen=True, eq=False)
-class Job:
-    """What a device is made ready for: frames of a camera, what they mean, and how depth comes of their phase."""
-
-    shape: tuple[int, int]
-    axis: Axis
-    layout: Layout
-    order: Order
-    ladder: Ladder
-    depths: Depths | StereoRig
 
 
 @dataclass(eq=False)

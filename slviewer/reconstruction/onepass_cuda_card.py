@@ -11,8 +11,7 @@ from slviewer.fringe.decode import spike_rules
 from slviewer.fringe.reference import dark_sigmas
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction import onepass_cuda_depths as depths
-from slviewer.reconstruction.onepass import Light, Scan
-from slviewer.reconstruction.onepass_cuda import Job
+from slviewer.reconstruction.onepass import Job, Light, Scan
 from slviewer.reconstruction.onepass_cuda_spikes import spike_kernels
 from slviewer.reconstruction.onepass_cuda_sweep import Plan, sweep_kernel
 

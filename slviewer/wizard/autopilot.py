@@ -4,10 +4,10 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slviewer.devices.world import Thing
 from slviewer.errors import Cancelled, SlviewerError
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import Place, Surface
@@ -15,11 +15,8 @@ from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
 from slviewer.simulation.scenes import Scene, Spheres
+from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import ScanView, Snapshot
-
-if TYPE_CHECKING:
-    from slviewer.devices.world import Thing
-    from slviewer.wizard.operator import Operator
 
 RIG = {"driver": "simulated", "preset": "letter", "scale": 0.5, "seed": 0}
 TARGET = "circles:21x16:9"
@@ -30,35 +27,34 @@ PATIENCE_S = 120.0
 
 
 class Autopilot:
-    """One flight. `says(act)` is told what it does now, and an empty sentence in the end; `before(act)` paces it."""
+    """The whole wizard once. The snapshot says which act it is at; `before(act)` paces it."""
 
     def __init__(
         self,
-        operator: "Operator",
-        says: Callable[[str], None] = lambda act: None,
+        operator: Operator,
         *,
         poses: int = 10,
         pause_s: float = 0.0,
         before: Callable[[str], None] = lambda act: None,
     ) -> None:
-        self._operator, self._says, self._before = operator, says, before
+        self._operator, self._before = operator, before
         self._poses, self._pause_s = poses, pause_s
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._fly, name="slviewer autopilot", daemon=True)
+        self._thread = threading.Thread(target=self._play, name="slviewer autopilot", daemon=True)
 
     @property
     def running(self) -> bool:
         return self._thread.is_alive()
 
     def start(self) -> None:
-        """Fly on a thread of its own."""
+        """Begin, on a thread of its own."""
         self._thread.start()
 
     def stop(self) -> None:
         """Ask for nothing more; what was asked for goes on."""
         self._stopped.set()
 
-    def _fly(self) -> None:
+    def _play(self) -> None:
         try:
             self.run()
             self._operator.tell("good", "autopilot has played the whole wizard: every step is done")
@@ -68,9 +64,9 @@ class Autopilot:
             self._operator.tell("error", f"autopilot gave up: {error}")
 
     def run(self) -> None:
-        """Fly on this thread. Raises Cancelled when stopped, SlviewerError with the notice where an act failed."""
+        """Do all acts on this thread. Raises Cancelled when stopped, SlviewerError with the notice of a failed act."""
         try:
-            self._says("Getting ready")
+            self._operator.show_act("Getting ready")
             self._prepare()
             self._calibrate()
             self._verify()
@@ -78,7 +74,7 @@ class Autopilot:
             self._measure()
             self._act("Writing the report", self._operator.report)
         finally:
-            self._says("")
+            self._operator.show_act("")
 
     def _prepare(self) -> None:
         operator = self._operator
@@ -132,7 +128,7 @@ class Autopilot:
         a, b = _across(operator.surface(latest))
         self._act("Measuring how wide the object is", partial(operator.measure_distance, latest, a, b))
 
-    def _place(self, thing: "Thing", scene: Scene) -> None:
+    def _place(self, thing: Thing, scene: Scene) -> None:
         T = np.eye(4)
         if isinstance(scene, Spheres):
             T[:3, 3] = scene.centres[0]
@@ -143,7 +139,7 @@ class Autopilot:
 
     def _act(self, act: str, request: Callable[[], bool]) -> None:
         """One request, and the end of all that follows from it."""
-        self._says(act)
+        self._operator.show_act(act)
         self._before(act)
         if self._stopped.wait(self._pause_s):
             raise Cancelled("autopilot was stopped")

@@ -3,8 +3,6 @@
 Requests (`operator`) and captures (`capture_requests`) reach in here; panels do not.
 """
 
-from __future__ import annotations
-
 import shutil
 import threading
 import time
@@ -12,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,6 +27,7 @@ from slviewer.wizard import tasks
 from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.diagnostics import LogKeeper
 from slviewer.wizard.jobs import Jobs, Reporter
+from slviewer.wizard.live_scan import Live, LiveCloud
 from slviewer.wizard.notices import Notices
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
@@ -38,9 +36,6 @@ from slviewer.wizard.result_views import thumbnail
 from slviewer.wizard.session_reader import Reader
 from slviewer.wizard.snapshot import PreviewView, RigView, SessionView, Snapshot, Space, WorldView
 from slviewer.wizard.steps import Brightness, Facts, views
-
-if TYPE_CHECKING:
-    from slviewer.wizard.live_scan import Live, LiveCloud
 
 SATURATED, DIM = 0.005, 0.35
 """Share of saturated pixels, and brightness of the brightest ones, from which on the operator is told."""
@@ -295,6 +290,11 @@ class Engine:
             self.teller.changed()
         for listener in self.preview_listeners:
             listener(view)
+
+    def publish_live(self, cloud: LiveCloud) -> None:
+        """Call every listener with a live cloud (on the live scan's thread)."""
+        for listener in self.live_listeners:
+            listener(cloud)
 
     # snapshots
 

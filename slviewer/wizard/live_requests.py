@@ -2,8 +2,14 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 
-from slviewer.wizard.live_scan import LiveCloud, keep_live, start_live
+from slviewer.devices.capture import Taken
+from slviewer.errors import InputError
+from slviewer.fringe.presets import short
+from slviewer.pipeline.capture import keep
+from slviewer.wizard.capture_requests import check_space, depth_axis, next_name
+from slviewer.wizard.live_scan import Live, LiveCloud
 from slviewer.wizard.requests import Asked, request
 
 
@@ -17,7 +23,22 @@ class LiveRequests(Asked):
     @request("Scanning live")
     def start_live(self) -> None:
         """Show clouds while patterns run, until `stop_live`, a capture, another rig or session, or a fault."""
-        start_live(self._engine)
+        engine = self._engine
+        view = engine.teller.now().session
+        if view is None or view.calibration is None:
+            raise InputError("calibrate first: without a calibration nothing can be measured live")
+        bench, store = engine.bench, engine.store
+        if bench is None:
+            raise InputError("no rig is chosen: choose one in the step Rig")
+        if bench.reel is not None:
+            raise InputError("a recording answers to its own patterns alone: choose a real rig or the simulated one")
+        axis = depth_axis(view.calibration)
+        sequence = replace(short(bench.rig.projector.size, axis), levels=engine.reader.levels())
+        live = Live(
+            store, axis, sequence, engine.acquisition, engine.notices, engine.publish_live, engine.teller.changed
+        )
+        live.start()
+        engine.live = live
 
     @request("Ending the live scan")
     def stop_live(self) -> None:
@@ -27,7 +48,20 @@ class LiveRequests(Asked):
     @request("Keeping the live scan")
     def keep_live(self, label: str = "") -> None:
         """Save what the latest live cloud was made of as a scan, and reconstruct it; the live scan goes on."""
-        keep_live(self._engine, label, self.reconstruct)
+        engine = self._engine
+        live, store = engine.live, engine.store
+        shot = live.stream.kept() if live is not None and live.running else None
+        if live is None or shot is None:
+            raise InputError("nothing is scanned live: press Live first, and wait for a cloud")
+        name = next_name(engine, "scan")
+        check_space(engine, name, len(shot.frames))
+        taken = Taken(shot.frames, shot.settings)
+        source = engine.acquisition.view().name
+        keep(store, name, "scan", live.stream.sequence, taken, source=source, purpose="scan")
+        if label.strip():
+            store.decide("names", {**(store.decision("names") or {}), name: label.strip()})
+        engine.queue_unfinished()
+        self.reconstruct(name)
 
     def on_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
         """Hear of every live cloud, on the thread that makes them; returns how to stop. A listener returns at once."""

@@ -8,22 +8,25 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slviewer.devices.capture import Taken
 from slviewer.errors import InputError
-from slviewer.fringe.presets import short
+from slviewer.fringe.decode import decode
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.capture import keep
+from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.models import check_accepted, insisted, load_model, load_stereo, preferred
 from slviewer.pipeline.scale import scale_factor
+from slviewer.reconstruction.axis_agreement import check_sizes
+from slviewer.reconstruction.onepass import OnePass, Scan
+from slviewer.reconstruction.onepass_cuda import has_pass, one_pass
+from slviewer.reconstruction.reconstruct import Model
 from slviewer.session.store import Session
-from slviewer.wizard.capture_requests import check_space, depth_axis, next_name
-from slviewer.wizard.engine import Engine
+from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.live_frames import Shot, Stream
-from slviewer.wizard.live_measuring import Measuring
+from slviewer.wizard.live_motion import hide_moved
+from slviewer.wizard.notices import Notices
 from slviewer.wizard.snapshot import LiveView
 
 TOLD_PER_S = 3.0
@@ -45,11 +48,25 @@ class LiveCloud:
 
 
 class Live:
-    """A live scan, from its start to its end. `figures` and `shown` may be called from any thread."""
+    """A live scan, from its start to its end.
 
-    def __init__(self, engine: Engine, axis: Axis, sequence: PatternSequence) -> None:
-        self._engine, self._store, self.axis = engine, engine.store, axis
-        self.stream = Stream(sequence, self._ended)
+    `publish(cloud)` is called with every cloud on the scan's own thread, `changed()` when figures changed or it ended.
+    `figures` and `shown` may be called from any thread.
+    """
+
+    def __init__(
+        self,
+        store: Session,
+        axis: Axis,
+        sequence: PatternSequence,
+        acquisition: Acquisition,
+        notices: Notices,
+        publish: Callable[[LiveCloud], None],
+        changed: Callable[[], None],
+    ) -> None:
+        self._store, self.axis, self._acquisition, self._notices = store, axis, acquisition, notices
+        self._publish, self._changed = publish, changed
+        self.stream = Stream(sequence, changed)
         self._lock = threading.Lock()
         self._made: deque[float] = deque()
         self._sent: deque[tuple[float, float]] = deque()
@@ -60,7 +77,7 @@ class Live:
     def start(self) -> None:
         """Begin. Raises DeviceError where the rig cannot, SlviewerError where the session has no calibration to use."""
         self._model = Calibrated(self._store, self.stream.sequence, self.axis)
-        self._engine.acquisition.stream(self.stream)
+        self._acquisition.stream(self.stream)
         self._thread.start()
 
     @property
@@ -94,8 +111,8 @@ class Live:
             try:
                 cloud = self._cloud(shot)
             except Exception as error:
-                self._engine.notices.fail("Live", error)
-                self._engine.acquisition.unstream()
+                self._notices.fail("Live", error)
+                self._acquisition.unstream()
                 return
             now = time.monotonic()
             with self._lock:
@@ -103,11 +120,10 @@ class Live:
                 _forget(self._made, now)
             if not self.running:
                 return
-            for listener in self._engine.live_listeners:
-                listener(cloud)
+            self._publish(cloud)
             if now - self._told > 1 / TOLD_PER_S:
                 self._told = now
-                self._engine.teller.changed()
+                self._changed()
 
     def _cloud(self, shot: Shot) -> LiveCloud:
         assert self._model is not None
@@ -116,8 +132,50 @@ class Live:
         self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
         return LiveCloud(self._number, points, texture, shot.begun)
 
-    def _ended(self) -> None:
-        self._engine.teller.changed()
+
+@dataclass(eq=False)
+class Measuring:
+    """A short sequence, a calibration, and the scale that was applied to it; ``calibrated``: the rig whose sizes the
+    frames must have. For one thread at a time."""
+
+    sequence: PatternSequence
+    axis: Axis
+    model: Model
+    factor: float = 1.0
+    calibrated: StereoRig | None = None
+    _fast: OnePass | None = field(init=False, repr=False, default=None)
+    _before: Scan | None = field(init=False, repr=False, default=None)
+
+    def __post_init__(self) -> None:
+        if has_pass(self.model):
+            self._fast = one_pass(self.sequence, self.model, self.axis)
+
+    def cloud(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(points (h, w, 3) float32 mm, texture (h, w)) of the frames (n, h, w); both are new arrays.
+
+        As `reconstruct` has them, but that what moved between the frames is NaN too. Raises InputError for frames that
+        are not those of the sequence, or of another camera.
+        """
+        if self.calibrated is not None:
+            height, width = frames.shape[1:]
+            check_sizes("the live scan", (width, height), self.sequence.projector_size, self.calibrated)
+        if self._fast is not None:
+            scan = self._fast.run(frames, out=self._room())
+            self._before, points = scan, scan.points
+            phase, modulation, noise = scan.phase, scan.modulation, scan.light.noise
+        else:
+            decoded = decode(self.sequence, frames, self.axis)
+            points = self.model.points(decoded)
+            phase, modulation, noise = decoded.phase, decoded.modulation, decoded.noise
+        hide_moved(self.sequence, frames, self.axis, phase, modulation, noise, points)
+        if self.factor != 1.0:
+            points *= np.float32(self.factor)
+        return points, frames[-1].copy()
+
+    def _room(self) -> Scan | None:
+        """The arrays of the scan before, but its points, which somebody may be drawing."""
+        before = self._before
+        return None if before is None else replace(before, points=np.empty_like(before.points))
 
 
 class Calibrated:
@@ -151,40 +209,6 @@ class Calibrated:
             )
         self._key = key
         return Measuring(self._sequence, self._axis, model, factor, load_stereo(store).rig)
-
-
-def start_live(engine: Engine) -> None:
-    """Begin to scan live, in place of what runs so. Raises InputError, DeviceError, SlviewerError."""
-    view = engine.teller.now().session
-    if view is None or view.calibration is None:
-        raise InputError("calibrate first: without a calibration nothing can be measured live")
-    bench = engine.bench
-    if bench is None:
-        raise InputError("no rig is chosen: choose one in the step Rig")
-    if bench.reel is not None:
-        raise InputError("a recording answers to its own patterns alone: choose a real rig or the simulated one")
-    axis = depth_axis(view.calibration)
-    sequence = replace(short(bench.rig.projector.size, axis), levels=engine.reader.levels())
-    live = Live(engine, axis, sequence)
-    live.start()
-    engine.live = live
-
-
-def keep_live(engine: Engine, label: str, follow: Callable[[str], object]) -> None:
-    """Save the capture of the latest live cloud as a scan, before this returns, and `follow(name)` then."""
-    live, store = engine.live, engine.store
-    shot = live.stream.kept() if live is not None and live.running else None
-    if live is None or shot is None:
-        raise InputError("nothing is scanned live: press Live first, and wait for a cloud")
-    name = next_name(engine, "scan")
-    check_space(engine, name, len(shot.frames))
-    taken = Taken(shot.frames, shot.settings)
-    source = engine.acquisition.view().name
-    keep(store, name, "scan", live.stream.sequence, taken, source=source, purpose="scan")
-    if label.strip():
-        store.decide("names", {**(store.decision("names") or {}), name: label.strip()})
-    engine.queue_unfinished()
-    follow(name)
 
 
 def _rate(times: "deque[float] | list[float]") -> float:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -30,7 +30,6 @@ from slviewer.surface.meshing import MeshingPlan
 from slviewer.target.board import Board
 from slviewer.wizard import diagnostics, tasks
 from slviewer.wizard.acquisition import LIGHTS
-from slviewer.wizard.autopilot import Autopilot
 from slviewer.wizard.capture_requests import sequence_for_poses, take_pose, take_scan
 from slviewer.wizard.engine import Engine
 from slviewer.wizard.export_files import export_file
@@ -53,13 +52,26 @@ _CHECKED: dict[Verdict, tuple[Level, str]] = {
 T = TypeVar("T")
 
 
+class Player(Protocol):
+    """What makes requests by itself, on a thread of its own: the autopilot."""
+
+    @property
+    def running(self) -> bool: ...
+
+    def start(self) -> None:
+        """Begin to make requests."""
+
+    def stop(self) -> None:
+        """Make no more requests."""
+
+
 class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:
         """Opens `session`, made where it is missing, and `rig`, by default the one that the session remembers."""
         self._engine = Engine(set_up, self.capture_pose)
-        self._autopilot: Autopilot | None = None
+        self._autopilot: Player | None = None
         self._surfaces = Surfaces()
         if session is not None:
             self.open_session(session, rig)
@@ -428,7 +440,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
 
     @request("Cancelling")
     def cancel(self) -> None:
-        """Cancel the capture that runs, else the job; autopilot lands too."""
+        """Cancel the capture that runs, else the job; an autopilot stops too."""
         if self._autopilot is not None:
             self._autopilot.stop()
         if not self._engine.acquisition.idle:
@@ -437,13 +449,18 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
             self._engine.jobs.cancel()
 
     @request("Starting autopilot")
-    def start_autopilot(self, poses: int = 10, pause_s: float = 0.5) -> None:
-        """Play the whole wizard on the simulated rig, with a pause before each act so that it can be watched."""
+    def start_autopilot(self, autopilot: Player) -> None:
+        """Let an autopilot make the requests, until it is done or `cancel` stops it."""
         with self._engine.lock:
             if self._autopilot is not None and self._autopilot.running:
-                raise InputError("autopilot is flying already")
-            self._autopilot = Autopilot(self, self._autopilot_says, poses=poses, pause_s=pause_s)
-            self._autopilot.start()
+                raise InputError("an autopilot is running already: cancel it first")
+            self._autopilot = autopilot
+            autopilot.start()
+
+    def show_act(self, act: str) -> None:
+        """Show in the snapshot what the autopilot does now; empty when it has ended."""
+        self._engine.autopilot = act
+        self._engine.teller.changed()
 
     def tell(self, level: Level, text: str) -> None:
         """Put a sentence of the caller's own among the notices."""
@@ -456,10 +473,6 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
         self._engine.close()
 
     # inside
-
-    def _autopilot_says(self, act: str) -> None:
-        self._engine.autopilot = act
-        self._engine.teller.changed()
 
     def _warn(self, text: str) -> None:
         self._engine.notices.tell("warning", text)

@@ -468,7 +468,7 @@ def _splined(session: Session) -> SplinedView | None:
     except SessionError:
         return None
     assert isinstance(model, SplinedModel)
-    found, fits = model.bundle.summary(), model.bundle.fits
+    found, fits = model.summary(), model.bundle.fits
     low, high = found["board_height_mm"]
     return SplinedView(
         noise_px=found["noise_px"],

@@ -79,7 +79,7 @@ def test_weights_come_from_the_residuals(model) -> None:
     assert 0.006 < noise.camera_px < 0.012
     assert max(noise.excess_px) < 0.003 and all(0.004 < s < 0.008 for s in noise.sample_px)
     assert all(fit.camera_trust > 0.7 and fit.projector_trust > 0.7 for fit in model.bundle.fits.values())
-    assert "splined" in model.bundle.text() and not model.bundle.left_out
+    assert "splined" in model.text() and not model.bundle.left_out
 
 
 def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(model, seen, stereo, true) -> None:
@@ -127,7 +127,7 @@ def test_what_is_saved_comes_back_the_same(model, true) -> None:
     phase = phase_map(true, np.full(true.camera.size[::-1], 600.0))
     assert np.array_equal(model.points(phase), again.points(phase), equal_nan=True)
     assert np.array_equal(model.bundle.factor, again.bundle.factor)
-    assert again.bundle.summary() == model.bundle.summary()
+    assert again.summary() == model.summary()
 
 
 def test_poses_of_one_axis_are_refused_with_what_is_missing(seen, stereo, true) -> None:

@@ -97,11 +97,11 @@ def test_the_frame_would_overstate_it(model) -> None:
 
 
 def test_the_volume_is_summed_up_before_anything_is_scanned(model) -> None:
-    figures = model.bundle.summary()["sigma_volume_mm"]
+    figures = model.summary()["sigma_volume_mm"]
     assert figures == volume_sigma(model.bundle)
     assert 0.001 < figures["median"] < figures["p95"] < figures["worst"]
     assert 0.5 < figures["supported"] < 1 and figures["axis"] == "x"
-    assert "3D uncertainty at" in model.bundle.text()
+    assert "3D uncertainty at" in model.text()
 
 
 def test_a_smooth_field_goes_on_farther_than_independent_differences_do() -> None:

@@ -24,8 +24,7 @@ from slviewer.simulation.truth import rig_record
 from slviewer.target.board import Board
 from slviewer.wizard import acquisition
 from slviewer.wizard.live_frames import Stream
-from slviewer.wizard.live_measuring import Measuring
-from slviewer.wizard.live_scan import LiveCloud
+from slviewer.wizard.live_scan import LiveCloud, Measuring
 from slviewer.wizard.operator import Operator
 
 SCALE = 0.15

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.observe import AXES, Observation
-from slviewer.calibration.splined.bundle import Bundle, adjust
+from slviewer.calibration.splined.adjust import adjust
+from slviewer.calibration.splined.board_shape import board_frame, board_heights
+from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.compiled import Compiled, compile_axis, pixel_rays
 from slviewer.calibration.splined.evidence import LEAST_SIGMA_PX
 from slviewer.calibration.splined.fields import undistort
-from slviewer.calibration.splined.uncertainty import SigmaMap, sigma_map
+from slviewer.calibration.splined.uncertainty import SigmaMap, sigma_map, volume_sigma
 from slviewer.calibration.splined.unknowns import Arrangement, lens_of
 from slviewer.calibration.splined.volume import is_lit
 from slviewer.calibration.stereo import StereoModel
@@ -137,6 +139,68 @@ class SplinedModel:
         organised points (h, w, 3) are. It is the same in every scan, and averages out in none. Where residuals exceed
         their noise it is larger by that ratio, for what they consist of then is not independent."""
         return self.sigma_map(axis).at(points) * np.float32(self.residuals_over_noise(axis))
+
+    @cached_property
+    def sigma_volume(self) -> dict[str, Any]:
+        """Uncertainty of the working volume, as ``uncertainty.volume_sigma`` returns it."""
+        return volume_sigma(self.bundle)
+
+    def summary(self) -> dict[str, Any]:
+        """The figures of ``text``, JSON-able."""
+        bundle = self.bundle
+        fields = {
+            device: float(np.sqrt(np.mean(part.coefficients[:, 1:-1, 1:-1] ** 2)))
+            for device, part in (("camera", bundle.state.rig.camera), ("projector", bundle.state.rig.projector))
+        }
+        height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
+        return {
+            "steps": bundle.steps,
+            "residuals_over_noise": {"x": bundle.noise.ratio[0], "y": bundle.noise.ratio[1]},
+            "noise_px": {
+                "camera": bundle.noise.camera_px,
+                "x": bundle.noise.sample_px[0],
+                "y": bundle.noise.sample_px[1],
+            },
+            "local_distortion_rms_px": fields,
+            "board_height_mm": [float(height.min()), float(height.max())],
+            "board_offsets_rms_mm": float(np.sqrt(np.mean(bundle.state.offsets**2))),
+            "cells_lit": {
+                "camera": float(np.mean(bundle.camera_poses > 0)),
+                "projector": float(np.mean(bundle.projector_poses > 0)),
+            },
+            "sigma_volume_mm": self.sigma_volume,
+            "left_out": dict(bundle.left_out),
+            "turned": list(bundle.turned),
+        }
+
+    def text(self) -> str:
+        """For people."""
+        bundle, s = self.bundle, self.summary()
+        noise, local, lit = s["noise_px"], s["local_distortion_rms_px"], s["cells_lit"]
+        low, high = s["board_height_mm"]
+        sure = s["sigma_volume_mm"]
+        near, far = sure["depths_mm"]
+        u, v, z = sure["worst_at"]
+        return "\n".join(
+            [
+                f"splined: residuals camera {noise['camera']:.4f} px, projector x {noise['x']:.4f}, "
+                f"y {noise['y']:.4f} px (robust; {max(bundle.noise.ratio):.1f} times the predicted noise), "
+                f"after {s['steps']} steps",
+                f"  local distortion {local['camera']:.3f} px RMS in the camera, "
+                f"{local['projector']:.3f} px in the projector",
+                f"  board: height {low:+.4f} ... {high:+.4f} mm, features misplaced by "
+                f"{s['board_offsets_rms_mm']:.4f} mm RMS",
+                *(
+                    [f"  board turned by 180 degrees in {', '.join(bundle.turned)}: numbered as in the others"]
+                    * bool(bundle.turned)
+                ),
+                f"  lit by target poses: {100 * lit['camera']:.0f} % of the camera's cells, "
+                f"{100 * lit['projector']:.0f} % of the projector's",
+                f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma): median "
+                f"{sure['median']:.4f} mm and 95 % below {sure['p95']:.4f} mm over the {100 * sure['supported']:.0f} % "
+                f"that the poses support; worst {sure['worst']:.3f} mm, at pixel ({u:.0f}, {v:.0f}) and {z:.0f} mm",
+            ]
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """What is not an array, JSON-able."""

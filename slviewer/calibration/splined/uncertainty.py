@@ -9,12 +9,13 @@ the fields' supported part: ``persistence``.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numba import prange
 from scipy.ndimage import binary_erosion, distance_transform_edt, uniform_filter
 
+from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.volume import (
     BestMotion,
@@ -28,9 +29,6 @@ from slviewer.calibration.splined.volume import (
 )
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
-
-if TYPE_CHECKING:
-    from slviewer.calibration.splined.found import Bundle
 
 NODES = (21, 16, 11)
 """Of the map across, down, and in depth: then what lies between is right within a tenth or two, and a map takes about a
@@ -59,7 +57,7 @@ class SigmaMap:
         return out
 
 
-def sigma_map(bundle: "Bundle", axis: Axis, near: float, far: float) -> SigmaMap:
+def sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> SigmaMap:
     """What the calibration leaves uncertain of the depths measured through one axis: a second of work.
 
     The rigid motion is that of the working volume's supported places.
@@ -87,7 +85,7 @@ def sigma_map(bundle: "Bundle", axis: Axis, near: float, far: float) -> SigmaMap
     return SigmaMap(np.ascontiguousarray(sigma[tuple(nearest)], np.float32), near, far)
 
 
-def sigma_of(bundle: "Bundle", axis: Axis, volume: Volume) -> np.ndarray:
+def sigma_of(bundle: Bundle, axis: Axis, volume: Volume) -> np.ndarray:
     """(n,) mm: standard deviation in all directions together of a volume's places, measured through one axis, without
     the rigid motion of those that are supported."""
     whitened = bundle.whitened(bundle.point_jacobian(axis, volume.pixels, volume.z))
@@ -95,7 +93,7 @@ def sigma_of(bundle: "Bundle", axis: Axis, volume: Volume) -> np.ndarray:
     return np.asarray(sigma * beyond(bundle, volume))
 
 
-def beyond(bundle: "Bundle", places: Volume) -> np.ndarray:
+def beyond(bundle: Bundle, places: Volume) -> np.ndarray:
     """(n,): by how much the priors' standard deviations are too small: 1 where target poses looked; elsewhere the
     persistence of the field, or fields, that none of them lit there."""
     factor = np.ones(len(places.z))
@@ -126,7 +124,7 @@ def persistence(device: Device, lit: np.ndarray) -> float:
     return max(1.0, float(np.sqrt(together / max(each, 1e-300))))
 
 
-def volume_sigma(bundle: "Bundle") -> dict[str, Any]:
+def volume_sigma(bundle: Bundle) -> dict[str, Any]:
     """How sure points of the working volume are, in all directions together, before anything is scanned.
 
     ``median``, ``p95`` mm over the places that target poses support; ``worst`` mm of all, and ``worst_at`` (u, v, z);
@@ -149,7 +147,7 @@ def volume_sigma(bundle: "Bundle") -> dict[str, Any]:
     }
 
 
-def _fitted(bundle: "Bundle", volume: Volume) -> np.ndarray:
+def _fitted(bundle: Bundle, volume: Volume) -> np.ndarray:
     """(n,) bool: the supported places; all, where these are too few to say how the space lies."""
     supported = volume.supported(bundle.state.rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
     return supported if np.count_nonzero(supported) >= LEAST_FITTED else np.ones(len(supported), bool)

@@ -17,7 +17,6 @@ from slviewer.gui.calibration_words import (
 from slviewer.gui.inputs import Choice, Follows, change, titled
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened, spread
-from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, block, cell, colours, table, toned
 from slviewer.pipeline.report import calibration_view
 from slviewer.report.curves import pixel_curves
@@ -93,7 +92,7 @@ class Panel:
             self._column = gui.add_number("Pixel column u", 0, min=0, step=1)
             self._row = gui.add_number("Pixel row v", 0, min=0, step=1)
             self._over = Choice(gui, "Cloud to click", "Shows a cloud in 3D; click on it to choose a pixel")
-            bring_button(self._stage, lambda: self._cloud.points if self._cloud else None)
+            self._stage.bring_button(lambda: self._cloud.points if self._cloud else None)
             self._curve_words = Words(gui)
             self._curves = Plot(gui)
         self._anyway.on_update(safely(self._toggle_anyway))
@@ -338,7 +337,7 @@ class Panel:
             self._painter.forget("cloud")
             self._cloud = None
             self._stage.scene.clear(LAYER)
-            self._stage.eyes.overview()
+            self._stage.viewpoints.overview()
             self._refresh()
             return
         self._refresh()
@@ -352,7 +351,7 @@ class Panel:
         self._stage.scene.cloud(LAYER, "cloud", cloud.points[rows, columns], colours(z, *spread(z)))
         self._stage.scene.show(LAYER, self._visible)
         if self._visible:
-            self._stage.eyes.at(f"{LAYER} {cloud.name}", cloud.points)
+            self._stage.viewpoints.at(f"{LAYER} {cloud.name}", cloud.points)
 
     def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
         cloud = self._cloud

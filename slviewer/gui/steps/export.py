@@ -11,7 +11,6 @@ from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.meshing import MeshInputs
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
-from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Words, block, cell, link, table, toned
 from slviewer.pipeline.export import FORMATS, What, file_name, foreseen_bytes, size, units
 from slviewer.wizard import result_views
@@ -69,7 +68,7 @@ class Panel:
             self._shape_done = Words(gui)
             self._write = gui.add_button("Write file", icon=viser.Icon.FILE_EXPORT)
             self._write.on_click(safely(self._ask_shape))
-            bring_button(self._stage, lambda: self._points)
+            self._stage.bring_button(lambda: self._points)
         with gui.add_folder("Calibration and poses"):
             self._numbers = Choice(gui, "What")
             self._number_format = Choice(gui, "Format")
@@ -192,7 +191,7 @@ class Panel:
 
     def _show_closely(self) -> None:
         if self._visible:
-            self._stage.eyes.at(f"{LAYER} {self._of.value}", self._points)
+            self._stage.viewpoints.at(f"{LAYER} {self._of.value}", self._points)
 
     # requests
 

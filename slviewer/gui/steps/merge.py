@@ -13,7 +13,6 @@ from slviewer.gui.merge_words import merge_words, refusal_words, turn_words
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import Painter, opened
 from slviewer.gui.steps.verify import likely
-from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Words
 from slviewer.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
 
@@ -67,7 +66,7 @@ class Panel:
         self._view = Choice(gui, "Show in 3D")
         self._view.on_change(safely(self._refresh))
         self._legend = Words(gui)
-        bring_button(self._stage, lambda: self._seen)
+        self._stage.bring_button(lambda: self._seen)
 
     def draw(self, snapshot: Snapshot) -> None:
         with self._lock:
@@ -208,7 +207,7 @@ class Panel:
         self._picks.show(self._visible and picking)
         self._legend.set("" if picking or self._drawn is None else self._drawn.legend)
         if self._visible and not picking and self._drawn is not None:
-            self._stage.eyes.at(f"{LAYER} {self._drawn.about}", self._drawn.points)
+            self._stage.viewpoints.at(f"{LAYER} {self._drawn.about}", self._drawn.points)
 
     # requests
 

@@ -16,7 +16,6 @@ from slviewer.gui.pictures import Painter, opened, spread
 from slviewer.gui.preview import drawn, legend, light_words
 from slviewer.gui.steps.verify import likely
 from slviewer.gui.undelete import Undelete
-from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Picture, Words, block, boxed, cell, colour_bar, colours, table, thumbnail, toned
 from slviewer.gui.world import Stand
 from slviewer.report.maps import error_limit
@@ -73,7 +72,7 @@ class Panel:
             self._reconstruct.on_click(safely(self._ask_cloud))
             self._colour = gui.add_dropdown("Colour by", COLOURS)
             self._legend = Words(gui)
-            bring_button(self._stage, lambda: self._cloud.points if self._cloud else None)
+            self._stage.bring_button(lambda: self._cloud.points if self._cloud else None)
             self._point = Words(gui)
             self._rename_to = gui.add_text("New name", "")
             rename = gui.add_button("Rename scan", icon=viser.Icon.PENCIL, color="gray")
@@ -210,7 +209,7 @@ class Panel:
 
     def _look(self) -> None:
         if self._visible and self._cloud is not None:
-            self._stage.eyes.at(f"{LAYER} {self._cloud.name}", self._cloud.points)
+            self._stage.viewpoints.at(f"{LAYER} {self._cloud.name}", self._cloud.points)
 
     def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
         cloud = self._cloud

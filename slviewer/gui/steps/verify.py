@@ -11,7 +11,6 @@ from slviewer.gui.inputs import Choice, change, titled
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened
 from slviewer.gui.preview import drawn, legend, light_words
-from slviewer.gui.views import bring_button
 from slviewer.gui.widgets import Html, Picture, Words, block, cell, colour_bar, colours, link, table, toned
 from slviewer.gui.world import Stand
 from slviewer.pipeline.verify import Shape
@@ -65,7 +64,7 @@ class Panel:
             self._maps = Plot(gui)
             self._model = Choice(gui, "Colours in 3D", "By whose error the cloud is coloured")
             self._legend = Words(gui)
-            bring_button(self._stage, lambda: self._cloud.points if self._cloud else None)
+            self._stage.bring_button(lambda: self._cloud.points if self._cloud else None)
         with gui.add_folder("All results", visible=False) as self._table_folder:
             self._table = Words(gui)
             self._write = gui.add_button("Write table as CSV", icon=viser.Icon.TABLE_EXPORT, color="gray")
@@ -175,7 +174,7 @@ class Panel:
 
     def _look(self) -> None:
         if self._visible and self._cloud is not None:
-            self._stage.eyes.at(f"{LAYER} {self._cloud.name}", self._cloud.points)
+            self._stage.viewpoints.at(f"{LAYER} {self._cloud.name}", self._cloud.points)
 
     # requests
 

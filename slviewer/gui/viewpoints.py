@@ -1,12 +1,9 @@
-"""Where the browsers look from: everybody turns the 3D view for himself; new clouds are brought before all eyes."""
+"""Viewpoints of the browsers: each operator turns the 3D view alone; a new cloud is brought into every view."""
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import numpy as np
 import viser
-
-from slviewer.gui.panel import Stage
 
 _FROM = np.array([-0.45, -0.35, -0.82])
 """From a little to the left and above of where the camera looks from: depth is seen, and nothing is upside down."""
@@ -17,8 +14,8 @@ OVERVIEW = ((-430.0, -560.0, -820.0), (55.0, 40.0, 330.0))
 FIELD_OF_VIEW = 0.75  # rad
 
 
-class Eyes:
-    """All browsers' views; `clients()` gives those that are there."""
+class Viewpoints:
+    """The viewpoints of all browsers; `clients()` gives those that are connected."""
 
     def __init__(self, clients: Callable[[], Iterable[viser.ClientHandle]]) -> None:
         self._clients = clients
@@ -40,13 +37,6 @@ class Eyes:
             bring(client, points)
 
 
-def bring_button(stage: Stage, points: Callable[[], np.ndarray | None]) -> viser.GuiButtonHandle:
-    """A button that turns the view of whoever clicks it to the points (..., 3) mm that it is given then, if any."""
-    button = stage.gui.add_button("Bring into view", icon=viser.Icon.FOCUS_2, color="gray")
-    button.on_click(stage.safely_with(lambda event: _bring(event, points())))
-    return button
-
-
 def bring(client: viser.ClientHandle, points: np.ndarray) -> None:
     """Let one browser look at the points (..., 3) mm; nothing happens where none is valid."""
     flat = points.reshape(-1, 3)
@@ -57,11 +47,6 @@ def bring(client: viser.ClientHandle, points: np.ndarray) -> None:
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     away = max(1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0)  # the field of view is that of the height
     _look(client, middle + _FROM * away, middle)
-
-
-def _bring(event: Any, points: np.ndarray | None) -> None:
-    if event.client is not None and points is not None:
-        bring(event.client, points)
 
 
 def _look(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
