@@ -11,7 +11,7 @@ import tyro
 from slviewer import terminal
 
 Axis = Literal["x", "y"]
-ModelName = Literal["stereo", "pixelwise", "anchored", "splined"]
+ModelName = Literal["stereo", "pixelwise", "splined"]
 Role = Literal["calibration", "scan"]
 Start = Literal["features", "turntable", "identity"]
 Method = Literal["grid", "poisson", "volume"]

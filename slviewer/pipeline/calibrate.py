@@ -7,7 +7,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from slviewer.calibration.anchored import AnchoredModel, calibrate_anchored
 from slviewer.calibration.diagnosis.splined_rules import judge_splined
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation, Smoothing
@@ -21,7 +20,7 @@ from slviewer.pipeline.models import available, preferred, save_fitted, save_ste
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.target.board import Board
 
-_LENGTH = {"pixelwise": 1.0, "anchored": 1.0, "splined": 2.0}
+_LENGTH = {"pixelwise": 1.0, "splined": 2.0}
 """How long each model takes, roughly, for the progress."""
 DEFAULT_MODELS = ("stereo", "pixelwise", "splined")
 T = TypeVar("T")
@@ -33,7 +32,6 @@ class CalibrationResult:
 
     stereo: StereoModel
     pixelwise: PixelwiseModel | None
-    anchored: AnchoredModel | None = None
     splined: SplinedModel | None = None
     verdict: Verdict = field(default_factory=Verdict)
 
@@ -56,8 +54,6 @@ class CalibrationResult:
                 "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.axes[0]),
                 "axes": {axis: self.pixelwise.median_rms_mm(axis) for axis in self.pixelwise.axes},
             }
-        if self.anchored is not None:
-            models["anchored"] = {"axes": {axis: self.anchored.median_rms_px(axis) for axis in self.anchored.axes}}
         if self.splined is not None:
             models["splined"] = self.splined.summary()
         return {
@@ -95,12 +91,6 @@ class CalibrationResult:
                     f"in {np.median(fit.poses[fitted]):.0f} poses (median); "
                     f"fit RMS z {fit_rms['z']:.3f}, x {fit_rms['x']:.3f}, y {fit_rms['y']:.3f} mm (median)"
                 )
-        if self.anchored is not None:
-            lines += [
-                f"anchored {axis}: corrections of {np.sqrt(c.prior[0, 0]):.3f} px (standard deviation at mid depth), "
-                f"fit RMS {self.anchored.median_rms_px(axis):.4f} px (median)"
-                for axis, c in self.anchored.corrections.items()
-            ]
         if self.splined is not None:
             lines.append(self.splined.text())
         lines.append(self.verdict.text())
@@ -121,8 +111,8 @@ def calibrate(
 ) -> CalibrationResult:
     """Calibrate from the session's captures of role calibration, and save the models in the session.
 
-    ``models``: by default stereo, pixelwise and splined. ``stereo`` is always made; ``pixelwise`` and ``anchored`` are
-    fitted on top of it, and ``splined`` starts from it. ``poses``: the only ones to calibrate from, ``exclude``: those
+    ``models``: by default stereo, pixelwise and splined. ``stereo`` is always made; ``pixelwise`` is fitted on
+    top of it, and ``splined`` starts from it. ``poses``: the only ones to calibrate from, ``exclude``: those
     to leave out; names or patterns such as ``pose_0*``, for this calibration alone. A pose that cannot be used is left
     out with the reason. The verdict is saved beside the models. Raises CalibrationRejected with its reason where it
     rejects them: then stereo alone is kept to look into, and used only where that is insisted on; where none could be
@@ -174,7 +164,7 @@ def calibrate(
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         save_stereo(store, stereo, inputs, settings, verdict)
-        for model in (made.pixelwise, made.anchored, made.splined):
+        for model in (made.pixelwise, made.splined):
             if model is not None:
                 save_fitted(store, model, inputs, settings)
         save_verdict(store, verdict, names)
@@ -220,16 +210,13 @@ def _made(
             warn(f"no {'pixel-wise' if name == 'pixelwise' else name} model: {error}")
             return None
 
-    pixelwise = anchored = splined = None
+    pixelwise = splined = None
     if "pixelwise" in models:
         fitting = told("pixelwise", "pixel-wise fit")
         pixelwise = tried("pixelwise", lambda: calibrate_pixelwise(observations, stereo, fitting))
-    if "anchored" in models:
-        correcting = told("anchored", "anchored fit")
-        anchored = tried("anchored", lambda: calibrate_anchored(observations, stereo, progress=correcting))
     if "splined" in models:
         adjusting = told("splined", "joint adjustment")
         splined = tried("splined", lambda: calibrate_splined(observations, stereo, adjusting))
         for name, why in splined.bundle.left_out.items() if splined else ():
             warn(f"{name} is left out of the splined model: it {why}")
-    return CalibrationResult(stereo, pixelwise, anchored, splined)
+    return CalibrationResult(stereo, pixelwise, splined)

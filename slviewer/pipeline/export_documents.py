@@ -126,7 +126,7 @@ def write_coefficients(store: Session, name: str, path: Path) -> str:
     """Each pixel's rational function as .npz with an ``about`` in words, of the model ``name`` (pixelwise or splined;
     empty: the one there is, pixelwise first); returns which."""
     there = [model for model in ("pixelwise", "splined") if model in available(store)]
-    if not (name or there) or name in ("stereo", "anchored"):
+    if not (name or there) or name == "stereo":
         raise InputError("only the pixelwise and the splined model have coefficients for each pixel: calibrate these")
     model = load_model(store, name or there[0])
     assert isinstance(model, PixelwiseModel | SplinedModel)

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.anchored import AnchoredModel
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
@@ -17,16 +16,15 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
 from slviewer.session.store import Session
 
-Model = StereoModel | PixelwiseModel | AnchoredModel | SplinedModel
+Model = StereoModel | PixelwiseModel | SplinedModel
 
-MODELS = ("stereo", "pixelwise", "anchored", "splined")
+MODELS = ("stereo", "pixelwise", "splined")
 VERDICT = "calibration/verdict"
 VALIDATION = "calibration/validation"
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
 _RESTORED: dict[str, Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], Model]] = {
     "pixelwise": PixelwiseModel.restored,
-    "anchored": AnchoredModel.restored,
     "splined": SplinedModel.restored,
 }
 
@@ -47,7 +45,7 @@ def save_stereo(
 
 def save_fitted(
     store: Session,
-    model: PixelwiseModel | AnchoredModel | SplinedModel,
+    model: PixelwiseModel | SplinedModel,
     inputs: Mapping[str, str],
     settings: Mapping[str, Any],
 ) -> None:

@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 
-from slviewer.calibration.anchored import calibrate_anchored
 from slviewer.calibration.centres import centred
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
@@ -31,7 +30,6 @@ Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], Mo
 FITS: dict[str, Fit] = {
     "stereo": lambda observations, stereo, progress: stereo,
     "pixelwise": calibrate_pixelwise,
-    "anchored": lambda observations, stereo, progress: calibrate_anchored(observations, stereo, progress=progress),
     "splined": calibrate_splined,
 }
 """How each model is made from the poses that stereo was made from."""

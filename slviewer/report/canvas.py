@@ -21,7 +21,7 @@ DENSITY = 2
 """Device pixels drawn for each CSS px."""
 
 INK, SOFT, RULE, EMPTY = "#1b2733", "#5a6877", "#e3e8ed", "#d5d9de"
-MODELS = {"stereo": "#d9692b", "pixelwise": "#2270b8", "anchored": "#8a6d3b", "splined": "#1f9673"}
+MODELS = {"stereo": "#d9692b", "pixelwise": "#2270b8", "splined": "#1f9673"}
 REGIONS = {"R1": "#7b5cc4", "R2": "#4f6375", "R3": "#b8436d"}
 BAND = "#e8eef4"
 _OTHERS = ("#6f7d8c", "#a04f9e")

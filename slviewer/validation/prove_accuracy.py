@@ -133,7 +133,7 @@ def prove_accuracy(
 
 def _row(rig: RigFigures) -> Row:
     row: Row = {"rig": rig.case.name, "seed": rig.case.seed}
-    row |= {model: rig.mean_mm(model) for model in ("stereo", "pixelwise", "anchored", "splined", FLOOR)}
+    row |= {model: rig.mean_mm(model) for model in ("stereo", "pixelwise", "splined", FLOOR)}
     row |= {f"ratio {region}": _over_floor(rig, region) for region in OVER_FLOOR}
     row |= {
         "predicted ratio": _predicted_over_floor(rig),

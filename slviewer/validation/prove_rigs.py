@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 
-from slviewer.calibration.anchored import calibrate_anchored
 from slviewer.calibration.centres import calibrate_centred
 from slviewer.calibration.observe import Observation, observe
 from slviewer.calibration.pixelwise import calibrate_pixelwise
@@ -131,7 +130,6 @@ def measure_rig(case: Case, scale: float, poses: int, progress: Progress = unhea
     stereo, observations = calibrate_centred(observations, rig.projector.size, TARGET)
     models: dict[str, Model] = {"stereo": stereo}
     models["pixelwise"] = calibrate_pixelwise(observations, stereo)
-    models["anchored"] = calibrate_anchored(observations, stereo)
     adjusting = perf_counter()
     models["splined"] = calibrate_splined(observations, stereo)
     adjusted = perf_counter()

@@ -15,7 +15,7 @@ from slviewer.evaluation.render import render
 from slviewer.evaluation.tables import rows
 from slviewer.pipeline.merge import Merge
 
-MODELS = ("stereo", "pixelwise", "anchored", "splined")
+MODELS = ("stereo", "pixelwise", "splined")
 
 
 @dataclass(frozen=True)

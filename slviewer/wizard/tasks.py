@@ -43,7 +43,7 @@ def judge_pose(session: Session, name: str, board: Board, report: Reporter) -> J
 def make_calibration(session: Session, target: str, report: Reporter, warn: Warn) -> CalibrationResult:
     """Calibrate every model that the poses which are not excluded allow; models of before do not outlive it."""
     guarded = session.guarded(report.saving)
-    models = ["stereo", "pixelwise", *(name for name in available(session) if name == "anchored")]
+    models = ["stereo", "pixelwise"]
     if lacking := lacking_for_splined(session):
         warn(f"no splined model: {lacking}")
     else:

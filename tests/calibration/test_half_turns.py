@@ -7,7 +7,7 @@ import pytest
 from splined_rig import BOARD, aligned_error, coarse_knots, observation, phase_map, poses, rig
 
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.splined.bundle import adjust
+from slviewer.calibration.splined.adjust import adjust
 from slviewer.calibration.splined.half_turns import may_be_turned, opposite
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import calibrate_stereo

@@ -7,8 +7,8 @@ import pytest
 from splined_rig import BOARD, PERIOD, aligned_error, coarse_knots, observation, phase_map, poses, rig, surface
 
 from slviewer.calibration.observe import Observation
+from slviewer.calibration.splined.adjust import adjust
 from slviewer.calibration.splined.board_shape import board_frame, board_heights
-from slviewer.calibration.splined.bundle import adjust
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from splined_rig import BOARD, aligned_error, coarse_knots, observation, phase_map, poses, rig, surface
 
-from slviewer.calibration.splined.bundle import adjust, gathered
+from slviewer.calibration.splined.adjust import adjust, gathered
 from slviewer.calibration.splined.fields import Device, displacement, image_of, ray_of, roughness, undisplaced
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.normal import normal_equations, predicted

@@ -6,18 +6,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slviewer.errors import SessionError
-from slviewer.pipeline.models import load_model, warn_if_stale
+from slviewer.errors import InputError, SessionError
+from slviewer.pipeline.models import available, load_model, preferred, warn_if_stale
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 
 
-@pytest.mark.parametrize("name", ["pixelwise", "anchored", "splined"])
+@pytest.mark.parametrize("name", ["pixelwise", "splined"])
 def test_a_calibration_of_another_layout_is_refused_with_what_to_do(tmp_path: Path, name: str) -> None:
     with Session.create(tmp_path / "session") as store:
         store.save_result(f"calibration/{name}", {"model": {"axes": ["x"], "periods_px": {"x": 18}}}, {"z": np.eye(2)})
         with pytest.raises(SessionError, match=f"the {name} calibration .* run `slviewer calibrate` again"):
             load_model(store, name)
+
+
+def test_a_calibration_of_a_model_that_is_no_more_is_ignored(recorded: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    with Session.open(folder, write=True) as store:
+        store.save_result("calibration/anchored", {"model": {"axes": ["x"]}, "inputs": {}}, {"z": np.eye(2)})
+        store.decide("model", "anchored")
+        assert available(store) == ("stereo", "pixelwise", "splined") and preferred(store) == "splined"
+        with pytest.raises(InputError, match=r"anchored .*stereo, pixelwise, splined"):
+            load_model(store, "anchored")
+    with Operator(folder) as operator:
+        shown = operator.wait_for(lambda s: s.session is not None and s.session.calibration is not None, 20.0)
+        assert shown is not None and shown.session is not None and shown.session.calibration is not None
+        assert shown.session.calibration.models == ("stereo", "pixelwise", "splined")
 
 
 def test_what_is_stale_is_told_in_one_sentence(tmp_path: Path) -> None:

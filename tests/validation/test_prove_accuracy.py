@@ -55,7 +55,7 @@ def test_a_rig_is_measured_from_its_images(proof: AccuracyProof) -> None:
     assert 0.97 < plane.rms_mm["splined"] / plane.rms_mm[FLOOR] < 1.15
     assert plane.rms_mm["stereo"] > 2 * plane.rms_mm["splined"]
     assert plane.predicted_mm == pytest.approx(plane.rms_mm[FLOOR], rel=0.05)
-    assert set(plane.rms_mm) == {"stereo", "pixelwise", "anchored", "splined", FLOOR}
+    assert set(plane.rms_mm) == {"stereo", "pixelwise", "splined", FLOOR}
     errors = rig.radius_mm[FLOOR]
     assert set(errors) == {"sphere_3", "sphere_4"} and 0 < max(map(abs, errors.values())) < 0.05
     assert 0 < abs(rig.spacing_mm[FLOOR]["sphere_3 - sphere_4"]) < 0.05
@@ -85,7 +85,7 @@ def test_the_perfect_instrument_errs_by_noise_alone() -> None:
 
 def figures(splined=1.0, predicted=1.0, radius=0.004, spacing=0.01, kept=1.0, local=None) -> RigFigures:
     """A rig whose planes come out so many times the floor."""
-    rms = {"stereo": 0.2, "pixelwise": 0.08, "anchored": 0.06, "splined": 0.04 * splined, FLOOR: 0.04}
+    rms = {"stereo": 0.2, "pixelwise": 0.08, "splined": 0.04 * splined, FLOOR: 0.04}
     planes = {
         f"plane_{i}": PlaneFigures(region, rms, 0.04 * predicted, 50_000, kept)
         for i, region in enumerate(("R1", "R2", "R3"))
