@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from slviewer.fringe.agreement_tests import Answer, failed_tests, is_sure, score_of
 from slviewer.fringe.axis_agreement import AxisFrames, AxisReader, agreement, described_frames
 from slviewer.fringe.contradiction import Contradiction
+from slviewer.fringe.ghost import ghost_suspects
 from slviewer.fringe.layout import Shift
 from slviewer.fringe.line_sample import LineSample
 from slviewer.fringe.residual_order import order_suspects, strange_suspects
@@ -32,14 +33,14 @@ def misplaced_steps(
 
 
 def unexplained_steps(sequence: PatternSequence, sample: LineSample, images: Images | None = None) -> set[int]:
-    """Frames that no step of their period explains."""
-    return {
-        suspect.frame
-        for axis in sequence.axes
-        for sampled in _sampled_steps(sequence, axis, sample, images)
-        if sampled.steps > 3
-        for suspect in strange_suspects(sampled)
-    }
+    """Frames that neither a step of their period explains, nor one with a share of the image before it."""
+    unexplained: set[int] = set()
+    for axis in sequence.axes:
+        for sampled in _sampled_steps(sequence, axis, sample, images):
+            if sampled.steps > 3:
+                unexplained |= {suspect.frame for suspect in strange_suspects(sampled)}
+                unexplained -= {suspect.frame for suspect in ghost_suspects(sampled)}
+    return unexplained
 
 
 def fitting_order(

@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.edge_blur import edge_error
 from slviewer.fringe.sequence import Axis
 
 GRAY_SIGMA_CELLS = 12**-0.5
@@ -96,3 +98,20 @@ class PhaseMap:
             if self.sigma_scale != 1:
                 sigma *= np.float32(self.sigma_scale)
         return np.where(self.mask, sigma, np.float32(np.nan))
+
+    @property
+    def sigma_px(self) -> np.ndarray:
+        """(h, w) float32 px: `sigma_phase` as standard deviation of the coordinate."""
+        return self.sigma_phase * np.float32(self.period_px / (2 * np.pi))
+
+    @cached_property
+    def edge_error_px(self) -> np.ndarray:
+        """(h, w) float32 px: by how much the camera's blur displaces the coordinate where the surface's brightness
+        jumps (see `edge_blur`); 0 for Gray code alone, NaN where the phase is."""
+        if self.steps == 0:
+            return self.phase * 0
+        a, b = self.noise
+        some = np.s_[::8, ::8]
+        level = float(np.mean(self.background[some], where=self.mask[some])) if self.mask[some].any() else 0.0
+        error = edge_error(self.phase, self.modulation, float(np.sqrt(max(a + b * level, 0.0) * 2 / self.steps)))
+        return error * np.float32(self.period_px / (2 * np.pi))

@@ -3,7 +3,9 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
@@ -49,7 +51,7 @@ def capture_cloud(
     for message in check.warnings:
         warn(message)
     cloud = scaled(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
-    return raised(cloud, check.sigma_factor)
+    return raised(cloud, check.sigma_factor, check.excess_px, phases)
 
 
 def check_capture(
@@ -114,8 +116,21 @@ def absolute_phases(
     return absolute
 
 
-def raised(cloud: Cloud, factor: float) -> Cloud:
-    """The cloud with sigmas larger by a factor."""
+def raised(
+    cloud: Cloud,
+    factor: float,
+    excess_px: NDArray[np.float32] | None = None,
+    phases: Mapping[Axis, PhaseMap] | None = None,
+) -> Cloud:
+    """The cloud with sigmas larger by a factor, and, by tiles of the image, by an error of the projector's coordinate
+    in px beside the noise of the ``phases``."""
+    if excess_px is not None and phases is not None:
+        phase = phases[cloud.axis]
+        noise_px = phase.sigma_px
+        excess = cv2.resize(excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
+        known = cloud.sigma_calibration
+        return replace(cloud, sigma_calibration=error if known is None else np.hypot(known, error))
     if factor == 1.0:
         return cloud
     left = None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor)

@@ -109,7 +109,7 @@ def axis_figures(phase: PhaseMap) -> dict[str, Any]:
 
 def sigma_px(phase: PhaseMap) -> np.ndarray:
     """(h, w) float32 px: the standard deviation of the projector coordinate; NaN where masked."""
-    return phase.sigma_phase * np.float32(phase.period_px / (2 * np.pi))
+    return phase.sigma_px
 
 
 def decode(

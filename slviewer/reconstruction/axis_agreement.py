@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
@@ -29,6 +30,10 @@ REFUSED_RATIO = 6.0
 REFUSED_PX = 2.0
 """A capture that misses its calibration by more than both does not belong to it: 2 px is also the reprojection error at
 which a calibration itself is rejected."""
+TILES = (12, 16)
+"""Rows and columns of tiles in each of which the axes are compared: a second light path spoils a part of an image."""
+LEAST_IN_TILE = 20
+"""Pixels, below which a tile says nothing."""
 LEAST_IN_FRONT = 0.8
 """Share of the points that lie before both devices: all of them, by the right calibration, but for decoding errors."""
 LEAST_MEASURED = (0.5, 0.8)
@@ -90,11 +95,14 @@ class AxisAgreement:
 
 @dataclass(frozen=True)
 class CaptureCheck:
-    """What a check found: by how much the predicted sigma is too small (1 where it is not), and what to warn of."""
+    """Result of a check. ``sigma_factor``: by how much the predicted sigma is too small, 1 where it is not.
+    ``excess_px``: float32, `TILES`, the px of the projector by which the axes miss each other in each tile of the image
+    beyond what is predicted; None where they do so nowhere, or everywhere alike."""
 
     sigma_factor: float = 1.0
     warnings: tuple[str, ...] = ()
     agreement: AxisAgreement | None = None
+    excess_px: NDArray[np.float32] | None = None
 
 
 def check_sizes(name: str, camera: tuple[int, int], projector: tuple[int, int] | None, calibrated: StereoRig) -> None:
@@ -162,7 +170,39 @@ def check_phases(
             f"{found.predicted_px:.2f} px is predicted: sigma was raised by a factor of {factor:.1f}; the rig may have "
             "moved since it was calibrated (run `slviewer check`), or the frames are disturbed"
         )
-    return CaptureCheck(factor, (*warnings, *_depth_warning(name, found.depths_mm, depth_range)), found)
+    excess = local_misfit(calibration, pixels, measured, sigma) if factor == 1.0 else None
+    if excess is not None:
+        warnings.append(
+            f"{name}: in {100 * np.mean(excess > 0):.0f} % of the image the x and y patterns miss each other by up to "
+            f"{excess.max():.2f} px by this calibration, and {found.misfit_px:.2f} px elsewhere: sigma was raised "
+            "there; look for reflections of the projector's light (a glossy table or wall, a shiny part, a deep "
+            "corner), or for something that moved"
+        )
+    return CaptureCheck(factor, (*warnings, *_depth_warning(name, found.depths_mm, depth_range)), found, excess)
+
+
+def local_misfit(
+    calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
+) -> NDArray[np.float32] | None:
+    """The px of the projector, `TILES` of the image, by which the axes miss each other in each tile beyond what is
+    predicted there; 0 where noise and the calibration's residuals explain it, None where they do so everywhere.
+
+    ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_agreement` takes them. What disturbs one axis disturbs the
+    other about as much.
+    """
+    rig = calibration.pinholes
+    distance, normal = epipolar_distance(rig, *calibration.sight(pixels, measured))
+    known = np.isfinite(distance)
+    distance, noise = np.abs(distance[known]), np.sum((normal[known] * sigma[known]) ** 2, axis=1)
+    tile = (pixels[known, ::-1] * TILES / np.array(rig.camera.size[::-1])).astype(int) @ (TILES[1], 1)
+    order = np.argsort(tile, kind="stable")
+    excess = np.zeros(TILES, np.float32)
+    for group in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
+        predicted = float(np.median(noise[group])) + calibration.residual_px**2
+        misfit = (1.4826 * float(np.median(distance[group]))) ** 2
+        if len(group) >= LEAST_IN_TILE and misfit > RAISED_RATIO**2 * predicted:
+            excess.flat[tile[group[0]]] = np.sqrt(misfit - predicted)
+    return excess if excess.any() else None
 
 
 def measure_agreement(
@@ -224,7 +264,8 @@ def _agreement(
 
 
 def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their noise (n, 2) px."""
+    """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their errors (n, 2) px
+    by noise and by blur at edges."""
     v, u = np.nonzero(np.logical_and.reduce([phase.mask for phase in phases.values()]))
     some = slice(None, None, max(1, -(-len(v) // SAMPLE)))
     v, u = v[some], u[some]
@@ -232,7 +273,7 @@ def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, n
     for column, axis in enumerate(("x", "y")):
         phase = phases[axis]  # type: ignore[index]
         measured[:, column] = phase.coordinate[v, u]
-        sigma[:, column] = phase.sigma_phase[v, u] * (phase.period_px / (2 * np.pi))
+        sigma[:, column] = np.hypot(phase.sigma_px[v, u], phase.edge_error_px[v, u])
     return np.column_stack([u, v]).astype(float), measured, sigma
 
 

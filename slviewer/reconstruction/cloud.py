@@ -14,10 +14,10 @@ class Cloud:
 
     ``points``: (h, w, 3) float32 mm in the camera's frame, NaN where invalid. ``axis``: the one that depth came from.
     ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm, predicted from the capture's noise.
-    ``sigma_calibration``: (h, w) float32 mm of z too, what the calibration leaves uncertain, rigid motion apart: the
-    same in every scan; None from a model that does not know. ``texture``: (h, w) grey or (h, w, 3) RGB, uint8, or None;
-    a 16-bit texture is scaled to 8 bits by the camera's range (10, 12, 14 or 16 bits, whichever holds its brightest
-    pixel).
+    ``sigma_calibration``: (h, w) float32 mm of z too, the same in every scan: what the calibration leaves uncertain,
+    rigid motion apart, and what blur at edges and light by other paths add; None where nothing of it is known.
+    ``texture``: (h, w) grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's
+    range (10, 12, 14 or 16 bits, whichever holds its brightest pixel).
     """
 
     points: np.ndarray

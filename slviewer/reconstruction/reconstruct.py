@@ -17,6 +17,11 @@ if TYPE_CHECKING:
 
 Axis = Literal["x", "y"]
 
+EDGE_SIGMAS = 10.0
+"""Standard deviations of noise, beyond which the error that blur makes at an edge masks a pixel; smaller ones are part
+of its uncertainty."""
+Measured = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+
 JUMP = 0.01
 """A neighbour this much nearer or deeper (share of the depth) belongs to another surface."""
 
@@ -74,12 +79,14 @@ def reconstruct(
                 f"The {model.name} calibration has no axis {axis}, only {_listed(model.axes)}: "
                 f"choose one of these, or calibrate with captures of axis {axis}."
             )
-        points, sigma_z = _measure(model, phases[axis])
+        points, sigma_z, edges = _measure(model, phases[axis])
     else:
         measured = _measure_all(model, phases)
         axis = _best_axis(measured)
-        points, sigma_z = measured[axis]
+        points, sigma_z, edges = measured[axis]
     left = model.sigma_calibration(axis, points) if isinstance(model, Sure) else None
+    if edges is not None:
+        left = edges if left is None else np.hypot(left, edges)
     return Cloud(points, axis, model.name, sigma_z, texture, left)
 
 
@@ -107,23 +114,30 @@ def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
     return out
 
 
-def _measure(model: Model, phase: PhaseMap) -> tuple[np.ndarray, np.ndarray]:
-    """Points (h, w, 3) mm and the standard deviation (h, w) mm of their depth: from the phase noise, and from what the
-    calibration's own phases scatter by beyond theirs."""
+def _measure(model: Model, phase: PhaseMap) -> Measured:
+    """Points (h, w, 3) mm, NaN where the camera's blur spoils the phase at an edge; the standard deviation (h, w) mm of
+    their depth, from the phase noise and from what the calibration's own phases scatter by beyond theirs; and the error
+    (h, w) mm of the depth that blur makes at edges, None for Gray code alone."""
     if phase.is_relative:
         raise InputError(
             f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px: resolve it by a depth range."
         )
     points = model.points(phase)
     sigma = model.sigma_z(phase, points)
+    noise_px = np.maximum(phase.sigma_px, np.float32(1e-9))
+    per_px = sigma / noise_px
     excess = model.excess_px(phase.axis) if isinstance(model, Scattered) else 0.0
     if excess > 0.0:
-        noise_px = phase.sigma_phase * np.float32(phase.period_px / (2 * np.pi))
-        sigma = sigma * np.sqrt(1 + (np.float32(excess) / np.maximum(noise_px, np.float32(1e-9))) ** 2)
-    return points, sigma
+        noise_px = np.hypot(noise_px, np.float32(excess))
+        sigma = per_px * noise_px
+    if phase.steps == 0:
+        return points, sigma, None
+    spoilt = phase.edge_error_px > EDGE_SIGMAS * noise_px
+    points[spoilt], sigma[spoilt] = np.nan, np.nan
+    return points, sigma, per_px * phase.edge_error_px
 
 
-def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, tuple[np.ndarray, np.ndarray]]:
+def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, Measured]:
     shared = [axis for axis in model.axes if axis in phases]
     if not shared:
         raise InputError(
@@ -133,11 +147,11 @@ def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, tu
     return {axis: _measure(model, phases[axis]) for axis in shared}
 
 
-def _best_axis(measured: Mapping[Axis, tuple[np.ndarray, np.ndarray]]) -> Axis:
+def _best_axis(measured: Mapping[Axis, Measured]) -> Axis:
     axes = list(measured)
     if len(axes) == 1:
         return axes[0]
-    valid = {axis: np.isfinite(points[..., 2]) & np.isfinite(sigma) for axis, (points, sigma) in measured.items()}
+    valid = {axis: np.isfinite(points[..., 2]) & np.isfinite(sigma) for axis, (points, sigma, _) in measured.items()}
     both = np.logical_and.reduce(list(valid.values()))
     if both.any():
         return min(axes, key=lambda axis: float(np.median(measured[axis][1][both])))

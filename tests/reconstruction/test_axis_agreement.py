@@ -142,3 +142,19 @@ def test_sizes_are_named_and_their_ratio() -> None:
         check_sizes("scan", SIZE, (456, 570), rig())
     with pytest.raises(InputError, match=r"camera image of 150x120 px, .* 160x120: "):
         check_sizes("scan", (150, 120), PROJECTOR, rig())
+
+
+def test_light_by_another_path_raises_sigma_where_it_falls() -> None:
+    """A mirror below the scene bends both axes by waves that no mean over the image shows."""
+    true, found = rig(), coordinates(rig())
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    wave = 0.3 * np.dstack([np.sin(u / 1.7 + v), np.sin(u / 2.3 - v)])
+    bent = found + np.where((v > 90)[..., None], wave, 0)
+    check = check_phases("scan", phases(bent), by(true), CALIBRATED)
+    assert check.sigma_factor == 1.0 and check.excess_px is not None
+    excess = check.excess_px
+    illuminated = np.isfinite(found[..., 0]).reshape(12, 10, 16, 10).mean((1, 3)) > 0.5
+    assert (excess[:9] == 0).all() and (excess[9:][illuminated[9:]] > 0).mean() > 0.9
+    assert 0.1 < np.median(excess[excess > 0]) < 0.4
+    (warning,) = check.warnings
+    assert warning.startswith("scan: ") and "reflections" in warning

@@ -40,7 +40,9 @@ class FakeModel:
 
 @dataclass
 class FakePhase:
-    is_relative = False
+    is_relative, steps = False, 18
+    sigma_px = np.full(SHAPE, 0.3, np.float32)
+    edge_error_px = np.zeros(SHAPE, np.float32)
 
     axis: str
     offset: np.ndarray
@@ -79,18 +81,23 @@ def test_sigma_is_compared_on_the_same_pixels() -> None:
 
 
 def test_what_the_calibrations_own_phases_scatter_by_is_part_of_sigma() -> None:
-    @dataclass
-    class Measured(FakePhase):
-        sigma_phase: np.ndarray
-        period_px: float
-
     class Scattering(FakeModel):
         def excess_px(self, axis: str) -> float:
             return 0.4
 
-    phase = Measured("x", np.zeros(SHAPE), np.full(SHAPE, 0.3), 2 * np.pi)
-    cloud = reconstruct(Scattering({"x": 0.02}), {"x": phase})
+    cloud = reconstruct(Scattering({"x": 0.02}), phases("x"))
     np.testing.assert_allclose(cloud.sigma_z, 0.02 * 0.5 / 0.3, rtol=1e-5)
+
+
+def test_blur_at_edges_masks_a_pixel_or_adds_to_its_uncertainty() -> None:
+    phase = FakePhase("x", np.zeros(SHAPE))
+    phase.edge_error_px = np.zeros(SHAPE, np.float32)
+    phase.edge_error_px[4], phase.edge_error_px[7] = 0.4, 3.1  # of a noise of 0.3 px, 0.02 mm
+    cloud = reconstruct(FakeModel({"x": 0.02}), {"x": phase})
+    assert not cloud.mask[7].any() and cloud.mask.mean() == 29 / 30
+    np.testing.assert_allclose(cloud.sigma_z[4], 0.02, rtol=1e-6)  # what averaging lessens
+    np.testing.assert_allclose(cloud.sigma[4], 0.02 * np.hypot(1, 4 / 3), rtol=1e-6)
+    np.testing.assert_allclose(cloud.sigma[5], 0.02, rtol=1e-6)
 
 
 def test_missing_axes_are_named() -> None:
