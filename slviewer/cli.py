@@ -11,20 +11,15 @@ from typing import Any
 import tyro
 
 from slviewer import __version__, terminal
-from slviewer.commands.batching import batch
-from slviewer.commands.comparing import compare
-from slviewer.commands.detecting import detect
+from slviewer.commands.calibration import accept, calibrate, check, detect, validate
 from slviewer.commands.devices import capture, devices, preflight
-from slviewer.commands.dimensions import measure, measurements
-from slviewer.commands.exporting import decode, export
-from slviewer.commands.importing import bring_in
-from slviewer.commands.measuring import calibrate, merge, reconstruct, validate, verify
-from slviewer.commands.meshing import mesh
+from slviewer.commands.documents import inspect, patterns, report, target
+from slviewer.commands.exports import decode, export
+from slviewer.commands.imports import import_command
+from slviewer.commands.measurements import measure, measurements
 from slviewer.commands.parsing import union
-from slviewer.commands.proving import prove
-from slviewer.commands.simulating import reproduce, simulate
-from slviewer.commands.telling import bench, inspect, patterns, report, target
-from slviewer.commands.trusting import accept, check
+from slviewer.commands.scans import batch, compare, merge, mesh, reconstruct, verify
+from slviewer.commands.validation import bench, prove, reproduce, simulate
 from slviewer.commands.wizard import wizard
 from slviewer.errors import Cancelled, SlviewerError
 
@@ -33,7 +28,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "devices": devices,
     "preflight": preflight,
     "capture": capture,
-    "import": bring_in,
+    "import": import_command,
     "calibrate": calibrate,
     "validate": validate,
     "decode": decode,

@@ -7,14 +7,16 @@ import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import viser
 
-from slviewer.gui.devices import Devices
+from slviewer.calibration.next_pose import nominal_lens
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import Panel, Stage
+from slviewer.gui.scene import CAMERA, PROJECTOR, Scene
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, meter, toned
 from slviewer.wizard.autopilot import Autopilot
-from slviewer.wizard.snapshot import Notice, PreviewView, Snapshot, StepView
+from slviewer.wizard.snapshot import CalibrationView, Notice, PreviewView, Snapshot, StepView
 
 STEPS_PX, STEP_PX = 236, 452
 """Widths of the two panels: at 1280 px of page, as much is left for the scene as the step takes."""
@@ -34,6 +36,33 @@ _ROOM_FOR_SCROLL_BARS = "<style>.mantine-ScrollArea-content{padding-right:10px}<
 _KEPT = 12  # of the latest notices, in the panel
 
 
+DEVICES = "devices"
+
+
+class DeviceLayer:
+    """Keeps their pyramids up to date."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._drawn: tuple[CalibrationView | None, tuple[int, int] | None] = (None, None)
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Show the devices of this snapshot."""
+        calibration = snapshot.session.calibration if snapshot.session else None
+        camera, projector = snapshot.rig.camera, snapshot.rig.projector
+        if (calibration, camera) == self._drawn:
+            return
+        self._drawn = (calibration, camera)
+        self._scene.clear(DEVICES)
+        if camera is not None:
+            K = nominal_lens(camera).K if calibration is None else calibration.K_camera
+            self._scene.device(DEVICES, "camera", K, camera, np.eye(4), CAMERA)
+        if projector is not None and calibration is not None:
+            T = np.eye(4)  # T_camera_projector: the inverse of X_p = R X_c + t
+            T[:3, :3], T[:3, 3] = calibration.R.T, -calibration.R.T @ calibration.t
+            self._scene.device(DEVICES, "projector", calibration.K_projector, projector, T, PROJECTOR)
+
+
 class Shell:
     """Builds the page once; `draw` and `draw_preview` bring it up to date, from one thread."""
 
@@ -41,7 +70,7 @@ class Shell:
         self, gui: viser.GuiApi, stage: Stage, steps: Sequence[StepView], ask_open: Callable[[str], Any]
     ) -> None:
         self._gui, self._stage = gui, stage
-        self._devices = Devices(stage.scene)
+        self._devices = DeviceLayer(stage.scene)
         self._panels = {step.key: _panel(step.key)(stage) for step in steps}
         self._drawn: Snapshot | None = None
         self._shown_key = ""

@@ -7,8 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.splined_rules import judge_splined
-from slviewer.calibration.diagnosis.verdict import Verdict
+from slviewer.calibration.diagnosis.verdict import Verdict, judge_splined
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined

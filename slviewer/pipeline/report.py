@@ -14,10 +14,11 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.lens import Lens
+from slviewer.inspection.quantities import Quantity
 from slviewer.pipeline.calibration_verdict import last_verdict
 from slviewer.pipeline.check import history
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
-from slviewer.pipeline.measured_views import measured_views
+from slviewer.pipeline.measurements import measurements, quantities_of, section_lines
 from slviewer.pipeline.models import (
     available,
     load_model,
@@ -35,13 +36,17 @@ from slviewer.report.data import (
     AcceptanceView,
     CalibrationView,
     CaptureRow,
+    DeviationView,
     DeviceParameters,
     DriftRow,
     ErrorMaps,
+    MeasurementRow,
     ModelsView,
     PixelCurve,
     PixelFitView,
     PoseResiduals,
+    Reading,
+    SectionView,
     SessionData,
     SpacingRow,
     VerificationView,
@@ -49,6 +54,7 @@ from slviewer.report.data import (
 from slviewer.report.page import write_page
 from slviewer.report.session import session_headlines, session_sections, session_title
 from slviewer.session.capture import Capture
+from slviewer.session.measurements import Measurement, measurement_arrays
 from slviewer.session.store import Session
 
 MOST_MAPS = 8
@@ -258,3 +264,46 @@ def curve_at(
         return None
     x, y, z = points.T
     return PixelCurve(pixel, axis, phase, z, x, y, fit.coefficients[:, v, u], fit.rms_mm[:, v, u])
+
+
+UNITS = {"deg": "°"}
+MOST_DRAWN = 6
+"""Sections, and comparisons with nominal models, that are drawn, the last ones; the CSV holds all."""
+
+
+def measured_views(store: Session) -> dict[str, Any]:
+    """``measurements``, ``sections`` and ``deviations`` of a report's data."""
+    every = measurements(store)
+    sections = [each for each in every if each.kind == "section"]
+    deviations = [each for each in every if each.kind == "deviation"]
+    return {
+        "measurements": [_row(each) for each in every if each.kind != "deviation"],
+        "sections": [SectionView(each.name, section_lines(store, each.id)[1]) for each in sections[-MOST_DRAWN:]],
+        "deviations": [_deviation(store, each) for each in deviations[-MOST_DRAWN:]],
+    }
+
+
+def _row(measured: Measurement) -> MeasurementRow:
+    data = measured.data
+    where = data.get("where", "")
+    if "between" in data:
+        where = " and ".join(data["between"])
+    notes = tuple(data["fit"]["warnings"]) if "fit" in data else ()
+    readings = [_reading(quantity) for quantity in quantities_of(measured)]
+    return MeasurementRow(measured.name, measured.kind, measured.source, readings, where, notes, measured.stale)
+
+
+def _reading(quantity: Quantity) -> Reading:
+    return Reading(quantity.name, quantity.value, UNITS.get(quantity.unit, quantity.unit), quantity.U, quantity.whole)
+
+
+def _deviation(store: Session, measured: Measurement) -> DeviationView:
+    arrays = measurement_arrays(store, measured.id)
+    return DeviationView(
+        name=measured.name,
+        source=measured.source,
+        nominal=measured.data["nominal"]["name"],
+        found=measured.data,
+        stale=measured.stale,
+        **arrays,
+    )

@@ -30,11 +30,11 @@ from slviewer.pipeline.simulate import TARGET, one_axis
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.simulation.boards import Shape
-from slviewer.simulation.perfect import PerfectModel
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene, Spheres
+from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.errors import InputError
-from slviewer.evaluation.histogram import Histogram, histogram
+from slviewer.evaluation.compare import Histogram, histogram
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.models import load_model, load_residuals, load_stereo

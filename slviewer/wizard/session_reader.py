@@ -34,8 +34,6 @@ from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard.export_files import listed
-from slviewer.wizard.measure_reading import read_measurements
-from slviewer.wizard.merge_reading import merge_view
 from slviewer.wizard.planner import Asked, Planner
 from slviewer.wizard.pose_plan import Features, Plan, plan, plan_at_hand, takes_time
 from slviewer.wizard.snapshot import (
@@ -53,6 +51,7 @@ from slviewer.wizard.snapshot import (
     SplinedView,
     VerificationRow,
 )
+from slviewer.wizard.stored_views import merge_view, read_measurements
 from slviewer.wizard.surfaces import nominals
 from slviewer.wizard.tasks import lacking_for_splined
 

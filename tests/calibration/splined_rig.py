@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from slviewer.calibration.observe import Observation
-from slviewer.calibration.samples import Samples
+from slviewer.calibration.observe import Observation, Samples
 from slviewer.calibration.splined import fields
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.polynomial import fit_polynomial

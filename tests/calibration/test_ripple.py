@@ -10,10 +10,8 @@ from slviewer.calibration.diagnosis.capture_rules import period, rippled
 from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.ripple import Ripple, phase_ripple
 from slviewer.calibration.diagnosis.solution import solution_evidence
-from slviewer.calibration.diagnosis.splined_rules import judge_splined
-from slviewer.calibration.diagnosis.verdict import Finding, Verdict
-from slviewer.calibration.observe import Observation
-from slviewer.calibration.samples import Samples
+from slviewer.calibration.diagnosis.verdict import Finding, Verdict, judge_splined
+from slviewer.calibration.observe import Observation, Samples
 from slviewer.calibration.splined.evidence import Noise, measured_noise
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 

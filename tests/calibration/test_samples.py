@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slviewer.calibration.samples import Samples, block_samples
+from slviewer.calibration.observe import Samples, block_samples
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 

@@ -8,8 +8,7 @@ from planted import board_before_a_wall, cloud, plane_depth, rectangle, sphere_d
 
 from slviewer.errors import InputError
 from slviewer.evaluation import letter
-from slviewer.evaluation.compare import Comparison, compare
-from slviewer.evaluation.histogram import histogram
+from slviewer.evaluation.compare import Comparison, compare, histogram
 from slviewer.evaluation.incidence import incidence
 from slviewer.evaluation.render import render
 from slviewer.evaluation.tables import rows

@@ -8,8 +8,7 @@ import trimesh
 
 from slviewer.errors import InputError
 from slviewer.registration.open3d_loader import open3d
-from slviewer.session.digits import lines
-from slviewer.session.mesh_files import MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
+from slviewer.session.mesh_files import MESH_FORMATS, POINT_FORMATS, estimated_bytes, lines, write_shape
 from slviewer.surface.shapes import Mesh, PointSet
 
 RNG = np.random.default_rng(7)

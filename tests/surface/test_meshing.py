@@ -9,8 +9,7 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.edit import fill_holes, smooth, thin, without_small_parts
 from slviewer.surface.fuse import fuse
-from slviewer.surface.grid import grid_mesh
-from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of, spacing
+from slviewer.surface.meshing import Meshed, MeshingPlan, grid_mesh, mesh_of, spacing
 from slviewer.surface.poisson import trimmed
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.surface.tools import compact

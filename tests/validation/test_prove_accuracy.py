@@ -12,11 +12,11 @@ from slviewer.calibration.splined import fields
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import AXES, gray_bits, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.simulation.perfect import PerfectModel
 from slviewer.simulation.plans import letter_plan, planes
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Scene
+from slviewer.simulation.truth import PerfectModel
 from slviewer.validation import prove_rigs
 from slviewer.validation.prove_accuracy import AccuracyProof, prove_accuracy
 from slviewer.validation.prove_rigs import FLOOR, PlaneFigures, RigFigures, cases

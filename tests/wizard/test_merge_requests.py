@@ -19,9 +19,9 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import rig_record
 from slviewer.wizard import result_views
-from slviewer.wizard.merge_reading import merge_view
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import MergeView, Snapshot
+from slviewer.wizard.stored_views import merge_view
 
 STEP_DEG = 12.0
 MIDDLE = np.array([0.0, 0.0, 520.0])

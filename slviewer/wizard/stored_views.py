@@ -1,4 +1,4 @@
-"""What the session keeps of a merge, as panels draw it."""
+"""Views of the merges and measurements that a session stores, read anew with every snapshot."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.session.measurements import FOLDER, NAMES, Measurement, as_saved
+from slviewer.session.store import Session
 from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 
 
@@ -56,3 +58,32 @@ def _pair(found: Mapping[str, Any]) -> MergedPair:
         float(turned),
         found.get("point_to_point_rms_mm"),
     )
+
+
+def read_measurements(
+    session: Session, hashes: Mapping[str, str], factors: Mapping[str, float]
+) -> tuple[Measurement, ...]:
+    """All measurements, in the order in which they were made, stale as ``pipeline.measurements.measurements`` says.
+
+    ``hashes``: of captures, and of calibrations that are fresh; ``factors``: {model: correction of scale} now.
+    """
+    known, found, names = dict(hashes), [], session.decision(NAMES) or {}
+    results = session.result_names()
+    for kind in ("scale/", "merge/", f"{FOLDER}/"):  # each is made from captures and from those before it
+        for result in (name for name in results if name.startswith(kind)):
+            meta = session.load_result(result, only=())[0]
+            if kind == f"{FOLDER}/":
+                used = meta["data"].get("scale")
+                scales = {} if used is None else {meta["model"]: used}
+            else:
+                scales = meta.get("scales", {})
+            stale = _changed(meta.get("inputs", {}), known) or _changed(scales, factors)
+            if kind == f"{FOLDER}/":
+                found.append(as_saved(result.removeprefix(kind), meta, names, stale))
+            if not stale:
+                known[result] = meta["hash"]
+    return tuple(found)
+
+
+def _changed(used: Mapping[str, object], now: Mapping[str, object]) -> bool:
+    return any(now.get(name) != value for name, value in used.items())

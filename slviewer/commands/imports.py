@@ -210,13 +210,13 @@ def _import_opencv_calibration(
     print(f"stereo calibration imported: {', '.join(sizes)}, baseline {model.baseline_mm:.1f} mm")
 
 
-def bring_in(command: Any) -> Callable[[], None]:
+def import_command(command: Any) -> Callable[[], None]:
     """Import captures or calibrations that other tools made."""
     run: Callable[[], None] = command
     return run
 
 
-bring_in.__annotations__["command"] = union(
+import_command.__annotations__["command"] = union(
     {
         "auto": _import_auto,
         "p18": _import_p18,

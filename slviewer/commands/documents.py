@@ -1,11 +1,10 @@
-"""What goes on paper, on a page, or to the terminal: patterns, targets, reports, figures."""
+"""What goes on paper, on a page, or to the terminal: patterns, targets, reports, what a session holds."""
 
 from pathlib import Path
 
 from tyro.conf import Positional
 
-from slviewer import terminal
-from slviewer.commands.parsing import deferred, ui, write_json
+from slviewer.commands.parsing import deferred, ui
 
 
 @deferred
@@ -60,30 +59,3 @@ def inspect(session: Positional[Path]) -> None:
     from slviewer.pipeline import inspect
 
     print(inspect.inspect(session))
-
-
-@deferred
-def bench(
-    calibration: bool = False, live: bool = False, minutes: float = 0.5, scale: float = 1.0, json: Path | None = None
-) -> None:
-    """Time the main stages on this machine, beside what they cannot beat.
-
-    Args:
-        calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full size).
-        live: Also scan live, at half the resolution, with one viewer that draws and one that stalls.
-        minutes: How long.
-        scale: Resolution of the camera, as a share of 1600x1200.
-        json: Write the figures to this file too.
-    """
-    from slviewer.validation import bench
-
-    result = bench.bench(calibration=calibration, scale=scale, progress=terminal.progress)
-    print(result.text())
-    figures = result.to_json()
-    if live:
-        from slviewer.validation.bench_live import live_rate
-
-        streamed = live_rate(0.5 * scale, 60 * minutes, terminal.progress)
-        print(streamed.text())
-        figures["live"] = streamed.to_json()
-    write_json(json, figures)
