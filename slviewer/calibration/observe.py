@@ -17,7 +17,7 @@ from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
-from slviewer.geometry.splines import Surface, fit_surface
+from slviewer.geometry.splines import SplineSurface, fit_surface
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
@@ -118,7 +118,7 @@ class Observation:
     points: np.ndarray
     camera: np.ndarray
     projector: np.ndarray
-    surfaces: Mapping[Axis, Surface | Polynomial2D]
+    surfaces: Mapping[Axis, SplineSurface | Polynomial2D]
     periods_px: Mapping[Axis, float]
     size: tuple[int, int]
     box: tuple[int, int, int, int]
@@ -157,26 +157,26 @@ class Observation:
         if self.samples is not None:
             arrays |= {f"samples_{name}": values for name, values in vars(self.samples).items()}
         for axis, surface in self.surfaces.items():
-            trend = surface.trend if isinstance(surface, Surface) else surface
+            trend = surface.trend if isinstance(surface, SplineSurface) else surface
             arrays |= {
                 f"{axis}_period_px": np.array(self.periods_px[axis]),
                 f"{axis}_trend": trend.coefficients,
                 f"{axis}_extent": np.array(trend.box),
             }
-            if isinstance(surface, Surface):
+            if isinstance(surface, SplineSurface):
                 arrays[f"{axis}_spline"] = surface.coefficients
         return arrays
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, np.ndarray]) -> "Observation":
         """The inverse of ``to_arrays``."""
-        surfaces: dict[Axis, Surface | Polynomial2D] = {}
+        surfaces: dict[Axis, SplineSurface | Polynomial2D] = {}
         captured: list[Axis] = [axis for axis in AXES if f"{axis}_trend" in arrays]
         for axis in captured:
             u0, v0, u1, v1 = (float(edge) for edge in arrays[f"{axis}_extent"])
             trend = Polynomial2D(arrays[f"{axis}_trend"], (u0, v0, u1, v1))
             spline = arrays.get(f"{axis}_spline")
-            surfaces[axis] = trend if spline is None else Surface(trend, spline)
+            surfaces[axis] = trend if spline is None else SplineSurface(trend, spline)
         width, height = (int(n) for n in arrays["size"])
         left, top, right, bottom = (int(edge) for edge in arrays["box"])
         return cls(
@@ -293,7 +293,7 @@ def smooth_axes(
     width: int,
     pitch: float,
     smoothing: Smoothing,
-) -> dict[Axis, Surface | Polynomial2D]:
+) -> dict[Axis, SplineSurface | Polynomial2D]:
     """`smooth` of each axis' (phase, weight), side by side."""
     with ThreadPoolExecutor(max(1, len(weighted))) as threads:
         found = threads.map(lambda one: smooth(one[0], one[1], box, width, pitch, smoothing), weighted.values())
@@ -307,7 +307,7 @@ def smooth(
     width: int,
     pitch: float,
     smoothing: Smoothing,
-) -> Surface | Polynomial2D:
+) -> SplineSurface | Polynomial2D:
     """The smoothed phase (step 2) of a board within ``box`` = (u0, v0, u1, v1): phase rad and weight are (v1 - v0,
     u1 - u0); the image's ``width`` and the board's ``pitch`` are in px."""
     u0, v0, u1, v1 = box

@@ -123,11 +123,11 @@ def preflight(
 @contextmanager
 def _set_up(port: int) -> Iterator["SetUp"]:
     """How rigs are set up; the projector page is served for one that needs it, until the block ends."""
-    from slviewer.pipeline.rig_choice import Bench, Board, Choice, needs_page, set_up
+    from slviewer.pipeline.rig_choice import Board, Choice, RigSetup, needs_page, set_up
 
     with ExitStack() as ended:
 
-        def make(choice: Choice, board: Board | None) -> Bench:
+        def make(choice: Choice, board: Board | None) -> RigSetup:
             return set_up(choice, board, channel=_page(port, ended) if needs_page(choice) else None)
 
         yield make

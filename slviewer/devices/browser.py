@@ -7,7 +7,7 @@ then, not yet emitted, and what the display adds is measured and waited for as t
 
 from collections.abc import Sequence
 
-from slviewer.devices.channel import Channel, Page
+from slviewer.devices.channel import Channel, PageConnection
 from slviewer.devices.drivers import Driver
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import check_index, check_level, check_sequence
@@ -31,7 +31,7 @@ class BrowserProjector(Openable):
         self._channel = channel
         self._sequence: PatternSequence | None = None
         self._sent: tuple[list[str], bytes] | None = None
-        self._page: Page | None = None  # that has what was sent
+        self._page: PageConnection | None = None  # that has what was sent
         self._changes = 0
 
     def open(self) -> None:

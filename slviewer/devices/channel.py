@@ -60,7 +60,7 @@ class Standing:
     size: tuple[int, int] | None = None
 
 
-class Page:
+class PageConnection:
     """One connection of a projector page. Asked from the projector's thread, fed from the server's."""
 
     def __init__(self, condition: threading.Condition, hello: Hello, send: Send) -> None:
@@ -107,7 +107,7 @@ class Channel:
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
-        self._page: Page | None = None
+        self._page: PageConnection | None = None
         self._size: tuple[int, int] | None = None
         self._light: int | None = None
 
@@ -144,7 +144,7 @@ class Channel:
             self._light = grey
             self._tell()
 
-    def page(self) -> Page:
+    def page(self) -> PageConnection:
         """The page, connected and able to show the patterns. Raises DeviceError with what to change."""
         with self._condition:
             if self._page is None:
@@ -154,7 +154,7 @@ class Channel:
 
     # the server's side
 
-    def connect(self, hello: str | bytes, send: Send) -> Page | None:
+    def connect(self, hello: str | bytes, send: Send) -> PageConnection | None:
         """The page that says hello; None where another window is the projector. Raises InputError for nonsense."""
         said: Hello = _said(hello, Hello)
         with self._condition:
@@ -169,11 +169,11 @@ class Channel:
                     else "another window was made the projector",
                 )
                 before.send(None)
-            page = self._page = Page(self._condition, said, send)
+            page = self._page = PageConnection(self._condition, said, send)
             self._tell()
             return page
 
-    def received(self, page: Page, message: str | bytes) -> None:
+    def received(self, page: PageConnection, message: str | bytes) -> None:
         """What a connected page says. Raises InputError for nonsense."""
         said = _said(message, Report | Done)
         with self._condition:
@@ -185,14 +185,14 @@ class Channel:
                 self._tell()
             self._condition.notify_all()
 
-    def disconnect(self, page: Page) -> None:
+    def disconnect(self, page: PageConnection) -> None:
         """The page is gone."""
         with self._condition:
             if self._page is page:
                 self._page = None
                 self._end(page, "the projector page was closed, or its connection was lost")
 
-    def _end(self, page: Page, why: str) -> None:
+    def _end(self, page: PageConnection, why: str) -> None:
         page.gone = f"{why}: capture again once it is ready"
         self._condition.notify_all()
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
-from slviewer.simulation.boards import FLAT, BoardScene, Pose, Shape, blank_board, printed_board
+from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, blank_board, printed_board
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
@@ -44,7 +44,7 @@ class SimulatedWorld:
     origin is its first feature, the plane's its middle, the sphere's its centre, the object's its own.
     """
 
-    def __init__(self, rig: SimulatedRig, board: Board | None = None, shape: Shape = FLAT) -> None:
+    def __init__(self, rig: SimulatedRig, board: Board | None = None, shape: BoardShape = FLAT) -> None:
         self.rig = rig
         self.shown = Shown((None, np.zeros(rig.projector.size[0], np.uint8)), 1.0, (rig.seed,), True)
         self._draft_rig = replace(rig, camera=replace(rig.camera, scale=min(rig.camera.scale, _DRAFT_SCALE)))
@@ -77,7 +77,7 @@ class SimulatedWorld:
         return board
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> BoardShape:
         """How far the board is from flat, and its features from their places."""
         return self._board().shape
 
@@ -92,7 +92,7 @@ class SimulatedWorld:
         R = self.pose.R
         return float(np.degrees(np.arctan2(R[0, 2], R[2, 2])))
 
-    def print_board(self, board: Board, shape: Shape = FLAT) -> None:
+    def print_board(self, board: Board, shape: BoardShape = FLAT) -> None:
         """Take another board, its middle on the camera's axis; it does not replace what stands before the rig.
 
         Raises InputError for ChArUco boards, which the simulation does not print.

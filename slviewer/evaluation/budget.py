@@ -25,7 +25,7 @@ class Contribution:
 
 
 @dataclass(frozen=True)
-class Budget:
+class ErrorBudget:
     """The contributions to a length of ``length_mm``."""
 
     length_mm: float
@@ -67,6 +67,6 @@ class Budget:
         return asdict(self) | {"U_mm": self.U_mm, "k": COVERAGE, "unknown": list(self.unknown)}
 
 
-def budget(length_mm: float, contributions: Sequence[Contribution]) -> Budget:
+def budget(length_mm: float, contributions: Sequence[Contribution]) -> ErrorBudget:
     """The budget of a length."""
-    return Budget(length_mm, tuple(contributions))
+    return ErrorBudget(length_mm, tuple(contributions))

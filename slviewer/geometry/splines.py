@@ -24,7 +24,7 @@ RIDGE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class SplineSurface:
     """A trend plus a tensor-product uniform cubic B-spline over ``trend.box``.
 
     ``coefficients``: (ny + 3, nx + 3) for ny x nx cells. NaN outside the box; in cells without samples it continues
@@ -67,7 +67,7 @@ def fit_surface(
     cells: tuple[int, int] = (12, 10),
     smooth: float = 1e-3,
     robust: bool = False,
-) -> Surface:
+) -> SplineSurface:
     """Cubic B-spline surface through ``values`` (n,) at pixels ``u``, ``v`` (n,), by penalised least squares.
 
     ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1) px, or a size
@@ -98,7 +98,7 @@ def fit_surface(
         coefficients = solution.reshape(ny + 3, nx + 3)
         return coefficients, _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients)
 
-    return Surface(trend, reweighted(solve, rest, weights) if robust else solve(weights)[0])
+    return SplineSurface(trend, reweighted(solve, rest, weights) if robust else solve(weights)[0])
 
 
 def _basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from slviewer.devices.channel import Channel, Standing
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.gui import shell as frame
 from slviewer.gui.panel import Stage
-from slviewer.gui.scene import Scene
+from slviewer.gui.scene import ViewerScene
 from slviewer.gui.shell import Shell
 from slviewer.gui.viewpoints import FIELD_OF_VIEW, OVERVIEW, Viewpoints
 from slviewer.pipeline.rig_choice import set_up
@@ -87,7 +87,7 @@ class App:
         self._problem = ""
         self._stage = Stage(
             page.gui,
-            Scene(page.scene),
+            ViewerScene(page.scene),
             Viewpoints(lambda: page.get_clients().values()),
             operator,
             self._offer,

@@ -13,7 +13,7 @@ from slviewer.gui.pictures import Painter, opened, spread
 from slviewer.gui.steps.scan import ordered
 from slviewer.gui.widgets import Html, Words, colour_bar, colours
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
-from slviewer.pipeline.measured_surface import MERGED, Place, Surface
+from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.session.measurements import Measurement, measurement_arrays
 from slviewer.wizard.snapshot import SessionView
 from slviewer.wizard.surfaces import place_at
@@ -32,7 +32,7 @@ class SurfaceBox:
         self._deviation: Measurement | None = None
         self._versions: dict[str, Any] = {}
         self._visible = False
-        self.on: Surface | None = None
+        self.on: MeasuredSurface | None = None
 
     def build(self) -> None:
         """The inputs."""
@@ -112,7 +112,7 @@ class SurfaceBox:
         key = (name, self._versions.get(name), colour if shown is None else shown.id)
         operator = self._stage.operator
 
-        def make() -> tuple[Surface, np.ndarray, np.ndarray, Html]:
+        def make() -> tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]:
             on = operator.surface(name)
             if shown is None:
                 return (on, *painting(on, COLOURS[0] if colour == DEVIATION else colour))
@@ -121,7 +121,7 @@ class SurfaceBox:
 
         self._painter.ask("surface", key, make, self._draw)
 
-    def _draw(self, made: tuple[Surface, np.ndarray, np.ndarray, Html]) -> None:
+    def _draw(self, made: tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]) -> None:
         on, points, painted, bar = made
         fresh = on is not self.on
         self.on = on
@@ -137,7 +137,7 @@ class SurfaceBox:
             self._stage.viewpoints.at(f"{self._layer} {self.on.source}", self.on.points)
 
 
-def painting(on: Surface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
+def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
     """(points (..., 3), their colours likewise, the legend) of a surface in one of COLOURS, thinned to be drawn."""
     step = 1
     if on.organised:  # row by row, so that what is drawn has no stripes

@@ -11,7 +11,7 @@ import numpy as np
 import viser
 
 from slviewer.devices.channel import Standing
-from slviewer.gui.scene import Scene
+from slviewer.gui.scene import ViewerScene
 from slviewer.gui.viewpoints import Viewpoints, bring
 from slviewer.server.viewers import Viewers
 from slviewer.wizard.snapshot import Level, PreviewView, Snapshot
@@ -30,7 +30,7 @@ class Stage:
     """
 
     gui: viser.GuiApi
-    scene: Scene
+    scene: ViewerScene
     viewpoints: Viewpoints
     operator: Any
     offer: Callable[[Path], str]

@@ -6,7 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slviewer.gui.scene import Colour, Scene
+from slviewer.gui.scene import Colour, ViewerScene
 from slviewer.gui.widgets import Html, Tone, block, cell, thumbnail, toned
 from slviewer.target.board import Board
 from slviewer.wizard.snapshot import PoseView
@@ -51,7 +51,7 @@ def pose_table(poses: Sequence[PoseView]) -> Html:
 class PoseBoards:
     """Keeps a layer's boards in step with the poses; `chosen(name)` is called for the one that is clicked on."""
 
-    def __init__(self, scene: Scene, layer: str, chosen: Callable[[str], None]) -> None:
+    def __init__(self, scene: ViewerScene, layer: str, chosen: Callable[[str], None]) -> None:
         self._scene, self._layer, self._chosen = scene, layer, chosen
         self._drawn: dict[str, Any] = {}
 

@@ -5,11 +5,11 @@ import viser
 from slviewer.gui.inputs import Follows, change
 from slviewer.gui.panel import Stage
 from slviewer.gui.widgets import Html, Tone, Words, block, cell, toned
-from slviewer.pipeline.check_results import Preflight, Verdict
+from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.wizard.snapshot import Snapshot
 
-_TONES: dict[Verdict, Tone] = {"good": "good", "warning": "warning", "bad": "error", "unknown": "dim"}
-_MARKS: dict[Verdict, str] = {"good": "✓", "warning": "!", "bad": "✕", "unknown": "?"}
+_TONES: dict[CheckVerdict, Tone] = {"good": "good", "warning": "warning", "bad": "error", "unknown": "dim"}
+_MARKS: dict[CheckVerdict, str] = {"good": "✓", "warning": "!", "bad": "✕", "unknown": "?"}
 _EXPOSURES: dict[str, tuple[float, ...]] = {
     "one": (),
     "two: once and 4 times": (1.0, 4.0),

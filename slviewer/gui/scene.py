@@ -23,7 +23,7 @@ _FRUSTUM_MM = 60.0
 _FLOOR_MM = 260.0
 
 
-class Scene:
+class ViewerScene:
     """Draws into viser's scene."""
 
     def __init__(self, api: viser.SceneApi) -> None:

@@ -13,7 +13,7 @@ import viser
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import Panel, Stage
-from slviewer.gui.scene import CAMERA, PROJECTOR, Scene
+from slviewer.gui.scene import CAMERA, PROJECTOR, ViewerScene
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, meter, toned
 from slviewer.wizard.autopilot import Autopilot
 from slviewer.wizard.snapshot import CalibrationView, Notice, PreviewView, Snapshot, StepView
@@ -42,7 +42,7 @@ DEVICES = "devices"
 class DeviceLayer:
     """Keeps their pyramids up to date."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: ViewerScene) -> None:
         self._scene = scene
         self._drawn: tuple[CalibrationView | None, tuple[int, int] | None] = (None, None)
 

@@ -31,7 +31,7 @@ SURE_RADIUS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class FeatureFit:
     """A feature with what its fit left over, mm.
 
     ``rms`` and ``maximum`` (signed, the one farthest off) over the points used; ``form``: width of the narrowest range
@@ -77,7 +77,7 @@ class Fit:
         }
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any], shared: np.ndarray | None) -> "Fit":
+    def from_dict(cls, data: Mapping[str, Any], shared: np.ndarray | None) -> "FeatureFit":
         """The inverse of ``to_dict``."""
         spread = Spread(np.array(data["scatter"]), shared, data["calibration"])
         return cls(
@@ -92,7 +92,7 @@ class Fit:
         )
 
 
-def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, calibration: str = "") -> Fit:
+def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, calibration: str = "") -> FeatureFit:
     """The shape of a region's points (n, 3) mm, by least squares of the distances, stray points set aside.
 
     ``shared``: what the calibration leaves uncertain at places, of the ``calibration`` of that name or hash. Raises
@@ -132,7 +132,7 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
         )
     farthest = float(residuals[counted][np.argmax(np.abs(residuals[counted]))])
     form = narrowest(residuals[counted], 0.95)
-    return Fit(feature, spread, rms, farthest, form, used, len(points) - used, tuple(warnings))
+    return FeatureFit(feature, spread, rms, farthest, form, used, len(points) - used, tuple(warnings))
 
 
 def least_squares(kind: Kind, points: np.ndarray, begin: Feature | None) -> Feature:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.figures import Decision, Figure, judge
+from slviewer.evaluation.acceptance.figures import AcceptanceFigure, Decision, judge
 from slviewer.inspection.deviation import Deviation
 
 DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
@@ -20,7 +20,7 @@ RULE = (
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ToleranceVerdict:
     """Deviations against plus and minus a tolerance, mm.
 
     ``lowest`` and ``highest``: the ends of the range of 99.7 % of the points, each with its decision; ``decision`` of
@@ -43,13 +43,13 @@ class Verdict:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Verdict":
+    def from_dict(cls, data: Mapping[str, Any]) -> "ToleranceVerdict":
         """The inverse of ``to_dict``."""
         low, high = tuple(data["lowest"]), tuple(data["highest"])
         return cls(**{**data, "lowest": low, "highest": high})
 
 
-def judged(found: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> Verdict:
+def judged(found: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> ToleranceVerdict:
     """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the surface's normal."""
     if not tolerance_mm > 0:
         raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
@@ -60,9 +60,9 @@ def judged(found: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> Verdi
     off = np.abs(signed)
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
     numbers = found.statistics()
-    ends = [Figure.of_length(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")]
+    ends = [AcceptanceFigure.of_length(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")]
     decisions = [judge(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends]
-    return Verdict(
+    return ToleranceVerdict(
         tolerance_mm,
         typical,
         (ends[0].error_mm, decisions[0]),

@@ -14,7 +14,7 @@ from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
 from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, measure
 from slviewer.evaluation.acceptance.result import Acceptance, conclude
-from slviewer.evaluation.budget import Budget, Contribution, budget
+from slviewer.evaluation.budget import Contribution, ErrorBudget, budget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decoded
@@ -36,7 +36,7 @@ class Accepted:
     acceptance: Acceptance
     factor: float
     applied: float | None
-    budget: Budget | None
+    budget: ErrorBudget | None
     repeatability: Repeatability | None
 
     def to_json(self) -> dict[str, Any]:
@@ -152,7 +152,7 @@ def _captures(store: Session, thing: Artefact) -> dict[str, str]:
     return found
 
 
-def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) -> Budget | None:
+def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) -> ErrorBudget | None:
     """Of the artefact's length, from what the test and the drift checks found."""
     scale = test.scale
     if scale is None:

@@ -13,7 +13,7 @@ from typing import Any
 from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.evaluation.render import render
 from slviewer.pipeline.batch_storage import resolved, swept
-from slviewer.pipeline.batch_tasks import Do, Done, Task, joined, listed, verification_file, worked
+from slviewer.pipeline.batch_tasks import Do, Task, TaskResult, joined, listed, verification_file, worked
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.verify import Shape, Verification
 
@@ -36,7 +36,7 @@ def dask_setup(worker):
 class Batch:
     """What came of every capture, in the order of the sessions. ``broken``: {session: why} of those without any."""
 
-    done: tuple[Done, ...]
+    done: tuple[TaskResult, ...]
     broken: Mapping[str, str]
     task: Task
 
@@ -125,16 +125,18 @@ def batch(
 
 def _worked(
     client: Any, wanted: Sequence[tuple[str, str]], task: Task, progress: Progress, warn: Warn
-) -> tuple[Done, ...]:
+) -> tuple[TaskResult, ...]:
     """What came of each (session, capture)."""
     found = _gathered(client, {(a, name): (worked, a, name, task) for a, name in wanted}, progress, warn)
-    done = tuple(came if isinstance(came, Done) else Done(a, name, failed=came) for (a, name), came in found.items())
+    done = tuple(
+        came if isinstance(came, TaskResult) else TaskResult(a, name, failed=came) for (a, name), came in found.items()
+    )
     for sentence in dict.fromkeys(f"{one.session}: {words}" for one in done for words in one.warnings):
         warn(sentence)
     return done
 
 
-def _joined(client: Any, done: Sequence[Done], task: Task, warn: Warn) -> dict[str, str]:
+def _joined(client: Any, done: Sequence[TaskResult], task: Task, warn: Warn) -> dict[str, str]:
     """Have each session's verifications written; {session: why it could not be done}."""
     parts: dict[str, list[Verification]] = {}
     for one in done:

@@ -40,7 +40,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Done:
+class TaskResult:
     """What came of one capture: its figures by name, or why it failed.
 
     ``verification``: without its maps, to be joined with those of the session's other captures.
@@ -69,7 +69,7 @@ def listed(address: str, patterns: Sequence[str], version: str) -> list[str] | s
         return _reason(error)
 
 
-def worked(address: str, capture: str, task: Task) -> Done:
+def worked(address: str, capture: str, task: Task) -> TaskResult:
     """Do the task with one capture; what it makes lies in the session's exports when this returns."""
     warnings: list[str] = []
     started = time.perf_counter()
@@ -81,7 +81,7 @@ def worked(address: str, capture: str, task: Task) -> Done:
                 with delivered(address, task.batch) as made:
                     done = _reconstructed(store, capture, task, made, warnings)
     except Exception as error:  # whatever it is ends this capture alone
-        return Done(address, capture, warnings=tuple(warnings), failed=_reason(error))
+        return TaskResult(address, capture, warnings=tuple(warnings), failed=_reason(error))
     figures = done.figures | {"s": round(time.perf_counter() - started, 1)}
     return replace(done, session=address, figures=figures, warnings=tuple(warnings))
 
@@ -112,7 +112,7 @@ def _check(version: str) -> None:
         raise InputError(f"the worker runs slviewer {__version__}, the batch {version}: install the same on both")
 
 
-def _reconstructed(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> Done:
+def _reconstructed(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> TaskResult:
     found = reconstruct(
         store,
         capture,
@@ -125,10 +125,10 @@ def _reconstructed(store: Session, capture: str, task: Task, made: Path, warning
     name = f"{capture}_{found.cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
     found.ply.rename(made / name)
     sigma = float(np.median(found.cloud.sigma_z[found.cloud.mask]))
-    return Done("", capture, {"points": found.points, "noise mm": sigma, "file": name})
+    return TaskResult("", capture, {"points": found.points, "noise mm": sigma, "file": name})
 
 
-def _verified(store: Session, capture: str, task: Task, warnings: list[str]) -> Done:
+def _verified(store: Session, capture: str, task: Task, warnings: list[str]) -> TaskResult:
     assert task.shape is not None
     found = verify(
         store,
@@ -141,7 +141,7 @@ def _verified(store: Session, capture: str, task: Task, warnings: list[str]) -> 
     )
     (comparison,) = found.captures.values()
     figures = {f"{model} RMS mm": result.rms_mm for model, result in comparison.results.items()}
-    return Done("", capture, figures, verification=_without_maps(found))
+    return TaskResult("", capture, figures, verification=_without_maps(found))
 
 
 def _without_maps(found: Verification) -> Verification:

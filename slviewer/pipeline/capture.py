@@ -13,7 +13,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.frame_residuals import keep_residuals
 from slviewer.pipeline.open_session import opened_or_made
-from slviewer.pipeline.rig_choice import Bench, SetUp, set_up
+from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import load_rig
 from slviewer.session.atomic import megabytes
 from slviewer.session.capture import Capture, Role
@@ -93,7 +93,7 @@ def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, g
         warn(note)
 
 
-def sequence_for(bench: Bench, patterns: str) -> PatternSequence:
+def sequence_for(bench: RigSetup, patterns: str) -> PatternSequence:
     """What is shown: the sequence of that name for the rig's projector, or the only one that the rig answers to."""
     if bench.reel is not None:
         return bench.reel.sequence
@@ -130,7 +130,7 @@ def keep(
     )
 
 
-def _check_space(store: Session, bench: Bench, frames: int) -> None:
+def _check_space(store: Session, bench: RigSetup, frames: int) -> None:
     """Raise SessionError before anything is captured that the disk would refuse."""
     (width, height), dtype = bench.rig.camera.size, bench.rig.camera.dtype
     needed, free = frames * width * height * dtype.itemsize, shutil.disk_usage(store.folder).free

@@ -6,7 +6,7 @@ from typing import Any
 
 from slviewer.calibration.drift.check import Drift, check_drift
 from slviewer.calibration.drift.floor import Reference, refer
-from slviewer.calibration.drift.view import View
+from slviewer.calibration.drift.view import DriftView
 from slviewer.calibration.observe import Smoothing, observe
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
@@ -93,7 +93,7 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
         board = Board.parse(stereo.board)
         observation = observe(capture, board, detect(board, capture_texture(shot, frames)), phases, _smoothing(store))
         progress(0.3, "what the calibration's own poses say")
-        drift = check_drift(_reference(store, stereo, capture), View.of(observation))
+        drift = check_drift(_reference(store, stereo, capture), DriftView.of(observation))
         progress(0.95, "saving")
         calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
         before = tuple(checked for checked in history(store) if checked.calibration == calibration)
@@ -110,7 +110,7 @@ def _reference(store: Session, stereo: StereoModel, capture: str) -> Reference:
     if store.state_of(REFERENCE) == "fresh" and capture not in stereo.poses:
         return Reference.restored(stereo.rig, store.load_result(REFERENCE)[1])
     poses = [name for name in stereo.poses if name != capture]
-    reference = refer(stereo.rig, [View.of(o) for o in load_observations(store, poses)])
+    reference = refer(stereo.rig, [DriftView.of(o) for o in load_observations(store, poses)])
     if capture not in stereo.poses:
         meta = {"inputs": store.input_hashes("calibration/stereo", *poses)}
         store.save_result(REFERENCE, meta, reference.to_arrays())

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Verdict = Literal["good", "warning", "bad", "unknown"]
+CheckVerdict = Literal["good", "warning", "bad", "unknown"]
 """Capture; capture if you must; do not capture before it is mended; it could not be found out."""
 
-_WORST_FIRST: tuple[Verdict, ...] = ("bad", "warning", "good")
+_WORST_FIRST: tuple[CheckVerdict, ...] = ("bad", "warning", "good")
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class Check:
     """
 
     name: str
-    verdict: Verdict
+    verdict: CheckVerdict
     sentence: str
     remedy: str
     figures: dict[str, Any]
@@ -38,7 +38,7 @@ class Preflight:
     seconds: float
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> CheckVerdict:
         """The worst of all checks; what is unknown does not make a good rig worse."""
         found = {check.verdict for check in self.checks}
         return next((verdict for verdict in _WORST_FIRST if verdict in found), "unknown")

@@ -11,9 +11,9 @@ from slviewer.evaluation.render import Row, render
 from slviewer.inspection.colours import colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.quantities import Quantity
-from slviewer.inspection.tolerance import DECIDED, RULE, Verdict, judged
+from slviewer.inspection.tolerance import DECIDED, RULE, ToleranceVerdict, judged
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.pipeline.measured_surface import Surface, surface
+from slviewer.pipeline.measured_surface import MeasuredSurface, surface
 from slviewer.pipeline.measurements import triangles_of
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.session.measurements import Measurement, save_measurement
@@ -37,7 +37,7 @@ class Compared:
     model: str
     nominal: Nominal
     found: Deviation
-    verdict: Verdict | None
+    verdict: ToleranceVerdict | None
     noise_mm: float
     ply: Path | None
     measurement: Measurement | None
@@ -137,7 +137,7 @@ def compare(
 
 def compare_surface(
     store: Session,
-    on: Surface,
+    on: MeasuredSurface,
     nominal: Nominal,
     *,
     tolerance: float | None = None,
@@ -201,7 +201,7 @@ def _rows(numbers: dict[str, float], noise: float) -> list[Row]:
     ]
 
 
-def _write(ply: Path, on: Surface, found: Deviation, nominal: Nominal, tolerance: float | None) -> None:
+def _write(ply: Path, on: MeasuredSurface, found: Deviation, nominal: Nominal, tolerance: float | None) -> None:
     """The points that belong to the nominal, with their deviation as a scalar and as colours, and the triangles between
     them where there are any."""
     kept = found.counted
@@ -225,10 +225,10 @@ def _write(ply: Path, on: Surface, found: Deviation, nominal: Nominal, tolerance
 
 def _kept(
     store: Session,
-    on: Surface,
+    on: MeasuredSurface,
     nominal: Nominal,
     found: Deviation,
-    verdict: Verdict | None,
+    verdict: ToleranceVerdict | None,
     noise: float,
     points: np.ndarray,
     name: str,

@@ -8,7 +8,7 @@ from slviewer.fringe.layout import white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.residual_sample import spread_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.check_results import Check, Verdict
+from slviewer.pipeline.check_results import Check, CheckVerdict
 
 CLIPPED, MUCH_CLIPPED = 0.005, 0.05
 """Shares of the illuminated pixels that are saturated: a warning, and bad."""
@@ -31,7 +31,7 @@ def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases
     figures = {"bright_share_of_full_scale": round(bright / full, 3), "saturated_share": round(clipped, 4)}
     if clipped > CLIPPED:
         said = f"{100 * clipped:.1f} % of the illuminated pixels are saturated."
-        verdict: Verdict = "bad" if clipped > MUCH_CLIPPED else "warning"
+        verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         remedy = "Lower the exposure, or capture with two exposures."
         return Check("exposure", verdict, said, remedy, figures)
     said = f"The brightest of the scene reaches {100 * bright / full:.0f} % of the camera's range"

@@ -21,7 +21,7 @@ from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
 from slviewer.session.importers import guessed_description
 from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
-from slviewer.session.importers.imported import ImportedCapture, Imports, Recording, Skipped, none_usable
+from slviewer.session.importers.imported import ImportableRecording, ImportedCapture, Imports, Skipped, none_usable
 from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
 from slviewer.session.store import Session, is_session
 
@@ -172,7 +172,7 @@ def _known_projector(session: SessionLike) -> tuple[int, int] | None:
     return sizes.pop() if len(sizes) == 1 else None
 
 
-def _assumptions(recording: Recording, capture: ImportedCapture) -> Iterator[str]:
+def _assumptions(recording: ImportableRecording, capture: ImportedCapture) -> Iterator[str]:
     """What was assumed of a capture because nothing stated it."""
     used = capture.settings.get("channel")
     if used and recording.channel is None:

@@ -26,7 +26,7 @@ Place = tuple[int, int] | int
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class MeasuredSurface:
     """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was measured.
 
     ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along ``normals`` for a
@@ -109,7 +109,7 @@ def surface(
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
-) -> Surface:
+) -> MeasuredSurface:
     """Reconstruct a capture to measure on it, or read a merge that the session keeps, named ``merge/<number>``."""
     with opened(session) as store:
         if scan.startswith(MERGED):
@@ -122,7 +122,7 @@ def surface(
     return found
 
 
-def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surface:
+def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> MeasuredSurface:
     """A capture's cloud, made with one of the session's calibrations, as a surface to measure on."""
     calibration = f"calibration/{fitted.name}"
     names = [scan, calibration]
@@ -132,7 +132,7 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surfac
     shared = None
     if isinstance(fitted, SplinedModel):
         shared = splined_shared(fitted.bundle, cloud.axis, scale, scale_sigma(store, fitted.name))
-    return Surface(
+    return MeasuredSurface(
         cloud.points,
         cloud.sigma_z,
         scan,
@@ -147,7 +147,7 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Surfac
     )
 
 
-def merged_surface(store: Session, merge: str, warn: Warn = unwarned) -> Surface:
+def merged_surface(store: Session, merge: str, warn: Warn = unwarned) -> MeasuredSurface:
     """A merge that the session keeps as ``merge/<number>``, in the frame of its reference's camera."""
     meta = store.load_result(merge, only=())[0]
     if not is_fresh(store, merge):
@@ -159,7 +159,7 @@ def merged_surface(store: Session, merge: str, warn: Warn = unwarned) -> Surface
     if normals is not None:
         normals = np.where(normals.any(axis=1, keepdims=True), normals, np.float32(np.nan))
     model = str(meta.get("model", ""))
-    return Surface(
+    return MeasuredSurface(
         points.points,
         sigma,
         merge,

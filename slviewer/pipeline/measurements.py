@@ -13,13 +13,13 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
-from slviewer.inspection.fitting import Fit, fit_feature
+from slviewer.inspection.fitting import FeatureFit, fit_feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.regions import Region
 from slviewer.inspection.relations import distance, relation
 from slviewer.inspection.section import CutPlane, section
 from slviewer.inspection.uncertainty import Spread
-from slviewer.pipeline.measured_surface import Place, Surface
+from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.mesh import grid_triangles
@@ -43,7 +43,7 @@ ROUGH = 5.0
 COLUMNS = ("id", "name", "kind", "scan", "quantity", "value", "unit", "U (k = 2)", "calibration in U", "state", "time")
 
 
-def add_point(session: SessionLike, on: Surface, at: Place, name: str = "") -> Measurement:
+def add_point(session: SessionLike, on: MeasuredSurface, at: Place, name: str = "") -> Measurement:
     """A picked point, for relations with what is fitted."""
     feature, spread = on.picked(at)
     x, y, z = (Quantity(axis, float(value), "mm") for axis, value in zip("xyz", feature.place, strict=True))
@@ -53,7 +53,7 @@ def add_point(session: SessionLike, on: Surface, at: Place, name: str = "") -> M
         return _saved(store, on, "point", [x, y, z], data, arrays, name)
 
 
-def add_distance(session: SessionLike, on: Surface, a: Place, b: Place, name: str = "") -> Measurement:
+def add_distance(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = "") -> Measurement:
     """The distance between two picked points."""
     (first, first_spread), (second, second_spread) = on.picked(a), on.picked(b)
     found = distance(first.place, second.place, first_spread, second_spread)
@@ -62,7 +62,7 @@ def add_distance(session: SessionLike, on: Surface, a: Place, b: Place, name: st
         return _saved(store, on, "distance", [found], data, {}, name)
 
 
-def add_fit(session: SessionLike, on: Surface, shape: Shape, region: Region, name: str = "") -> Measurement:
+def add_fit(session: SessionLike, on: MeasuredSurface, shape: Shape, region: Region, name: str = "") -> Measurement:
     """A plane, sphere or cylinder fitted to a region. Raises InputError where the region does not hold it."""
     found = fit_feature(shape, on.within(region), on.shared, on.calibration)
     noise = on.noise(region)
@@ -107,7 +107,7 @@ def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measur
         return saved
 
 
-def add_section(session: SessionLike, on: Surface, a: Place, b: Place, name: str = "") -> Measurement:
+def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = "") -> Measurement:
     """The surface cut along a line between two picked points, at right angles to it as nearly as the camera looks."""
     ends = [on.picked(place)[0].place for place in (a, b)]
     middle = (ends[0] + ends[1]) / 2
@@ -203,7 +203,7 @@ def export_measurements(session: SessionLike, out: Path | str) -> int:
         return len(list_measurements(store))
 
 
-def triangles_of(on: Surface) -> tuple[np.ndarray, np.ndarray]:
+def triangles_of(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) float64 and faces (m, 3) of a surface; a scan's end where its depth jumps."""
     if on.faces is not None:
         return np.asarray(on.points, np.float64), on.faces
@@ -222,13 +222,13 @@ def feature_of(store: Session, measured: Measurement) -> tuple[Feature, Spread]:
     if measured.kind == "point":
         spread = Spread(np.array(measured.data["scatter"]), shared, measured.data["calibration"])
         return Feature.from_dict(measured.data["feature"]), spread
-    fit = Fit.from_dict(measured.data["fit"], shared)
+    fit = FeatureFit.from_dict(measured.data["fit"], shared)
     return fit.feature, fit.spread
 
 
 def _saved(
     store: Session,
-    on: Surface,
+    on: MeasuredSurface,
     kind: str,
     found: list[Quantity],
     data: dict[str, Any],

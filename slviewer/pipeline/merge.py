@@ -20,7 +20,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Alignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import picked_start
-from slviewer.registration.static_scene import Contradiction, ObjectAlignment, register_object
+from slviewer.registration.static_scene import ObjectAlignment, SceneContradiction, register_object
 from slviewer.registration.turntable import Axis
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
@@ -50,7 +50,7 @@ class Merge:
     scale: str = ""
     kept: str = ""
     static_points: Mapping[str, int] = field(default_factory=dict)
-    contradictions: Mapping[Pair, Contradiction] = field(default_factory=dict)
+    contradictions: Mapping[Pair, SceneContradiction] = field(default_factory=dict)
 
     @property
     def reference(self) -> str:

@@ -22,7 +22,7 @@ MERGE = "merge/"
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class MeshResult:
     """A mesh, what it was made of, and the file it went to. ``merged`` says how the scans were merged for it."""
 
     meshed: Meshed
@@ -53,7 +53,7 @@ def mesh(
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
-) -> Mesh:
+) -> MeshResult:
     """Mesh a scan, several scans merged, or a merge that the session keeps (``merge/2``, ``merge/`` for the last one).
 
     ``out``: .ply, .stl, .obj or .glb; by default a .ply in the session's exports. Scans are merged into the frame of
@@ -91,4 +91,4 @@ def mesh(
     progress(0.95, f"writing {path.name}")
     write_shape(path, meshed.mesh, notes=(f"of {', '.join(sources)}", *meshed.text().splitlines()))
     progress(1.0, "meshed")
-    return Mesh(meshed, sources, path, merged)
+    return MeshResult(meshed, sources, path, merged)

@@ -34,7 +34,7 @@ from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.report.data import (
     AcceptanceView,
-    CalibrationView,
+    CalibrationFigures,
     CaptureRow,
     DeviationView,
     DeviceParameters,
@@ -215,7 +215,7 @@ def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping
     )
 
 
-def calibration_view(store: Session) -> CalibrationView:
+def calibration_view(store: Session) -> CalibrationFigures:
     """The session's stereo calibration as figures and tables show it, with every pose's residuals.
 
     Raises InputError where there is none.
@@ -224,14 +224,14 @@ def calibration_view(store: Session) -> CalibrationView:
     return _calibration(store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))})
 
 
-def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str, Observation]) -> CalibrationView:
+def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str, Observation]) -> CalibrationFigures:
     residuals = {}
     for name, r in load_residuals(store).items():
         if name in observations:
             o = observations[name]
             residuals[name] = PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
     rig = stereo.rig
-    return CalibrationView(
+    return CalibrationFigures(
         camera=_parameters(rig.camera, stereo.focal_sigma_px.get("camera", np.nan)),
         projector=_parameters(rig.projector, stereo.focal_sigma_px.get("projector", np.nan)),
         R=rig.R,

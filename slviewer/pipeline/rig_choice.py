@@ -26,7 +26,7 @@ px, and what its camera is set to where nobody asks for anything else."""
 
 
 @dataclass(frozen=True)
-class Bench:
+class RigSetup:
     """A rig that can be opened; `world` is what stands before a simulated one, `focal_px` the lens's nominal focal
     length in camera px, where it is known, `reel` what is played back.
     """
@@ -37,10 +37,10 @@ class Bench:
     reel: Reel | None = None
 
 
-SetUp = Callable[[Choice, Board | None], Bench]
+SetUp = Callable[[Choice, Board | None], RigSetup]
 
 
-def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = None) -> Bench:
+def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = None) -> RigSetup:
     """The devices of a choice, not opened yet; `board` is what stands before a simulated rig, `channel` leads to the
     projector page where one is served.
 
@@ -54,13 +54,13 @@ def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = Non
             return replace(bench, rig=replace(bench.rig, settle_ms=settle_ms))
         if choice.get("driver") == "replay":
             played = reel(**options)
-            return Bench(played.rig, focal_px=focal, reel=played)
+            return RigSetup(played.rig, focal_px=focal, reel=played)
         if "driver" in choice:
             chosen = driver(str(choice["driver"]))
             if chosen.rig is None:
                 raise InputError(f"the driver {choice['driver']} offers no whole rig: choose a camera and a projector")
             rig = chosen.rig(**options, **_wired(chosen, channel))
-            return Bench(replace(rig, settle_ms=settle_ms or rig.settle_ms), focal_px=focal)
+            return RigSetup(replace(rig, settle_ms=settle_ms or rig.settle_ms), focal_px=focal)
         camera, projector = (dict(options.pop(which)) for which in ("camera", "projector"))
         eye, lamp = driver(camera.pop("driver")), driver(projector.pop("driver"))
         if eye.camera is None or lamp.projector is None:
@@ -71,7 +71,7 @@ def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = Non
             lamp.projector(**projector, **_wired(lamp, channel)),
             settle_ms,
         )
-        return Bench(rig, focal_px=focal)
+        return RigSetup(rig, focal_px=focal)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the rig {dict(choice)} cannot be set up ({error}): choose it again") from error
 
@@ -92,8 +92,8 @@ def _wired(driver: Driver, channel: Channel | None) -> dict[str, Channel | None]
     return {"channel": channel} if driver.channel else {}
 
 
-def _simulated(board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0) -> Bench:
+def _simulated(board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0) -> RigSetup:
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     rig = letter(scale, seed)
-    return Bench(simulated_rig(world := SimulatedWorld(rig, board)), world, rig.camera.focal_px[0] * scale)
+    return RigSetup(simulated_rig(world := SimulatedWorld(rig, board)), world, rig.camera.focal_px[0] * scale)

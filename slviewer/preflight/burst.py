@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.preflight.bench import Bench
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _WHITE, _DARK = 24, 12
 
@@ -19,14 +19,14 @@ class Burst:
     dark_s: np.ndarray
 
 
-def take(bench: Bench) -> Burst:
+def take(bench: RigUnderTest) -> Burst:
     """Images in white light, then in the dark."""
     white_s, white = _images(bench, 255, _WHITE)
     dark_s, dark = _images(bench, None, _DARK)
     return Burst(white, dark, white_s, dark_s)
 
 
-def _images(bench: Bench, grey: int | None, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _images(bench: RigUnderTest, grey: int | None, count: int) -> tuple[np.ndarray, np.ndarray]:
     bench.show(grey, "steadiness of the light")
     bench.wait()
     begun, images = zip(*(bench.timed() for _ in range(count)), strict=True)

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from slviewer.pipeline.check_results import Check, Verdict
+from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
-from slviewer.preflight.bench import Bench
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _TARGET = 0.85  # of full scale, for the 99.5th percentile of what is lit
 _BACK_OFF = 0.5  # how much light is too much cannot be seen: half of it, then look again
 
 
-def exposure(bench: Bench) -> tuple[Check, float | None]:
+def exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     """The check, and the exposure in ms to set instead; None where the present one is right or unknown."""
     level, full = bench.white[bench.lit], bench.full
     bright = float(np.quantile(level, 0.995))
@@ -29,7 +29,7 @@ def exposure(bench: Bench) -> tuple[Check, float | None]:
     }
     change = f"by {factor:.2g} times" if wanted is None else f"from {present:g} ms to {wanted:g} ms"
     if clipped > CLIPPED:
-        verdict: Verdict = "bad" if clipped > MUCH_CLIPPED else "warning"
+        verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         said = f"{100 * clipped:.1f} % of what the projector lights is saturated in white light."
         if bright < 0.985 * full:
             return Check("exposure", verdict, said, "Turn what shines, or capture with two exposures.", figures), None

@@ -4,7 +4,7 @@ import numpy as np
 
 from slviewer.fringe.response import fitted_gamma, harmonic_error_rad, linearising, nonlinearity
 from slviewer.pipeline.check_results import Check
-from slviewer.preflight.bench import Bench
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _LEVELS = np.arange(18) * 15
 CURVED = 0.03
@@ -13,7 +13,7 @@ _FEWEST = 500  # pixels
 _UNSTEADY = 0.02
 
 
-def gamma(bench: Bench) -> tuple[Check, tuple[int, ...] | None, float]:
+def gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, float]:
     """The check, the table for `PatternSequence.levels`, and the light of grey level 127.5 as a share of white."""
     where = bench.usable()
     if np.count_nonzero(where) < _FEWEST:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.pipeline.check_results import Check
-from slviewer.preflight.bench import Bench
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CHANGES = 8
 _NEAR, _NEAREST = (
@@ -33,7 +33,7 @@ class _Change:
         return 1000 * self.begun[place] if place > 0 else 0.0
 
 
-def latency(bench: Bench) -> tuple[Check, float | None]:
+def latency(bench: RigUnderTest) -> tuple[Check, float | None]:
     """The check, and the `settle_ms` that follows from it; fills in the bench's frame time, delay and stale images."""
     if bench.lit.mean() < _FEWEST_LIT:
         return Check("latency", "unknown", "The delay cannot be measured: no change of light is seen.", "", {}), None
@@ -92,7 +92,7 @@ def latency(bench: Bench) -> tuple[Check, float | None]:
     return Check("latency", "warning" if long else "good", said, remedy, figures), settle
 
 
-def _change(bench: Bench, i: int) -> _Change:
+def _change(bench: RigUnderTest, i: int) -> _Change:
     """One change from dark to white or back; each begins at another moment of the camera's own clock."""
     target = 0.0 if i % 2 == 0 else 1.0  # the references leave it white
     time.sleep(bench.frame_ms / 1000 * i / _CHANGES)
@@ -107,7 +107,7 @@ def _change(bench: Bench, i: int) -> _Change:
             return _Change(tuple(begun), False)
 
 
-def _stale(bench: Bench, settle_ms: float, i: int) -> int:
+def _stale(bench: RigUnderTest, settle_ms: float, i: int) -> int:
     """How many images are still old after a wait that is long enough."""
     target = 0.0 if i % 2 == 0 else 1.0
     bench.show(255 if target else None, "freshness of the images")
@@ -118,7 +118,7 @@ def _stale(bench: Bench, settle_ms: float, i: int) -> int:
     return old
 
 
-def _near(bench: Bench) -> float:
+def _near(bench: RigUnderTest) -> float:
     return min(_NEAREST, max(_NEAR, 5 * bench.unsteady))
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from slviewer.pipeline.check_results import Check
-from slviewer.preflight.bench import Bench
 from slviewer.preflight.burst import Burst
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _BRIGHT, _TOO_BRIGHT = 0.35, 0.8  # room over projector
 _STEP = 0.02  # of the projector's light
@@ -13,7 +13,7 @@ _EXPLAINS = 0.6  # of the variance, by one mains frequency and not by the other
 _DRIFTS = 0.8
 
 
-def ambient(bench: Bench, last_dark: np.ndarray) -> Check:
+def ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
     """Light in the dark frames, and whether it was the same at the end."""
     where = bench.lit
     room = float(np.median(bench.dark[where])) / max(bench.contrast, 1e-6)
@@ -39,7 +39,7 @@ def ambient(bench: Bench, last_dark: np.ndarray) -> Check:
     return Check("ambient", "good", f"The room adds {100 * room:.0f} % to the projector's light.", "", figures)
 
 
-def flicker(bench: Bench, burst: Burst) -> Check:
+def flicker(bench: RigUnderTest, burst: Burst) -> Check:
     """Brightness of whole images from one to the next, beyond what noise makes of it."""
     where, span = bench.usable(), max(bench.contrast, 1e-6)
     if not where.any():

@@ -10,7 +10,7 @@ from slviewer.fringe.residual import frame_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.fringe.suspect import LIGHT_FAULTS
 from slviewer.pipeline.check_results import Check
-from slviewer.preflight.bench import Bench
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _BEFORE, _AFTER = (1, 0, 0, 1, 0, 1), (0, 1, 1, 0)
 _STEPS = 12
@@ -18,7 +18,7 @@ _PERIODS = 10  # across the projector
 _LAGS = (1, 2, 3)
 
 
-def order(bench: Bench) -> tuple[Check, Check]:
+def order(bench: RigUnderTest) -> tuple[Check, Check]:
     """The checks of the order, and of images that are handed out twice."""
     projector = bench.rig.projector.size
     levels = {1: Frame("white"), 0: Frame("black")}
@@ -34,7 +34,7 @@ def order(bench: Bench) -> tuple[Check, Check]:
     return _judged(bench, sequence, stack), repeated_images(sequence, stack)
 
 
-def _judged(bench: Bench, sequence: PatternSequence, stack: np.ndarray) -> Check:
+def _judged(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -> Check:
     n = len(stack)
     levels = {i: int(f.kind == "white") for i, f in enumerate(sequence.frames) if f.kind in ("white", "black")}
     shares = {i: bench.share(stack[i][:: bench.stride, :: bench.stride].astype(np.float32), bench.lit) for i in levels}

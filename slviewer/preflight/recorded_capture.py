@@ -15,7 +15,7 @@ from slviewer.fringe.residual import FrameResiduals
 from slviewer.fringe.response import harmonic_error_rad, nonlinearity
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
-from slviewer.pipeline.check_results import Check, Preflight, Verdict
+from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, unheard
 from slviewer.pipeline.frame_residuals import residuals
@@ -182,7 +182,7 @@ def _decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
     sentence = "; ".join(said)
     sentence = f"{sentence[0].upper()}{sentence[1:]}."
     if least < _LEAST_ILLUMINATED or worst < _TOO_FEW:
-        verdict: Verdict = "bad"
+        verdict: CheckVerdict = "bad"
     else:
         verdict = "warning" if worst < _FEW else "good"
     remedy = "" if verdict == "good" else "See the picture that `slviewer decode` writes: it shows where, and why."

@@ -7,12 +7,12 @@ from slviewer.devices.protocols import Rig
 from slviewer.pipeline.check_results import Check, Preflight
 from slviewer.pipeline.feedback import Progress, unheard
 from slviewer.preflight import burst
-from slviewer.preflight.bench import Bench
 from slviewer.preflight.exposure import exposure
 from slviewer.preflight.gamma import gamma
 from slviewer.preflight.latency import latency
 from slviewer.preflight.light import ambient, flicker
 from slviewer.preflight.order import order
+from slviewer.preflight.rig_under_test import RigUnderTest
 from slviewer.preflight.screen import screen
 from slviewer.preflight.sharpness import sharpness
 from slviewer.preflight.stillness import stillness
@@ -46,7 +46,7 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
             if say is not None:
                 say(check.sentence if not check.remedy else f"{check.sentence} {check.remedy}")
 
-    bench = Bench(rig, tick)
+    bench = RigUnderTest(rig, tick)
     bench.find_references()
     delay, settle_ms = latency(bench)
     if settle_ms is None:

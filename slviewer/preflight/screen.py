@@ -3,14 +3,14 @@
 import numpy as np
 
 from slviewer.pipeline.check_results import Check
-from slviewer.preflight.bench import Bench
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CODE = (1, 0, 1, 1, 0, 0, 1, 0)
 _FOLLOWS = 0.9  # correlation with the code
 _NOTHING, _LITTLE = 0.01, 0.1  # shares of the image
 
 
-def screen(bench: Bench) -> Check:
+def screen(bench: RigUnderTest) -> Check:
     """On and off by a code that nothing else in the room follows; what follows it is what is lit from here on."""
     images = np.stack([bench.look(255 if on else None, "which screen the camera sees") for on in _CODE])
     code = np.array(_CODE) - np.mean(_CODE)

@@ -11,13 +11,13 @@ from slviewer.devices.protocols import Rig
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.check_results import Check
-from slviewer.preflight.bench import Bench
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _TELLS = 0.08  # grey must be so far from half as bright as white
 _OFF = 0.3  # of that distance
 
 
-def sharpness(bench: Bench, middle: float) -> Check:
+def sharpness(bench: RigUnderTest, middle: float) -> Check:
     """`middle`: light of the middle grey level as a share of white, which the gamma check measured."""
     where = bench.usable()
     if abs(middle - 0.5) < _TELLS or not where.any():

@@ -3,8 +3,8 @@
 import numpy as np
 
 from slviewer.pipeline.check_results import Check
-from slviewer.preflight.bench import Bench
 from slviewer.preflight.burst import Burst
+from slviewer.preflight.rig_under_test import RigUnderTest
 
 _BLOCK = 6  # sampled pixels
 _SIGMAS = 8.0
@@ -12,7 +12,7 @@ _CHANGE = 0.04  # of the projector's light
 _SOMETHING, _MUCH = 0.004, 0.05  # shares of what is lit
 
 
-def stillness(bench: Bench, burst: Burst, last_white: np.ndarray) -> Check:
+def stillness(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Check:
     """White images of the beginning, the middle and the end, block by block, whatever the light as a whole did."""
     blocks = np.stack([_blocks(image, bench.lit) for image in (bench.white, *burst.white, last_white)])
     seen = np.isfinite(blocks[0])

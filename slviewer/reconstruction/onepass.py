@@ -23,7 +23,7 @@ from slviewer.reconstruction.cloud import Cloud
 
 
 @dataclass(frozen=True)
-class Light:
+class LightLevels:
     """What a rig's frames say about themselves: ``noise`` (a, b) and ``mean`` as `measure_noise` and `fringe_mean`
     have them, and the grey level ``white`` at which the camera clips. It changes when the camera is set anew."""
 
@@ -33,7 +33,7 @@ class Light:
 
 
 @dataclass(frozen=True, eq=False)
-class Scan:
+class PassResult:
     """What one pass leaves on the camera's grid; the next pass into the same arrays writes over it.
 
     ``points`` (h, w, 3) float32 mm, NaN where invalid; ``phase`` (h, w) float32 rad, absolute, NaN where ``reason``
@@ -50,7 +50,7 @@ class Scan:
     sigma_z: np.ndarray
     modulation: np.ndarray
     texture: np.ndarray
-    light: Light
+    light: LightLevels
 
     def cloud(self) -> Cloud:
         """The organised cloud; it shares this scan's arrays."""
@@ -111,15 +111,15 @@ class OnePass:
         _, height, width = self._depths.c.shape
         return height, width
 
-    def light(self, frames: np.ndarray) -> Light:
+    def light(self, frames: np.ndarray) -> LightLevels:
         """What the frames (n, h, w) say about camera and light, from a sample of their pixels; of uint16 frames the
         largest grey level is sought in all of them."""
         self._check(frames)
         white = white_level(frames, self.sequence.select(self.axis))
         mean = fringe_mean(self._layout, frames) if is_plain(self._layout) else MIDDLE
-        return Light(measure_noise(self._layout, frames, white), mean, white)
+        return LightLevels(measure_noise(self._layout, frames, white), mean, white)
 
-    def run(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
+    def run(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
         """The scan of frames (n, h, w) uint8 or uint16, spikes mended.
 
         ``light``: of earlier frames of the same rig; None measures it from these. ``out``: an earlier scan of frames
@@ -129,7 +129,7 @@ class OnePass:
         self.mend(scan)
         return scan
 
-    def sweep(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
+    def sweep(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
         """The first pass: every pixel by itself; each frame is read once."""
         frames, scan = self._begun(frames, light, out)
         deep = frames.dtype == np.uint16
@@ -150,7 +150,7 @@ class OnePass:
             return self.sweep(frames, self.light(frames), scan)
         return scan
 
-    def mend(self, scan: Scan) -> None:
+    def mend(self, scan: PassResult) -> None:
         """The second pass, over few pixels: spikes of one period are moved, lonely and outside pixels masked."""
         rules, maps = spike_rules(self._layout), _maps(scan)
         if rules.plain:
@@ -168,7 +168,9 @@ class OnePass:
                 f"{width}x{height}: use captures of the same camera, at the same resolution and without cropping."
             )
 
-    def _begun(self, frames: np.ndarray, light: Light | None, out: Scan | None) -> tuple[np.ndarray, Scan]:
+    def _begun(
+        self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None
+    ) -> tuple[np.ndarray, PassResult]:
         """The frames, checked and in one piece, and the arrays to write into."""
         self._check(frames)
         frames = np.ascontiguousarray(frames)
@@ -178,11 +180,11 @@ class OnePass:
             raise InputError("The arrays to write into belong to other frames: leave them out, and new ones are made.")
         return frames, scan
 
-    def _room(self, dtype: np.dtype, light: Light) -> Scan:
+    def _room(self, dtype: np.dtype, light: LightLevels) -> PassResult:
         phase, sigma_z, modulation = (np.empty(self.shape, np.float32) for _ in range(3))
         points, reason = np.empty((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
         texture = np.empty(self.shape, dtype)
-        return Scan(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, texture, light)
+        return PassResult(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, texture, light)
 
 
 def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
@@ -199,7 +201,7 @@ def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
     raise InputError(f"{what} is not measured in one pass: decode and reconstruct it")
 
 
-def _maps(scan: Scan) -> kernels.Maps:
+def _maps(scan: PassResult) -> kernels.Maps:
     return kernels.Maps(scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture)
 
 

@@ -13,7 +13,7 @@ from slviewer.fringe.decode import decode, ladder_of, texture
 from slviewer.fringe.layout import clip_level
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry import cuda_device
-from slviewer.reconstruction.onepass import Job, Light, OnePass, Scan, _order, one_pass_layout
+from slviewer.reconstruction.onepass import Job, LightLevels, OnePass, PassResult, _order, one_pass_layout
 
 if TYPE_CHECKING:  # it imports CUDA
     from slviewer.reconstruction.onepass_cuda_card import Card
@@ -64,13 +64,13 @@ class CudaPass(OnePass):
             return height, width
         return super().shape
 
-    def run(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
+    def run(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
         return self._scan(frames, light, out, True)
 
-    def sweep(self, frames: np.ndarray, light: Light | None = None, out: Scan | None = None) -> Scan:
+    def sweep(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
         return self._scan(frames, light, out, False)
 
-    def mend(self, scan: Scan) -> None:
+    def mend(self, scan: PassResult) -> None:
         if isinstance(self.model, StereoModel):
             raise InputError("a stereo calibration's spikes are mended where they are found: use run, not sweep")
         super().mend(scan)
@@ -84,7 +84,7 @@ class CudaPass(OnePass):
             self._card = Card(self._job(), dtype)
         return self._card
 
-    def _scan(self, frames: np.ndarray, light: Light | None, out: Scan | None, mended: bool) -> Scan:
+    def _scan(self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None, mended: bool) -> PassResult:
         frames, scan = self._begun(frames, light, out)
         if cuda_device.device() is not None:
             try:
@@ -96,7 +96,7 @@ class CudaPass(OnePass):
             return self._defined(frames, scan)
         return super().run(frames, scan.light, scan) if mended else super().sweep(frames, scan.light, scan)
 
-    def _on_card(self, frames: np.ndarray, scan: Scan, mended: bool) -> Scan:
+    def _on_card(self, frames: np.ndarray, scan: PassResult, mended: bool) -> PassResult:
         card = self.card(frames.dtype)
         card.load(frames)
         card.sweep(scan.light)
@@ -113,20 +113,20 @@ class CudaPass(OnePass):
         depths = self.model.rig if isinstance(self.model, StereoModel) else self._depths
         return Job(self.shape, self.axis, self._layout, self._order, self._ladder, depths)
 
-    def _defined(self, frames: np.ndarray, scan: Scan) -> Scan:
+    def _defined(self, frames: np.ndarray, scan: PassResult) -> PassResult:
         """A stereo calibration's scan by the processor."""
         assert isinstance(self.model, StereoModel)
         found = decode(self.sequence, frames, self.axis)
         points = self.model.points(found)
         sigma = self.model.sigma_z(found, points)
-        light = Light(found.noise, scan.light.mean, scan.light.white)
-        return Scan(
+        light = LightLevels(found.noise, scan.light.mean, scan.light.white)
+        return PassResult(
             self.axis, self.model.name, points, found.phase, found.reason, sigma, found.modulation,
             texture(self.sequence, frames), light,
         )  # fmt: skip
 
-    def _room(self, dtype: np.dtype, light: Light) -> Scan:
+    def _room(self, dtype: np.dtype, light: LightLevels) -> PassResult:
         phase, sigma_z, modulation = (cuda_device.frame_room(self.shape, np.float32) for _ in range(3))
         points, reason = cuda_device.frame_room((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
         grey = cuda_device.frame_room(self.shape, dtype)
-        return Scan(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, grey, light)
+        return PassResult(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, grey, light)

@@ -11,9 +11,9 @@ from slviewer.fringe.decode import spike_rules
 from slviewer.fringe.reference import dark_sigmas
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction import onepass_cuda_depths as depths
-from slviewer.reconstruction.onepass import Job, Light, Scan
+from slviewer.reconstruction.onepass import Job, LightLevels, PassResult
 from slviewer.reconstruction.onepass_cuda_spikes import spike_kernels
-from slviewer.reconstruction.onepass_cuda_sweep import Plan, sweep_kernel
+from slviewer.reconstruction.onepass_cuda_sweep import SweepPlan, sweep_kernel
 
 THREADS = 256
 """Of a block: eight warps, which leave every scheduler of a multiprocessor with work, whatever registers they need."""
@@ -66,7 +66,7 @@ class Card:
         for first, last, room in self._runs:
             room.copy_to_device(frames[first:last].reshape(-1), stream=self.stream)
 
-    def sweep(self, light: Light) -> None:
+    def sweep(self, light: LightLevels) -> None:
         """The first pass over the frames that were loaded."""
         if self._deep:
             self._highest.copy_to_device(self._none, stream=self.stream)
@@ -85,7 +85,7 @@ class Card:
         find_refused[self._grid](self._phase, self._words)
         refuse[self._grid](self._words, self._phase, self._reason, self._points, self._sigma_z)
 
-    def fetch(self, scan: Scan) -> int:
+    def fetch(self, scan: PassResult) -> int:
         """Fill a scan's arrays, texture only where it is made of fringes; the largest grey level, 0 of uint8 frames."""
         pairs = [
             (self._points, scan.points),
@@ -103,9 +103,9 @@ class Card:
         return int(highest[0])
 
 
-def _plan(job: Job, others: int) -> Plan:
+def _plan(job: Job, others: int) -> SweepPlan:
     found, order, ladder = job.layout, job.order, job.ladder
-    return Plan(
+    return SweepPlan(
         tuple(int(start) for start in order.starts),
         order.cosines,
         order.sines,

@@ -28,7 +28,7 @@ NOISE_A, NOISE_B, DARK_LEVELS, DARK_SIGMAS, WHITE, MEAN = range(6)
 """What a light is, float32: see `fringe.kernels.Scale`, and `threshold` for the mean."""
 
 
-class Plan(NamedTuple):
+class SweepPlan(NamedTuple):
     """What of a sequence a kernel is compiled for. Frames lie one after the other: phase steps, longest period first,
     period i from ``starts[i]`` on; Gray bits; their inverses; the complementary bit; those that only tell how bright
     the camera's white is."""
@@ -51,7 +51,7 @@ class Plan(NamedTuple):
     misfit: float
 
 
-def sweep_kernel(plan: Plan, pixels: int, measure: Callable[..., Any], deep: bool, shaded: bool) -> Any:
+def sweep_kernel(plan: SweepPlan, pixels: int, measure: Callable[..., Any], deep: bool, shaded: bool) -> Any:
     """The kernel for one plan and one of `onepass_cuda_depths`.
 
     ``deep``: the largest grey level is sought, as uint16 frames need. ``shaded``: texture is the fringes' background.
@@ -95,7 +95,7 @@ def sweep_kernel(plan: Plan, pixels: int, measure: Callable[..., Any], deep: boo
     return sweep
 
 
-def _shift(plan: Plan, pixels: int) -> Any:
+def _shift(plan: SweepPlan, pixels: int) -> Any:
     """Device function: wrapped phase, modulation, background and largest sample of the period in some frames."""
     cosines, sines, stride = plan.cosines.astype(np.float32), plan.sines.astype(np.float32), np.uint64(pixels)
 
@@ -132,7 +132,7 @@ def _verdict(B, A, clipped, inconsistent, light):
     return INCONSISTENT if inconsistent else VALID
 
 
-def _coded(plan: Plan, pixels: int) -> Any:
+def _coded(plan: SweepPlan, pixels: int) -> Any:
     """Device function: (absolute phase, reason, modulation, background) of a pixel by Gray code."""
     shift = _shift(plan, pixels)
     steps, bits, inverses, complementary = plan.starts[-1], plan.bits, plan.inverses > 0, plan.complementary > 0
@@ -204,7 +204,7 @@ def _coded(plan: Plan, pixels: int) -> Any:
     return decode
 
 
-def _levels(plan: Plan, pixels: int) -> Any:
+def _levels(plan: SweepPlan, pixels: int) -> Any:
     """Device function: (absolute phase, reason, modulation, background) of a pixel by several periods."""
     shift = _shift(plan, pixels)
     count, levels = len(plan.starts) - 1, len(plan.periods)

@@ -58,7 +58,7 @@ class Sampled:
 
 
 @dataclass(frozen=True)
-class Contradiction:
+class SceneContradiction:
     """Of the samples of two scans that the other's view covers (``compared``), the ``share`` that lies in front of the
     other's surface by more than ``gate_mm``: it would have had to see them."""
 
@@ -78,7 +78,7 @@ class ObjectAlignment:
     alignment: Alignment
     clouds: Mapping[str, Cloud]
     static: Mapping[str, np.ndarray]
-    contradictions: Mapping[Pair, Contradiction]
+    contradictions: Mapping[Pair, SceneContradiction]
 
 
 def register_object(
@@ -214,13 +214,13 @@ def heights(scan: Sampled, onto: Sampled, T: np.ndarray) -> np.ndarray:
     return out
 
 
-def contradiction(scan: Sampled, onto: Sampled, T: np.ndarray, widest_mm: float) -> Contradiction:
+def contradiction(scan: Sampled, onto: Sampled, T: np.ndarray, widest_mm: float) -> SceneContradiction:
     """How much of two scans contradicts where ``T`` (4, 4) puts the first on the second, seen from either; points of
     one surface lie within ``widest_mm``."""
     height = np.concatenate([heights(scan, onto, T), heights(onto, scan, np.linalg.inv(T))])
     gate = gate_of(height, widest_mm)
     known = height[np.isfinite(height)]
-    return Contradiction(len(known), float(np.mean(known > gate)) if len(known) else 0.0, gate)
+    return SceneContradiction(len(known), float(np.mean(known > gate)) if len(known) else 0.0, gate)
 
 
 def gate_of(height: np.ndarray, widest_mm: float) -> float:

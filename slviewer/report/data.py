@@ -182,7 +182,7 @@ class PoseResiduals:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationView:
+class CalibrationFigures:
     """A stereo calibration: lenses, ``R`` (3, 3) and ``t`` (3,) mm camera to projector, and how well the poses agree.
 
     ``pose_rms_px`` holds (camera, projector) by pose; ``residuals`` may be empty where none were kept.
@@ -320,7 +320,7 @@ class SessionData:
 
     name: str
     captures: Sequence[CaptureRow]
-    calibration: CalibrationView | None = None
+    calibration: CalibrationFigures | None = None
     pixel_fits: Sequence[PixelFitView] = ()
     verifications: Sequence[VerificationView] = ()
     spacings: Sequence[SpacingRow] = ()

@@ -21,7 +21,7 @@ from slviewer.report.canvas import (
     tidy,
 )
 from slviewer.report.data import DeviationView, MeasurementRow, SectionView
-from slviewer.report.page import Cell, Column, Figure, Item, Mark, Notice, Section, Table
+from slviewer.report.page import Cell, Column, Figure, Item, Mark, PageNotice, Section, Table
 from slviewer.report.shaded import render, view_rotation
 from slviewer.report.tables import UNKNOWN, number
 
@@ -37,9 +37,9 @@ MOST_DRAWN = 4000
 def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[SectionView]) -> Section:
     """Every measurement with its units and uncertainties, and each section as it was cut."""
     items: list[Item] = [
-        Notice(f"{row.name} was measured on what has since changed: measure it again.") for row in rows if row.stale
+        PageNotice(f"{row.name} was measured on what has since changed: measure it again.") for row in rows if row.stale
     ]
-    items += [Notice(f"{row.name}: {note}.") for row in rows for note in row.notes]
+    items += [PageNotice(f"{row.name}: {note}.") for row in rows for note in row.notes]
     body: list[list[str | Cell]] = []
     for row in rows:
         for i, reading in enumerate(row.readings):
@@ -112,10 +112,10 @@ def _deviation(view: DeviationView) -> list[Item]:
         words = DECIDED[verdict["decision"]]
         kind = {"pass": "good", "fail": "warning", "undecided": "warning"}[verdict["decision"]]
         items.append(
-            Notice(f"{view.name}, tolerance ± {verdict['tolerance_mm']:g} mm: {words}.", kind)  # type: ignore[arg-type]
+            PageNotice(f"{view.name}, tolerance ± {verdict['tolerance_mm']:g} mm: {words}.", kind)  # type: ignore[arg-type]
         )
     if view.stale:
-        items.append(Notice(f"{view.name}: the scan or its calibration has changed since; compare it again."))
+        items.append(PageNotice(f"{view.name}: the scan or its calibration has changed since; compare it again."))
     items += [deviation_picture(view), _table(view)]
     return items
 

@@ -82,14 +82,14 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Notice:
+class PageNotice:
     """A sentence that must not be overlooked."""
 
     text: str
     kind: Literal["warning", "good", "plain"] = "warning"
 
 
-Item = Figure | Table | Notice
+Item = Figure | Table | PageNotice
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import Any
 
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.report.data import AcceptanceView, DriftRow, ModelsView
-from slviewer.report.page import Cell, Column, Headline, Item, Mark, Notice, Section, Table
+from slviewer.report.page import Cell, Column, Headline, Item, Mark, PageNotice, Section, Table
 from slviewer.report.tables import UNKNOWN, number
 
 _LEVELS: dict[str, tuple[str, str]] = {
@@ -24,11 +24,11 @@ _DECISIONS: dict[str | None, tuple[str, Mark]] = {
 def verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
     """The level in plain words, and every finding with what to do."""
     words, kind = _LEVELS[verdict.level]
-    items: list[Item] = [Notice(words, kind)]  # type: ignore[arg-type]
+    items: list[Item] = [PageNotice(words, kind)]  # type: ignore[arg-type]
     for finding in verdict.findings:
         mended = finding.severity == "note"
         what = "Mended already." if mended else f"What to do: {finding.remedy}."
-        items.append(Notice(f"{finding.sentence}. {what}", "plain" if mended else "warning"))
+        items.append(PageNotice(f"{finding.sentence}. {what}", "plain" if mended else "warning"))
     text = "" if of_calibration else "This is said of the last attempt to calibrate, of which nothing came."
     return Section("Verdict", text, items)
 
@@ -42,7 +42,7 @@ def verdict_headline(verdict: Verdict) -> Headline:
 
 def models_section(models: ModelsView) -> Section:
     """Which models there are, how they compare on poses that they were not made from, and what splined found."""
-    items: list[Item] = [Notice(f"{model}: {words}.", "plain") for model, words in models.scales.items()]
+    items: list[Item] = [PageNotice(f"{model}: {words}.", "plain") for model, words in models.scales.items()]
     used = f"Measured with {models.used}"
     used += (
         "."
@@ -83,7 +83,7 @@ def models_section(models: ModelsView) -> Section:
     if models.splined is not None:
         items.append(_splined_table(models.splined))
         items += [
-            Notice(f"{name} is left out of the splined model: it {why}")
+            PageNotice(f"{name} is left out of the splined model: it {why}")
             for name, why in models.splined["left_out"].items()
         ]
     return Section("Models", used, items)
@@ -129,12 +129,12 @@ def _acceptance(view: AcceptanceView) -> list[Item]:
     )
     decided, _ = _DECISIONS[found["decision"]]
     items: list[Item] = [
-        Notice(f"{named}: {decided.upper() if found['decision'] else decided}.",
+        PageNotice(f"{named}: {decided.upper() if found['decision'] else decided}.",
                "good" if found["decision"] == "pass" else "plain" if found["decision"] is None else "warning")
     ]  # fmt: skip
     if view.stale:
-        items.append(Notice("The calibration or the captures have changed since this test: test again."))
-    items += [Notice(f"Incomplete: {what}.") for what in found["lacks"]]
+        items.append(PageNotice("The calibration or the captures have changed since this test: test again."))
+    items += [PageNotice(f"Incomplete: {what}.") for what in found["lacks"]]
     rows: list[list[str | Cell]] = []
     for each in found["judgements"]:
         worst, limit = each["worst"], each["limit_mm"]
@@ -213,7 +213,7 @@ def drift_section(checks: Sequence[DriftRow]) -> Section:
     columns += [Column("board seems larger by", "ppm"), Column("off its epipolar lines", "px")]
     columns.append(Column("of", align="left"))
     items: list[Item] = [
-        Notice(f"{last.capture}: {last.verdict}{because}.", "good" if kept else "warning"),
+        PageNotice(f"{last.capture}: {last.verdict}{because}.", "good" if kept else "warning"),
         Table(columns, rows, "Drift checks, the latest first"),
     ]
     return Section("Drift", "One board against the saved calibration: whether the rig is still as it was.", items)

@@ -10,7 +10,7 @@ from slviewer.report.clouds import clouds, merged_cloud
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import PlaneRow, ReproductionData
 from slviewer.report.maps import error_limit, error_maps, rms_maps
-from slviewer.report.page import Cell, Column, Headline, Item, Notice, Section, Table
+from slviewer.report.page import Cell, Column, Headline, Item, PageNotice, Section, Table
 from slviewer.report.space import planes_in_space
 from slviewer.report.tables import (
     mean_of,
@@ -90,8 +90,8 @@ def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
 
 
 def _calibration(data: ReproductionData) -> Section:
-    items: list[Item] = [Notice(note) for note in data.notes]
-    items += [Notice(f"{name} was left out: {why}") for name, why in data.poses_left_out.items()]
+    items: list[Item] = [PageNotice(note) for note in data.notes]
+    items += [PageNotice(f"{name} was left out: {why}") for name, why in data.poses_left_out.items()]
     rows: list[list[str | Cell]] = [
         [
             f"reprojection, {device}",
@@ -136,14 +136,14 @@ def _planes(data: ReproductionData) -> Section:
     if count and np.isfinite(ratio):
         compared = f"{ratio:.2f} times flatter" if ratio >= 1 else f"{1 / ratio:.2f} times less flat"
         items.append(
-            Notice(
+            PageNotice(
                 f"Inside the calibrated depths the pixel-wise model is {compared} than stereo in the mean.",
                 "good" if ratio >= 1 else "warning",
             )
         )
     if lost:
         items.append(
-            Notice(
+            PageNotice(
                 f"Stereo is flatter on {', '.join(lost)}: a pixel's rational function extrapolates beyond the depths "
                 "that it was fitted to."
             )

@@ -4,10 +4,10 @@ import numpy as np
 
 from slviewer.report.canvas import percentile
 from slviewer.report.clouds import clouds, merged_cloud
-from slviewer.report.data import CalibrationView, DeviceParameters, SessionData, VerificationView
+from slviewer.report.data import CalibrationFigures, DeviceParameters, SessionData, VerificationView
 from slviewer.report.maps import error_maps, rms_maps
 from slviewer.report.measurements import deviations_section, measurements_section
-from slviewer.report.page import Cell, Column, Headline, Item, Mark, Notice, Section, Table
+from slviewer.report.page import Cell, Column, Headline, Item, Mark, PageNotice, Section, Table
 from slviewer.report.quality import (
     acceptance_section,
     drift_section,
@@ -115,8 +115,8 @@ def session_sections(data: SessionData) -> list[Section]:
 
 def _notices(data: SessionData) -> list[Section]:
     unused = [row for row in data.captures if row.state in ("left out", "excluded")]
-    items: list[Item] = [Notice(warning) for warning in data.warnings]
-    items += [Notice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
+    items: list[Item] = [PageNotice(warning) for warning in data.warnings]
+    items += [PageNotice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
     return [Section("To notice", "", items)] if items else []
 
 
@@ -149,7 +149,7 @@ def _captures(data: SessionData) -> Section:
     return Section("Captures", "" if rows else "The session holds no captures yet.", [table] if rows else [])
 
 
-def _reprojection(calibration: CalibrationView) -> Section:
+def _reprojection(calibration: CalibrationFigures) -> Section:
     rms = calibration.reprojection_rms_px
     items: list[Item] = []
     if calibration.pose_rms_px:
@@ -179,7 +179,7 @@ def _reprojection(calibration: CalibrationView) -> Section:
     return Section("Reprojection", text, items)
 
 
-def _pose_table(calibration: CalibrationView) -> Table:
+def _pose_table(calibration: CalibrationFigures) -> Table:
     typical = np.sqrt(np.nanmean(np.square(list(calibration.pose_rms_px.values())), axis=0))
     columns = [
         Column("pose", align="left"),
@@ -197,7 +197,7 @@ def _pose_table(calibration: CalibrationView) -> Table:
     return Table(columns, rows, "Reprojection RMS of each pose")
 
 
-def _parameters(calibration: CalibrationView) -> Section:
+def _parameters(calibration: CalibrationFigures) -> Section:
     def lens(device: DeviceParameters) -> list[str]:
         K, D, sigma = device.K, device.D, device.focal_sigma_px
         spread = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""

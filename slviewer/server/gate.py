@@ -11,8 +11,8 @@ from viser import _messages as messages
 from slviewer.server import viser_internals as inside
 from slviewer.server.access import Role
 from slviewer.server.connection import Connection
-from slviewer.server.uploads import Budget, Uploads
-from slviewer.server.values import Refused, check_value
+from slviewer.server.uploads import UploadBudget, Uploads
+from slviewer.server.values import ValueRefused, check_value
 
 logger = logging.getLogger("slviewer.server")
 
@@ -26,7 +26,7 @@ class ViserGate:
     A refused message is dropped: it may be no attack at all, but a click on a button that was disabled a moment ago.
     """
 
-    def __init__(self, server: viser.ViserServer, connection: Connection, role: Role, budget: Budget) -> None:
+    def __init__(self, server: viser.ViserServer, connection: Connection, role: Role, budget: UploadBudget) -> None:
         self._server = server
         self._connection = connection
         self._role = role
@@ -43,7 +43,7 @@ class ViserGate:
             return None
         try:
             return self._passed(message, raw)
-        except Refused as refused:
+        except ValueRefused as refused:
             logger.debug("client %s: dropped %s: %s", self._client, type(message).__name__, refused)
             self._answer(message, refused)
         except Exception:  # what the check stumbles over, viser would too
@@ -61,15 +61,15 @@ class ViserGate:
         # besides where they look from, those who watch may say that they have drawn something, when they are asked
         watching = messages.ViewerCameraMessage | messages.LocalStorageGetItemResponseMessage
         if self._role != "operator" and not isinstance(message, watching):
-            raise Refused("this link only watches", correct=True)
+            raise ValueRefused("this link only watches", correct=True)
         if not _finite(vars(message)):
-            raise Refused("numbers that are none")
+            raise ValueRefused("numbers that are none")
         match message:
             case messages.ViewerCameraMessage():
                 _camera(message)
             case messages.GuiUpdateMessage():
                 if message.updates.keys() != {"value"}:
-                    raise Refused("only an input's value can be set")
+                    raise ValueRefused("only an input's value can be set")
                 check_value(self._enabled(message.uuid), message.updates["value"])
             case messages.GuiButtonHoldMessage():
                 _require(inside.holds(self._enabled(message.uuid), message.frequency))
@@ -107,18 +107,18 @@ class ViserGate:
             case messages.SceneNodeDragMessage():
                 _require(inside.node_drags(scene, client, message.name))
             case _:
-                raise Refused("no message of clients")
+                raise ValueRefused("no message of clients")
 
     def _enabled(self, uuid: str) -> Any:
         assert self._client is not None
         handle = inside.gui_input(self._server, self._client, uuid)
         if handle is None:
-            raise Refused("nothing to be seen there")
+            raise ValueRefused("nothing to be seen there")
         if getattr(handle, "disabled", False):
-            raise Refused("disabled", correct=True)
+            raise ValueRefused("disabled", correct=True)
         return handle
 
-    def _answer(self, message: Any, refused: Refused) -> None:
+    def _answer(self, message: Any, refused: ValueRefused) -> None:
         assert self._client is not None
         if isinstance(message, messages.FileTransferStartUpload):
             inside.refuse_upload(
@@ -137,13 +137,13 @@ class ViserGate:
 
 def _require(condition: bool) -> None:
     if not condition:
-        raise Refused("nothing listens to that")
+        raise ValueRefused("nothing listens to that")
 
 
 def _camera(message: messages.ViewerCameraMessage) -> None:
     usable = 0 < message.image_height < 2**15 and 0 < message.image_width < 2**15 and math.hypot(*message.wxyz) > 1e-6
     if not usable:
-        raise Refused("no camera")
+        raise ValueRefused("no camera")
 
 
 def _finite(value: Any) -> bool:

@@ -19,7 +19,7 @@ from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
 from slviewer.server.responses import script_hash
 from slviewer.server.routes import Routes
-from slviewer.server.uploads import Budget
+from slviewer.server.uploads import UploadBudget
 
 MESSAGE_LIMIT = 32 * 2**20
 """Bytes of one message from a browser; the largest is a picture that the server asked it for."""
@@ -100,7 +100,7 @@ def serve(
         routes, downloads = Routes(), Downloads()
         scripts = (*pins.VISER_SCRIPTS, script_hash(viser_internals.ONE_DRAW))
         door = Door(access, routes, downloads, viser_internals.client_page(), scripts)
-        budget = Budget(upload_limit)
+        budget = UploadBudget(upload_limit)
         started: list[viser.ViserServer] = []
 
         def serve_viser(viser_handler: Callable[..., Any], _host: str, _port: int, **options: Any) -> serve_websockets:

@@ -5,13 +5,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from slviewer.server.text import safe_name
-from slviewer.server.values import Refused
+from slviewer.server.values import ValueRefused
 
 SMALLEST_PART = 4096
 """Bytes; viser's page sends half a megabyte at a time. Smaller parts would cost more memory than they carry."""
 
 
-class Budget:
+class UploadBudget:
     """How many bytes of unfinished uploads the server holds for all clients together (viser keeps them in memory)."""
 
     def __init__(self, limit: int) -> None:
@@ -33,7 +33,7 @@ class _Transfer:
 class Uploads:
     """The uploads that one client has under way."""
 
-    def __init__(self, budget: Budget, forget: Callable[[str], None]) -> None:
+    def __init__(self, budget: UploadBudget, forget: Callable[[str], None]) -> None:
         self._budget = budget
         self._forget = forget
         self._transfers: dict[str, _Transfer] = {}
@@ -42,11 +42,11 @@ class Uploads:
         """The announcement (a FileTransferStartUpload) with a safe file name; Refused where it asks for too much."""
         size, parts = message.size_bytes, message.part_count
         if size < 0 or not (parts == 0 if size == 0 else 1 <= parts <= size // SMALLEST_PART + 1):
-            raise Refused("an upload whose parts cannot make up its size")
+            raise ValueRefused("an upload whose parts cannot make up its size")
         if size > self._budget.limit - self._budget.used:
-            raise Refused(f"an upload of {size / 1e6:.0f} MB where {self._budget.limit / 1e6:.0f} MB are allowed")
+            raise ValueRefused(f"an upload of {size / 1e6:.0f} MB where {self._budget.limit / 1e6:.0f} MB are allowed")
         if message.transfer_uuid in self._budget.names:
-            raise Refused("an upload that is under way")
+            raise ValueRefused("an upload that is under way")
         if size:  # an empty file is complete with its announcement
             self._budget.used += size
             self._budget.names.add(message.transfer_uuid)
@@ -57,7 +57,7 @@ class Uploads:
         """Count one part (a FileTransferPart) in; Refused, and the upload forgotten, where it was not announced."""
         transfer = self._transfers.get(message.transfer_uuid)
         if transfer is None:
-            raise Refused("a part of no upload")
+            raise ValueRefused("a part of no upload")
         transfer.received += len(message.content)
         fits = (
             message.source_component_uuid == transfer.source
@@ -70,7 +70,7 @@ class Uploads:
         if not fits or (complete and transfer.received != transfer.size):
             self._end(message.transfer_uuid)
             self._forget(message.transfer_uuid)
-            raise Refused("a part that was not announced")
+            raise ValueRefused("a part that was not announced")
         if complete:
             self._end(message.transfer_uuid)
 

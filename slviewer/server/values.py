@@ -9,7 +9,7 @@ TEXT_LIMIT = 20_000
 """Characters; no input of the wizard needs a tenth of it."""
 
 
-class Refused(Exception):
+class ValueRefused(Exception):
     """A message that is dropped; `correct` where the client should be shown the true value again.
 
     A number outside its range is not corrected: whoever types 50 into a field that starts at 10 passes through 5.
@@ -51,12 +51,12 @@ def check_value(handle: Any, value: Any) -> None:
             for channel in value:
                 _number(channel, 0, 0, 255)
         case _:  # an upload button's file arrives as an upload, and what is unknown changes nothing
-            raise Refused("this input takes no value")
+            raise ValueRefused("this input takes no value")
 
 
 def _require(condition: bool, reason: str, correct: bool = False) -> None:
     if not condition:
-        raise Refused(reason, correct)
+        raise ValueRefused(reason, correct)
 
 
 def _length(value: Any, current: tuple) -> None:

@@ -29,7 +29,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Shape:
+class BoardShape:
     """How far a board departs from a plane, mm: z = bow_x (1 - X^2) + bow_y (1 - Y^2) + twist X Y.
 
     X and Y run from -1 to 1 over the board; z points away from the camera. `misplaced_mm` is the standard deviation of
@@ -42,7 +42,7 @@ class Shape:
     misplaced_mm: float = 0.0
 
 
-FLAT = Shape()
+FLAT = BoardShape()
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class BoardScene:
     board: Board | None
     corner: tuple[float, float]
     plate: tuple[float, float]
-    shape: Shape
+    shape: BoardShape
     misplacement: np.ndarray
     diameter_mm: float = 0.0
     white: float = 0.85
@@ -118,7 +118,7 @@ class BoardScene:
 def printed_board(
     board: Board,
     pose: Pose,
-    shape: Shape = FLAT,
+    shape: BoardShape = FLAT,
     seed: int = 0,
     margin_mm: float | None = None,
     diameter_mm: float | None = None,
@@ -148,6 +148,6 @@ def printed_board(
     )  # fmt: skip
 
 
-def blank_board(pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: Shape = FLAT) -> BoardScene:
+def blank_board(pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: BoardShape = FLAT) -> BoardScene:
     """A white plate of `size` mm whose middle is the origin of its frame."""
     return BoardScene(pose, None, (-size[0] / 2, -size[1] / 2), size, shape, np.zeros((0, 2)))

@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
-from slviewer.simulation.boards import BoardScene, Pose, Shape, blank_board
+from slviewer.simulation.boards import BoardScene, BoardShape, Pose, blank_board
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.rig import SimulatedRig
@@ -215,7 +215,7 @@ def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
     if not isinstance(scene, BoardScene):
         return scene
     bow = bow_mm * np.random.default_rng([number, 0xF1]).uniform(-1, 1, 3)
-    return replace(scene, shape=Shape(float(bow[0]), float(bow[1]), float(bow[2])))
+    return replace(scene, shape=BoardShape(float(bow[0]), float(bow[1]), float(bow[2])))
 
 
 def moving_scenes(scene: Scene, by_mm: float) -> list[Scene]:

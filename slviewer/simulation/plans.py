@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.simulation.boards import FLAT, BoardScene, Pose, Shape, blank_board, printed_board
+from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, blank_board, printed_board
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene, Spheres, sphere
@@ -55,7 +55,7 @@ _MOVED_OBJECTS = {
 
 
 def letter_plan(
-    rig: SimulatedRig, board: Board | None = None, poses: int = 25, shape: Shape = FLAT
+    rig: SimulatedRig, board: Board | None = None, poses: int = 25, shape: BoardShape = FLAT
 ) -> dict[str, Scene]:
     """Every capture of the preset by name: pose_01 ..., plane_01 ... plane_10, sphere_1 ... sphere_6, object_r1 ... r3.
 

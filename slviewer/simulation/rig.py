@@ -29,7 +29,7 @@ class Sensor:
 
 
 @dataclass(frozen=True)
-class Light:
+class Illumination:
     """The projector's light and the room's, relative to full white on a board that faces the projector at its focus."""
 
     ambient: float
@@ -50,7 +50,7 @@ class SimulatedRig:
     R: np.ndarray
     t: np.ndarray
     sensor: Sensor
-    light: Light
+    light: Illumination
     seed: int = 0
 
     @property
@@ -94,7 +94,7 @@ def letter(
         for name, stream in zip(("camera", "projector"), streams[:2], strict=True)
     )
     R, t = _arrangement(np.random.default_rng(streams[2]), preset["arrangement"])
-    light = Light(**preset["light"])
+    light = Illumination(**preset["light"])
     if gamma is not None:
         light = dataclasses.replace(light, gamma=gamma)
     if flicker is not None:

@@ -17,7 +17,7 @@ _GATE_SIGMAS = 6.0
 
 
 @dataclass(frozen=True)
-class Agreement:
+class SurfaceAgreement:
     """Two scans where they overlap: ``places`` compared; ``rms_mm``, ``bias_mm`` (median), of the distance of the
     second's surface above the first's along the normal; ``gate_mm``, within which they are one; ``log_gain``, the
     median logarithm of the second's brightness over the first's, or None without colours."""
@@ -29,9 +29,9 @@ class Agreement:
     log_gain: float | None
 
 
-def agreements(views: Mapping[str, View], say: Callable[[float], None]) -> dict[tuple[str, str], Agreement]:
+def agreements(views: Mapping[str, View], say: Callable[[float], None]) -> dict[tuple[str, str], SurfaceAgreement]:
     """Every ordered pair of scans of which the first meets the second in enough places."""
-    found: dict[tuple[str, str], Agreement] = {}
+    found: dict[tuple[str, str], SurfaceAgreement] = {}
     ways = list(permutations(views, 2))
     for i, (a, b) in enumerate(ways):
         say(i / len(ways))
@@ -41,7 +41,7 @@ def agreements(views: Mapping[str, View], say: Callable[[float], None]) -> dict[
     return found
 
 
-def _compared(here: View, there: View) -> Agreement | None:
+def _compared(here: View, there: View) -> SurfaceAgreement | None:
     mask = here.mask
     every = slice(None, None, max(1, int(mask.sum()) // _SAMPLES))
     T = np.linalg.inv(there.T) @ here.T
@@ -61,7 +61,7 @@ def _compared(here: View, there: View) -> Agreement | None:
     height = height[met]
     scatter = 1.4826 * float(np.median(np.abs(height)))
     gate = min(max(_GATE_SIGMAS * scatter, 3.0 * noise, 0.25 * spacing), window)
-    return Agreement(
+    return SurfaceAgreement(
         places=int(met.sum()),
         rms_mm=float(np.sqrt(np.mean(height[np.abs(height) <= gate] ** 2))),
         bias_mm=float(np.median(height)),
@@ -83,7 +83,9 @@ def _log_gain(
     return float(np.median(np.log(second[exposed] / first[exposed])))
 
 
-def colour_gains(views: Mapping[str, View], pairs: Mapping[tuple[str, str], Agreement]) -> dict[str, float] | None:
+def colour_gains(
+    views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement]
+) -> dict[str, float] | None:
     """What each scan's colours are multiplied by so that overlapping ones agree; their mean logarithm is 0.
 
     None where a scan has no colours.

@@ -14,7 +14,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.surface.agreement import Agreement, agreements, colour_gains
+from slviewer.surface.agreement import SurfaceAgreement, agreements, colour_gains
 from slviewer.surface.meeting_kernels import FIELDS, gather, vote
 from slviewer.surface.shapes import PointSet
 from slviewer.surface.view import View, view_of
@@ -40,7 +40,7 @@ class Fused:
     seen_by: np.ndarray
     names: tuple[str, ...]
     left_out: dict[str, dict[str, int]]
-    pairs: dict[tuple[str, str], Agreement]
+    pairs: dict[tuple[str, str], SurfaceAgreement]
 
     @property
     def shared(self) -> float:
@@ -104,7 +104,7 @@ def fuse(
 
 
 def _denied(
-    views: Mapping[str, View], pairs: Mapping[tuple[str, str], Agreement], say: Progress
+    views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement], say: Progress
 ) -> dict[str, np.ndarray]:
     """By scan, (h, w) bool: the points that more scans see through than see."""
     sure = {name: _sure(view) for name, view in views.items()}
@@ -132,7 +132,7 @@ def _sure(view: View) -> np.ndarray:
     return np.asarray(whole & (view.inner > SURE) & (towards > 0.25))
 
 
-def _gate(pairs: Mapping[tuple[str, str], Agreement], a: str, b: str, here: View, there: View) -> float:
+def _gate(pairs: Mapping[tuple[str, str], SurfaceAgreement], a: str, b: str, here: View, there: View) -> float:
     pair = pairs.get((a, b)) or pairs.get((b, a))
     return pair.gate_mm if pair else max(here.spacing, there.spacing)
 
@@ -140,7 +140,7 @@ def _gate(pairs: Mapping[tuple[str, str], Agreement], a: str, b: str, here: View
 def _fused_points(
     name: str,
     views: Mapping[str, View],
-    pairs: Mapping[tuple[str, str], Agreement],
+    pairs: Mapping[tuple[str, str], SurfaceAgreement],
     gains: Mapping[str, float] | None,
 ) -> tuple[PointSet, np.ndarray]:
     """The points that a scan keeps, in the reference's frame, and how many scans each is the mean of."""

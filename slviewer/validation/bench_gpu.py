@@ -9,7 +9,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry import cuda_device
-from slviewer.reconstruction.onepass import Light
+from slviewer.reconstruction.onepass import LightLevels
 from slviewer.reconstruction.onepass_cuda import CudaPass
 from slviewer.validation.bench_floors import median, row
 
@@ -44,7 +44,7 @@ def gpu_rows(
     ]
 
 
-def _kernel_alone(one: CudaPass, frames: np.ndarray, light: Light) -> tuple[float, float, int]:
+def _kernel_alone(one: CudaPass, frames: np.ndarray, light: LightLevels) -> tuple[float, float, int]:
     """(seconds of the first pass, seconds of a copy on the device that moves as much, bytes moved), by its clock."""
     from numba import cuda
 

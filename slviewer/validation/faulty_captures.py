@@ -22,7 +22,7 @@ from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.pose_evidence import examine
-from slviewer.simulation.boards import Pose, Shape, printed_board
+from slviewer.simulation.boards import BoardShape, Pose, printed_board
 from slviewer.simulation.hostile_frames import delay_frames, drop_frame, swap_groups
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
@@ -48,13 +48,13 @@ class Looked:
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class FaultBench:
     """A rig, a board, and its captures, each rendered and examined when it is first asked for."""
 
     rig: SimulatedRig
     board: Board = BOARD
     count: int = POSES
-    shape: Shape = field(default_factory=Shape)
+    shape: BoardShape = field(default_factory=BoardShape)
     steps: int = 18
     _frames: dict[int, np.ndarray] = field(default_factory=dict, init=False, repr=False)
     _looked: dict[int, Looked] = field(default_factory=dict, init=False, repr=False)
@@ -141,13 +141,13 @@ class Bench:
         return [self.look(i, spoil(self.frames(i))) if only == i else self.looked(i) for i in range(self.count)]
 
 
-Fault = Callable[[Bench], Attempt]
+Fault = Callable[[FaultBench], Attempt]
 
 
 def _described(**change: Any) -> Fault:
     """Fringes of other periods than the description says: {axis: described period}."""
 
-    def attempt(bench: Bench) -> Attempt:
+    def attempt(bench: FaultBench) -> Attempt:
         frames = tuple(
             replace(f, period_px=change[f.axis]) if f.kind == "phase" and f.axis in change else f
             for f in bench.sequence.frames
@@ -161,7 +161,7 @@ def _described(**change: Any) -> Fault:
 def _given(columns: int, rows: int) -> Fault:
     """A board of another size than the one that was captured."""
 
-    def attempt(bench: Bench) -> Attempt:
+    def attempt(bench: FaultBench) -> Attempt:
         board = replace(bench.board, columns=columns, rows=rows)
         return bench.attempt([bench.look(i, bench.frames(i), board=board) for i in bench.every], board)
 
@@ -171,7 +171,7 @@ def _given(columns: int, rows: int) -> Fault:
 def _renumbered(order: Callable[[np.ndarray], np.ndarray]) -> Fault:
     """Features of one pose in another order; ``order`` turns (rows, columns) indices."""
 
-    def attempt(bench: Bench) -> Attempt:
+    def attempt(bench: FaultBench) -> Attempt:
         looked = bench.clean()
         seen = looked[2].observation
         assert seen is not None
@@ -188,7 +188,7 @@ def _renumbered(order: Callable[[np.ndarray], np.ndarray]) -> Fault:
 def _moved(by_mm: Sequence[float], share: float) -> Fault:
     """One pose whose board is elsewhere after this share of the frames."""
 
-    def attempt(bench: Bench) -> Attempt:
+    def attempt(bench: FaultBench) -> Attempt:
         pose, frames = bench.poses[2], bench.frames(2).copy()
         from_frame = round(share * len(frames))
         frames[from_frame:] = bench.rendered(Pose(pose.R, pose.t + np.array(by_mm)), 2)[from_frame:]
@@ -204,14 +204,14 @@ def _spoilt(spoil: Callable[[np.ndarray], np.ndarray], only: int | None = None) 
 
 
 def _rendered(**change: Any) -> Fault:
-    def attempt(bench: Bench) -> Attempt:
+    def attempt(bench: FaultBench) -> Attempt:
         return bench.attempt([bench.look(i, bench.rendered(bench.poses[i], i, **change)) for i in bench.every])
 
     return attempt
 
 
 def _gamma(gamma: float) -> Fault:
-    def attempt(bench: Bench) -> Attempt:
+    def attempt(bench: FaultBench) -> Attempt:
         light = replace(bench.rig.light, gamma=gamma)
         curved = replace(bench, rig=replace(bench.rig, light=light))
         return curved.attempt([curved.look(i, curved.rendered(bench.poses[i], i)) for i in bench.every])
@@ -222,7 +222,7 @@ def _gamma(gamma: float) -> Fault:
 def _parallel(tilt_deg: float, spread_deg: float) -> Fault:
     """All boards tilted alike, but for a hand's unsteadiness."""
 
-    def attempt(bench: Bench) -> Attempt:
+    def attempt(bench: FaultBench) -> Attempt:
         rng = np.random.default_rng(5)
         middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
         looked = []
@@ -236,7 +236,7 @@ def _parallel(tilt_deg: float, spread_deg: float) -> Fault:
     return attempt
 
 
-def _without_corner(bench: Bench) -> Attempt:
+def _without_corner(bench: FaultBench) -> Attempt:
     """Poses of which none reaches the image's top right."""
     wide = replace(bench, count=MANY)
     width, height = bench.rig.camera.size

@@ -39,7 +39,7 @@ _SAME_SURFACE_MM = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredScan:
     """A scan, point by point.
 
     ``points`` (n, 3) mm as measured, ``truth`` (n, 3) mm of the same pixels, NaN where they see no surface directly,
@@ -55,7 +55,7 @@ class Measured:
 
 
 @dataclass(eq=False)
-class Report:
+class CaseReport:
     """What the program said of a case: its warnings, the causes that it named by word, and the error that ended it."""
 
     warnings: list[str] = field(default_factory=list)
@@ -116,7 +116,7 @@ class HostileBench:
         frames = expose_frames(renderer.rig, light, self.sequence, room, number, fault, severity, self.seed)
         return frames, renderer, clean
 
-    def store(self, session: Path, captures: dict[str, np.ndarray], report: Report) -> None:
+    def store(self, session: Path, captures: dict[str, np.ndarray], report: CaseReport) -> None:
         """Write frames as images with a TOML, and import them as anyone would; poses and scans by their names."""
         for role in ("calibration", "scan"):
             names = [name for name in captures if name.startswith("pose_") == (role == "calibration")]
@@ -135,7 +135,7 @@ class HostileBench:
                 raise
         report.named += named_causes(self.sequence, captures, report.warnings)
 
-    def calibrate(self, session: Path, report: Report) -> None:
+    def calibrate(self, session: Path, report: CaseReport) -> None:
         """Calibrate the session's target poses; the report gets the verdict's causes."""
         try:
             calibrate(session, str(BOARD), models=self.models, warn=report.warnings.append)
@@ -144,7 +144,7 @@ class HostileBench:
                 verdict = last_verdict(store)
             report.named += [frozenset({cause}) for cause in verdict.causes] if verdict else []
 
-    def measure(self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: Report) -> Measured:
+    def measure(self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: CaseReport) -> MeasuredScan:
         """Reconstruct a stored scan and fit its shape; compare with the ``truth`` that the renderers know."""
         shape = "plane" if name.startswith("plane") else "sphere"
         done = reconstruct(
@@ -158,7 +158,7 @@ class HostileBench:
         return compare_with_truth(done.cloud, *truth)
 
 
-def compare_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> Measured:
+def compare_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:
     """The cloud's points beside those that a perfect instrument would measure, of the scene as it was."""
     truth = renderer.truth()
     points = truth.points
@@ -168,7 +168,7 @@ def compare_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> Mea
     with np.errstate(invalid="ignore"):
         target = np.abs(points[..., 2] - clean.truth().points[..., 2]) < _SAME_SURFACE_MM
     measured = cloud.mask
-    return Measured(
+    return MeasuredScan(
         cloud.points[measured].astype(float),
         points[measured],
         cloud.sigma[measured].astype(float),
@@ -226,9 +226,9 @@ def named_causes(
     return list(named)
 
 
-def run_case(work: Callable[[Report], Sequence[Measured]]) -> tuple[Report, Sequence[Measured]]:
+def run_case(work: Callable[[CaseReport], Sequence[MeasuredScan]]) -> tuple[CaseReport, Sequence[MeasuredScan]]:
     """Do it, and say what came of it: an error ends the case and goes into the report."""
-    report = Report()
+    report = CaseReport()
     try:
         return report, work(report)
     except Exception as error:  # a crash is a result here, and others still have to run

@@ -7,7 +7,7 @@ from typing import Any
 
 from slviewer.evaluation.render import Row, render
 from slviewer.pipeline.feedback import Progress, part, unheard
-from slviewer.validation.prove_rigs import FLOOR, Case, RigFigures, cases, measure_rig
+from slviewer.validation.prove_rigs import FLOOR, RigCase, RigFigures, cases, measure_rig
 
 POSES = 25
 OVER_FLOOR = {"R1": 1.4, "R2": 1.1, "R3": 1.1}
@@ -25,7 +25,7 @@ LEAST_KEPT = 0.9
 
 
 @dataclass(frozen=True)
-class Check:
+class BandCheck:
     """One figure of one rig, and the band in which it must lie."""
 
     rig: str
@@ -45,26 +45,30 @@ class Check:
         return f"{self.rig}: {self.what} is {self.value:.4g}, wanted {band}"
 
 
-def checks(figures: RigFigures) -> tuple[Check, ...]:
+def checks(figures: RigFigures) -> tuple[BandCheck, ...]:
     """What is demanded of one rig."""
     floor, splined = figures.mean_mm(FLOOR), figures.mean_mm("splined")
     rig = figures.case.name
     regions = {plane.region for plane in figures.planes.values()}
     predicted = _predicted_over_floor(figures)
     found = [
-        Check(rig, "stereo over splined, of stereo over the floor,", floor / splined, OF_STEREO, 1 / BELOW_FLOOR),
+        BandCheck(rig, "stereo over splined, of stereo over the floor,", floor / splined, OF_STEREO, 1 / BELOW_FLOOR),
         *(
-            Check(rig, f"splined over the floor in {region}", _over_floor(figures, region), BELOW_FLOOR, most)
+            BandCheck(rig, f"splined over the floor in {region}", _over_floor(figures, region), BELOW_FLOOR, most)
             for region, most in OVER_FLOOR.items()
             if region in regions
         ),
-        Check(rig, "predicted floor over the floor, of the worst plane,", predicted, 1 - PREDICTED, 1 + PREDICTED),
-        Check(rig, "share of the pixels that splined measures", _kept(figures), LEAST_KEPT, 1.0),
-        Check(rig, "largest error of a sphere's radius in mm", _largest(figures.radius_mm["splined"]), 0.0, RADIUS_MM),
-        Check(rig, "largest error of a spacing in mm", _largest(figures.spacing_mm["splined"]), 0.0, SPACING_MM),
+        BandCheck(rig, "predicted floor over the floor, of the worst plane,", predicted, 1 - PREDICTED, 1 + PREDICTED),
+        BandCheck(rig, "share of the pixels that splined measures", _kept(figures), LEAST_KEPT, 1.0),
+        BandCheck(
+            rig, "largest error of a sphere's radius in mm", _largest(figures.radius_mm["splined"]), 0.0, RADIUS_MM
+        ),
+        BandCheck(rig, "largest error of a spacing in mm", _largest(figures.spacing_mm["splined"]), 0.0, SPACING_MM),
     ]
     if figures.case.local_distortion_px == 0:
-        found.append(Check(rig, "splined over stereo", splined / figures.mean_mm("stereo"), BELOW_FLOOR, OVER_STEREO))
+        found.append(
+            BandCheck(rig, "splined over stereo", splined / figures.mean_mm("stereo"), BELOW_FLOOR, OVER_STEREO)
+        )
     return tuple(found)
 
 
@@ -76,7 +80,7 @@ class AccuracyProof:
     scale: float
 
     @property
-    def checks(self) -> tuple[Check, ...]:
+    def checks(self) -> tuple[BandCheck, ...]:
         """Of all rigs, in order."""
         return tuple(check for rig in self.rigs for check in checks(rig))
 
@@ -116,7 +120,7 @@ class AccuracyProof:
 def prove_accuracy(
     scale: float = 1.0,
     *,
-    rigs: Sequence[Case] | None = None,
+    rigs: Sequence[RigCase] | None = None,
     poses: int = POSES,
     seed: int = 0,
     progress: Progress = unheard,

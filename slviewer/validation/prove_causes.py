@@ -9,17 +9,17 @@ from slviewer.calibration.diagnosis.attempt import Attempt
 from slviewer.calibration.diagnosis.verdict import Cause
 from slviewer.evaluation.render import render
 from slviewer.pipeline.feedback import Progress, unheard
-from slviewer.simulation.boards import Shape
+from slviewer.simulation.boards import BoardShape
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
-from slviewer.validation.faulty_captures import BOARD, FAULTS, POSES, Bench
+from slviewer.validation.faulty_captures import BOARD, FAULTS, POSES, FaultBench
 
 BOARDS = (BOARD, Board.parse("circles:14x11:13"), Board.parse("circles:17x13:11"), Board.parse("chessboard:10x7:18"))
 """That clean calibrations are made from in turn."""
 
 
 @dataclass(frozen=True)
-class Case:
+class CauseCase:
     """One fault: the ``cause`` that must be named first (None: none must be), and the ``attempt`` that it spoilt."""
 
     name: str
@@ -35,10 +35,10 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Proof:
+class CauseProof:
     """What came of all faults."""
 
-    cases: tuple[Case, ...]
+    cases: tuple[CauseCase, ...]
     scale: float
 
     @property
@@ -99,33 +99,35 @@ def prove_causes(
     steps: int = 18,
     seed: int = 0,
     progress: Progress = unheard,
-) -> Proof:
+) -> CauseProof:
     """Every fault in turn, then ``clean`` calibrations of different rigs, poses and boards.
 
     ``scale``: resolution of the camera, as a share of the Letter's. ``poses`` of each rig, captured in so many phase
     ``steps``.
     """
-    cases: list[Case] = []
+    cases: list[CauseCase] = []
     total = len(faults) + clean
-    bench = Bench(letter(scale, seed), count=poses, steps=steps)
+    bench = FaultBench(letter(scale, seed), count=poses, steps=steps)
     for name in faults:
         progress(len(cases) / total, name)
         cause, fault = FAULTS[name]
         begun = perf_counter()
         attempt = fault(bench)
-        cases.append(Case(name, cause, attempt, perf_counter() - begun))
+        cases.append(CauseCase(name, cause, attempt, perf_counter() - begun))
     for name, attempt, seconds in _clean(scale, clean, poses, steps, seed):
-        cases.append(Case(name, None, attempt, seconds))
+        cases.append(CauseCase(name, None, attempt, seconds))
         progress(len(cases) / total, name)
     progress(1.0, "proven")
-    return Proof(tuple(cases), scale)
+    return CauseProof(tuple(cases), scale)
 
 
 def _clean(scale: float, count: int, poses: int, steps: int, seed: int) -> Iterator[tuple[str, Attempt, float]]:
     for k in range(count):
         begun = perf_counter()
         board = BOARDS[k % len(BOARDS)]
-        bench = Bench(letter(scale, seed + 1 + k), board, poses + k % 5, Shape(misplaced_mm=0.01 * (k % 3)), steps)
+        bench = FaultBench(
+            letter(scale, seed + 1 + k), board, poses + k % 5, BoardShape(misplaced_mm=0.01 * (k % 3)), steps
+        )
         yield (
             f"clean, seed {seed + 1 + k}, {board}, {bench.count} poses",
             bench.attempt(bench.clean()),

@@ -24,8 +24,8 @@ from slviewer.simulation.plans import planes, rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.target.board import Board
-from slviewer.validation.faulty_captures import BOARD, Bench
-from slviewer.wizard.pose_plan import Features, plan
+from slviewer.validation.faulty_captures import BOARD, FaultBench
+from slviewer.wizard.pose_plan import PoseFeatures, plan
 
 POSES, RIGS = 12, 5
 MOST_OVER_FLOOR, LEAST_SUPPORTED = 1.3, 0.85
@@ -139,7 +139,7 @@ def prove_guidance(
     outcomes: list[Outcome] = []
     total = rigs * len(ways)
     for k in range(rigs):
-        bench = Bench(letter(scale, seed + k), BOARD, poses, steps=steps)
+        bench = FaultBench(letter(scale, seed + k), BOARD, poses, steps=steps)
         targets = _targets(bench)
         for way in ways:
             told = partial(_tell, progress, len(outcomes) / total, 1 / total, f"rig {k + 1} of {rigs}, {way}")
@@ -159,7 +159,7 @@ def _tell(progress: Progress, done: float, share: float, which: str, of_it: floa
     progress(done + share * of_it, f"{which}: {words}")
 
 
-def _drawn(bench: Bench, told: Progress) -> list[Observation]:
+def _drawn(bench: FaultBench, told: Progress) -> list[Observation]:
     seen = []
     for i, pose in enumerate(target_poses(bench.rig, BOARD, bench.count)):
         told(0.9 * i / bench.count, f"pose {i + 1}")
@@ -169,7 +169,7 @@ def _drawn(bench: Bench, told: Progress) -> list[Observation]:
     return seen
 
 
-def _guided(bench: Bench, told: Progress) -> tuple[list[Observation], float]:
+def _guided(bench: FaultBench, told: Progress) -> tuple[list[Observation], float]:
     """Poses where the wizard asks for them, and the sigma that it predicts in the end."""
     rig, board = bench.rig, bench.board
     rng = np.random.default_rng([rig.seed, 0x6D])
@@ -192,9 +192,9 @@ def _guided(bench: Bench, told: Progress) -> tuple[list[Observation], float]:
             seen.append(observation)
 
 
-def _features(seen: Observation) -> Features:
+def _features(seen: Observation) -> PoseFeatures:
     noise = np.nan if seen.samples is None else float(np.nanmedian(seen.samples.sigma))
-    return Features(seen.points, seen.camera, seen.projector, noise)
+    return PoseFeatures(seen.points, seen.camera, seen.projector, noise)
 
 
 def _asked(rig: SimulatedRig, board: Board, outline_px: np.ndarray) -> np.ndarray:
@@ -233,7 +233,7 @@ class _Target:
     exact: np.ndarray
 
 
-def _targets(bench: Bench) -> list[_Target]:
+def _targets(bench: FaultBench) -> list[_Target]:
     rig, found = bench.rig, []
     sequence = one_axis(bench.sequence, "x")
     for i, (name, scene) in enumerate(planes().items()):

@@ -21,7 +21,7 @@ from slviewer.evaluation.render import render
 from slviewer.pipeline.feedback import Progress, unheard
 from slviewer.simulation.hostile import FAULTS, SEVERITIES, Direction, Fault, Severity
 from slviewer.simulation.rig import letter
-from slviewer.validation.hostile_captures import SCANS, HostileBench, Measured, Report, run_case
+from slviewer.validation.hostile_captures import SCANS, CaseReport, HostileBench, MeasuredScan, run_case
 
 WITHIN = 1.5
 """Times the undisturbed RMS, within which a case is measured."""
@@ -73,7 +73,7 @@ class Figures:
 
 
 @dataclass(frozen=True)
-class Case:
+class HostileCase:
     """One fault at one severity, and what came of it."""
 
     fault: str
@@ -93,10 +93,10 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Proof:
+class HostileProof:
     """What came of all cases."""
 
-    cases: tuple[Case, ...]
+    cases: tuple[HostileCase, ...]
     scale: float
 
     @property
@@ -136,7 +136,7 @@ class Proof:
         }
 
 
-def _row(case: Case) -> dict[str, Any]:
+def _row(case: HostileCase) -> dict[str, Any]:
     figures = case.figures
     nan = float("nan")
     return {
@@ -161,7 +161,7 @@ def prove_hostile(
     splined: bool = True,
     seed: int = 0,
     progress: Progress = unheard,
-) -> Proof:
+) -> HostileProof:
     """Put every fault at every severity into scans, and into target poses, and judge what the program makes of them.
 
     ``cases``: some of them, as "flicker", "flicker:mild" or "flicker:mild:scan". ``splined``: measure with the splined
@@ -169,7 +169,7 @@ def prove_hostile(
     """
     chosen = choose_cases(cases)
     rig = letter(scale, seed) if splined else letter(scale, seed, local_distortion_px=0.0)
-    done: list[Case] = []
+    done: list[HostileCase] = []
     with tempfile.TemporaryDirectory(prefix="slviewer-hostile-") as folder:
         models = ("stereo", "splined") if splined else ("stereo",)
         bench = HostileBench(rig, Path(folder), poses=8 if splined else 7, models=models, seed=seed)
@@ -179,7 +179,7 @@ def prove_hostile(
             progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
             done.append(trial.run(name, severity, direction))
     progress(1.0, "proven")
-    return Proof(tuple(done), scale)
+    return HostileProof(tuple(done), scale)
 
 
 def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direction]]:
@@ -209,7 +209,7 @@ class _Trial:
     def __init__(self, bench: HostileBench) -> None:
         self._bench = bench
         self._session = bench.folder / "sound"
-        report = Report()
+        report = CaseReport()
         bench.store(self._session, {name: bench.capture(name)[0] for name in bench.scenes}, report)
         bench.calibrate(self._session, report)
         measured = [bench.measure(self._session, name, bench.capture(name)[1:], report) for name in SCANS]
@@ -217,7 +217,7 @@ class _Trial:
         self.floor = score(measured, self.gauge)
         self.said = report
 
-    def run(self, name: str, severity: Severity, direction: Direction) -> Case:
+    def run(self, name: str, severity: Severity, direction: Direction) -> HostileCase:
         """One case."""
         fault, begun = FAULTS[name], perf_counter()
         if direction == "scan":
@@ -230,14 +230,14 @@ class _Trial:
         outcome, named = judge(fault, severity, report, figures, self.floor)
         messages = [*report.warnings, *([f"{type(report.error).__name__}: {report.error}"] if report.error else [])]
         seconds = perf_counter() - begun
-        return Case(name, severity, direction, outcome, figures, self.floor, named, tuple(messages), seconds)
+        return HostileCase(name, severity, direction, outcome, figures, self.floor, named, tuple(messages), seconds)
 
-    def _scan(self, fault: Fault, severity: Severity, report: Report) -> Sequence[Measured]:
+    def _scan(self, fault: Fault, severity: Severity, report: CaseReport) -> Sequence[MeasuredScan]:
         shots = {name: self._bench.capture(name, fault, severity) for name in SCANS}
         self._bench.store(self._session, {name: shot[0] for name, shot in shots.items()}, report)
         return [self._bench.measure(self._session, name, shot[1:], report) for name, shot in shots.items()]
 
-    def _calibrate(self, fault: Fault, severity: Severity, report: Report) -> Sequence[Measured]:
+    def _calibrate(self, fault: Fault, severity: Severity, report: CaseReport) -> Sequence[MeasuredScan]:
         bench, session = self._bench, self._bench.folder / "hostile"
         shutil.rmtree(session, ignore_errors=True)
         struck = bench.targets[: fault.struck[SEVERITIES.index(severity)]]
@@ -249,7 +249,7 @@ class _Trial:
 
 
 def judge(
-    fault: Fault, severity: Severity, report: Report, figures: Figures | None, floor: Figures
+    fault: Fault, severity: Severity, report: CaseReport, figures: Figures | None, floor: Figures
 ) -> tuple[Outcome, tuple[str, ...]]:
     """The outcome of a case, and the causes that the program named."""
     named = list(report.named)
@@ -279,7 +279,7 @@ def judge(
     return ("noisier as predicted" if figures.coverage >= LEAST * floor.coverage else "UNEXPLAINED LOSS"), words
 
 
-def fit_gauge(measured: Sequence[Measured]) -> tuple[np.ndarray, np.ndarray]:
+def fit_gauge(measured: Sequence[MeasuredScan]) -> tuple[np.ndarray, np.ndarray]:
     """R (3, 3) and t (3,) mm that carry the measured points of all scans onto their truth.
 
     Least squares over the better nine tenths of the targets' points.
@@ -300,7 +300,7 @@ def fit_gauge(measured: Sequence[Measured]) -> tuple[np.ndarray, np.ndarray]:
     return R, t
 
 
-def score(measured: Sequence[Measured], gauge: tuple[np.ndarray, np.ndarray]) -> Figures:
+def score(measured: Sequence[MeasuredScan], gauge: tuple[np.ndarray, np.ndarray]) -> Figures:
     """The figures of scans, errors of z in mm after the motion of ``gauge``."""
     R, t = gauge
     errors = np.concatenate([(m.points @ R.T + t - m.truth)[:, 2] for m in measured])

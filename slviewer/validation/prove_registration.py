@@ -40,7 +40,7 @@ from slviewer.simulation.turning import STEP_DEG, stone
 from slviewer.surface.shapes import Mesh
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
-from slviewer.validation.prove_accuracy import Check
+from slviewer.validation.prove_accuracy import BandCheck
 from slviewer.validation.prove_surface import SurfaceProof, prove_surface
 
 POSES = 25
@@ -54,7 +54,7 @@ _EVERY = 37  # of the pixels, to find the calibrated camera's frame from
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class RegisteredScans:
     """Scans of one object: their clouds, how they were registered, the true poses T_camera_object (4, 4) in the
     calibrated camera's frame, and the seconds that registering took."""
 
@@ -96,34 +96,36 @@ class RegistrationProof:
     """What came of the three depths, of the turn, of the surfaces made from them, and of what had to be refused: the
     reason by pair, or "accepted"."""
 
-    depths: Measured
-    turn: Measured
+    depths: RegisteredScans
+    turn: RegisteredScans
     surface: SurfaceProof
     refusals: Mapping[str, tuple[str, str]]
     scale: float
 
     @property
-    def checks(self) -> tuple[Check, ...]:
+    def checks(self) -> tuple[BandCheck, ...]:
         """All that is demanded."""
         found = []
         for name in self.depths.clouds:
             if name != self.depths.alignment.reference:
                 onto = self.depths.alignment.reference
                 shift, turn = self.depths.error(name, onto, self.depths.alignment.T_reference_scan[name])
-                found.append(Check(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
-                found.append(Check(name, "error of its turn in degrees", turn, 0.0, TURN_DEG))
+                found.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
+                found.append(BandCheck(name, "error of its turn in degrees", turn, 0.0, TURN_DEG))
         loops = self.turn.alignment.loops
-        found.append(Check("three depths", "seconds to register", self.depths.seconds, 0.0, SECONDS))
+        found.append(BandCheck("three depths", "seconds to register", self.depths.seconds, 0.0, SECONDS))
         left = max((loop.after.shift_mm for loop in loops), default=float("nan"))
-        found.append(Check("turn", "largest loop error in mm once adjusted", left, 0.0, LOOP_MM))
-        found.append(Check("turn", "loop error in mm round all scans", self.turn.round_all()[0], 0.0, LOOP_MM))
+        found.append(BandCheck("turn", "largest loop error in mm once adjusted", left, 0.0, LOOP_MM))
+        found.append(BandCheck("turn", "loop error in mm round all scans", self.turn.round_all()[0], 0.0, LOOP_MM))
         good = len(self.depths.alignment.pairs) + len(self.turn.alignment.pairs)
-        found.append(Check("good pairs", "number accepted", float(good), GOOD_PAIRS, float("inf")))
+        found.append(BandCheck("good pairs", "number accepted", float(good), GOOD_PAIRS, float("inf")))
         for what, ratio in zip(("shift", "turn"), self.honesty, strict=True):
-            found.append(Check("all pairs", f"predicted over true error of the {what}", ratio, *HONEST))
+            found.append(BandCheck("all pairs", f"predicted over true error of the {what}", ratio, *HONEST))
         found += self.surface.checks
         for name, (wanted, got) in self.refusals.items():
-            found.append(Check(name, f"refused as {wanted} (it was: {got})", float(got in wanted.split("/")), 1.0, 1.0))
+            found.append(
+                BandCheck(name, f"refused as {wanted} (it was: {got})", float(got in wanted.split("/")), 1.0, 1.0)
+            )
         return tuple(found)
 
     @property
@@ -254,11 +256,11 @@ def _registered(
     truth: Mapping[str, np.ndarray],
     starts: Starts | None,
     progress: Progress,
-) -> Measured:
+) -> RegisteredScans:
     begun = perf_counter()
     found = register_all(clouds, reference, starts, lambda done: progress(done, "registering"))
     taken = perf_counter() - begun
-    return Measured(clouds, found, {name: truth[name] for name in clouds}, taken)
+    return RegisteredScans(clouds, found, {name: truth[name] for name in clouds}, taken)
 
 
 def _reason(pair: Mapping[str, Cloud]) -> str:

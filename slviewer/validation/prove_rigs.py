@@ -29,7 +29,7 @@ from slviewer.pipeline.feedback import Progress, unheard
 from slviewer.pipeline.simulate import TARGET, one_axis
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
-from slviewer.simulation.boards import Shape
+from slviewer.simulation.boards import BoardShape
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
@@ -46,14 +46,14 @@ JUDGED = ("stereo", "splined", FLOOR)
 
 
 @dataclass(frozen=True)
-class Case:
+class RigCase:
     """A simulated rig of the Letter's kind, and the board that it is calibrated with."""
 
     name: str
     seed: int = 0
     fine: bool = False
     local_distortion_px: float | None = None
-    shape: Shape = field(default_factory=Shape)
+    shape: BoardShape = field(default_factory=BoardShape)
 
     def rig(self, scale: float) -> SimulatedRig:
         """At so many times the Letter's resolution."""
@@ -61,18 +61,18 @@ class Case:
         return letter(scale, self.seed, local_distortion_px=self.local_distortion_px, texture=texture)
 
 
-BENT = Shape(bow_x_mm=0.1, bow_y_mm=0.1, twist_mm=0.05, misplaced_mm=0.02)
+BENT = BoardShape(bow_x_mm=0.1, bow_y_mm=0.1, twist_mm=0.05, misplaced_mm=0.02)
 
 
-def cases(seed: int = 0) -> tuple[Case, ...]:
+def cases(seed: int = 0) -> tuple[RigCase, ...]:
     """The default rig and five others; another seed makes six others of the same kinds."""
     return (
-        Case("coarse", seed),
-        Case("fine", seed + 1, fine=True),
-        Case("coarse, bent board", seed + 2, shape=BENT),
-        Case("fine and strong, bent board", seed + 3, fine=True, local_distortion_px=0.2, shape=BENT),
-        Case("coarse again", seed + 4),
-        Case("none", seed + 5, local_distortion_px=0.0),
+        RigCase("coarse", seed),
+        RigCase("fine", seed + 1, fine=True),
+        RigCase("coarse, bent board", seed + 2, shape=BENT),
+        RigCase("fine and strong, bent board", seed + 3, fine=True, local_distortion_px=0.2, shape=BENT),
+        RigCase("coarse again", seed + 4),
+        RigCase("none", seed + 5, local_distortion_px=0.0),
     )
 
 
@@ -93,7 +93,7 @@ class RigFigures:
     """What one rig came to: planes by name, and errors in mm by model, of spheres' radii and of the spacings of their
     centres. ``seconds`` by stage."""
 
-    case: Case
+    case: RigCase
     planes: Mapping[str, PlaneFigures]
     radius_mm: Mapping[str, Mapping[str, float]]
     spacing_mm: Mapping[str, Mapping[str, float]]
@@ -110,7 +110,7 @@ class RigFigures:
         return float(np.mean([p.predicted_mm for p in self.planes.values()]))
 
 
-def measure_rig(case: Case, scale: float, poses: int, progress: Progress = unheard) -> RigFigures:
+def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = unheard) -> RigFigures:
     """Calibrate a rig from ``poses`` rendered captures of its board, and measure ten planes and six spheres with it."""
     rig = case.rig(scale)
     board = Board.parse(TARGET)

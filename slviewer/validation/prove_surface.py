@@ -11,7 +11,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.fuse import fuse
 from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
 from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.validation.prove_accuracy import Check
+from slviewer.validation.prove_accuracy import BandCheck
 
 OVER_SINGLE = 1.3
 """A fused surface's deviation over that of the best single scan, at most."""
@@ -29,13 +29,13 @@ class SurfaceProof:
     meshed: Meshed
 
     @property
-    def checks(self) -> tuple[Check, ...]:
+    def checks(self) -> tuple[BandCheck, ...]:
         """All that is demanded."""
         ratio = self.fused_mm / min(self.single_mm.values())
         return (
-            Check("three depths, fused", "RMS deviation over the best single scan's", ratio, 0.3, OVER_SINGLE),
-            Check("turn, mesh", "RMS deviation from the true mesh in mm", self.turned_mm, 0.005, MESH_MM),
-            Check("turn, mesh", "watertight", float(self.meshed.topology.watertight), 1.0, 1.0),
+            BandCheck("three depths, fused", "RMS deviation over the best single scan's", ratio, 0.3, OVER_SINGLE),
+            BandCheck("turn, mesh", "RMS deviation from the true mesh in mm", self.turned_mm, 0.005, MESH_MM),
+            BandCheck("turn, mesh", "watertight", float(self.meshed.topology.watertight), 1.0, 1.0),
         )
 
     def text(self) -> str:

@@ -15,8 +15,8 @@ from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.feedback import Progress, part, unheard
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.validation.faulty_captures import Bench
-from slviewer.validation.prove_rigs import Case, cases
+from slviewer.validation.faulty_captures import FaultBench
+from slviewer.validation.prove_rigs import RigCase, cases
 
 POSES = 25
 BAND = (0.7, 1.5)
@@ -120,9 +120,9 @@ def prove_uncertainty(
     return UncertaintyProof(tuple(found), scale, poses)
 
 
-def calibrated(case: Case, rig: SimulatedRig, poses: int, progress: Progress = unheard) -> SplinedModel:
+def calibrated(case: RigCase, rig: SimulatedRig, poses: int, progress: Progress = unheard) -> SplinedModel:
     """The splined model from rendered target poses."""
-    bench = Bench(rig, count=poses, shape=case.shape)
+    bench = FaultBench(rig, count=poses, shape=case.shape)
     looks = []
     for i in range(poses):
         progress(0.7 * i / poses, f"{case.name}: pose {i + 1} of {poses}")

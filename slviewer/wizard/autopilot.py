@@ -10,7 +10,7 @@ import numpy as np
 from slviewer.devices.world import Thing
 from slviewer.errors import Cancelled, SlviewerError
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measured_surface import Place, Surface
+from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
@@ -167,7 +167,7 @@ def _good_poses(snapshot: Snapshot) -> int:
     return sum(pose.state in ("good", "used", "left out") for pose in poses)
 
 
-def _cap(on: Surface) -> Region:
+def _cap(on: MeasuredSurface) -> Region:
     """What lies around the point that is nearest to the camera, half as far as anything measured."""
     z = np.where(on.measured, on.points[..., 2], np.inf)
     top = on.points[np.unravel_index(int(np.argmin(z)), z.shape)]
@@ -175,7 +175,7 @@ def _cap(on: Surface) -> Region:
     return Region.ball(top, 0.5 * float(np.percentile(away, 95)))
 
 
-def _across(on: Surface) -> tuple[Place, Place]:
+def _across(on: MeasuredSurface) -> tuple[Place, Place]:
     """The two ends of the image row in which most was measured."""
     v = int(np.argmax(on.measured.sum(axis=1)))
     columns = np.flatnonzero(on.measured[v])

@@ -51,7 +51,7 @@ def take_pose(engine: Engine, name: str | None = None) -> None:
 def take_scan(engine: Engine, purpose: Purpose, label: str, follow: Callable[[str], object]) -> None:
     """Capture anything but the target, and `follow(name)` once it is saved."""
     store = engine.store
-    view = engine.teller.now().session
+    view = engine.publisher.now().session
     if view is None or view.calibration is None:
         raise InputError("calibrate first: without a calibration a capture cannot be measured")
     sequence = sequence_for_poses(engine)
@@ -82,7 +82,7 @@ def _take(
     def saved() -> None:
         engine.queue_unfinished()
         follow()
-        engine.teller.changed(session=True)
+        engine.publisher.changed(session=True)
         if bench is not None and bench.reel is not None:
             if engine.acquisition.view().light in ("dark", "pattern"):  # which the next one may not hold
                 engine.acquisition.shine("white")

@@ -18,7 +18,7 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.frame_residuals import keep_residuals
-from slviewer.pipeline.rig_choice import Bench, Choice, SetUp, needs_page
+from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, needs_page
 from slviewer.pipeline.rig_presets import save_rig
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
@@ -31,9 +31,9 @@ from slviewer.wizard.live_scan import Live, LiveCloud
 from slviewer.wizard.notices import Notices
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
-from slviewer.wizard.publisher import Teller
+from slviewer.wizard.publisher import Publisher
 from slviewer.wizard.result_views import thumbnail
-from slviewer.wizard.session_reader import Reader
+from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import PreviewView, RigView, SessionView, Snapshot, Space, WorldView
 from slviewer.wizard.steps import Brightness, Facts, views
 
@@ -55,12 +55,12 @@ class Engine:
         self.live_listeners: list[Callable[[LiveCloud], None]] = []
         self.hands_free = HandsFree()
         self.autopilot = ""
-        self.bench: Bench | None = None
+        self.bench: RigSetup | None = None
         self.preflight: Preflight | None = None  # of the rig in use
         self.not_merged = ""  # why, where the latest merge that was asked for came to nothing
         self._choice: Choice | None = None
         self._rig_fault = ""  # why the chosen rig could not even be set up
-        self._reader: Reader | None = None
+        self._reader: SessionReader | None = None
         self._session_view: SessionView | None = None
         self._unreadable = 0
         self._enough = False  # whether the poses were, when that was last known for sure
@@ -68,13 +68,13 @@ class Engine:
         self._brightness: Brightness = ""
         nothing = Facts(None, RigView(), None)
         empty = Snapshot(0, None, RigView(), None, None, (), views(nothing), None, False, "")
-        self.teller = Teller(self._make_snapshot, empty)
-        self.notices = Notices(self.teller.changed)
-        self.jobs = Jobs(self.notices, self.teller.changed)
-        self._planner = Planner(lambda: self.teller.changed(session=True))
+        self.publisher = Publisher(self._make_snapshot, empty)
+        self.notices = Notices(self.publisher.changed)
+        self.jobs = Jobs(self.notices, self.publisher.changed)
+        self._planner = Planner(lambda: self.publisher.changed(session=True))
         self.watcher = Watcher(self._seen)
-        self.acquisition = Acquisition(self.notices, self.teller.changed, self.watcher.offer)
-        self.teller.start()
+        self.acquisition = Acquisition(self.notices, self.publisher.changed, self.watcher.offer)
+        self.publisher.start()
 
     # session and rig
 
@@ -84,7 +84,7 @@ class Engine:
         return None if reader is None else reader.session
 
     @property
-    def reader(self) -> Reader:
+    def reader(self) -> SessionReader:
         """Of the open session. Raises SessionError where none is open."""
         reader = self._reader
         if reader is None:
@@ -118,7 +118,7 @@ class Engine:
             store = Session.open_or_create(path)
             self.acquisition.unstream()
             self.jobs.cancel_all()
-            self._reader, self._session_view, self._queued = Reader(store, self._planner), None, set()
+            self._reader, self._session_view, self._queued = SessionReader(store, self._planner), None, set()
             self._enough, self.not_merged = False, ""
             if before is not None:
                 before.close()
@@ -209,7 +209,7 @@ class Engine:
         self.watcher.close()
         self.jobs.close()
         self._planner.close()
-        self.teller.close()
+        self.publisher.close()
         with self.lock:
             if self.session is not None:
                 self.session.close()
@@ -240,7 +240,7 @@ class Engine:
             self.jobs.submit(
                 f"Looking at {capture.name}",
                 partial(self._finish, reader, capture),
-                lambda _: self.teller.changed(session=True),
+                lambda _: self.publisher.changed(session=True),
                 failed=partial(self._judging_failed, reader, capture),
                 background=True,
             )
@@ -251,27 +251,27 @@ class Engine:
             self._queued = {key for key in self._queued if key[0] != capture.hash}
         self.queue_unfinished()
 
-    def _finish(self, reader: Reader, capture: Capture, report: Reporter) -> None:
+    def _finish(self, reader: SessionReader, capture: Capture, report: Reporter) -> None:
         if capture.name not in reader.session.capture_names():
             return  # deleted since
         if not reader.has_thumbnail(capture):
             reader.add_thumbnail(capture, thumbnail(capture))
-            self.teller.changed(session=True)
+            self.publisher.changed(session=True)
         target = reader.target()
         if reader.lacks_judgement(capture, target):
             judged = tasks.judge_pose(reader.session, capture.name, Board.parse(target), report)
             if judged.observation is None:
                 self.notices.tell("warning", f"{capture.name} cannot be used: {judged.refused}")
-            self.teller.changed(session=True)  # before what may wait
+            self.publisher.changed(session=True)  # before what may wait
         if reader.session.state_of(f"trust/{capture.name}") != "fresh":
             for sentence in keep_residuals(reader.session.guarded(report.saving), capture.name):
                 self.notices.tell("warning", f"{capture.name}: {sentence}")
 
-    def _judging_failed(self, reader: Reader, capture: Capture, error: BaseException) -> None:
+    def _judging_failed(self, reader: SessionReader, capture: Capture, error: BaseException) -> None:
         self.notices.fail(f"Looking at {capture.name}", error)
         if isinstance(error, InputError):
             reader.add_unreadable(capture, str(error))
-        self.teller.changed(session=True)
+        self.publisher.changed(session=True)
 
     # previews
 
@@ -287,7 +287,7 @@ class Engine:
             brightness = ""
         if brightness != self._brightness:
             self._brightness = brightness
-            self.teller.changed()
+            self.publisher.changed()
         for listener in self.preview_listeners:
             listener(view)
 
@@ -299,7 +299,7 @@ class Engine:
     # snapshots
 
     def _make_snapshot(self, version: int, session_changed: bool) -> Snapshot:
-        """(On the teller's thread.)"""
+        """(On the publisher's thread.)"""
         reader, bench, rig = self._reader, self.bench, self.acquisition.view()
         if reader is not None and (session_changed or self._session_view is None):
             self._read(reader, rig, bench)
@@ -335,7 +335,7 @@ class Engine:
             not_merged=self.not_merged,
         )
 
-    def _read(self, reader: Reader, rig: RigView, bench: Bench | None) -> None:
+    def _read(self, reader: SessionReader, rig: RigView, bench: RigSetup | None) -> None:
         try:
             view = self._session_view = reader.read(rig, bench.focal_px if bench else None)
             self._unreadable = 0
@@ -346,7 +346,7 @@ class Engine:
         except (SlviewerError, OSError) as error:  # files were being changed, most likely: read them once more
             self._unreadable += 1
             if self._unreadable < _PATIENCE:
-                self.teller.changed(session=True)
+                self.publisher.changed(session=True)
             elif self._unreadable == _PATIENCE:  # told once, until it can be read again
                 self.notices.fail("Reading the session", error)
         self._watch()

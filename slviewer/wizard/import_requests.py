@@ -13,7 +13,7 @@ from slviewer.session import atomic
 from slviewer.session.importers.archive import unpack, unpacked_size
 from slviewer.session.names import safe_name
 from slviewer.wizard.jobs import Reporter
-from slviewer.wizard.requests import Asked, request
+from slviewer.wizard.requests import RequestHandler, request
 
 IMPORTING = "Importing"
 UNPACKED = "import"
@@ -21,7 +21,7 @@ UNPACKED = "import"
 T = TypeVar("T")
 
 
-class ImportRequests(Asked):
+class ImportRequests(RequestHandler):
     """Importing by the worker, with the function of the command line."""
 
     @request(IMPORTING)
@@ -43,7 +43,7 @@ class ImportRequests(Asked):
         def done(names: list[str]) -> None:
             engine.notices.tell("good", f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}")
             engine.queue_unfinished()
-            engine.teller.changed(session=True)
+            engine.publisher.changed(session=True)
 
         engine.jobs.submit(IMPORTING, partial(read, layout, options), done)
 

@@ -14,7 +14,7 @@ from slviewer.geometry.cuda_device import frame_room
 
 
 @dataclass(eq=False)
-class Shot:
+class LiveCapture:
     """One short capture: frames (n, h, w); when its first frame was asked for, by `time.monotonic`; the settings."""
 
     frames: np.ndarray
@@ -34,8 +34,8 @@ class Stream:
         self.sequence, self._on_end = sequence, on_end
         self._condition = threading.Condition()
         self._free: list[np.ndarray] = []
-        self._waiting: Shot | None = None
-        self._read: Shot | None = None
+        self._waiting: LiveCapture | None = None
+        self._read: LiveCapture | None = None
         self._over = False
         self.taken = 0
         """Captures that are whole, those included that nobody read."""
@@ -58,13 +58,13 @@ class Stream:
         else:
             rig.projector.show(count - 1)  # one that changed during this exposure says so only when it is asked again
             last = frames[-1].copy()
-            self._give(Shot(frames, begun, settings))
+            self._give(LiveCapture(frames, begun, settings))
             return last
         with self._condition:
             self._free.append(frames)
         return None
 
-    def next(self) -> Shot | None:
+    def next(self) -> LiveCapture | None:
         """Wait for a capture that was not read yet, the newest; its frames stay as they are until the next call.
         None once the stream has ended.
         """
@@ -76,12 +76,12 @@ class Stream:
             self._read, self._waiting = self._waiting, None
             return self._read
 
-    def kept(self) -> Shot | None:
+    def kept(self) -> LiveCapture | None:
         """A copy of the capture that was read last; None before the first."""
         with self._condition:
             if self._read is None:
                 return None
-            return Shot(self._read.frames.copy(), self._read.begun, self._read.settings)
+            return LiveCapture(self._read.frames.copy(), self._read.begun, self._read.settings)
 
     @property
     def over(self) -> bool:
@@ -103,13 +103,13 @@ class Stream:
             return frame_room(shape, dtype)
         return found
 
-    def _give(self, shot: Shot) -> None:
+    def _give(self, shot: LiveCapture) -> None:
         with self._condition:
             self._recycle(self._waiting)  # nobody was quick enough for it
             self._waiting = shot
             self.taken += 1
             self._condition.notify_all()
 
-    def _recycle(self, shot: Shot | None) -> None:
+    def _recycle(self, shot: LiveCapture | None) -> None:
         if shot is not None:
             self._free.append(shot.frames)

@@ -10,10 +10,10 @@ from slviewer.fringe.presets import short
 from slviewer.pipeline.capture import keep
 from slviewer.wizard.capture_requests import check_space, depth_axis, next_name
 from slviewer.wizard.live_scan import Live, LiveCloud
-from slviewer.wizard.requests import Asked, request
+from slviewer.wizard.requests import RequestHandler, request
 
 
-class LiveRequests(Asked):
+class LiveRequests(RequestHandler):
     """Starting, ending and keeping; and hearing of its clouds."""
 
     @abstractmethod
@@ -24,7 +24,7 @@ class LiveRequests(Asked):
     def start_live(self) -> None:
         """Show clouds while patterns run, until `stop_live`, a capture, another rig or session, or a fault."""
         engine = self._engine
-        view = engine.teller.now().session
+        view = engine.publisher.now().session
         if view is None or view.calibration is None:
             raise InputError("calibrate first: without a calibration nothing can be measured live")
         bench, store = engine.bench, engine.store
@@ -35,7 +35,7 @@ class LiveRequests(Asked):
         axis = depth_axis(view.calibration)
         sequence = replace(short(bench.rig.projector.size, axis), levels=engine.reader.levels())
         live = Live(
-            store, axis, sequence, engine.acquisition, engine.notices, engine.publish_live, engine.teller.changed
+            store, axis, sequence, engine.acquisition, engine.notices, engine.publish_live, engine.publisher.changed
         )
         live.start()
         engine.live = live

@@ -19,12 +19,12 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.models import check_accepted, insisted, load_model, load_stereo, preferred
 from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.axis_agreement import check_sizes
-from slviewer.reconstruction.onepass import OnePass, Scan
+from slviewer.reconstruction.onepass import OnePass, PassResult
 from slviewer.reconstruction.onepass_cuda import has_pass, one_pass
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.session.store import Session
 from slviewer.wizard.acquisition import Acquisition
-from slviewer.wizard.live_frames import Shot, Stream
+from slviewer.wizard.live_frames import LiveCapture, Stream
 from slviewer.wizard.live_motion import hide_moved
 from slviewer.wizard.notices import Notices
 from slviewer.wizard.snapshot import LiveView
@@ -125,7 +125,7 @@ class Live:
                 self._told = now
                 self._changed()
 
-    def _cloud(self, shot: Shot) -> LiveCloud:
+    def _cloud(self, shot: LiveCapture) -> LiveCloud:
         assert self._model is not None
         points, texture = self._model.current().cloud(shot.frames)
         self._number += 1
@@ -144,7 +144,7 @@ class Measuring:
     factor: float = 1.0
     calibrated: StereoRig | None = None
     _fast: OnePass | None = field(init=False, repr=False, default=None)
-    _before: Scan | None = field(init=False, repr=False, default=None)
+    _before: PassResult | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         if has_pass(self.model):
@@ -172,7 +172,7 @@ class Measuring:
             points *= np.float32(self.factor)
         return points, frames[-1].copy()
 
-    def _room(self) -> Scan | None:
+    def _room(self) -> PassResult | None:
         """The arrays of the scan before, but its points, which somebody may be drawing."""
         before = self._before
         return None if before is None else replace(before, points=np.empty_like(before.points))

@@ -13,7 +13,7 @@ from slviewer.inspection.regions import Region
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline import measurements
 from slviewer.pipeline.compare import Compared, compare_surface
-from slviewer.pipeline.measured_surface import Place, Surface
+from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.session import atomic
 from slviewer.session.measurements import Measurement
 from slviewer.session.names import safe_name
@@ -21,7 +21,7 @@ from slviewer.session.nominal import Units, read_nominal
 from slviewer.session.store import Session
 from slviewer.wizard.export_files import delivered
 from slviewer.wizard.jobs import Reporter
-from slviewer.wizard.requests import Asked, request
+from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.surfaces import NOMINALS, Surfaces
 
 TABLE = "measurements.csv"
@@ -29,12 +29,12 @@ MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 T = TypeVar("T")
 
 
-class MeasureRequests(Asked):
+class MeasureRequests(RequestHandler):
     """Measuring on a scan or a merge, each by the worker; and the list of what was measured."""
 
     _surfaces: Surfaces
 
-    def surface(self, name: str) -> Surface:
+    def surface(self, name: str) -> MeasuredSurface:
         """A scan or merge as it is measured on; reading it takes its time, and InputError says why it cannot be."""
         return self._surfaces.of(self._engine.store, name)
 
@@ -149,7 +149,7 @@ class MeasureRequests(Asked):
 
         self._submit("Writing the table", work, str)
 
-    def _measure(self, on: str, make: Callable[[Session, Surface], Measurement]) -> None:
+    def _measure(self, on: str, make: Callable[[Session, MeasuredSurface], Measurement]) -> None:
         store = self._engine.store
 
         def work(report: Reporter) -> Measurement:

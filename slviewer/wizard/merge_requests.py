@@ -11,7 +11,7 @@ from slviewer.registration.refusal import Refused
 from slviewer.wizard import tasks
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.notices import words_for
-from slviewer.wizard.requests import Asked, request
+from slviewer.wizard.requests import RequestHandler, request
 
 MERGING = "Merging"
 _ELSEWHERE = {
@@ -24,7 +24,7 @@ _ELSEWHERE = {
 T = TypeVar("T")
 
 
-class MergeRequests(Asked):
+class MergeRequests(RequestHandler):
     """Merging scans by the worker; what could not be merged is told until the next try."""
 
     @request(MERGING)
@@ -59,7 +59,7 @@ class MergeRequests(Asked):
     @request("Undoing the merge")
     def undo_merge(self) -> None:
         """Move the current merge to the trash; the one before it is current again."""
-        view, store = self._engine.teller.now().session, self._engine.store
+        view, store = self._engine.publisher.now().session, self._engine.store
         if view is None or view.merge is None:
             raise InputError("there is no merge to take back")
         store.trash_result(f"merge/{view.merge.name}")

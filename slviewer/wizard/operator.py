@@ -18,7 +18,7 @@ from slviewer.devices.world import Thing
 from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.calibrate import CalibrationResult
-from slviewer.pipeline.check_results import Preflight, Verdict
+from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.pipeline.export import FORMATS, What, check_export
 from slviewer.pipeline.models import available, check_accepted, insist, insisted
 from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
@@ -42,7 +42,7 @@ from slviewer.wizard.requests import request
 from slviewer.wizard.snapshot import Level, PreviewView, Snapshot
 from slviewer.wizard.surfaces import Surfaces
 
-_CHECKED: dict[Verdict, tuple[Level, str]] = {
+_CHECKED: dict[CheckVerdict, tuple[Level, str]] = {
     "good": ("good", "the rig is fit to capture with"),
     "warning": ("warning", "the rig can capture, and could do better: the step Rig says how"),
     "bad": ("error", "the rig is not fit to capture with: the step Rig says what to mend"),
@@ -93,7 +93,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
 
     def snapshot(self) -> Snapshot:
         """The latest snapshot."""
-        return self._engine.teller.latest
+        return self._engine.publisher.latest
 
     def preview(self) -> PreviewView | None:
         """The latest preview; None until there is one."""
@@ -107,7 +107,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
         Changes that come fast are told together. A callback must return soon.
         """
         engine = self._engine
-        stop = engine.teller.listen(callback)
+        stop = engine.publisher.listen(callback)
         with engine.lock:
             if preview is not None:
                 engine.preview_listeners = [*engine.preview_listeners, preview]
@@ -121,7 +121,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
 
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
         """The first snapshot for which `condition` holds; None where it took longer."""
-        return self._engine.teller.wait_for(condition, timeout_s)
+        return self._engine.publisher.wait_for(condition, timeout_s)
 
     def settle(self, timeout_s: float = 60.0) -> Snapshot:
         """The snapshot after all captures and jobs that were asked for, with the next pose chosen.
@@ -137,7 +137,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
             )
             if idle is None:
                 raise SlviewerError(f"there is still work to be done after {timeout_s:g} s: cancel it, or wait longer")
-            now = engine.teller.now()
+            now = engine.publisher.now()
             if now.session is None or not now.session.planning:
                 return now
 
@@ -265,7 +265,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
 
     def place_at_suggestion(self) -> bool:
         """Put the simulated board where the next pose is suggested."""
-        view = self._engine.teller.now().session
+        view = self._engine.publisher.now().session
         if view is None or view.suggestion is None:
             self._engine.notices.tell("error", "no pose is suggested yet: choose a rig and a target first")
             return False
@@ -350,11 +350,11 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
 
         def done(result: CalibrationResult) -> None:
             engine.notices.tell(*tasks.told_calibration(result))
-            engine.teller.changed(session=True)
+            engine.publisher.changed(session=True)
 
         def failed(error: BaseException) -> None:
             engine.notices.fail("Calibrating", error)
-            engine.teller.changed(session=True)  # what was rejected is kept, to look into
+            engine.publisher.changed(session=True)  # what was rejected is kept, to look into
 
         engine.jobs.submit(
             "Calibrating", lambda r: tasks.make_calibration(store, target, r, self._warn), done, failed=failed
@@ -404,7 +404,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
         by default. `name` is the scan of a cloud or a mesh, and the model of coefficients; a merge is the current one.
         `plan` says how to mesh.
         """
-        store, view = self._engine.store, self._engine.teller.now().session
+        store, view = self._engine.store, self._engine.publisher.now().session
         chosen = file_format or FORMATS.get(what, ("",))[0]
         check_export(what, chosen)
         if what not in ("report", "table"):
@@ -429,7 +429,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
     def diagnostic_bundle(self) -> None:
         """Write a zip with versions, settings, logs and small previews, no frames, into the exports."""
         engine = self._engine
-        store, snapshot = engine.store, engine.teller.now()
+        store, snapshot = engine.store, engine.publisher.now()
         self._submit(
             "Collecting diagnostics",
             lambda r: diagnostics.write_bundle(store, snapshot, engine.preview, engine.log, r),
@@ -460,7 +460,7 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
     def show_act(self, act: str) -> None:
         """Show in the snapshot what the autopilot does now; empty when it has ended."""
         self._engine.autopilot = act
-        self._engine.teller.changed()
+        self._engine.publisher.changed()
 
     def tell(self, level: Level, text: str) -> None:
         """Put a sentence of the caller's own among the notices."""
@@ -488,6 +488,6 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
 
         def done(result: T) -> None:
             self._engine.notices.tell("good", sentence(result))
-            self._engine.teller.changed(session=True)
+            self._engine.publisher.changed(session=True)
 
         self._engine.jobs.submit(name, make, done, failed=failed)

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from slviewer.wizard.notices import log
-from slviewer.wizard.pose_plan import Plan
+from slviewer.wizard.pose_plan import PosePlan
 from slviewer.wizard.preview_watcher import Latest
 
 KEPT = 8
 """Plans remembered: who excludes a pose and includes it again need not wait twice."""
 
 
-class Asked(NamedTuple):
+class PlanRequest(NamedTuple):
     """What a plan depends on: the board's notation, the sizes of camera and projector, (name, hash) of each pose's
     frames, the hash of the calibration (empty: none), the nominal focal length, and how many poses were refused."""
 
@@ -28,9 +28,9 @@ class Asked(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    asked: Asked
-    think: Callable[[], Plan]
-    at_hand: Plan
+    asked: PlanRequest
+    think: Callable[[], PosePlan]
+    at_hand: PosePlan
 
 
 class Planner:
@@ -42,14 +42,14 @@ class Planner:
     def __init__(self, changed: Callable[[], None]) -> None:
         self._changed = changed
         self._lock = threading.Lock()
-        self._plans: dict[Asked, Plan] = {}
-        self._last: tuple[Asked, Plan] | None = None
+        self._plans: dict[PlanRequest, PosePlan] = {}
+        self._last: tuple[PlanRequest, PosePlan] | None = None
         self._task: _Task | None = None
         self._thread = Latest("slviewer planner", self._work)
 
     def plan(
-        self, asked: Asked, at_hand: Callable[[Plan | None], Plan], think: Callable[[], Plan]
-    ) -> tuple[Plan, bool]:
+        self, asked: PlanRequest, at_hand: Callable[[PosePlan | None], PosePlan], think: Callable[[], PosePlan]
+    ) -> tuple[PosePlan, bool]:
         """(the plan, whether `think()` is still at it).
 
         Meanwhile `at_hand(before)` answers, where `before` is the last plan for the same board and devices, with those

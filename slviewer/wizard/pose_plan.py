@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.calibration.guidance.bench import Expected, GuidanceBench
 from slviewer.calibration.guidance.choosing import Guidance, guide
+from slviewer.calibration.guidance.coarse_rig import Expected, GuidanceBench
 from slviewer.calibration.guidance.rough import LEAST_POSES as LEAST_FOR_A_RIG
 from slviewer.calibration.guidance.rough import rough_rig
 from slviewer.calibration.next_pose import (
@@ -33,7 +33,7 @@ from slviewer.target.board import Board
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
+class PoseFeatures:
     """What a pose's observation says of its board: points (n, 3) mm, camera and projector (n, 2) px; and how noisy the
     projector's coordinates of its bright places are, px (NaN: not known)."""
 
@@ -51,7 +51,7 @@ LEAST_POSES = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class PosePlan:
     """Poses as far as they are known, what they cover, and what should come next.
 
     ``sigma_mm``: the 3D standard deviation that a calibration from these poses is predicted to have over the working
@@ -76,11 +76,11 @@ def plan(
     board: Board,
     camera: tuple[int, int],
     projector: tuple[int, int],
-    features: Mapping[str, Features],
+    features: Mapping[str, PoseFeatures],
     stereo: StereoModel | None,
     focal_px: float | None,
     refused: int,
-) -> Plan:
+) -> PosePlan:
     """The plan after poses with these `features`.
 
     The rig is the calibrated one if there is a `stereo` calibration of this camera, else what the poses tell; the lens,
@@ -110,13 +110,13 @@ def plan(
         except (InputError, np.linalg.LinAlgError):  # devices that share no view: what covers most may mend it
             guidance = None
     if guidance is None:
-        return Plan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
+        return PosePlan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
     T = guidance.poses[refused % len(guidance.poses)]
     next_mm = guidance.sigma_next_mm
-    return Plan(lens, poses, covered, described(board, lens, T), usual, guidance.sigma_mm, next_mm)
+    return PosePlan(lens, poses, covered, described(board, lens, T), usual, guidance.sigma_mm, next_mm)
 
 
-def takes_time(features: Mapping[str, Features], stereo: StereoModel | None, camera: tuple[int, int]) -> bool:
+def takes_time(features: Mapping[str, PoseFeatures], stereo: StereoModel | None, camera: tuple[int, int]) -> bool:
     """Whether `plan` has to ask a rig's information, rather than what poses cover."""
     return _calibrated(stereo, camera) or len(features) >= LEAST_FOR_A_RIG
 
@@ -125,12 +125,12 @@ def plan_at_hand(
     board: Board,
     camera: tuple[int, int],
     projector: tuple[int, int],
-    features: Mapping[str, Features],
+    features: Mapping[str, PoseFeatures],
     stereo: StereoModel | None,
     focal_px: float | None,
     refused: int,
-    before: Plan | None,
-) -> Plan:
+    before: PosePlan | None,
+) -> PosePlan:
     """What can be said at once, as in `plan`: where the poses are by the calibration, or by the lens of the plan
     `before`, and a suggestion by what they cover."""
     if _calibrated(stereo, camera):
@@ -143,20 +143,20 @@ def plan_at_hand(
     poses = _placed(features, lens, known)
     usual = USUAL_SIGMA * float(np.mean(depth_range(board, lens)))
     covered = coverage(board, lens, list(poses.values()))
-    return Plan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
+    return PosePlan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
 
 
 def _calibrated(stereo: StereoModel | None, camera: tuple[int, int]) -> bool:
     return stereo is not None and stereo.rig.camera.size == camera
 
 
-def _lens(seen: list[Features], camera: tuple[int, int], focal_px: float | None) -> Lens:
+def _lens(seen: list[PoseFeatures], camera: tuple[int, int], focal_px: float | None) -> Lens:
     if focal_px is not None:
         return nominal_lens(camera, focal_px)
     return estimated_lens([f.points for f in seen], [f.camera for f in seen], camera)
 
 
-def _placed(features: Mapping[str, Features], lens: Lens, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _placed(features: Mapping[str, PoseFeatures], lens: Lens, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """T_camera_board (4, 4) of each pose: as `known`, else as the lens says; without those that it cannot tell."""
     poses = {}
     for name, one in features.items():
@@ -170,7 +170,7 @@ def _spread(
     board: Board,
     lens: Lens,
     projector: tuple[int, int],
-    features: Mapping[str, Features],
+    features: Mapping[str, PoseFeatures],
     poses: Mapping[str, np.ndarray],
     refused: int,
 ) -> Suggestion | None:

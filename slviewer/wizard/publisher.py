@@ -1,4 +1,4 @@
-"""Who is told of changes: one thread that makes snapshots and hands them out, many changes at once."""
+"""Snapshots for subscribers: one thread makes and publishes them, one for many changes that come together."""
 
 import threading
 import time
@@ -11,8 +11,8 @@ PAUSE_S = 0.05
 """Between two snapshots: a panel needs no more than twenty a second."""
 
 
-class Teller:
-    """Makes a snapshot when something has changed, and tells everybody who listens.
+class Publisher:
+    """Makes a snapshot when something has changed, and publishes it to every listener.
 
     `make(version, session_changed)` is called on this thread, or by `now`; never by two at a time.
     """
@@ -24,7 +24,7 @@ class Teller:
         self._changed, self._session_changed, self._closing = False, False, False
         self._latest = first
         self._listeners: dict[int, Callable[[Snapshot], None]] = {}
-        self._thread = threading.Thread(target=self._serve, name="slviewer teller", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="slviewer publisher", daemon=True)
 
     def start(self) -> None:
         """Begin to make snapshots: once everything is there that `make` looks at."""
@@ -42,13 +42,13 @@ class Teller:
         return self._latest
 
     def now(self) -> Snapshot:
-        """A snapshot of this moment, told to everybody."""
+        """A snapshot of this moment, published to every listener."""
         self.changed(session=True)
-        self._tell()
+        self._publish()
         return self._latest
 
     def listen(self, callback: Callable[[Snapshot], None]) -> Callable[[], None]:
-        """Call back with every snapshot from now on, on the teller's thread; returns how to stop that."""
+        """Call back with every snapshot from now on, on the publisher's thread; returns how to stop that."""
         with self._condition:
             number = max(self._listeners, default=0) + 1
             self._listeners[number] = callback
@@ -83,10 +83,10 @@ class Teller:
                 self._condition.wait_for(lambda: self._changed or self._closing)
                 if self._closing:
                     return
-            self._tell()
+            self._publish()
             time.sleep(PAUSE_S)
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         with self._making:
             with self._condition:
                 if not self._changed:

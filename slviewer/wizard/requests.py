@@ -7,14 +7,14 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 from slviewer.wizard.engine import Engine
 
 
-class Asked:
+class RequestHandler:
     """Whoever takes requests for an engine."""
 
     _engine: Engine
 
 
 P = ParamSpec("P")
-Self = TypeVar("Self", bound=Asked)
+Self = TypeVar("Self", bound=RequestHandler)
 Request = Callable[Concatenate[Any, P], bool]
 
 
@@ -30,7 +30,7 @@ def request(doing: str) -> Callable[[Callable[Concatenate[Self, P], None]], Requ
                 self._engine.notices.fail(doing, error)
                 return False
             finally:
-                self._engine.teller.changed(session=True)
+                self._engine.publisher.changed(session=True)
             return True
 
         return ask

@@ -34,8 +34,8 @@ from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard.export_files import listed
-from slviewer.wizard.planner import Asked, Planner
-from slviewer.wizard.pose_plan import Features, Plan, plan, plan_at_hand, takes_time
+from slviewer.wizard.planner import Planner, PlanRequest
+from slviewer.wizard.pose_plan import PoseFeatures, PosePlan, plan, plan_at_hand, takes_time
 from slviewer.wizard.snapshot import (
     CalibrationView,
     CentreDistance,
@@ -56,7 +56,7 @@ from slviewer.wizard.surfaces import nominals
 from slviewer.wizard.tasks import lacking_for_splined
 
 
-class Reader:
+class SessionReader:
     """Reads one session again and again, and keeps what is dear to read under its content hash."""
 
     def __init__(self, session: Session, planner: Planner) -> None:
@@ -185,11 +185,11 @@ class Reader:
         calibration: CalibrationView | None,
         rig: RigView,
         focal_px: float | None,
-    ) -> tuple[tuple[PoseView, ...], Plan | None, bool]:
+    ) -> tuple[tuple[PoseView, ...], PosePlan | None, bool]:
         """(the poses, the plan after them, whether it is still being thought of)."""
         excluded = self.session.excluded()
         used = self._meta("calibration/stereo").get("inputs", {}) if stereo is not None else {}
-        features: dict[str, Features] = {}
+        features: dict[str, PoseFeatures] = {}
         states: dict[str, tuple[PoseState, str]] = {}
         for name, capture in captures.items():
             if capture.role != "calibration":
@@ -210,7 +210,7 @@ class Reader:
             model = self._meta("calibration/stereo")["hash"] if trusted is not None else ""
             poses = tuple((name, captures[name].hash) for name in counted)
             board = Board.parse(target)
-            asked = Asked(target, camera, projector, poses, model, focal_px, refused)
+            asked = PlanRequest(target, camera, projector, poses, model, focal_px, refused)
             known = board, camera, projector, counted, trusted, focal_px, refused
             if takes_time(counted, trusted, camera):
                 at_hand = partial(plan_at_hand, *known)
@@ -219,7 +219,7 @@ class Reader:
                 planned = self._keep(asked, partial(plan, *known))
         return self._views(captures, states, features, planned, calibration, target), planned, planning
 
-    def _foreseen(self, planned: Plan) -> Foreseen:
+    def _foreseen(self, planned: PosePlan) -> Foreseen:
         decided = self.sigma_wanted_mm()
         wanted = planned.usual_mm if decided is None else decided
         return Foreseen(planned.sigma_mm, planned.sigma_next_mm, wanted, planned.reaches(wanted))
@@ -253,8 +253,8 @@ class Reader:
         self,
         captures: Mapping[str, Capture],
         states: Mapping[str, tuple[PoseState, str]],
-        features: Mapping[str, Features],
-        planned: Plan | None,
+        features: Mapping[str, PoseFeatures],
+        planned: PosePlan | None,
         calibration: CalibrationView | None,
         target: str,
     ) -> tuple[PoseView, ...]:
@@ -279,8 +279,8 @@ class Reader:
             )
         return tuple(views)
 
-    def _features(self, name: str, content_hash: str) -> Features:
-        def load() -> Features:
+    def _features(self, name: str, content_hash: str) -> PoseFeatures:
+        def load() -> PoseFeatures:
             said = ("points", "camera", "projector")
             try:
                 arrays = self.session.load_result(f"poses/{name}", only=(*said, "samples_sigma"))[1]
@@ -288,7 +288,7 @@ class Reader:
                 arrays = self.session.load_result(f"poses/{name}", only=said)[1]
             sigma = arrays.pop("samples_sigma", np.zeros(0))
             known = sigma[np.isfinite(sigma)]
-            return Features(**arrays, noise_px=float(np.median(known)) if known.size else np.nan)
+            return PoseFeatures(**arrays, noise_px=float(np.median(known)) if known.size else np.nan)
 
         return self._keep(("features", content_hash), load)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.pipeline.measured_surface import MERGED, Place, Surface, merged_surface, surface_of
+from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place, merged_surface, surface_of
 from slviewer.pipeline.models import load_model
 from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.cloud import Cloud
@@ -23,9 +23,9 @@ class Surfaces:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._key: tuple[str, str, str] | None = None
-        self._kept: Surface | None = None
+        self._kept: MeasuredSurface | None = None
 
-    def of(self, store: Session, name: str) -> Surface:
+    def of(self, store: Session, name: str) -> MeasuredSurface:
         """A capture's cloud as it was reconstructed, or a merge (``merge/<number>``).
 
         Raises InputError where there is none, or where what it was made from has changed since.
@@ -46,7 +46,7 @@ class Surfaces:
             return self._kept
 
 
-def _scanned(store: Session, name: str) -> Surface:
+def _scanned(store: Session, name: str) -> MeasuredSurface:
     meta, arrays = store.load_result(f"clouds/{name}")
     left = arrays.get("sigma_calibration")
     points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
@@ -54,7 +54,7 @@ def _scanned(store: Session, name: str) -> Surface:
     return surface_of(store, name, cloud, load_model(store, meta["model"]))
 
 
-def place_at(on: Surface, origin: np.ndarray, direction: np.ndarray) -> Place | None:
+def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> Place | None:
     """The measured point closest to a ray from origin (3,) mm along direction (3,), in the surface's frame; None where
     the ray passes it by."""
     index = nearest(on.points, origin, direction)
@@ -63,7 +63,7 @@ def place_at(on: Surface, origin: np.ndarray, direction: np.ndarray) -> Place | 
     return (index[1], index[0]) if on.organised else index[0]
 
 
-def point_at(on: Surface, place: Place) -> np.ndarray:
+def point_at(on: MeasuredSurface, place: Place) -> np.ndarray:
     """(3,) mm: the point of a place."""
     index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
     return np.asarray(on.points[index], np.float64)

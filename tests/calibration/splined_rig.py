@@ -10,7 +10,7 @@ from slviewer.calibration.splined import fields
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.simulation.board_kernels import intersect
-from slviewer.simulation.boards import FLAT, BoardScene, Pose, Shape, printed_board
+from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, printed_board
 from slviewer.simulation.plans import target_poses
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.target.board import Board
@@ -40,7 +40,7 @@ def observation(
     true: SimulatedRig,
     pose: Pose,
     name: str,
-    shape: Shape = FLAT,
+    shape: BoardShape = FLAT,
     samples: int = 1500,
     moved_mm: float = 0.0,
     axes: tuple[str, ...] = ("x", "y"),

@@ -5,13 +5,13 @@ import pytest
 from splined_rig import BOARD, poses, rig
 
 from slviewer.calibration.guidance import choosing
-from slviewer.calibration.guidance.bench import Expected, GuidanceBench
 from slviewer.calibration.guidance.choosing import guide, predicted_sigma
+from slviewer.calibration.guidance.coarse_rig import Expected, GuidanceBench
 from slviewer.calibration.guidance.information import Information, Sight
 from slviewer.calibration.guidance.rough import rough_rig
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
-from slviewer.wizard.pose_plan import LEAST_POSES, Features, plan
+from slviewer.wizard.pose_plan import LEAST_POSES, PoseFeatures, plan
 
 
 @pytest.fixture(autouse=True)
@@ -95,7 +95,7 @@ def test_noise_that_was_seen_is_expected() -> None:
 
 def test_a_plan_asks_until_the_wanted_sigma_is_reached(true, seen) -> None:
     sizes = true.camera.size, true.projector.size
-    features = {f"pose_{i:02d}": Features(*each) for i, each in enumerate(seen)}
+    features = {f"pose_{i:02d}": PoseFeatures(*each) for i, each in enumerate(seen)}
     nothing, few, many = (
         plan(BOARD, *sizes, dict(list(features.items())[:n]), None, None, 0) for n in (0, 4, LEAST_POSES)
     )

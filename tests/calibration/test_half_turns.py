@@ -11,7 +11,7 @@ from slviewer.calibration.splined.adjust import adjust
 from slviewer.calibration.splined.half_turns import may_be_turned, opposite
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import calibrate_stereo
-from slviewer.simulation.boards import Shape
+from slviewer.simulation.boards import BoardShape
 from slviewer.target.board import Board
 
 __all__ = ["coarse_knots"]  # a fixture for every test here
@@ -26,7 +26,7 @@ def true():
 
 @pytest.fixture(scope="module")
 def seen(true) -> list[Observation]:
-    shape = Shape(bow_x_mm=0.1, twist_mm=0.05, misplaced_mm=0.03)
+    shape = BoardShape(bow_x_mm=0.1, twist_mm=0.05, misplaced_mm=0.03)
     return [observation(true, pose, f"pose_{i:02d}", shape) for i, pose in enumerate(poses(true, 10))]
 
 

@@ -12,7 +12,7 @@ from slviewer.calibration.diagnosis.ripple import Ripple, phase_ripple
 from slviewer.calibration.diagnosis.solution import solution_evidence
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict, judge_splined
 from slviewer.calibration.observe import Observation, Samples
-from slviewer.calibration.splined.evidence import Noise, measured_noise
+from slviewer.calibration.splined.residual_noise import Noise, measured_noise
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 
 

@@ -15,7 +15,7 @@ from slviewer.errors import Cancelled, DeviceError, InputError
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import complementary, p18
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.simulation.boards import Pose, Shape
+from slviewer.simulation.boards import BoardShape, Pose
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -185,7 +185,7 @@ def test_each_thing_keeps_its_place(world, rig):
 
 def test_another_board_can_be_printed(world, rig):
     board = Board.parse("chessboard:9x6:15")
-    world.print_board(board, Shape(bow_x_mm=0.1))
+    world.print_board(board, BoardShape(bow_x_mm=0.1))
     assert world.board == board and world.shape.bow_x_mm == 0.1 and world.standing == "board"
     rig.projector.show_level(255)
     assert len(detect(board, seen(rig)).ids) == 54

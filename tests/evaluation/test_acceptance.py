@@ -10,7 +10,7 @@ import pytest
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact, Limits
-from slviewer.evaluation.acceptance.figures import Figure, decide, narrowest
+from slviewer.evaluation.acceptance.figures import AcceptanceFigure, decide, narrowest
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure
 from slviewer.evaluation.acceptance.places import bar_places, plane_places, sphere_places
 from slviewer.evaluation.acceptance.result import conclude
@@ -120,7 +120,7 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
         unsure = true_test.artefact
     errors = [0.005, -0.003, 0.001]
     u = unsure.at_measurement(unsure.spacing)[1]
-    assert decide([Figure.of_length(SPACING, "", error, u) for error in errors], limit) == decision
+    assert decide([AcceptanceFigure.of_length(SPACING, "", error, u) for error in errors], limit) == decision
     judged = conclude(replace(unsure, limits=Limits(spacing_mm=limit)), "stereo", true_test.positions)
     assert judged.decision in ("pass", "fail", "undecided") and judged.decision.upper() in judged.text()
     assert "claims conformity with neither" in judged.text()

@@ -13,7 +13,7 @@ from slviewer.gui.measure_words import deviation_figure, measurement_words, meas
 from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
-from slviewer.pipeline.measured_surface import Surface
+from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.session.measurements import Measurement
 from slviewer.wizard.surfaces import place_at
 
@@ -117,11 +117,13 @@ def test_words_of_measurements() -> None:
 
 def test_a_merge_is_painted_and_clicked_as_a_scan_is() -> None:
     points = np.stack([np.arange(5.0), np.zeros(5), np.full(5, 300.0)], axis=1).astype(np.float32)
-    merge = Surface(points, np.full(5, 0.1, np.float32), "merge/1", "stereo", {}, texture=np.full((5, 3), 9, np.uint8))
+    merge = MeasuredSurface(
+        points, np.full(5, 0.1, np.float32), "merge/1", "stereo", {}, texture=np.full((5, 3), 9, np.uint8)
+    )
     assert place_at(merge, np.zeros(3), points[3]) == 3
     drawn_points, painted, _ = painting(merge, "texture")
     assert drawn_points is not points and drawn_points.shape == painted.shape == (5, 3) and painted.max() == 9
     assert "along the normal" in text(painting(merge, "uncertainty")[2])
-    scan = Surface(points[None], np.full((1, 5), 0.1, np.float32), "scan_01", "stereo", {})
+    scan = MeasuredSurface(points[None], np.full((1, 5), 0.1, np.float32), "scan_01", "stereo", {})
     assert place_at(scan, np.zeros(3), points[3]) == (3, 0)
     assert "depth" in painting(scan, "texture")[2]  # where there is no texture

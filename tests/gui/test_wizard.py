@@ -15,7 +15,7 @@ from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose,
 
 from slviewer.devices.faults import Faults, breakable
 from slviewer.gui.app import App
-from slviewer.pipeline.rig_choice import Bench, Choice, set_up
+from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard import tasks
@@ -309,10 +309,10 @@ class Breakable:
 
     faults: Faults
 
-    def __call__(self, choice: Choice, board: Board | None) -> Bench:
+    def __call__(self, choice: Choice, board: Board | None) -> RigSetup:
         bench = set_up(choice, board)
         rig, self.faults = breakable(bench.rig)
-        return Bench(rig, bench.world, bench.focal_px)
+        return RigSetup(rig, bench.world, bench.focal_px)
 
 
 def test_a_fault_ends_one_capture_and_says_so(tmp_path: Path, browser: Browser) -> None:

@@ -8,7 +8,7 @@ from shapes_of_points import MIDDLE, cylinder, plane, sphere, strewn
 
 from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
-from slviewer.inspection.fitting import Fit, fit_feature, least_squares
+from slviewer.inspection.fitting import FeatureFit, fit_feature, least_squares
 from slviewer.inspection.uncertainty import scatter
 
 
@@ -111,6 +111,6 @@ def test_a_features_parameters_move_it_as_its_jacobian_says(kind) -> None:
 
 def test_a_fit_is_the_same_after_it_was_kept() -> None:
     found = fit_feature("sphere", sphere(2000, 50.0, 0.8, 0.02))
-    again = Fit.from_dict(json.loads(json.dumps(found.to_dict())), None)
+    again = FeatureFit.from_dict(json.loads(json.dumps(found.to_dict())), None)
     assert [q.text() for q in again.quantities()] == [q.text() for q in found.quantities()]
     assert "radius 50.0" in again.quantities()[0].text() and "± 0.0" in again.quantities()[0].text()

@@ -16,18 +16,18 @@ from slviewer.pipeline.models import available, rejection
 from slviewer.pipeline.poses import known
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.validation.faulty_captures import BOARD, Bench
+from slviewer.validation.faulty_captures import BOARD, FaultBench
 
 Run = Callable[..., tuple[int, str, str]]
 POSES = 7
 
 
 @pytest.fixture(scope="module")
-def bench() -> Bench:
-    return Bench(letter(0.2, 3), count=POSES, steps=6)
+def bench() -> FaultBench:
+    return FaultBench(letter(0.2, 3), count=POSES, steps=6)
 
 
-def fill(folder: Path, bench: Bench, period_px: float = 18.0, force: bool = False) -> None:
+def fill(folder: Path, bench: FaultBench, period_px: float = 18.0, force: bool = False) -> None:
     """Save the poses, their fringes described as of this period."""
     frames = tuple(replace(f, period_px=period_px) if f.kind == "phase" else f for f in bench.sequence.frames)
     sequence = replace(bench.sequence, frames=frames)
@@ -38,7 +38,7 @@ def fill(folder: Path, bench: Bench, period_px: float = 18.0, force: bool = Fals
 
 
 @pytest.fixture(scope="module")
-def good(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good(bench: FaultBench, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session with a sound calibration, to be copied before it is changed."""
     session = tmp_path_factory.mktemp("good") / "session"
     fill(session, bench)
@@ -63,7 +63,7 @@ def test_a_verdict_is_told_and_kept(session: Path, tmp_path: Path, run: Run) -> 
         assert rejection(store) == ""
 
 
-def test_a_rejected_calibration_is_kept_and_refused(bench: Bench, session: Path, tmp_path: Path, run: Run) -> None:
+def test_a_rejected_calibration_is_kept_and_refused(bench: FaultBench, session: Path, tmp_path: Path, run: Run) -> None:
     ply = tmp_path / "cloud.ply"
     fill(session, bench, period_px=16.0, force=True)
     status, _, error = run("calibrate", session, "--target", BOARD)
@@ -105,7 +105,7 @@ def test_where_nothing_came_of_it_the_session_keeps_what_it_had(session: Path, t
     assert run("reconstruct", session, "pose_00", "--out", tmp_path / "cloud.ply")[0] == 0
 
 
-def test_a_description_that_contradicts_itself(bench: Bench, tmp_path: Path, run: Run) -> None:
+def test_a_description_that_contradicts_itself(bench: FaultBench, tmp_path: Path, run: Run) -> None:
     session = tmp_path / "session"
     fill(session, bench, period_px=6.0)
     status, _, error = run("calibrate", session, "--target", BOARD)
@@ -115,7 +115,7 @@ def test_a_description_that_contradicts_itself(bench: Bench, tmp_path: Path, run
         assert verdict is not None and verdict.causes == ("fringe-period",)
 
 
-def test_a_pose_that_moved_is_left_out_with_its_reason(bench: Bench, session: Path, run: Run) -> None:
+def test_a_pose_that_moved_is_left_out_with_its_reason(bench: FaultBench, session: Path, run: Run) -> None:
     frames = bench.frames(2).copy()
     pose = bench.poses[2]
     half = len(frames) // 2
@@ -128,7 +128,7 @@ def test_a_pose_that_moved_is_left_out_with_its_reason(bench: Bench, session: Pa
 
 
 def test_gamma_below_five_steps_is_named_and_not_taken_for_another_period() -> None:
-    three = Bench(letter(0.2, 3), count=6, steps=3)
+    three = FaultBench(letter(0.2, 3), count=6, steps=3)
     curve = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
     sound = three.attempt([three.looked(i) for i in range(6)])
     bent = three.attempt([three.look(i, curve[three.frames(i)]) for i in range(6)])

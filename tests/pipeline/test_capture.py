@@ -14,7 +14,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.capture_phases import capture_texture
-from slviewer.pipeline.rig_choice import Bench, set_up
+from slviewer.pipeline.rig_choice import RigSetup, set_up
 from slviewer.pipeline.rig_presets import to_toml
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -137,8 +137,8 @@ def test_a_disk_without_room_is_found_before_the_capture(tmp_path: Path, monkeyp
 
 
 def test_colours_are_kept(tmp_path: Path):
-    def in_colour(choice, board) -> Bench:
-        return Bench(coloured(set_up(choice, board).rig))
+    def in_colour(choice, board) -> RigSetup:
+        return RigSetup(coloured(set_up(choice, board).rig))
 
     shot = capture(tmp_path / "session", "a", {**RIG, "scale": 0.1}, role="scan", set_up=in_colour)
     assert shot.texture is not None and shot.texture.shape == (120, 160, 3)

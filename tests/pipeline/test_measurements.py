@@ -16,7 +16,7 @@ from slviewer.evaluation.region import find_spheres
 from slviewer.fringe.presets import p18
 from slviewer.inspection.regions import Region
 from slviewer.pipeline import measurements
-from slviewer.pipeline.measured_surface import Surface, surface
+from slviewer.pipeline.measured_surface import MeasuredSurface, surface
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import one_axis
@@ -56,7 +56,7 @@ def made(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def balls(made) -> Surface:
+def balls(made) -> MeasuredSurface:
     return surface(made, "balls")
 
 

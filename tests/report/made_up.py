@@ -3,7 +3,7 @@
 import numpy as np
 
 from slviewer.report.data import (
-    CalibrationView,
+    CalibrationFigures,
     CaptureRow,
     CloudView,
     DeviceParameters,
@@ -249,7 +249,7 @@ def session_data(width: int = 1600) -> SessionData:
     return SessionData(
         name="Vase <script>alert(1)</script>",
         captures=captures,
-        calibration=CalibrationView(
+        calibration=CalibrationFigures(
             DeviceParameters(K, D, (width, height), 1.2),
             DeviceParameters(K * [[0.4], [0.8], [1]], -D, (912, 1140), 2.1),
             R,

@@ -12,7 +12,7 @@ from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.drift.check import Drift
 from slviewer.evaluation.crossvalidation import CrossValidation, HeldOut
 from slviewer.report.data import AcceptanceView, DriftRow, ModelsView, PlaneRow, SpacingRow
-from slviewer.report.page import Cell, Figure, Notice, Section, Table, write_page
+from slviewer.report.page import Cell, Figure, PageNotice, Section, Table, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
     reproduction_headlines,
@@ -32,7 +32,7 @@ def texts(section: Section) -> str:
             cells = [c for row in (*item.rows, *item.footer) for c in row]
             words += [item.caption, *item.notes, *(c.text if isinstance(c, Cell) else c for c in cells)]
         else:
-            words.append(item.text if isinstance(item, Notice) else item.caption)
+            words.append(item.text if isinstance(item, PageNotice) else item.caption)
     return "\n".join(words)
 
 
@@ -73,7 +73,7 @@ def test_the_letters_own_figures_stand_beside_ours(reproduction: list[Section]) 
 
 def test_where_pixelwise_loses_it_is_said(reproduction: list[Section]) -> None:
     planes = reproduction[1]
-    assert any(isinstance(i, Notice) and i.kind == "warning" and "plane_01" in i.text for i in planes.items)
+    assert any(isinstance(i, PageNotice) and i.kind == "warning" and "plane_01" in i.text for i in planes.items)
     table = next(i for i in planes.items if isinstance(i, Table))
     first, third = by_title(table, 0), by_title(table, 2)
     assert first["pixelwise", "RMS"] == Cell("0.219", "worse") and first["stereo", "RMS"] == Cell("0.134", "better")

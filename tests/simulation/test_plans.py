@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slviewer.errors import InputError
-from slviewer.simulation.boards import FLAT, Shape
+from slviewer.simulation.boards import FLAT, BoardShape
 from slviewer.simulation.plans import letter_plan, objects, planes, spheres, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -89,7 +89,7 @@ def test_the_plan_names_every_capture_and_its_truth_can_be_saved():
         record, arrays = truth_record(rig, scene)
         json.dumps(record)
         assert set(arrays) == ({"features", "camera", "projector"} if name.startswith("pose_") else set())
-    for shape, low, high in ((FLAT, 0.0, 0.0), (Shape(misplaced_mm=0.01), 0.008, 0.012)):
+    for shape, low, high in ((FLAT, 0.0, 0.0), (BoardShape(misplaced_mm=0.01), 0.008, 0.012)):
         board = letter_plan(rig, poses=3, shape=shape)["pose_01"]
         offset = (truth_record(rig, board)[1]["features"] - BOARD.points)[:, :2].std()
         assert low <= offset <= high

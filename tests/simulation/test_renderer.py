@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18, phase_steps
 from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.simulation.boards import Pose, Shape, blank_board, printed_board
+from slviewer.simulation.boards import BoardShape, Pose, blank_board, printed_board
 from slviewer.simulation.film import psf_taps
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
@@ -101,7 +101,7 @@ def test_circles_are_seen_where_they_are():
     rig = letter(0.5)
     board = Board.parse("circles:21x16:9")
     pose = Pose(rotation(np.array([0.25, -0.2, 0.05])), np.array([-88.0, -68.0, 600.0]))
-    scene = printed_board(board, pose, Shape(0.2, 0.1, -0.1, 0.02))
+    scene = printed_board(board, pose, BoardShape(0.2, 0.1, -0.1, 0.02))
     image = Renderer(rig, scene).capture(PatternSequence(PROJECTOR, (Frame("texture"),)))[0]
     detection = detect(board, image)
     error = detection.pixels - rig.camera.project(pose.to_camera(scene.features))[detection.ids]

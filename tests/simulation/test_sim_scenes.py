@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from slviewer.errors import InputError
-from slviewer.simulation.boards import Pose, Shape, blank_board, printed_board
+from slviewer.simulation.boards import BoardShape, Pose, blank_board, printed_board
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
@@ -25,7 +25,7 @@ def test_a_blank_board_lies_on_its_plane():
 
 
 def test_a_bowed_board_has_the_shape_it_says():
-    scene = blank_board(TILTED, shape=Shape(0.3, -0.2, 0.25))
+    scene = blank_board(TILTED, shape=BoardShape(0.3, -0.2, 0.25))
     surface = scene.trace(RIG.camera.rays())
     hit = np.isfinite(surface.points[..., 2])
     local = (surface.points[hit] - TILTED.t) @ TILTED.R
@@ -41,7 +41,7 @@ def test_a_bowed_board_has_the_shape_it_says():
 def test_printed_circles_cover_their_share_of_the_plate():
     board = Board.parse("circles:21x16:9")
     pose = Pose(np.eye(3), np.array([-90.0, -67.5, 620.0]))
-    scene = printed_board(board, pose, Shape(misplaced_mm=0.02), margin_mm=9)
+    scene = printed_board(board, pose, BoardShape(misplaced_mm=0.02), margin_mm=9)
     surface = scene.trace(RIG.camera.rays())
     per_pixel = np.prod(620 / np.array(RIG.camera.focal_px) / 0.25)  # mm^2, but for the lens's distortion
     local = surface.points[..., :2] - pose.t[:2]
@@ -49,7 +49,7 @@ def test_printed_circles_cover_their_share_of_the_plate():
     dark = (scene.white - surface.albedo[inner]).sum() / (scene.white - scene.dark)
     assert dark * per_pixel == pytest.approx(336 * np.pi * 2.25**2, rel=0.02)
     assert np.allclose(scene.misplacement.std(), 0.02, rtol=0.1)
-    again = printed_board(board, TILTED, Shape(misplaced_mm=0.02), margin_mm=9)
+    again = printed_board(board, TILTED, BoardShape(misplaced_mm=0.02), margin_mm=9)
     assert np.array_equal(scene.misplacement, again.misplacement)  # the same board at another pose
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from slviewer.validation.faulty_captures import FAULTS
-from slviewer.validation.prove_causes import Proof, prove_causes
+from slviewer.validation.prove_causes import CauseProof, prove_causes
 
 SINGLE = (
     "board transposed in one pose",
@@ -30,12 +30,12 @@ ALL = SINGLE + SHARE
 
 
 @pytest.fixture(scope="module")
-def proof() -> Proof:
+def proof() -> CauseProof:
     return prove_causes(0.15, faults=ALL, clean=1, poses=7, steps=6)
 
 
 @pytest.mark.parametrize("fault", ALL)
-def test_each_cause_is_named_first(proof: Proof, fault: str) -> None:
+def test_each_cause_is_named_first(proof: CauseProof, fault: str) -> None:
     case = next(case for case in proof.cases if case.name == fault)
     assert case.named, case.attempt.verdict.text()
     finding = case.attempt.verdict.findings[0]
@@ -45,14 +45,14 @@ def test_each_cause_is_named_first(proof: Proof, fault: str) -> None:
     assert alone or case.attempt.verdict.level != "good"
 
 
-def test_clean_calibrations_raise_no_alarm(proof: Proof) -> None:
+def test_clean_calibrations_raise_no_alarm(proof: CauseProof) -> None:
     clean = [case for case in proof.cases if case.cause is None]
     assert len(clean) == 1
     for case in clean:
         assert case.named and case.attempt.verdict.level == "good", case.attempt.verdict.text()
 
 
-def test_the_table_says_it_all(proof: Proof) -> None:
+def test_the_table_says_it_all(proof: CauseProof) -> None:
     assert proof.holds and f"{len(ALL) + 1} of {len(ALL) + 1} named rightly" in proof.text()
     data = json.loads(json.dumps(proof.to_json()))
     assert data["holds"] and data["confusion"]["none"] == {"none": 1}

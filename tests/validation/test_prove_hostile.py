@@ -7,7 +7,7 @@ import pytest
 
 from slviewer.errors import InputError, UsageError
 from slviewer.simulation.hostile import FAULTS
-from slviewer.validation.hostile_captures import Measured, Report
+from slviewer.validation.hostile_captures import CaseReport, MeasuredScan
 from slviewer.validation.prove_hostile import Figures, choose_cases, fit_gauge, judge, prove_hostile, score
 
 FLOOR = Figures(0.06, 0.06, 0.003, 0.99)
@@ -19,7 +19,7 @@ RIGHT, OTHER = frozenset({"flicker"}), frozenset({"projector-size"})
 
 
 def outcome(figures, *named, severity="medium", error=None):
-    return judge(FAULTS["flicker"], severity, Report([], list(named), error), figures, FLOOR)[0]
+    return judge(FAULTS["flicker"], severity, CaseReport([], list(named), error), figures, FLOOR)[0]
 
 
 def test_cases_are_judged_by_errors_and_by_what_was_said():
@@ -40,12 +40,12 @@ def test_a_rigid_motion_is_no_error_and_a_bend_is_one():
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     noise = rng.normal(0, 0.05, truth.shape) * [0, 0, 1]
     moved = (truth - [3, 4, 5]) @ turn + noise @ turn
-    measured = [Measured(moved, truth, np.full(4000, 0.05), np.ones(4000, bool), 5000)]
+    measured = [MeasuredScan(moved, truth, np.full(4000, 0.05), np.ones(4000, bool), 5000)]
     figures = score(measured, fit_gauge(measured))
     assert 0.045 < figures.rms_mm < 0.051 and figures.predicted_mm == pytest.approx(0.05)
     assert figures.gross < 0.006 and figures.coverage == 0.8
     bent = moved + 1e-4 * (truth[:, :1] ** 2) * [0, 0, 1]
-    measured = [Measured(bent, truth, np.full(4000, 0.05), np.ones(4000, bool), 5000)]
+    measured = [MeasuredScan(bent, truth, np.full(4000, 0.05), np.ones(4000, bool), 5000)]
     assert score(measured, fit_gauge(measured)).gross > 0.3
 
 

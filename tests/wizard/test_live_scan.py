@@ -17,7 +17,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import short
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.models import load_stereo, save_imported_stereo
-from slviewer.pipeline.rig_choice import Bench, Choice, set_up
+from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.simulation.truth import rig_record
@@ -49,10 +49,10 @@ class Wizard:
         assert self.operator.wait_for(lambda s: s.rig.state == "open", 10)
         self.operator.place("object")
 
-    def _set_up(self, choice: Choice, board: Board | None) -> Bench:
+    def _set_up(self, choice: Choice, board: Board | None) -> RigSetup:
         bench = set_up(choice, board)
         rig, self.faults = breakable(bench.rig)
-        return Bench(rig, bench.world, bench.focal_px)
+        return RigSetup(rig, bench.world, bench.focal_px)
 
     def goes_on(self, more: int = 3) -> None:
         seen = len(self.clouds)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slviewer.devices.faults import Faults, breakable
-from slviewer.pipeline.rig_choice import Bench, Choice, set_up
+from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard import acquisition, preview_watcher
@@ -27,10 +27,10 @@ class Breakable:
 
     faults: Faults
 
-    def __call__(self, choice: Choice, board: Board | None) -> Bench:
+    def __call__(self, choice: Choice, board: Board | None) -> RigSetup:
         bench = set_up(choice, board)
         rig, self.faults = breakable(bench.rig)
-        return Bench(rig, bench.world, bench.focal_px)
+        return RigSetup(rig, bench.world, bench.focal_px)
 
 
 @pytest.fixture

@@ -10,22 +10,24 @@ import pytest
 
 from slviewer.calibration.next_pose import coverage, described, nominal_lens
 from slviewer.target.board import Board
-from slviewer.wizard.planner import Asked, Planner
-from slviewer.wizard.pose_plan import Plan
+from slviewer.wizard.planner import Planner, PlanRequest
+from slviewer.wizard.pose_plan import PosePlan
 
 BOARD = Board.parse("circles:15x12:12")
 SIZE = (400, 300)
 
 
-def plan_of(poses: tuple[str, ...], sigma: float | None = None, depth: float = 600.0) -> Plan:
+def plan_of(poses: tuple[str, ...], sigma: float | None = None, depth: float = 600.0) -> PosePlan:
     lens, T = nominal_lens(SIZE), np.eye(4)
     T[2, 3] = depth
     placed = dict.fromkeys(poses, T)
-    return Plan(lens, placed, coverage(BOARD, lens, [T] * len(poses)), described(BOARD, lens, T), 0.03, sigma, sigma)
+    return PosePlan(
+        lens, placed, coverage(BOARD, lens, [T] * len(poses)), described(BOARD, lens, T), 0.03, sigma, sigma
+    )
 
 
-def asked(*poses: str, hashes: str = "", target: str = str(BOARD)) -> Asked:
-    return Asked(target, SIZE, (912, 1140), tuple((name, name + hashes) for name in poses), "", None, 0)
+def asked(*poses: str, hashes: str = "", target: str = str(BOARD)) -> PlanRequest:
+    return PlanRequest(target, SIZE, (912, 1140), tuple((name, name + hashes) for name in poses), "", None, 0)
 
 
 class Mind:
@@ -34,12 +36,12 @@ class Mind:
     def __init__(self) -> None:
         self.begun, self.may_end, self.found = threading.Event(), threading.Event(), plan_of(())
 
-    def __call__(self) -> Plan:
+    def __call__(self) -> PosePlan:
         self.begun.set()
         assert self.may_end.wait(10)
         return self.found
 
-    def finds(self, found: Plan) -> None:
+    def finds(self, found: PosePlan) -> None:
         self.found = found
         self.may_end.set()
 
@@ -68,9 +70,9 @@ def test_what_is_at_hand_answers_until_the_plan_is_there(planner: Planner, chang
     assert planner.plan(asked("a", "b", "c"), lambda before: quick, mind) == (good, False)
 
     # one pose more: what was foretold and suggested still holds; one pose less: it does not
-    told: list[Plan | None] = []
+    told: list[PosePlan | None] = []
 
-    def at_hand(before: Plan | None) -> Plan:
+    def at_hand(before: PosePlan | None) -> PosePlan:
         told.append(before)
         return plan_of(("a", "b", "c", "d"))
 
@@ -103,7 +105,7 @@ def test_only_the_latest_question_is_thought_of(planner: Planner, changes: threa
 def test_where_thinking_fails_what_is_at_hand_remains(
     planner: Planner, changes: threading.Semaphore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fails() -> Plan:
+    def fails() -> PosePlan:
         raise np.linalg.LinAlgError("singular")
 
     quick = replace(plan_of(("a",)), sigma_mm=None)

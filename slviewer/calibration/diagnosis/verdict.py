@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from slviewer.calibration.splined.evidence import Noise
+from slviewer.calibration.splined.residual_noise import Noise
 
 Level = Literal["good", "doubtful", "rejected"]
 Severity = Literal["note", "doubtful", "rejected"]

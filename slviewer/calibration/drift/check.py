@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import f as fisher
 
-from slviewer.calibration.drift.floor import Answer, Reference
-from slviewer.calibration.drift.view import View
+from slviewer.calibration.drift.floor import PoseChange, Reference
+from slviewer.calibration.drift.view import DriftView
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 
@@ -101,7 +101,7 @@ class Drift:
         return cls(**plain)
 
 
-def check_drift(reference: Reference, view: View) -> Drift:
+def check_drift(reference: Reference, view: DriftView) -> Drift:
     """The verdict on a calibration from one later view of its board.
 
     Raises InputError where the view shows no axis that the calibration has.
@@ -160,7 +160,7 @@ def check_drift(reference: Reference, view: View) -> Drift:
     )
 
 
-def _explained(found: Answer, information: np.ndarray, about: float, along: np.ndarray) -> str:
+def _explained(found: PoseChange, information: np.ndarray, about: float, along: np.ndarray) -> str:
     """The single movements that explain the change nearly as well as any, with their sizes."""
     moves = np.vstack([np.eye(6), along])  # (7, 6); a longer baseline is the last
     names = [*(name for name, _, _ in _MOVES), "change of the baseline"]

@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from slviewer.calibration.drift.view import KINDS, Field, Linear, View, linear
+from slviewer.calibration.drift.view import KINDS, DriftView, Field, Linear, linear
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.robust import robust_sigma, tukey_weights
@@ -31,7 +31,7 @@ RIG_SIGMAS = np.array([3e-3] * 3 + [3.0] * 3)
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class PoseChange:
     """How far the projector seems to have moved in one view: ``change`` (6,) rad and mm, as ``Linear`` orders it.
 
     ``spreads``: by kind (6, 6), its covariance for errors of 1 px in every observation; ``by_growth`` (6,): what it
@@ -66,9 +66,9 @@ class Reference:
     shared: np.ndarray
     covariance: np.ndarray
     sigmas: Mapping[str, float]
-    answers: tuple[Answer, ...]
+    answers: tuple[PoseChange, ...]
 
-    def ask(self, view: View) -> Answer:
+    def ask(self, view: DriftView) -> PoseChange:
         """What a later view answers."""
         equations = linear(self.rig, view)
         known = _design(equations)
@@ -94,14 +94,14 @@ class Reference:
         """The inverse of ``to_arrays``, of a calibration with this rig."""
         each = zip(*(arrays[name] for name in ("names", "changes", "spreads", "by_growth", "figures")), strict=True)
         answers = tuple(
-            Answer(str(name), change, dict(zip(KINDS, spreads, strict=True)), growth, *(float(f) for f in figures))
+            PoseChange(str(name), change, dict(zip(KINDS, spreads, strict=True)), growth, *(float(f) for f in figures))
             for name, change, spreads, growth, figures in each
         )
         sigmas = {kind: float(sigma) for kind, sigma in zip(KINDS, arrays["sigmas"], strict=True)}
         return cls(rig, arrays["shared"], arrays["covariance"], sigmas, answers)
 
 
-def refer(rig: StereoRig, views: Sequence[View]) -> Reference:
+def refer(rig: StereoRig, views: Sequence[DriftView]) -> Reference:
     """Lens errors and floor from a calibration's own views. Raises InputError for fewer than LEAST_POSES."""
     if len(views) < LEAST_POSES:
         raise InputError(
@@ -128,7 +128,7 @@ def refer(rig: StereoRig, views: Sequence[View]) -> Reference:
     return Reference(rig, shared, covariance, sigmas, answers)
 
 
-def answer(e: Linear, shared: np.ndarray, sigmas: Mapping[str, float], supported: np.ndarray) -> Answer:
+def answer(e: Linear, shared: np.ndarray, sigmas: Mapping[str, float], supported: np.ndarray) -> PoseChange:
     """What one view says, with lens errors from elsewhere."""
     usable = e.usable & supported
     left = np.where(usable, e.residuals, 0.0) - _design(e) @ shared
@@ -144,7 +144,7 @@ def answer(e: Linear, shared: np.ndarray, sigmas: Mapping[str, float], supported
     samples = across[e.kinds == 1] + across[e.kinds == 2]
     said = (w[e.kinds == 1] > 0) & (w[e.kinds == 2] > 0)
     unexplained = (left - both @ (gain @ left))[w > 0]
-    return Answer(
+    return PoseChange(
         e.name,
         gain[6:] @ left,
         {kind: gain[6:, e.kinds == i] @ gain[6:, e.kinds == i].T for i, kind in enumerate(KINDS)},
@@ -211,7 +211,7 @@ def _spread(equations: Sequence[Linear], left: Sequence[np.ndarray], kind: int, 
     return max(robust_sigma(values), 1e-3) if len(values) else otherwise
 
 
-def _worth(answers: Sequence[Answer], start: Mapping[str, float]) -> dict[str, float]:
+def _worth(answers: Sequence[PoseChange], start: Mapping[str, float]) -> dict[str, float]:
     """The sigma of each kind that makes the changes seen most likely, if none of them is one.
 
     Neighbouring samples err alike, so that one is worth less than its own scatter says.

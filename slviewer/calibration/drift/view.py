@@ -28,7 +28,7 @@ STEPS = np.array([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class DriftView:
     """``camera`` (n, 2) px of board ``points`` (n, 3) mm; ``pixels`` (m, 2) px of the board in the camera, and the
     ``projector`` coordinates (m, 2) px there, a column of NaN for an axis that was not captured."""
 
@@ -39,7 +39,7 @@ class View:
     projector: np.ndarray
 
     @classmethod
-    def of(cls, observation: Observation) -> "View":
+    def of(cls, observation: Observation) -> "DriftView":
         """The view that an observation of the board holds."""
         u0, v0, _, _ = observation.box
         v, u = np.nonzero(observation.region)
@@ -120,7 +120,7 @@ class Linear:
         return np.asarray(np.isfinite(self.residuals) & np.isfinite(self.change).all(1))
 
 
-def linear(rig: StereoRig, view: View) -> Linear:
+def linear(rig: StereoRig, view: DriftView) -> Linear:
     """The equations of a view, at the pose that the camera alone gives."""
     T = _pose(rig, view)
     middle = view.points.mean(0)
@@ -188,7 +188,7 @@ def _cubic(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
     return cell, np.stack([g**3, 3 * f**3 - 6 * f**2 + 4, 3 * g**3 - 6 * g**2 + 4, f**3], 1) / 6.0
 
 
-def _pose(rig: StereoRig, view: View) -> np.ndarray:
+def _pose(rig: StereoRig, view: DriftView) -> np.ndarray:
     """(4, 4) T_camera_board from the camera alone."""
     rays = rig.camera.undistort(view.camera)
     try:

@@ -7,7 +7,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from slviewer.calibration.guidance.bench import GuidanceBench
+from slviewer.calibration.guidance.coarse_rig import GuidanceBench
 from slviewer.calibration.guidance.information import Information, Sight
 from slviewer.calibration.next_pose import depth_range
 

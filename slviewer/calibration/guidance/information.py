@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cholesky, eigh, solve_triangular
 
-from slviewer.calibration.guidance.bench import GuidanceBench
+from slviewer.calibration.guidance.coarse_rig import GuidanceBench
 from slviewer.calibration.splined.posterior import point_rows
 from slviewer.calibration.splined.unknowns import State
 from slviewer.calibration.splined.volume import Volume, better_axis, motion_free, working_volume

@@ -5,7 +5,7 @@ import numpy as np
 from slviewer.calibration.splined.board_shape import TERMS
 from slviewer.calibration.splined.normal import Work
 from slviewer.calibration.splined.residuals import DENSE, HEIGHT, OFFSET, feature_row, sample_row
-from slviewer.calibration.splined.unknowns import RIG, Arrangement, Layout
+from slviewer.calibration.splined.unknowns import RIG, Arrangement, UnknownLayout
 from slviewer.geometry.jit import kernel
 
 POSE = HEIGHT
@@ -14,7 +14,7 @@ POSE = HEIGHT
 
 def pose_rows(
     rig: Arrangement,
-    layout: Layout,
+    layout: UnknownLayout,
     T_camera_board: np.ndarray,
     points: np.ndarray,
     frame: np.ndarray,

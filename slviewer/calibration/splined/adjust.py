@@ -9,10 +9,10 @@ from scipy.linalg import cho_solve, lapack
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.board_shape import board_frame
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
-from slviewer.calibration.splined.evidence import Noise, measured_noise, own_sigmas, pose_trust, robust_weights
 from slviewer.calibration.splined.half_turns import half_turned, may_be_turned, turned_over
 from slviewer.calibration.splined.normal import Data, normal_equations, predicted
 from slviewer.calibration.splined.prior import Prior
+from slviewer.calibration.splined.residual_noise import Noise, measured_noise, own_sigmas, pose_trust, robust_weights
 from slviewer.calibration.splined.unknowns import State
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solve_triangular
 
-from slviewer.calibration.splined.evidence import Noise
 from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.posterior import point_rows
+from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.splined.unknowns import Arrangement, State
 from slviewer.fringe.sequence import Axis
 

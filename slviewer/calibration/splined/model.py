@@ -12,8 +12,8 @@ from slviewer.calibration.splined.adjust import adjust
 from slviewer.calibration.splined.board_shape import board_frame, board_heights
 from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.compiled import Compiled, compile_axis, pixel_rays
-from slviewer.calibration.splined.evidence import LEAST_SIGMA_PX
 from slviewer.calibration.splined.fields import undistort
+from slviewer.calibration.splined.residual_noise import LEAST_SIGMA_PX
 from slviewer.calibration.splined.uncertainty import SigmaMap, sigma_map, volume_sigma
 from slviewer.calibration.splined.unknowns import Arrangement, lens_of
 from slviewer.calibration.splined.volume import is_lit

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.calibration.splined.board_shape import GAUGE_MM, HEIGHT_SIGMA_MM, OFFSET_SIGMA_MM, offset_gauge
-from slviewer.calibration.splined.evidence import better_strength
 from slviewer.calibration.splined.fields import roughness
 from slviewer.calibration.splined.normal import Data
+from slviewer.calibration.splined.residual_noise import better_strength
 from slviewer.calibration.splined.unknowns import State
 
 POSE_SIGMA = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])

@@ -28,7 +28,7 @@ class Arrangement(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Layout:
+class UnknownLayout:
     """Order of the unknowns: poses (6 each), height, offsets (2 each), then the rig: both lenses (9 each), rotation and
     translation, the camera's field and the projector's (u's coefficients, then v's).
 
@@ -95,9 +95,9 @@ class State:
         )
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> UnknownLayout:
         knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
-        return Layout(len(self.t_board), len(self.offsets), knots[0], knots[1])
+        return UnknownLayout(len(self.t_board), len(self.offsets), knots[0], knots[1])
 
     def moved(self, step: np.ndarray) -> "State":
         """The state after a step in the vector's order; rotations turn from the left by small rotation vectors."""

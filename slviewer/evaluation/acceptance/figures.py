@@ -28,7 +28,7 @@ def narrowest(deviations: np.ndarray, share: float) -> float:
 
 
 @dataclass(frozen=True)
-class Figure:
+class AcceptanceFigure:
     """One property at one position: ``error_mm`` with the test's expanded uncertainty ``U_mm`` (k = 2).
 
     ``within_95_mm``, ``within_997_mm``: (low, high), as the module says; of form and flatness low is 0 and high the
@@ -43,13 +43,13 @@ class Figure:
     within_997_mm: tuple[float, float]
 
     @classmethod
-    def of_form(cls, name: str, position: str, deviations: np.ndarray, U_mm: float) -> "Figure":
+    def of_form(cls, name: str, position: str, deviations: np.ndarray, U_mm: float) -> "AcceptanceFigure":
         """The form that points' deviations from their shape show."""
         inner, outer = narrowest(deviations, 0.95), narrowest(deviations, 0.997)
         return cls(name, position, inner, U_mm, (0.0, inner), (0.0, outer))
 
     @classmethod
-    def of_length(cls, name: str, position: str, error_mm: float, u_mm: float) -> "Figure":
+    def of_length(cls, name: str, position: str, error_mm: float, u_mm: float) -> "AcceptanceFigure":
         """A length's error with its standard uncertainty."""
         inner, outer = K_95 * u_mm, K_997 * u_mm
         return cls(
@@ -71,7 +71,7 @@ class Judgement:
     """One property over all positions: the ``worst`` figure, the limit, and the decision (None without a limit)."""
 
     property: str
-    worst: Figure
+    worst: AcceptanceFigure
     limit_mm: float | None
     decision: Decision | None
 
@@ -80,14 +80,14 @@ class Judgement:
         return asdict(self)
 
 
-def judge(name: str, figures: Sequence[Figure], limit_mm: float | None) -> Judgement:
+def judge(name: str, figures: Sequence[AcceptanceFigure], limit_mm: float | None) -> Judgement:
     """The decision on one property from its figures at all positions."""
     mine = [figure for figure in figures if figure.property == name]
     worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
     return Judgement(name, worst, limit_mm, None if limit_mm is None else decide(mine, limit_mm))
 
 
-def decide(figures: Sequence[Figure], limit_mm: float) -> Decision:
+def decide(figures: Sequence[AcceptanceFigure], limit_mm: float) -> Decision:
     """Pass, fail or undecided: RULE."""
     if any(abs(figure.error_mm) - figure.U_mm > limit_mm for figure in figures):
         return "fail"

@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 
 from slviewer.evaluation.acceptance.artefact import Artefact
-from slviewer.evaluation.acceptance.figures import Figure
+from slviewer.evaluation.acceptance.figures import AcceptanceFigure
 from slviewer.evaluation.incidence import incidence
 from slviewer.evaluation.plane import PlaneResult, evaluate_plane
 from slviewer.evaluation.sphere import SphereResult, evaluate_spheres
@@ -26,7 +26,7 @@ class Position:
 
     position: str
     capture: str
-    figures: tuple[Figure, ...]
+    figures: tuple[AcceptanceFigure, ...]
     rms_mm: tuple[float, ...]
     floor_mm: tuple[float, ...]
     noise_mm: float
@@ -34,7 +34,7 @@ class Position:
     incidence: dict[str, float] | None
     warnings: tuple[str, ...]
 
-    def error(self, name: str) -> Figure:
+    def error(self, name: str) -> AcceptanceFigure:
         """The worst figure of a property at this position."""
         return max((f for f in self.figures if f.property == name), key=lambda f: abs(f.error_mm))
 
@@ -55,7 +55,7 @@ def measure(
     noise = 0.0
     if artefact.kind == "plane":
         shown = [evaluate_plane(cloud.points, plate, cloud.sigma_z)]
-        figures = [Figure.of_form(FLATNESS, position, shown[0].error_map, artefact.form_U_mm)]
+        figures = [AcceptanceFigure.of_form(FLATNESS, position, shown[0].error_map, artefact.form_U_mm)]
     else:
         nominal = float(np.mean([diameter.mm for diameter in artefact.diameters])) / 2
         shown = evaluate_spheres(cloud.points, len(artefact.diameters), cloud.sigma_z, nominal)
@@ -74,7 +74,9 @@ def measure(
     )
 
 
-def _of_balls(artefact: Artefact, cloud: Cloud, balls: list[SphereResult], position: str) -> tuple[list[Figure], float]:
+def _of_balls(
+    artefact: Artefact, cloud: Cloud, balls: list[SphereResult], position: str
+) -> tuple[list[AcceptanceFigure], float]:
     """The figures of one ball or two, and the noise of a length between their centres (of a diameter, for one)."""
     known = [artefact.at_measurement(diameter) for diameter in artefact.diameters]
     # the certificate's order says nothing of left and right: the balls' own sizes do
@@ -83,9 +85,9 @@ def _of_balls(artefact: Artefact, cloud: Cloud, balls: list[SphereResult], posit
     spreads = [_fit_covariance(cloud.points, ball) for ball in balls]
     figures = []
     for ball, (diameter, u), spread in zip(balls, known, spreads, strict=True):
-        figures.append(Figure.of_form(FORM, position, ball.error_map, artefact.form_U_mm))
+        figures.append(AcceptanceFigure.of_form(FORM, position, ball.error_map, artefact.form_U_mm))
         u_size = float(np.hypot(u, 2 * np.sqrt(spread[3, 3])))
-        figures.append(Figure.of_length(SIZE, position, 2 * ball.radius_mm - diameter, u_size))
+        figures.append(AcceptanceFigure.of_length(SIZE, position, 2 * ball.radius_mm - diameter, u_size))
     if artefact.spacing is None:
         return figures, float(2 * np.sqrt(spreads[0][3, 3]))
     between = balls[1].sphere.centre - balls[0].sphere.centre
@@ -93,7 +95,7 @@ def _of_balls(artefact: Artefact, cloud: Cloud, balls: list[SphereResult], posit
     along = between / length
     noise = float(np.sqrt(sum(along @ spread[:3, :3] @ along for spread in spreads)))
     true, u = artefact.at_measurement(artefact.spacing)
-    figures.append(Figure.of_length(SPACING, position, length - true, float(np.hypot(u, noise))))
+    figures.append(AcceptanceFigure.of_length(SPACING, position, length - true, float(np.hypot(u, noise))))
     return figures, noise
 
 

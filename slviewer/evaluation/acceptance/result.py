@@ -20,7 +20,7 @@ OUTSIDE = 50.0
 
 
 @dataclass(frozen=True)
-class Scale:
+class ScaleEstimate:
     """How much too long the instrument measures, ppm; ``u_ppm`` is its standard uncertainty.
 
     From the errors of one length at several positions: their mean, with the scatter between positions (widened for
@@ -54,7 +54,7 @@ class Acceptance:
     model: str
     positions: tuple[Position, ...]
     judgements: tuple[Judgement, ...]
-    scale: Scale | None
+    scale: ScaleEstimate | None
 
     @property
     def decision(self) -> Decision | None:
@@ -156,7 +156,7 @@ def conclude(artefact: Artefact, model: str, positions: Sequence[Position]) -> A
     return Acceptance(artefact, model, tuple(positions), judgements, _scale(artefact, positions))
 
 
-def _scale(artefact: Artefact, positions: Sequence[Position]) -> Scale | None:
+def _scale(artefact: Artefact, positions: Sequence[Position]) -> ScaleEstimate | None:
     """By the spacing of a ball bar's centres, by a sphere's diameter; None for a plane."""
     length = artefact.spacing or (artefact.diameters[0] if artefact.diameters else None)
     if length is None:
@@ -169,7 +169,7 @@ def _scale(artefact: Artefact, positions: Sequence[Position]) -> Scale | None:
         u_mean = float(errors.std(ddof=1) / np.sqrt(n) * student.ppf(0.975, n - 1) / K_95)
     else:
         u_mean = positions[0].noise_mm
-    return Scale(1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n)
+    return ScaleEstimate(1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n)
 
 
 def _half(interval: tuple[float, float]) -> float:

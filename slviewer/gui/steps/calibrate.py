@@ -20,7 +20,7 @@ from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened, spread
 from slviewer.gui.widgets import Html, Words, block, cell, colours, table, toned
 from slviewer.pipeline.report import calibration_view
 from slviewer.report.curves import pixel_curves
-from slviewer.report.data import CalibrationView as Details
+from slviewer.report.data import CalibrationFigures as Details
 from slviewer.report.data import DeviceParameters
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure

@@ -67,7 +67,13 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import SEQUENCE_KEYS, PatternSequence, parse_size
 from slviewer.session.importers.frame_groups import FrameGroup, has_wildcard, images_by_name, read_groups
 from slviewer.session.importers.images import Channel
-from slviewer.session.importers.imported import Imports, Recording, collect_captures, listed, strangers_warning
+from slviewer.session.importers.imported import (
+    ImportableRecording,
+    Imports,
+    collect_captures,
+    listed,
+    strangers_warning,
+)
 
 _KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
 
@@ -136,13 +142,13 @@ def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tupl
     """
     described = read_description(toml, projector)
 
-    def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
+    def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
         files = described.select_files(folder)
         settings: dict[str, Any] = {"gray_origin_given": described.gray_origin_given}
         exposures = described.exposures_ms
         if len(exposures) == 1:
             settings["exposure_ms"], exposures = exposures[0], ()
-        recording = Recording(name, described.sequence, files, folder, settings, described.channel, exposures)
+        recording = ImportableRecording(name, described.sequence, files, folder, settings, described.channel, exposures)
         return recording, strangers_warning(folder, sorted(set(images_by_name(folder)) - set(files)))
 
     files = described.groups[0].files

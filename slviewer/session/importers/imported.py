@@ -38,7 +38,7 @@ class ImportedCapture:
 
 
 @dataclass(frozen=True)
-class Recording:
+class ImportableRecording:
     """One capture that is complete by its file names, not yet read."""
 
     name: str
@@ -76,7 +76,7 @@ class Skipped:
 class Imports:
     """All captures of a source. Iterating reads them one at a time, so that memory is needed for one."""
 
-    recordings: Sequence[Recording]
+    recordings: Sequence[ImportableRecording]
     warnings: Sequence[str]  # files and folders that were not used
     skipped: Sequence[Skipped] = ()  # captures whose files are missing, double or contradict the layout
 
@@ -92,7 +92,7 @@ def collect_captures(
     prefix: str | None,
     is_capture: Callable[[Path], bool],
     looks_like: str,
-    describe: Callable[[Path, str], tuple[Recording, list[str]]],
+    describe: Callable[[Path, str], tuple[ImportableRecording, list[str]]],
 ) -> Imports:
     """The captures of a source in counting order: `source` itself if it is one, else the folders right inside it.
 

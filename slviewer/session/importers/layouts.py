@@ -10,7 +10,7 @@ from slviewer.session.importers.imported import Imports, visible
 
 
 @dataclass(frozen=True)
-class Layout:
+class FolderLayout:
     """How a tool lays its captures out on disk.
 
     `read(source, prefix=, projector=, ...)` reads a source; `is_capture(folder)` tells by file names whether a folder
@@ -27,18 +27,18 @@ class Layout:
 LAYOUTS = {
     layout.name: layout
     for layout in (
-        Layout("p18", "pose_XX/{V,H}/P18_FNN images", p18.read, p18.is_capture, (912, 1140)),
-        Layout(
+        FolderLayout("p18", "pose_XX/{V,H}/P18_FNN images", p18.read, p18.is_capture, (912, 1140)),
+        FolderLayout(
             "procam-calibration",
             "capture_N/graycode_NN images",
             procam_calibration.read,
             procam_calibration.is_capture,
             (1024, 768),
         ),
-        Layout("slstudio", "frameSeq_NN images", slstudio.read, slstudio.is_capture),
-        Layout("sltk", "TIME_[AA-BB-CC_NN]_img images", sltk.read, sltk.is_capture),
-        Layout("opencv-graycode", "pattern_camN_imN images", opencv_graycode.read, opencv_graycode.is_capture),
-        Layout("frames", "images and a TOML that describes them", frames.read, lambda folder: False),
+        FolderLayout("slstudio", "frameSeq_NN images", slstudio.read, slstudio.is_capture),
+        FolderLayout("sltk", "TIME_[AA-BB-CC_NN]_img images", sltk.read, sltk.is_capture),
+        FolderLayout("opencv-graycode", "pattern_camN_imN images", opencv_graycode.read, opencv_graycode.is_capture),
+        FolderLayout("frames", "images and a TOML that describes them", frames.read, lambda folder: False),
     )
 }
 

@@ -15,7 +15,13 @@ from slviewer.fringe.presets import gray
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.importers.frame_groups import images_by_name, match_files
 from slviewer.session.importers.images import read_frames
-from slviewer.session.importers.imported import Imports, Recording, collect_captures, listed, strangers_warning
+from slviewer.session.importers.imported import (
+    ImportableRecording,
+    Imports,
+    collect_captures,
+    listed,
+    strangers_warning,
+)
 
 _LIT, _MOSTLY = 0.25, 0.9
 """Share of the largest difference from which on a pixel counts; share of these in which white is brighter than black:
@@ -42,14 +48,14 @@ def read(
     def select(folder: Path) -> list[Path]:
         return match_files(folder, files) if files else images_by_name(folder)
 
-    def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
+    def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
         found = select(folder)
         if len(kinds := {re.sub(r"\d+$", "", file.stem) for file in found}) > 1:
             shown = listed([f"{kind}N" for kind in sorted(kinds)])
             raise InputError(f'it holds images named {shown}: choose one with --files "{min(kinds)}*"')
         shown_sequence = _shown(sequence, len(found))
         _check_shadow_images(found, shown_sequence)
-        recording = Recording(name, shown_sequence, tuple(found), folder)
+        recording = ImportableRecording(name, shown_sequence, tuple(found), folder)
         return recording, strangers_warning(folder, [file for file in images_by_name(folder) if file not in found])
 
     def looks_so(folder: Path) -> bool:

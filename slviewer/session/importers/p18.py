@@ -12,8 +12,8 @@ from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.session.importers.images import IMAGE_SUFFIXES, read_image
 from slviewer.session.importers.imported import (
+    ImportableRecording,
     Imports,
-    Recording,
     collect_captures,
     listed,
     strangers_warning,
@@ -40,7 +40,7 @@ def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] 
     )  # fmt: skip
 
 
-def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Recording, list[str]]:
+def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
     files: list[Path] = []
     frames: list[Frame] = []
     texture: Path | None = None
@@ -65,7 +65,7 @@ def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Recor
             frames.append(Frame("texture"))
     if texture is None:
         warnings.append(f"{pose.name} has no texture (P18_F25 or F26): its clouds take their grey from the fringes")
-    return Recording(name, PatternSequence(projector, tuple(frames)), tuple(files), pose), warnings
+    return ImportableRecording(name, PatternSequence(projector, tuple(frames)), tuple(files), pose), warnings
 
 
 def _numbered(folder: Path) -> tuple[dict[int, Path], list[str]]:

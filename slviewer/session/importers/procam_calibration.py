@@ -11,8 +11,8 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import gray
 from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import (
+    ImportableRecording,
     Imports,
-    Recording,
     collect_captures,
     listed,
     strangers_warning,
@@ -30,11 +30,11 @@ def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] 
     """
     sequence = gray(projector)
 
-    def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
+    def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
         numbered, strangers = _numbered(folder)
         _check_count(folder, set(numbered), len(sequence.frames), projector)
         files = tuple(numbered[number] for number in range(len(sequence.frames)))
-        return Recording(name, sequence, files, folder), strangers_warning(folder, strangers)
+        return ImportableRecording(name, sequence, files, folder), strangers_warning(folder, strangers)
 
     return collect_captures(Path(source), prefix, is_capture, "graycode_NN images", describe)
 

@@ -21,7 +21,13 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
 from slviewer.session.importers.frame_groups import images_by_name
-from slviewer.session.importers.imported import Imports, Recording, collect_captures, listed, strangers_warning
+from slviewer.session.importers.imported import (
+    ImportableRecording,
+    Imports,
+    collect_captures,
+    listed,
+    strangers_warning,
+)
 
 Codec = Literal["2x3", "nstep", "3", "4", "gray"]
 _FILE = re.compile(r"frameSeq_(\d+)", re.IGNORECASE)
@@ -54,14 +60,14 @@ def read(
     if projector is None:
         raise InputError("the fringes of SLStudio depend on the projector's size: give it with --projector 912x1140")
 
-    def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
+    def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
         numbered = {int(match[1]): file for file in images_by_name(folder) if (match := _FILE.fullmatch(file.stem))}
         if missing := [number for number in range(max(numbered)) if number not in numbered]:
             raise InputError(f"it lacks frameSeq_{listed([f'{n:02d}' for n in missing])}: copy or record them again")
         files = tuple(numbered[number] for number in sorted(numbered))
         others = sorted(set(images_by_name(folder)) - set(files))
         sequence = _sequence(projector, len(files), codec, axis)
-        return Recording(name, sequence, files, folder), strangers_warning(folder, others)
+        return ImportableRecording(name, sequence, files, folder), strangers_warning(folder, others)
 
     return collect_captures(Path(source), prefix, is_capture, "frameSeq_NN images", describe)
 

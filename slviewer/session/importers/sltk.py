@@ -11,7 +11,14 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import AXES
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.importers.images import IMAGE_SUFFIXES
-from slviewer.session.importers.imported import Imports, Recording, collect_captures, listed, strangers_warning, visible
+from slviewer.session.importers.imported import (
+    ImportableRecording,
+    Imports,
+    collect_captures,
+    listed,
+    strangers_warning,
+    visible,
+)
 
 _FILE = re.compile(r".*\[(\d+)-(\d+)-(\d+)_(\d+)\].*")
 
@@ -19,13 +26,13 @@ _FILE = re.compile(r".*\[(\d+)-(\d+)-(\d+)_(\d+)\].*")
 def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None) -> Imports:
     """Captures named after their folders. A capture is skipped where a bit or its negative is missing or double."""
 
-    def describe(folder: Path, name: str) -> tuple[Recording, list[str]]:
+    def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
         files, strangers = _files(folder)
         frames = _frames(files)
         ordered = sorted(files, key=lambda fields: fields[3])
         sequence = PatternSequence(projector, tuple(frames[fields] for fields in ordered))
         paths = tuple(files[fields] for fields in ordered)
-        return Recording(name, sequence, paths, folder), strangers_warning(folder, strangers)
+        return ImportableRecording(name, sequence, paths, folder), strangers_warning(folder, strangers)
 
     return collect_captures(Path(source), prefix, is_capture, "images named ..._[AA-BB-CC_NN]_...", describe)
 

@@ -15,7 +15,7 @@ from slviewer.calibration.splined.board_shape import (
     offset_gauge,
 )
 from slviewer.calibration.splined.fields import CELLS_ACROSS, RIDGE, Device, roughness
-from slviewer.calibration.splined.unknowns import LENS, RIG, Arrangement, Layout
+from slviewer.calibration.splined.unknowns import LENS, RIG, Arrangement, UnknownLayout
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.target.board import Board
@@ -81,9 +81,9 @@ class GuidanceBench:
         return board_frame(self.board.points)
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> UnknownLayout:
         knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
-        return Layout(0, len(self.points), knots[0], knots[1])
+        return UnknownLayout(0, len(self.points), knots[0], knots[1])
 
     @property
     def stands_for(self) -> float:

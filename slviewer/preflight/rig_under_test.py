@@ -18,7 +18,7 @@ _MEAN = 8
 _SIGMAS = 6.0
 
 
-class Bench:
+class RigUnderTest:
     """An open rig. Images come as (h, w) float32 grey levels of every `stride`-th row and column.
 
     ``settle_ms`` and ``stale`` are what the latency check finds: the time to wait after a change, and how many images
