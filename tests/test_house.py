@@ -110,6 +110,12 @@ def test_every_package_has_its_layer_and_none_outgrows_the_others() -> None:
     assert max(shares.values()) <= MOST_SHARE, shares
 
 
+def test_the_architecture_page_lists_the_packages_in_their_order() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    table = [line.split("`")[1] for line in page.splitlines() if line.startswith("| `")]
+    assert table == PACKAGES
+
+
 @pytest.mark.parametrize("path", [p for p in SOURCES if p.relative_to(ROOT / "slviewer").parts[0] in NUMERIC], ids=str)
 def test_numeric_packages_know_no_device_and_no_browser(path: Path) -> None:
     banned = {"viser", "zarr", "tyro", "websockets", "jinja2", "matplotlib"}

@@ -14,7 +14,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.feedback import Warn, unwarned
 from slviewer.pipeline.models import Model, load_stereo
 from slviewer.pipeline.scale import scale_factor, scaled
-from slviewer.reconstruction.axis_agreement import CaptureCheck, check_phases, check_sizes
+from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import reconstruct
 from slviewer.reconstruction.relative_phase import resolve_phase
@@ -47,25 +47,14 @@ def capture_cloud(
     the capture miss each other, which is a warning if ``accept_rejected``. Where they miss each other by more than
     noise explains, the cloud's sigmas are raised by that factor, and ``warn`` says so.
     """
-    check = check_capture(store, model, capture, phases, accept_rejected)
+    stereo = load_stereo(store)
+    check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
+    calibration = model if isinstance(model, SplinedModel) else stereo
+    check = check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
     for message in check.warnings:
         warn(message)
     cloud = scaled(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
     return raised(cloud, check.sigma_factor, check.excess_px, phases)
-
-
-def check_capture(
-    store: Session,
-    model: Model,
-    capture: Capture,
-    phases: Mapping[Axis, PhaseMap],
-    accept_rejected: bool = False,
-) -> CaptureCheck:
-    """Whether a capture belongs to a calibration, as ``axis_agreement.check_phases`` finds it."""
-    stereo = load_stereo(store)
-    check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
-    calibration = model if isinstance(model, SplinedModel) else stereo
-    return check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
 
 
 def absolute_phases(

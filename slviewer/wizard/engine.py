@@ -13,17 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
+from slviewer.calibration.observe import Smoothing
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.frame_residuals import keep_residuals
+from slviewer.pipeline.poses import judge_all
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, needs_page
 from slviewer.pipeline.rig_presets import save_rig
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.wizard import tasks
 from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.diagnostics import LogKeeper
 from slviewer.wizard.jobs import Jobs, Reporter
@@ -259,7 +260,9 @@ class Engine:
             self.publisher.changed(session=True)
         target = reader.target()
         if reader.lacks_judgement(capture, target):
-            judged = tasks.judge_pose(reader.session, capture.name, Board.parse(target), report)
+            report(0.0, f"looking at {capture.name}")
+            session = reader.session.guarded(report.saving)
+            judged = next(judge_all(session, [capture.name], Board.parse(target), Smoothing()))
             if judged.observation is None:
                 self.notices.tell("warning", f"{capture.name} cannot be used: {judged.refused}")
             self.publisher.changed(session=True)  # before what may wait

@@ -259,10 +259,6 @@ class Operator(LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
         """Move what stands before the simulated rig to a distance on its ray; turn it so far about the vertical."""
         self._engine.world.bring(distance_mm, turn_deg)
 
-    def place_board(self, T_camera_board: np.ndarray) -> bool:
-        """Put the simulated board there."""
-        return self.place("board", T_camera_board)
-
     def place_at_suggestion(self) -> bool:
         """Put the simulated board where the next pose is suggested."""
         view = self._engine.publisher.now().session

@@ -12,7 +12,6 @@ All of them name their inputs, so that what has become stale is seen.
 
 import numpy as np
 
-from slviewer.calibration.observe import Smoothing
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.sphere import SphereResult
@@ -20,24 +19,14 @@ from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record, next_merge
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE, available, best, insisted
-from slviewer.pipeline.poses import Judged, judge_all
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.validate import validate
 from slviewer.pipeline.verify import Shape, verify
 from slviewer.session.store import Session
-from slviewer.target.board import Board
 from slviewer.wizard.export_files import delivered
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.snapshot import Level
-
-SMOOTHING = Smoothing()
-
-
-def judge_pose(session: Session, name: str, board: Board, report: Reporter) -> Judged:
-    """Decode a target pose, find its board, and keep what it says."""
-    report(0.0, f"looking at {name}")
-    return next(judge_all(session.guarded(report.saving), [name], board, SMOOTHING))
 
 
 def make_calibration(session: Session, target: str, report: Reporter, warn: Warn) -> CalibrationResult:

@@ -94,7 +94,7 @@ def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: Breakab
     # a board that is not seen is refused, in words, and the suggestion changes
     T = np.eye(4)
     T[:3, 3] = [60, -60, 560]
-    assert operator.place_board(T) and operator.capture_pose()
+    assert operator.place("board", T) and operator.capture_pose()
     refused = operator.settle()
     assert states(refused) == {"pose_01": "good", "pose_02": "good", "pose_03": "refused"}
     assert "pose_03 cannot be used" in last(refused) and "in view" in refused.pose("pose_03").why  # type: ignore[union-attr]

@@ -301,7 +301,7 @@ class Panel:
 
     def _drop(self, T_camera_middle: np.ndarray) -> None:
         if self._board is not None:
-            self._stage.operator.place_board(T_camera_middle @ np.linalg.inv(self._middle(self._board)))
+            self._stage.operator.place("board", T_camera_middle @ np.linalg.inv(self._middle(self._board)))
 
     @staticmethod
     def _middle(board: Board) -> np.ndarray:
