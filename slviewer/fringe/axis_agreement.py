@@ -90,8 +90,11 @@ def described_frames(
     )
 
 
-def reversed_bits(frames: AxisFrames) -> AxisFrames:
-    """The same with the Gray bits from the least significant to the most; the complementary bit stays."""
+def reversed_bits(frames: AxisFrames, with_complementary: bool = False) -> AxisFrames:
+    """The same with the Gray bits from the least significant to the most; the complementary bit stays in its place, or
+    comes first."""
+    if with_complementary:
+        return replace(frames, bits=frames.bits[::-1])
     last = frames.bits[len(frames.bits) - frames.complementary :]
     gray = frames.bits[: len(frames.bits) - frames.complementary]
     return replace(frames, bits=(*gray[::-1], *last), inverse=frames.inverse[::-1])

@@ -66,6 +66,12 @@ def _variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list
     if len(frames.bits) - frames.complementary > 1:
         text = f"the Gray bits of axis {axis} are in reverse order, the least significant first: number them backwards"
         bits.append((reversed_bits(frames), [Contradiction("bit-order", text, axis, None)]))
+        if frames.complementary:
+            text = (
+                f"the Gray bits of axis {axis} are in reverse order, the complementary bit first: number all of them "
+                "backwards"
+            )
+            bits.append((reversed_bits(frames, True), [Contradiction("bit-order", text, axis, None)]))
         text = f"the Gray bits of axis {axis} are inverted: exchange each bit with its inverse"
         inverted = replace(frames, inverted=True)
         bits.append((inverted, [Contradiction("bit-order", text, axis, None)]))

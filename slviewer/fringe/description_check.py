@@ -13,7 +13,7 @@ from slviewer.fringe.agreement_tests import failed_tests, is_sure, score_of
 from slviewer.fringe.axis_agreement import Agreement, AxisReader, agreement, coordinates, described_frames
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
-from slviewer.fringe.frame_light import equalize_frames, estimate_frame_light
+from slviewer.fringe.frame_light import FrameLight, describe_unexplained, equalize_frames, estimate_frame_light
 from slviewer.fringe.frame_order import fitting_order, misplaced_steps, unexplained_steps
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.line_sample import LineSample, coded_frames, grid_sample, sample_lines
@@ -25,6 +25,11 @@ MOSTLY = 0.5
 APART = 6
 """Pixels of the grid over which coordinates are compared: several cells of the code."""
 FEWEST_TURNS = 100
+MOST_CLIPPED = 0.05
+"""Mean share of saturated values at illuminated pixels, beyond which bits and fringes become unreadable in places."""
+SUDDENLY = 0.2
+"""Of the share of saturated values later on: no more of them before means that the light changed."""
+_OF_STEPS = ("duplicate-frame", "frame-order", "step-order")
 MIRRORED = 0.8
 """Share of the pixels that see a mirror image where an axis is reversed; elsewhere they are noise and depth steps."""
 
@@ -36,12 +41,42 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
     """
     check_stack(sequence, stack)
     contradictions = _find_contradictions(sequence, stack)
-    if not contradictions or not (light := estimate_frame_light(sequence, stack)).is_significant:
-        return contradictions
+    if not contradictions:
+        return ()
+    light = estimate_frame_light(sequence, stack)
+    if not light.is_significant:
+        is_vague = all(contradiction.cause in ("unreadable", "duplicate-frame") for contradiction in contradictions)
+        return (is_vague and _disturbed_light(sequence, stack, light)) or contradictions
     under_equal_light = _find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
     is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
     # Frames out of their place spoil the estimate of the light: what explains them as they are is believed.
     return contradictions if under_equal_light and is_explained else under_equal_light
+
+
+def _disturbed_light(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> tuple[Contradiction, ...]:
+    """What makes frames unreadable that saturate, or differ in their light by more than can be corrected."""
+    sample = sample_lines(sequence, stack)
+    coded = coded_frames(sequence)
+    illuminated = sample.swing(coded) > sample.least_swing
+    clipped = np.array([float(np.mean(sample.frames[i][illuminated] >= sample.white)) for i in coded])
+    if np.mean(clipped) > MOST_CLIPPED:
+        k = max(range(2, len(coded) - 1), key=lambda k: float(np.median(clipped[k:]) - clipped[:k].max()))
+        if clipped[:k].max() < SUDDENLY * np.median(clipped[k:]):
+            text = (
+                f"from frame {coded[k] + 1} on {100 * np.mean(clipped[k:]):.0f} % of the illuminated pixels are "
+                "saturated, and hardly any before: the light of the room changed; keep it constant, or switch it off, "
+                "and lower the exposure"
+            )
+            return (Contradiction("room-light", text, None, float(coded[k])),)
+        share = 100 * float(np.mean(clipped))
+        text = (
+            f"{share:.0f} % of the illuminated pixels are saturated in the mean of the frames: lower the exposure or "
+            "the gain, and capture again"
+        )
+        return (Contradiction("saturation", text, None, share),)
+    if disturbance := describe_unexplained(light):
+        return (Contradiction(*disturbance, None, None),)
+    return ()
 
 
 def _find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
@@ -57,9 +92,9 @@ def _find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[
     strange = set() if disordered else unexplained_steps(sequence, sample)
     if not any(failed.values()) and not disordered and not strange:
         return _mirrored(sequence, sample)
-    if disordered and all(contradiction.cause in ("duplicate-frame", "frame-order") for contradiction in disordered):
+    if disordered and all(contradiction.cause in _OF_STEPS for contradiction in disordered):
         return tuple(disordered)  # steps of one period, which says all about them
-    if exchanged := _axes_exchanged(sequence, readers, failed):
+    if exchanged := _axes_exchanged(sequence, sample, failed):
         return exchanged
     answers = {axis: explain_axis(readers[axis], sequence, axis) for axis in sequence.axes if failed[axis]}
     explained = [answers[axis][0].score if answers.get(axis) else score_of(stated[axis]) for axis in sequence.axes]
@@ -108,19 +143,39 @@ def _without_pattern(sequence: PatternSequence, sample: LineSample) -> tuple[Con
 
 
 def _axes_exchanged(
-    sequence: PatternSequence, readers: dict[Axis, AxisReader], failed: dict[Axis, set[str]]
+    sequence: PatternSequence, sample: LineSample, failed: dict[Axis, set[str]]
 ) -> tuple[Contradiction, ...]:
-    """Both axes fit, each described as the other."""
+    """Both axes fit with all frames of the other one, or with its phase steps or its Gray bits alone."""
     if len(sequence.axes) < 2 or not any(failed.values()):
         return ()
-    other: dict[Axis, Axis] = {"x": "y", "y": "x"}
-    for axis in sequence.axes:
-        frames = described_frames(sequence, other[axis])
-        frames = replace(frames, extent=described_frames(sequence, axis).extent)
-        a = agreement(readers[other[axis]], frames)
-        if failed_tests(frames, a) or not is_sure(frames, a):
-            return ()
-    return (_exchanged_axes("the codes along x fit the projector's rows, and those along y its columns"),)
+    reader = AxisReader(sample, coded_frames(sequence))
+    x, y = (described_frames(sequence, axis) for axis in ("x", "y"))
+    steps = [[(period, len(images)) for period, images in frames.shifts] for frames in (x, y)]
+    for with_steps, with_bits in ((True, True), (True, False), (False, True)):
+        if with_steps != with_bits and (steps[0] != steps[1] or len(x.bits) != len(y.bits)):
+            continue
+        variants = []
+        for frames, other in ((x, y), (y, x)):
+            if with_steps and with_bits:
+                variants.append(replace(other, extent=frames.extent))
+            elif with_steps:
+                variants.append(replace(frames, shifts=other.shifts))
+            else:
+                variants.append(replace(frames, bits=other.bits, inverse=other.inverse))
+        agreements = [agreement(reader, variant) for variant in variants]
+        if any(
+            failed_tests(variant, a) or not is_sure(variant, a) for variant, a in zip(variants, agreements, strict=True)
+        ):
+            continue
+        if with_steps and with_bits:
+            return (_exchanged_axes("the codes along x fit the projector's rows, and those along y its columns"),)
+        which = "phase steps" if with_steps else "Gray frames"
+        text = (
+            f"the {which} described as x fit the other frames of y, and those described as y the other frames of x: "
+            f"exchange the {which} of x and y in the description"
+        )
+        return (Contradiction("axes-swapped", text, None, None),)
+    return ()
 
 
 def _exchanged_axes(seen: str) -> Contradiction:

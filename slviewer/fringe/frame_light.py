@@ -16,7 +16,7 @@ from slviewer.fringe.layout import check_stack, white_level
 from slviewer.fringe.light_fit import Fit, Light, LightModel, Remainder, Term, equalized_sample, fit_light, room_changes
 from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.fringe.suspect import Suspect
+from slviewer.fringe.suspect import Fault, Suspect
 
 LEAST_GAIN = 0.005
 """rms variation of the gains below which they are left alone: what a camera's curve and blur pretend at most."""
@@ -64,7 +64,8 @@ MODELS: tuple[tuple[Term, ...], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class FrameLight:
-    """The light of each of n frames, relative to their mean; `terms` is empty where it need not be corrected.
+    """The light of each of n frames, relative to their mean; `terms` is empty where it need not, or cannot, be
+    corrected: `unexplained` are the terms by which frames differ, though they explain too little of what is seen.
 
     ``drift``: rms of the gains' logarithm; ``wave``: rms amplitude of the wave along the rows, relative; ``room``
     (n,): room light of each frame as a share of the mean grey level, from 0 on.
@@ -75,6 +76,7 @@ class FrameLight:
     drift: float = 0.0
     wave: float = 0.0
     room: np.ndarray | None = None
+    unexplained: tuple[Term, ...] = ()
 
     @property
     def is_significant(self) -> bool:
@@ -106,7 +108,7 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     if fit is not gains and not _is_worth_it(sample, fit):
         fit = gains
     if not _explains(sample, fit):
-        return steady
+        return replace(steady, unexplained=fit.terms)
     light = _with_fine_stripes(sample, _with_nearest(sample, fit))
     used = list(fit.informed)
     room = _room(sample, light, used)
@@ -179,6 +181,27 @@ def original_levels(
     """Modulation, background and noise (a, b) of equalized frames in the grey levels of the capture."""
     per_level = np.float32(1 / factor)
     return modulation * per_level, background * per_level, (noise[0] / factor**2, noise[1] / factor)
+
+
+def describe_unexplained(light: FrameLight) -> tuple[Fault, str] | None:
+    """What differs between the frames by more than can be corrected, and what to do; None where nothing does."""
+    if not light.unexplained:
+        return None
+    if "wave" in light.unexplained:
+        return "flicker", (
+            "the light varies along the image rows and between the frames by more than can be corrected (lamps or a "
+            "projector that flicker, under a rolling shutter): make the exposure time a multiple of 10 ms (8.33 ms "
+            "where the mains have 60 Hz) and of the projector's frame, and switch off the lamps of the room"
+        )
+    if len(light.unexplained) > 1:
+        return "room-light", (
+            "the light of the room changes between the frames by more than can be corrected: keep it constant, or "
+            "switch it off"
+        )
+    return "exposure-drift", (
+        "the brightness varies from frame to frame by more than can be corrected (automatic exposure, or an unsteady "
+        "lamp): lock the camera's exposure, gain and white balance"
+    )
 
 
 def light_suspects(sequence: PatternSequence, light: FrameLight) -> list[Suspect]:

@@ -8,7 +8,7 @@ from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.ghost import ghost_suspects
 from slviewer.fringe.layout import Shift
 from slviewer.fringe.line_sample import LineSample
-from slviewer.fringe.residual_order import order_suspects, strange_suspects
+from slviewer.fringe.residual_order import order_suspects, shown_steps, strange_suspects
 from slviewer.fringe.residual_sample import Fringe, fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
 
@@ -25,7 +25,15 @@ def misplaced_steps(
     out = []
     causes = {"late": "duplicate-frame", "dropped": "missing-frame", "lag": "frame-lag"}
     for sampled in _sampled_steps(sequence, axis, sample, images):
-        for suspect in order_suspects(sampled):
+        suspects = order_suspects(sampled)
+        if suspects and (steps := shown_steps(sampled)):
+            order = ", ".join(str(step) for step in steps)
+            text = (
+                f"the {len(steps)} phase steps of axis {axis} come in the order {order}: number the frames so in the "
+                "description"
+            )
+            return [Contradiction("step-order", text, axis, None)]
+        for suspect in suspects:
             cause = causes.get(suspect.fault, "frame-order")
             text = f"{suspect.sentence}: put the frames in order, or capture again"
             out.append(Contradiction(cause, text, axis, float(suspect.frame)))
@@ -37,9 +45,8 @@ def unexplained_steps(sequence: PatternSequence, sample: LineSample, images: Ima
     unexplained: set[int] = set()
     for axis in sequence.axes:
         for sampled in _sampled_steps(sequence, axis, sample, images):
-            if sampled.steps > 3:
+            if sampled.steps > 3 and not ghost_suspects(sampled):  # else all steps hold a share of the image before
                 unexplained |= {suspect.frame for suspect in strange_suspects(sampled)}
-                unexplained -= {suspect.frame for suspect in ghost_suspects(sampled)}
     return unexplained
 
 

@@ -22,11 +22,11 @@ SIGMAS = 10.0
 def ghost_share(sampled: Fringe) -> tuple[float, float]:
     """The share of the image before in each image, and its standard error, from the first step of a period.
 
-    NaN where no frame was captured right before the first step, where three steps fit anything, or where frames of
-    other light explain the residuals as well.
+    NaN where three steps fit anything, or where frames of other light explain the residuals as well. Before the very
+    first frame of a capture there is none, and it alone lacks its share.
     """
-    before = sampled.beside.get(sampled.shift.indices[0] - 1)
-    if before is None or sampled.steps < 4:
+    before = sampled.beside.get(sampled.shift.indices[0] - 1, sampled.fitted[0])
+    if sampled.steps < 4:
         return np.nan, np.nan
     keep = sampled.keep
     left = keep.astype(np.float32) @ sampled.frames
@@ -53,11 +53,15 @@ def ghost_suspects(sampled: Fringe) -> list[Suspect]:
     if not (LEAST_SHARE < share < MOST_SHARE and share > SIGMAS * error):
         return []
     i = sampled.shift.indices[0]
+    if i == 0:
+        seen = f"frame 1 lacks the {100 * share:.0f} % of the image before it that the other frames hold"
+    else:
+        seen = f"frame {i + 1} holds {100 * share:.0f} % of the image before it, and so may every frame"
     return [
         Suspect(
             i,
             "strange",
-            f"frame {i + 1} holds {100 * share:.0f} % of the image before it, and so may every frame: the projector "
+            f"{seen}: the projector "
             "changes its image slowly, or the camera exposes during the change; wait longer after each pattern",
         )
     ]

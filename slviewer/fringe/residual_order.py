@@ -29,6 +29,9 @@ _ALIKE = 0.1  # difference of repeated frames in square, as a share of what thei
 _LIGHT_ALONE = 0.4  # of its difference that remains when its light is made that of the others
 _DARKEST = 0.6  # no lamp flickers by more
 _MOST_FAULTS = 3
+_FEWEST_ORDERED = 5  # of four steps and fewer every order is a turn, a reflection or an exchange of two
+_OFF_STEP = 0.25  # of a step, and of the radius, by which a frame may be off the place of its step
+_FEW_MISPLACED = 0.5  # of the frames: these have changed places, and the others are in order
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,32 @@ def order_suspects(sampled: Fringe) -> list[Suspect]:
         now = found[0]
         told.append(_told(found, sampled.shift.indices))
     return told
+
+
+def shown_steps(sampled: Fringe) -> list[int] | None:
+    """The step that each frame of a period shows, where they are all there in an order of their own; None where the
+    frames are in their described order, apart from where it begins and which way it runs, or in none.
+
+    The frames less their mean span the plane of the vectors cos(2 pi k / n) and sin(2 pi k / n): in any orthonormal
+    basis of this plane the place of a frame is its step, turned or mirrored.
+    """
+    n = sampled.steps
+    if n < _FEWEST_ORDERED:
+        return None
+    frames = sampled.seen - sampled.seen.mean(axis=0)
+    basis = np.linalg.eigh((frames @ frames.T).astype(float))[1][:, -2:]
+    turns = np.arctan2(basis[:, 1], basis[:, 0]) * n / (2 * np.pi)
+    turns -= np.angle(np.mean(np.exp(2j * np.pi * turns))) / (2 * np.pi)  # whole steps apart
+    places = np.rint(turns).astype(int) % n
+    radius = np.hypot(*basis.T) / np.sqrt(2 / n)
+    if len(set(places.tolist())) < n or np.abs(turns - np.rint(turns)).max() > _OFF_STEP or np.ptp(radius) > _OFF_STEP:
+        return None
+    described = np.arange(n)
+    orders = [(sign * places + first) % n for sign in (1, -1) for first in range(n)]
+    steps = min(orders, key=lambda order: np.count_nonzero(order != described))
+    if np.count_nonzero(steps != described) <= _FEW_MISPLACED * n:
+        return None
+    return [int(step) for step in min(orders, key=lambda order: (order[0], order[1]))]
 
 
 def strange_suspects(sampled: Fringe) -> list[Suspect]:

@@ -47,6 +47,7 @@ _WORDS: tuple[tuple[str, frozenset[str]], ...] = (
     (r"% of the image before", frozenset({"crosstalk"})),
     (r"are saturated and masked", frozenset({"saturation"})),
     (r"fringes are weak", frozenset({"dark"})),
+    (r"lamps or a projector that flicker", frozenset({"flicker"})),
     (r"images were compressed", frozenset({"jpeg"})),
     (r"axes are exchanged", frozenset({"axes-swapped"})),
     (r"axis is reversed|turned by 180", frozenset({"axis-reversed"})),
@@ -308,10 +309,11 @@ def score(measured: Sequence[MeasuredScan], gauge: tuple[np.ndarray, np.ndarray]
     target = np.concatenate([m.on_target for m in measured])
     expected = sum(m.expected for m in measured)
     wrong = ~(np.abs(errors) <= SIGMAS * sigma)  # also where nothing is to be seen
-    squares = np.sort(errors[target] ** 2)[: max(1, int(_TRIMMED * np.count_nonzero(target)))]
+    most = max(1, int(_TRIMMED * np.count_nonzero(target)))
+    squares, predicted = np.sort(errors[target] ** 2)[:most], np.sort(sigma[target] ** 2)[:most]
     return Figures(
         float(np.sqrt(squares.mean())) if len(squares) else float("nan"),
-        float(np.sqrt(np.mean(sigma[target] ** 2))) if target.any() else float("nan"),
+        float(np.sqrt(predicted.mean())) if len(predicted) else float("nan"),
         float(wrong.mean()) if len(wrong) else 0.0,
         float(np.count_nonzero(target) / max(expected, 1)),
     )
