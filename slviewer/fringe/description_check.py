@@ -13,7 +13,7 @@ from slviewer.fringe.agreement_tests import failed_tests, is_sure, score_of
 from slviewer.fringe.axis_agreement import Agreement, AxisReader, agreement, coordinates, described_frames
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
-from slviewer.fringe.frame_light import FrameLight, describe_unexplained, equalize_frames, estimate_frame_light
+from slviewer.fringe.frame_light import describe_disturbance, equalize_frames, estimate_frame_light
 from slviewer.fringe.frame_order import fitting_order, misplaced_steps, unexplained_steps
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.line_sample import LineSample, coded_frames, grid_sample, sample_lines
@@ -27,6 +27,8 @@ APART = 6
 FEWEST_TURNS = 100
 MOST_CLIPPED = 0.05
 """Mean share of saturated values at illuminated pixels, beyond which bits and fringes become unreadable in places."""
+UNSTEADY = 0.1
+"""Relative rms of the mean brightness of phase steps, which incomplete fringes do not reach."""
 SUDDENLY = 0.2
 """Of the share of saturated values later on: no more of them before means that the light changed."""
 _OF_STEPS = ("duplicate-frame", "frame-order", "step-order")
@@ -44,39 +46,52 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
     if not contradictions:
         return ()
     light = estimate_frame_light(sequence, stack)
-    if not light.is_significant:
-        is_vague = all(contradiction.cause in ("unreadable", "duplicate-frame") for contradiction in contradictions)
-        return (is_vague and _disturbed_light(sequence, stack, light)) or contradictions
-    under_equal_light = _find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
-    is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
-    # Frames out of their place spoil the estimate of the light: what explains them as they are is believed.
-    return contradictions if under_equal_light and is_explained else under_equal_light
-
-
-def _disturbed_light(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> tuple[Contradiction, ...]:
-    """What makes frames unreadable that saturate, or differ in their light by more than can be corrected."""
+    if light.is_significant:
+        under_equal_light = _find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
+        is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
+        # Frames out of their place spoil the estimate of the light: what explains them as they are is believed.
+        return contradictions if under_equal_light and is_explained else under_equal_light
+    if any(contradiction.cause not in ("unreadable", "duplicate-frame") for contradiction in contradictions):
+        return contradictions
     sample = sample_lines(sequence, stack)
     coded = coded_frames(sequence)
     illuminated = sample.swing(coded) > sample.least_swing
     clipped = np.array([float(np.mean(sample.frames[i][illuminated] >= sample.white)) for i in coded])
     if np.mean(clipped) > MOST_CLIPPED:
-        k = max(range(2, len(coded) - 1), key=lambda k: float(np.median(clipped[k:]) - clipped[:k].max()))
-        if clipped[:k].max() < SUDDENLY * np.median(clipped[k:]):
-            text = (
-                f"from frame {coded[k] + 1} on {100 * np.mean(clipped[k:]):.0f} % of the illuminated pixels are "
-                "saturated, and hardly any before: the light of the room changed; keep it constant, or switch it off, "
-                "and lower the exposure"
-            )
-            return (Contradiction("room-light", text, None, float(coded[k])),)
-        share = 100 * float(np.mean(clipped))
+        return (_saturated(coded, clipped),)
+    unsteady = _unsteadiness(sequence, sample, illuminated)
+    if light.unexplained and unsteady > UNSTEADY:
+        return (Contradiction(*describe_disturbance(light.unexplained), None, unsteady),)
+    return contradictions
+
+
+def _saturated(coded: list[int], clipped: np.ndarray) -> Contradiction:
+    """What to say of ``coded`` frames in which these shares of the illuminated pixels are saturated."""
+    k = max(range(2, len(coded) - 1), key=lambda k: float(np.median(clipped[k:]) - clipped[:k].max()))
+    if clipped[:k].max() < SUDDENLY * np.median(clipped[k:]):
         text = (
-            f"{share:.0f} % of the illuminated pixels are saturated in the mean of the frames: lower the exposure or "
-            "the gain, and capture again"
+            f"from frame {coded[k] + 1} on {100 * np.mean(clipped[k:]):.0f} % of the illuminated pixels are saturated, "
+            "and hardly any before: the light of the room changed; keep it constant, or switch it off, and lower the "
+            "exposure"
         )
-        return (Contradiction("saturation", text, None, share),)
-    if disturbance := describe_unexplained(light):
-        return (Contradiction(*disturbance, None, None),)
-    return ()
+        return Contradiction("room-light", text, None, float(coded[k]))
+    share = 100 * float(np.mean(clipped))
+    text = (
+        f"{share:.0f} % of the illuminated pixels are saturated in the mean of the frames: lower the exposure or the "
+        "gain, and capture again"
+    )
+    return Contradiction("saturation", text, None, share)
+
+
+def _unsteadiness(sequence: PatternSequence, sample: LineSample, illuminated: np.ndarray) -> float:
+    """The largest relative rms by which the mean brightness of the phase steps of one period differs: whatever their
+    order, under equal light it does not, as long as several fringes are seen."""
+    worst = 0.0
+    for axis in sequence.axes:
+        for _, images in described_frames(sequence, axis).shifts[-1:]:
+            means = [float(sample.frames[i][illuminated].mean()) for i in images if i is not None]
+            worst = max(worst, float(np.std(means) / max(np.mean(means), 1e-6)))
+    return worst
 
 
 def _find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:

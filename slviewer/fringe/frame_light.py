@@ -183,17 +183,15 @@ def original_levels(
     return modulation * per_level, background * per_level, (noise[0] / factor**2, noise[1] / factor)
 
 
-def describe_unexplained(light: FrameLight) -> tuple[Fault, str] | None:
-    """What differs between the frames by more than can be corrected, and what to do; None where nothing does."""
-    if not light.unexplained:
-        return None
-    if "wave" in light.unexplained:
+def describe_disturbance(terms: Sequence[Term]) -> tuple[Fault, str]:
+    """What differs between frames whose light has these ``terms``, by more than can be corrected, and what to do."""
+    if "wave" in terms:
         return "flicker", (
             "the light varies along the image rows and between the frames by more than can be corrected (lamps or a "
             "projector that flicker, under a rolling shutter): make the exposure time a multiple of 10 ms (8.33 ms "
             "where the mains have 60 Hz) and of the projector's frame, and switch off the lamps of the room"
         )
-    if len(light.unexplained) > 1:
+    if len(terms) > 1:
         return "room-light", (
             "the light of the room changes between the frames by more than can be corrected: keep it constant, or "
             "switch it off"

@@ -25,15 +25,14 @@ def misplaced_steps(
     out = []
     causes = {"late": "duplicate-frame", "dropped": "missing-frame", "lag": "frame-lag"}
     for sampled in _sampled_steps(sequence, axis, sample, images):
-        suspects = order_suspects(sampled)
-        if suspects and (steps := shown_steps(sampled)):
+        if steps := shown_steps(sampled):
             order = ", ".join(str(step) for step in steps)
             text = (
                 f"the {len(steps)} phase steps of axis {axis} come in the order {order}: number the frames so in the "
                 "description"
             )
             return [Contradiction("step-order", text, axis, None)]
-        for suspect in suspects:
+        for suspect in order_suspects(sampled):
             cause = causes.get(suspect.fault, "frame-order")
             text = f"{suspect.sentence}: put the frames in order, or capture again"
             out.append(Contradiction(cause, text, axis, float(suspect.frame)))

@@ -85,7 +85,7 @@ def shown_steps(sampled: Fringe) -> list[int] | None:
     described = np.arange(n)
     orders = [(sign * places + first) % n for sign in (1, -1) for first in range(n)]
     steps = min(orders, key=lambda order: np.count_nonzero(order != described))
-    if np.count_nonzero(steps != described) <= _FEW_MISPLACED * n:
+    if np.count_nonzero(steps != described) < _FEW_MISPLACED * n:
         return None
     return [int(step) for step in min(orders, key=lambda order: (order[0], order[1]))]
 

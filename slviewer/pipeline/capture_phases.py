@@ -9,7 +9,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, texture
 from slviewer.fringe.description_check import check_description
-from slviewer.fringe.frame_light import describe_unexplained, estimate_frame_light
+from slviewer.fringe.frame_light import describe_disturbance, estimate_frame_light
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
@@ -84,8 +84,10 @@ def check_capture(
             worst = int(np.argmax(shares))
             seen, cure = list(_REASONS.values())[worst]
             raise InputError(f"{name}: {share} along {axis}, {100 * shares[worst]:.0f} % {seen}: {cure}")
-        if disturbance := describe_unexplained(estimate_frame_light(sequence, frames)):
-            raise InputError(f"{name}: no pixel carries a readable {axis} pattern: {disturbance[1]}")
+        if unexplained := estimate_frame_light(sequence, frames).unexplained:
+            raise InputError(
+                f"{name}: no pixel carries a readable {axis} pattern: {describe_disturbance(unexplained)[1]}"
+            )
         middle = float(np.median(phase.modulation))
         raise InputError(
             f"{name}: no pixel carries a readable {axis} pattern (median modulation {middle:.1f} grey levels): raise "
@@ -109,8 +111,9 @@ def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping
         white = white_level(frames, sequence.select(axis))
         least = dark_limit(np.array([background], np.float32), phase.noise, white, dark_sigmas(layout(sequence, axis)))
         if modulation < NEAR_DARK * float(least[0]):
-            if disturbance := describe_unexplained(estimate_frame_light(sequence, frames)):
-                messages.append(f"{disturbance[1]}; pixels of a modulation below {float(least[0]):.1f} are masked")
+            if unexplained := estimate_frame_light(sequence, frames).unexplained:
+                cause = describe_disturbance(unexplained)[1]
+                messages.append(f"{cause}; pixels of a modulation below {float(least[0]):.1f} are masked")
                 break
             messages.append(
                 f"the {axis} fringes are weak, {modulation:.0f} grey levels in the median, and pixels below "

@@ -147,6 +147,43 @@ def test_exchanged_axes_are_named(name: str) -> None:
     assert causes(exchanged, frames) == [("axes-swapped", None)]
 
 
+@pytest.mark.parametrize("kinds", [("phase",), ("gray", "complementary")])
+def test_steps_or_bits_of_the_other_axis_are_named(kinds: tuple[str, ...]) -> None:
+    sequence, frames = taken("complementary")
+    x, y = ([i for i, f in enumerate(sequence.frames) if f.axis == axis and f.kind in kinds] for axis in AXES)
+    order = np.arange(len(frames))
+    order[x], order[y] = y, x
+    assert causes(sequence, frames[order])[0][0] == "axes-swapped"
+
+
+def test_bits_in_reverse_order_after_the_complementary_one_are_named() -> None:
+    sequence, frames = taken("complementary")
+    order = np.arange(len(frames))
+    for axis in AXES:
+        places = [i for i, f in enumerate(sequence.frames) if f.axis == axis and f.kind in ("gray", "complementary")]
+        order[places] = places[::-1]
+    assert causes(sequence, frames[order]) == [("bit-order", "x"), ("bit-order", "y")]
+
+
+@pytest.mark.parametrize("steps", [[*range(0, 18, 2), *range(1, 18, 2)], [k // 2 + 9 * (k % 2) for k in range(18)]])
+def test_all_steps_in_another_order_are_named(steps: list[int]) -> None:
+    sequence, frames = taken("p18")
+    order = np.arange(len(frames))
+    places = np.array(sequence.find("phase", "y"))
+    order[places] = places[steps]
+    (contradiction,) = check_description(sequence, frames[order])
+    assert (contradiction.cause, contradiction.axis) == ("step-order", "y")
+    assert ", ".join(map(str, steps)) in contradiction.message
+
+
+def test_a_lamp_that_saturates_the_later_frames_is_named() -> None:
+    sequence, frames = taken("p18")
+    lamp = np.where(np.arange(len(frames)) >= 20, 170, 0)[:, None, None]
+    switched_on = np.clip(frames.astype(int) + lamp, 0, 255).astype(np.uint8)
+    (contradiction,) = check_description(sequence, switched_on)
+    assert contradiction.cause == "room-light" and "frame 21 " in contradiction.message
+
+
 @pytest.mark.parametrize("name", ["p18", "complementary", "three", "inverses"])
 def test_the_sign_of_one_axis_is_named(name: str) -> None:
     sequence, frames = taken(name)

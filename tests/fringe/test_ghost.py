@@ -42,5 +42,8 @@ def test_nothing_else_is_taken_for_it(fault, severity):
     assert ghost_suspects(sampled(fault, severity)) == []
 
 
-def test_without_a_frame_before_nothing_is_said():
-    assert np.isnan(ghost_share(sampled("crosstalk", "severe", "x"))[0])
+def test_the_first_frame_of_a_capture_lacks_the_share_of_the_others():
+    assert ghost_share(sampled("crosstalk", "severe", "x"))[0] == pytest.approx(0.15, rel=0.25)
+    assert ghost_suspects(sampled(axis="x")) == []
+    (suspect,) = ghost_suspects(sampled("crosstalk", "severe", "x"))
+    assert suspect.frame == 0 and "lacks" in suspect.sentence
