@@ -90,7 +90,7 @@ def _unsteadiness(sequence: PatternSequence, sample: LineSample, illuminated: np
     for axis in sequence.axes:
         for _, images in described_frames(sequence, axis).shifts[-1:]:
             means = [float(sample.frames[i][illuminated].mean()) for i in images if i is not None]
-            worst = max(worst, float(np.std(means) / max(np.mean(means), 1e-6)))
+            worst = max(worst, float(np.std(means)) / max(float(np.mean(means)), 1e-6))
     return worst
 
 
