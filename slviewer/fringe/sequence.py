@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any, Generic, Literal, NamedTuple, TypeVar, get_args
 
@@ -347,3 +347,10 @@ def _check_complete(found: list[int], wanted: range, what: str) -> None:
 
 def _listed(values: Any) -> str:
     return ", ".join(f"{v:g}" for v in sorted(values))
+
+
+def one_axis(sequence: PatternSequence, axis: Axis) -> PatternSequence:
+    """The frames of one axis, and one texture."""
+    frames = [f for f in sequence.frames if f.axis == axis]
+    texture = [f for f in sequence.frames if f.kind == "texture"][:1]
+    return replace(sequence, frames=(*frames, *texture))

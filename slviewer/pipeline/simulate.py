@@ -4,7 +4,6 @@ import json
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.session.importers.imported import ImportedCapture
 from slviewer.session.ply import write_ply
@@ -101,10 +100,3 @@ def turn_plan(rig: SimulatedRig, board: Board, poses: int) -> dict[str, Scene]:
         for i, pose in enumerate(target_poses(rig, board, poses), 1)
     }
     return {**targets, **moved_objects(), **turning()}
-
-
-def one_axis(sequence: PatternSequence, axis: Axis) -> PatternSequence:
-    """The frames of one axis, and one texture."""
-    frames = [f for f in sequence.frames if f.axis == axis]
-    texture = [f for f in sequence.frames if f.kind == "texture"][:1]
-    return replace(sequence, frames=(*frames, *texture))

@@ -23,14 +23,14 @@ from slviewer.fringe.layout import layout
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import multifrequency, p18
 from slviewer.fringe.reference import decode_reference
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.fringe.threshold import fringe_mean
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.feedback import Progress, part, unheard
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.open_session import opened
 from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.simulate import TARGET, one_axis, simulate
+from slviewer.pipeline.simulate import TARGET, simulate
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.session.ply import write_ply

@@ -15,10 +15,10 @@ from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.errors import InputError
 from slviewer.evaluation.render import render
 from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.shapes import fit_plane
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, unheard
-from slviewer.pipeline.simulate import one_axis
 from slviewer.simulation.boards import BoardScene, Pose
 from slviewer.simulation.plans import planes, rotation, target_poses
 from slviewer.simulation.renderer import Renderer

@@ -21,9 +21,10 @@ from slviewer.evaluation import letter as the_letter
 from slviewer.evaluation.render import Row, render
 from slviewer.fringe.decode import texture
 from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, part, unheard
-from slviewer.pipeline.simulate import TARGET, one_axis, turn_plan
+from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct
 from slviewer.registration.multiway import Alignment, Starts, register_all

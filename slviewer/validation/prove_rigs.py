@@ -23,10 +23,10 @@ from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.fringe.decode import texture
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, unheard
-from slviewer.pipeline.simulate import TARGET, one_axis
+from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.simulation.boards import BoardShape

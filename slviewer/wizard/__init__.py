@@ -7,7 +7,7 @@
 `preview_watcher`   one thread that looks at the latest preview frame: board, brightness, stillness
 `jobs`              one worker that computes, one job after the other; each can be cancelled within a second
 `session_reader`    what the session's files say: poses, calibration, verifications, scans, merge
-`steps`             the eight steps, and what each is waiting for
+`steps`             the nine steps, and what each is waiting for
 `snapshot`          what a panel draws
 `autopilot`         plays the whole wizard on the simulated rig, by the same requests
 ==================  ====================================================================================================

@@ -8,9 +8,8 @@ import numpy as np
 
 from slviewer.devices.capture import Taken
 from slviewer.errors import DeviceError, InputError, SessionError
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence, one_axis
 from slviewer.pipeline.capture import keep, sequence_for
-from slviewer.pipeline.simulate import one_axis
 from slviewer.session.atomic import megabytes
 from slviewer.wizard.acquisition import CaptureRequest
 from slviewer.wizard.engine import Engine

@@ -18,9 +18,9 @@ from slviewer.evaluation.budget import Contribution, budget
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.simulate import one_axis
 from slviewer.reconstruction.reconstruct import reconstruct
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer

@@ -16,10 +16,10 @@ from distributed import Client
 from slviewer.cli import main
 from slviewer.errors import Cancelled, SlviewerError, UsageError
 from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.reconstruct import reconstruct
-from slviewer.pipeline.simulate import one_axis
 from slviewer.pipeline.verify import verify
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session

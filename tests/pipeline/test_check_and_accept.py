@@ -10,12 +10,12 @@ import pytest
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.places import bar_places
 from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.accept import accept
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.check import REFERENCE, check, history
 from slviewer.pipeline.models import load_stereo, save_imported_stereo
 from slviewer.pipeline.scale import scale_factor
-from slviewer.pipeline.simulate import one_axis
 from slviewer.session.store import Session
 from slviewer.simulation.boards import printed_board
 from slviewer.simulation.plans import rotation, target_poses

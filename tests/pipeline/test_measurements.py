@@ -14,12 +14,12 @@ from trimesh.creation import box
 from slviewer.errors import InputError, SessionError
 from slviewer.evaluation.region import find_spheres
 from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline import measurements
 from slviewer.pipeline.measured_surface import MeasuredSurface, surface
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.report import report
-from slviewer.pipeline.simulate import one_axis
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset

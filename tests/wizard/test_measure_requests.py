@@ -10,10 +10,10 @@ import trimesh
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measurements import measurements, quantities_of
 from slviewer.pipeline.models import save_imported_stereo
-from slviewer.pipeline.simulate import one_axis
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose

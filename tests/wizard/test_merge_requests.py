@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.models import save_imported_stereo
-from slviewer.pipeline.simulate import one_axis
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
