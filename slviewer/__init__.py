@@ -1,5 +1,12 @@
 """slviewer: a camera and a projector as a metrology-grade 3D scanner.
 
+    import slviewer as sl
+
+gives what a notebook needs, imported when it is first used. On a session, a folder that holds captures and results,
+work `import_captures`, `calibrate`, `reconstruct`, `verify`, `merge`, `mesh` and `measure`, named after their commands.
+On arrays, without a session, work `read_captures`, `decode`, `detect_board`, `calibrate_frames`, `reconstruct_cloud`,
+`evaluate_plane`, `evaluate_sphere`, `align_clouds`, `fuse_clouds`, `mesh_cloud`, `draw_error_maps` and `write_ply`.
+
 Conventions, the same everywhere:
 
 =================  ==========================================================================================
@@ -25,4 +32,93 @@ inspection, simulation, devices, session, report, pipeline, preflight, wizard, s
 command line at the end. A package imports only from those before it.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from slviewer.errors import SlviewerError
+    from slviewer.evaluation.plane import evaluate_plane
+    from slviewer.evaluation.sphere import evaluate_sphere
+    from slviewer.fringe.decode import decode, texture
+    from slviewer.fringe.description_check import check_description
+    from slviewer.fringe.phase import PhaseMap
+    from slviewer.fringe.presets import complementary, gray, multifrequency, p18
+    from slviewer.fringe.sequence import Frame, PatternSequence
+    from slviewer.pipeline.calibrate import CalibrationResult, calibrate, calibrate_frames, save_calibration
+    from slviewer.pipeline.import_captures import import_captures, read_captures
+    from slviewer.pipeline.measure import measure
+    from slviewer.pipeline.merge import merge
+    from slviewer.pipeline.mesh import mesh
+    from slviewer.pipeline.models import load_calibration
+    from slviewer.pipeline.reconstruct import reconstruct
+    from slviewer.pipeline.verify import verify
+    from slviewer.reconstruction.cloud import Cloud
+    from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_cloud
+    from slviewer.registration.multiway import register_all as align_clouds
+    from slviewer.report.maps import error_maps as draw_error_maps
+    from slviewer.session.ply import write_ply
+    from slviewer.session.store import Session
+    from slviewer.surface.fuse import fuse as fuse_clouds
+    from slviewer.surface.meshing import mesh_of as mesh_cloud
+    from slviewer.target.board import Board
+    from slviewer.target.detect import detect as detect_board
+
 __version__ = "0.1.0"
+
+_EXPORTS = {
+    "Board": "target.board",
+    "CalibrationResult": "pipeline.calibrate",
+    "Cloud": "reconstruction.cloud",
+    "Frame": "fringe.sequence",
+    "PatternSequence": "fringe.sequence",
+    "PhaseMap": "fringe.phase",
+    "Session": "session.store",
+    "SlviewerError": "errors",
+    "align_clouds": "registration.multiway:register_all",
+    "calibrate": "pipeline.calibrate",
+    "calibrate_frames": "pipeline.calibrate",
+    "check_description": "fringe.description_check",
+    "complementary": "fringe.presets",
+    "decode": "fringe.decode",
+    "detect_board": "target.detect:detect",
+    "draw_error_maps": "report.maps:error_maps",
+    "evaluate_plane": "evaluation.plane",
+    "evaluate_sphere": "evaluation.sphere",
+    "fuse_clouds": "surface.fuse:fuse",
+    "gray": "fringe.presets",
+    "import_captures": "pipeline.import_captures",
+    "load_calibration": "pipeline.models",
+    "measure": "pipeline.measure",
+    "merge": "pipeline.merge",
+    "mesh": "pipeline.mesh",
+    "mesh_cloud": "surface.meshing:mesh_of",
+    "multifrequency": "fringe.presets",
+    "p18": "fringe.presets",
+    "read_captures": "pipeline.import_captures",
+    "reconstruct": "pipeline.reconstruct",
+    "reconstruct_cloud": "reconstruction.reconstruct:reconstruct",
+    "save_calibration": "pipeline.calibrate",
+    "texture": "fringe.decode",
+    "verify": "pipeline.verify",
+    "write_ply": "session.ply",
+}
+"""{public name: module}, or module:name where it has another name there."""
+
+__all__ = [
+    "Board", "CalibrationResult", "Cloud", "Frame", "PatternSequence", "PhaseMap", "Session", "SlviewerError",
+    "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "decode", "detect_board",
+    "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray", "import_captures",
+    "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "multifrequency", "p18", "read_captures",
+    "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify", "write_ply",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _EXPORTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, original = _EXPORTS[name].partition(":")
+    return getattr(import_module(f"{__name__}.{module}"), original or name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

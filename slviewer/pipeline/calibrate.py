@@ -1,22 +1,27 @@
 """From a session's target poses to calibrations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
 import numpy as np
 
+from slviewer.calibration.diagnosis.attempt import Attempt
 from slviewer.calibration.diagnosis.verdict import Verdict, judge_splined
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError, UsageError
-from slviewer.pipeline.calibration_verdict import attempt, keep_rejected, rejected, save_verdict
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.calibration_verdict import attempt, attempt_poses, keep_rejected, rejected, save_verdict
+from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.models import available, preferred, save_fitted, save_stereo, warn_if_frame_changed
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
+from slviewer.pipeline.poses import Judged, read_pose
+from slviewer.session.store import Session
 from slviewer.target.board import Board
 
 _LENGTH = {"pixelwise": 1.0, "splined": 2.0}
@@ -33,6 +38,11 @@ class CalibrationResult:
     pixelwise: PixelwiseModel | None
     splined: SplinedModel | None = None
     verdict: Verdict = field(default_factory=Verdict)
+
+    @property
+    def best(self) -> StereoModel | PixelwiseModel | SplinedModel:
+        """The most accurate of the models: splined, else pixelwise, else stereo."""
+        return self.splined or self.pixelwise or self.stereo
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``calibrate --json``."""
@@ -143,32 +153,96 @@ def calibrate(
             keep_rejected(store, stereo, settings, found.verdict)
             save_verdict(store, found.verdict, names)
             raise rejected(found.verdict, kept=True)
-        if found.warning:
-            warn(found.warning)
-        for name, why in stereo.left_out.items():
-            if name not in left_out:
-                warn(f"{name} is left out: {why}")
-        for finding in found.verdict.findings:
-            if finding.severity == "doubtful":
-                warn(finding.text())
-        made = _made(models, stereo, found.observations, part(progress, 0.66, 0.97), warn)
-        verdict = judge_splined(found.verdict, made.splined.bundle.noise) if made.splined else found.verdict
-        for finding in verdict.findings:
-            if finding not in found.verdict.findings:
-                warn(finding.text())
-        if verdict.level == "rejected":
-            keep_rejected(store, stereo, settings, verdict)
-            save_verdict(store, verdict, names)
-            raise rejected(verdict, kept=True)
+        made = _fit_models(found, models, part(progress, 0.66, 0.97), warn, left_out)
+        if made.verdict.level == "rejected":
+            keep_rejected(store, stereo, settings, made.verdict)
+            save_verdict(store, made.verdict, names)
+            raise rejected(made.verdict, kept=True)
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
-        save_stereo(store, stereo, inputs, settings, verdict)
-        for model in (made.pixelwise, made.splined):
-            if model is not None:
-                save_fitted(store, model, inputs, settings)
-        save_verdict(store, verdict, names)
+        _save_models(store, made, inputs, settings)
+        save_verdict(store, made.verdict, names)
         warn_if_frame_changed(store, before, warn)
         progress(1.0, "calibrated")
+    return made
+
+
+def calibrate_frames(
+    sequence: PatternSequence,
+    poses: Mapping[str, np.ndarray],
+    target: str,
+    *,
+    models: Sequence[str] = (),
+    smoothing: str = "spline",
+    degree: int = 5,
+    progress: Progress = unheard,
+    warn: Warn = unwarned,
+) -> CalibrationResult:
+    """Calibrate from the frames of target poses in memory; nothing is saved.
+
+    ``poses``: {name: (n, h, w) uint8 or uint16}, the frames of each pose in the order of ``sequence``. ``target`` and
+    the options as in ``calibrate``. Raises CalibrationRejected with the reason where the poses make no sound
+    calibration.
+    """
+    board, step_2 = Board.parse(target), Smoothing(smoothing, degree)
+    if not poses:
+        raise InputError("no target pose was given: capture the board in at least three positions and tilts")
+
+    def read() -> Iterator[Judged]:
+        for name, frames in poses.items():
+            phases = decode_frames(name, sequence, frames)
+            texture = texture_8bit(sequence, frames)
+            yield read_pose(name, sequence, frames, phases, texture, board, step_2, examine=True)
+
+    found = attempt_poses(read(), len(poses), sequence, board, {}, part(progress, 0, 0.65))
+    if found.stereo is None or found.verdict.level == "rejected":
+        raise rejected(found.verdict, kept=False)
+    made = _fit_models(found, models or DEFAULT_MODELS, part(progress, 0.66, 1.0), warn)
+    if made.verdict.level == "rejected":
+        raise rejected(made.verdict, kept=False)
+    return made
+
+
+def save_calibration(session: SessionLike, result: CalibrationResult) -> None:
+    """Save the models of ``result`` in a session, which is created where there is none; those that it held before are
+    moved to its trash."""
+    with opened_or_made(session) as store:
+        for name in available(store):
+            store.trash_result(f"calibration/{name}")
+        _save_models(store, result, {}, {})
+
+
+def _save_models(
+    store: Session, result: CalibrationResult, inputs: Mapping[str, str], settings: Mapping[str, Any]
+) -> None:
+    save_stereo(store, result.stereo, inputs, settings, result.verdict)
+    for model in (result.pixelwise, result.splined):
+        if model is not None:
+            save_fitted(store, model, inputs, settings)
+
+
+def _fit_models(
+    found: Attempt, models: Sequence[str], progress: Progress, warn: Warn, excluded: Container[str] = ()
+) -> CalibrationResult:
+    """The models that follow from a stereo calibration that was not rejected, with the verdict on all of them.
+
+    Warns of poses that were left out, but for those ``excluded`` before, and of what is doubtful.
+    """
+    stereo = found.stereo
+    assert stereo is not None
+    if found.warning:
+        warn(found.warning)
+    for name, why in stereo.left_out.items():
+        if name not in excluded:
+            warn(f"{name} is left out: {why}")
+    for finding in found.verdict.findings:
+        if finding.severity == "doubtful":
+            warn(finding.text())
+    made = _made(models, stereo, found.observations, progress, warn)
+    verdict = judge_splined(found.verdict, made.splined.bundle.noise) if made.splined else found.verdict
+    for finding in verdict.findings:
+        if finding not in found.verdict.findings:
+            warn(finding.text())
     return replace(made, verdict=verdict)
 
 

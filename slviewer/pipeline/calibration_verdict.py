@@ -1,6 +1,6 @@
 """The verdict on a session's calibration: made with it, kept beside it, and asked before it is used."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from slviewer.fringe.layout import layout
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.models import VERDICT, available, save_stereo
-from slviewer.pipeline.poses import judge_all
+from slviewer.pipeline.poses import Judged, judge_all
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
@@ -32,14 +32,27 @@ def attempt(
     operator excluded.
     """
     sequence = store.load_capture(names[0]).sequence
+    poses = judge_all(store, names, board, smoothing, examine=True)
+    return attempt_poses(poses, len(names), sequence, board, left_out, progress)
+
+
+def attempt_poses(
+    poses: Iterable[Judged],
+    count: int,
+    sequence: PatternSequence,
+    board: Board,
+    left_out: Mapping[str, str],
+    progress: Progress,
+) -> Attempt:
+    """Calibrate stereo from ``count`` target poses as they are read, and judge it; ``left_out`` as in ``attempt``."""
     if contradiction := contradicting(sequence):
         evidence = Evidence(str(board), sequence.projector, (), contradiction=contradiction)
         return Attempt(judged(evidence), evidence, None, (), dict(left_out))
     observations: list[Observation] = []
     evidence_of_poses = []
     refused = dict(left_out)
-    for i, pose in enumerate(judge_all(store, names, board, smoothing, examine=True), 1):
-        progress(i / len(names), f"read {pose.name}")
+    for i, pose in enumerate(poses, 1):
+        progress(i / count, f"read {pose.name}")
         if pose.observation is None:
             refused[pose.name] = pose.refused
         else:

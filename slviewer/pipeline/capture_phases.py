@@ -151,9 +151,18 @@ def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
     choice = capture.exposure_choice
     if colour is None and choice is not None:
         return toned(radiance(image, choice, capture.exposures_ms))
+    return eight_bit(image)
+
+
+def texture_8bit(sequence: PatternSequence, frames: np.ndarray) -> np.ndarray:
+    """(h, w) uint8: the scene under white light, from the frames (n, h, w) of a sequence."""
+    return eight_bit(texture(sequence, frames))
+
+
+def eight_bit(image: np.ndarray) -> np.ndarray:
+    """The image in uint8, its brightest pixel 255 where it has 16 bits."""
     if image.dtype == np.uint16:
-        top = max(int(image.max()), 1)
-        image = cv2.convertScaleAbs(image, alpha=255.0 / top)
+        image = cv2.convertScaleAbs(image, alpha=255.0 / max(int(image.max()), 1))
     return np.ascontiguousarray(image, np.uint8)
 
 

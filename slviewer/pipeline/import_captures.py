@@ -57,6 +57,44 @@ def import_captures(
     Captures that cannot be read or decoded are skipped, and ``warn`` hears why. Raises InputError where none is left,
     or, with ``strict``, for the first of them; nothing is saved then.
     """
+    known = None if projector else _known_projector(session)
+    found = _find_captures(source, layout, sequence, prefix, projector, channel, known, warn, options)
+    return _save(found, session, role, origin, force, strict, progress, warn)
+
+
+def read_captures(
+    source: Path | str,
+    layout: str = "detect",
+    *,
+    sequence: Path | str | None = None,
+    projector: Size | None = None,
+    channel: Channel | None = None,
+    warn: Warn = unwarned,
+    **options: Any,
+) -> list[ImportedCapture]:
+    """Read a folder of captures of any known layout into memory, as ``import_captures`` does; nothing is saved.
+
+    Of several exposures each pixel comes from the longest that did not clip it. Raises InputError where an image cannot
+    be used; captures that are incomplete are skipped with a warning.
+    """
+    found = _find_captures(source, layout, sequence, None, projector, channel, None, warn, options)
+    for message in (*found.warnings, *map(str, found.skipped)):
+        warn(message)
+    return [replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in found]
+
+
+def _find_captures(
+    source: Path | str,
+    layout: str,
+    sequence: Path | str | None,
+    prefix: str | None,
+    projector: Size | None,
+    channel: Channel | None,
+    known: tuple[int, int] | None,
+    warn: Warn,
+    options: dict[str, Any],
+) -> Imports:
+    """The captures of a folder, not yet read; ``known``: the projector's size where nobody states it."""
     source = Path(source).expanduser()
     if layout == "detect":
         layout = "frames" if sequence is not None else detect_layout(source)
@@ -68,12 +106,12 @@ def import_captures(
         if toml is None:
             raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
         options["toml"] = Path(toml)
-    elif size is None and (size := _known_projector(session)) is not None:
+    elif size is None and (size := known) is not None:
         warn(f"the projector is taken to have {size[0]}x{size[1]} px, as in the session: --projector for another size")
     found = LAYOUTS[layout].read(source, prefix=prefix, projector=size, **options)
     if channel is not None:
         found = replace(found, recordings=[replace(recording, channel=channel) for recording in found.recordings])
-    return _save(found, session, role, origin, force, strict, progress, warn)
+    return found
 
 
 def import_p18(source: Path | str, session: SessionLike, **options: Any) -> list[str]:

@@ -14,6 +14,7 @@ from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.session.store import Session
 
 Model = StereoModel | PixelwiseModel | SplinedModel
@@ -90,6 +91,15 @@ def load_stereo(store: Session) -> StereoModel:
         Lens(m["K_camera"], m["D_camera"], camera), Lens(m["K_projector"], m["D_projector"], projector), m["R"], m["T"]
     )
     return StereoModel.made_elsewhere(rig)
+
+
+def load_calibration(session: SessionLike, model: str | None = None, *, accept_rejected: bool = False) -> Model:
+    """The calibration of a session called ``model``; by default the one that the session prefers.
+
+    Raises InputError where there is none, CalibrationRejected for one that was rejected, unless that is accepted.
+    """
+    with opened(session) as store:
+        return load_model(store, model or best(store, accept_rejected))
 
 
 def load_stereo_if_complete(store: Session) -> StereoModel | None:

@@ -9,7 +9,7 @@ from slviewer.calibration.diagnosis.evidence import PoseEvidence
 from slviewer.calibration.observe import READING, Observation, Smoothing, observe
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decoded
 from slviewer.pipeline.pose_evidence import examine as examine_frames
 from slviewer.pipeline.pose_evidence import keep_evidence, known_evidence
@@ -29,6 +29,35 @@ class Judged:
     evidence: PoseEvidence | None = None
 
 
+def read_pose(
+    name: str,
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    phases: dict[Axis, PhaseMap],
+    texture: np.ndarray,
+    board: Board,
+    smoothing: Smoothing,
+    examine: bool = False,
+) -> Judged:
+    """The observation of a decoded target pose, or the reason why there is none.
+
+    ``texture`` (h, w) or (h, w, 3) uint8 shows the board. ``examine``: with the evidence of its frames (n, h, w).
+    """
+    found: Detection | None = None
+    seen: Observation | None = None
+    refused = ""
+    try:
+        found = detect(board, texture)
+        seen = observe(name, board, found, phases, smoothing)
+        check_capture(name, sequence, frames, phases)
+    except InputError as error:
+        refused = str(error).removeprefix(f"{name}: ")
+    evidence = None
+    if examine:
+        evidence = examine_frames(name, sequence, frames, phases, board, texture, found, seen, refused)
+    return Judged(name, None if refused else seen, refused, evidence)
+
+
 def judge(
     store: Session,
     capture: Capture,
@@ -38,25 +67,11 @@ def judge(
     smoothing: Smoothing,
     examine: bool = False,
 ) -> Judged:
-    """Detect the board and read the pose, and keep what was found in the session.
-
-    ``examine``: look at its frames too, for what may be wrong with them.
-    """
+    """Read the pose as ``read_pose`` does, and save the result in the session."""
     texture = capture_texture(capture, frames)
-    found: Detection | None = None
-    seen: Observation | None = None
-    refused = ""
-    try:
-        found = detect(board, texture)
-        seen = observe(capture.name, board, found, phases, smoothing)
-        check_capture(capture.name, capture.sequence, frames, phases)
-    except InputError as error:
-        refused = str(error).removeprefix(f"{capture.name}: ")
-    evidence = None
-    if examine:
-        evidence = examine_frames(capture.name, capture.sequence, frames, phases, board, texture, found, seen, refused)
-        keep_evidence(store, capture, board, evidence)
-    judged = Judged(capture.name, None if refused else seen, refused, evidence)
+    judged = read_pose(capture.name, capture.sequence, frames, phases, texture, board, smoothing, examine)
+    if judged.evidence is not None:
+        keep_evidence(store, capture, board, judged.evidence)
     meta = {
         "target": str(board),
         "smoothing": _settings(smoothing),
