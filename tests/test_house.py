@@ -71,8 +71,7 @@ def package_of(module: str) -> str | None:
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_imports_run_one_way(path: Path) -> None:
     place = path.relative_to(ROOT / "slviewer").with_suffix("").parts[0]
-    if place == "__init__":
-        assert imports_of(path) == set()
+    if place == "__init__":  # public names, imported when they are first used
         return
     for name in imports_of(path):
         package = package_of(name)
@@ -85,6 +84,7 @@ def test_imports_run_one_way(path: Path) -> None:
 def module_graph() -> dict[str, set[str]]:
     """{module: modules that it imports}, also inside functions and for type checking alone."""
     names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in SOURCES}
+    names.pop("slviewer.__init__")
     graph = {}
     for module, path in names.items():
         imported = imports_of(path)
