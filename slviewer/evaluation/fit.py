@@ -45,8 +45,8 @@ class ShapeResult:
         if self.set_aside_share <= SET_ASIDE_WARNING:
             return None
         return (
-            f"{100 * self.set_aside_share:.1f} % of the points lie beyond {SET_ASIDE_SIGMA:g} robust sigma and were "
-            "set aside: look at the error map before you trust the RMS."
+            f"{100 * self.set_aside_share:.1f} % of the points are outliers, beyond {SET_ASIDE_SIGMA:g} robust "
+            "standard deviations, and not part of the RMS: look at the error map before you trust it."
         )
 
 

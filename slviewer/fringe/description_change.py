@@ -64,12 +64,12 @@ def _variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list
     """The description with bits, phase sign or both changed; and what each change means."""
     bits: list[tuple[AxisFrames, list[Contradiction]]] = [(frames, [])]
     if len(frames.bits) - frames.complementary > 1:
-        text = f"the Gray bits of axis {axis} are in reverse order, the least significant first: number them backwards"
+        text = f"the Gray bits of axis {axis} are in reverse order, the finest stripes first: reverse the bit numbers"
         bits.append((reversed_bits(frames), [Contradiction("bit-order", text, axis, None)]))
         if frames.complementary:
             text = (
-                f"the Gray bits of axis {axis} are in reverse order, the complementary bit first: number all of them "
-                "backwards"
+                f"the Gray bits of axis {axis} are in reverse order, the complementary bit first: reverse the numbers "
+                "of all of them"
             )
             bits.append((reversed_bits(frames, True), [Contradiction("bit-order", text, axis, None)]))
         text = f"the Gray bits of axis {axis} are inverted: exchange each bit with its inverse"
@@ -80,8 +80,8 @@ def _variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list
         if frames.shifts:
             flipped = replace(variant, sign=-variant.sign)
             text = (
-                f"the phase of axis {axis} falls where the coordinate rises: set phase_sign = {flipped.sign} for axis "
-                f"{axis}"
+                f"the fringes of axis {axis} shift in the opposite direction to the description: set phase_sign = "
+                f"{flipped.sign} for axis {axis}"
             )
             yield flipped, [*changes, Contradiction("step-order", text, axis, float(flipped.sign))]
     if frames.shifts and not frames.bits:
@@ -114,9 +114,9 @@ def _with_values(
             out.append(
                 Contradiction(
                     "gray-cell",
-                    f"a cell of the Gray code of axis {axis} holds {cell / period:.3g} fringes, and "
-                    f"{frames.cell_px / period:.3g} were described: set gray_cell_px = {cell:.4g}, or "
-                    f"period_px = {fitting:.4g} if the cells are right",
+                    f"a cell of the Gray code of axis {axis} covers {cell / period:.3g} fringe periods, and the "
+                    f"description says {frames.cell_px / period:.3g}: set gray_cell_px = {cell:.4g}, or period_px = "
+                    f"{fitting:.4g} if the cells are right",
                     axis,
                     cell,
                 )
@@ -160,7 +160,7 @@ def _phase_shifted(frames: AxisFrames, a: Agreement, late: float, axis: Axis) ->
     share = share_of_period(2 * np.pi * late)
     shifted = Contradiction(
         "phase-offset",
-        f"the phase steps of axis {axis} begin {share} than described: set phase_offset = {offset:.3f}",
+        f"the phase steps of axis {axis} begin {share} than described: set phase_offset = {offset:.3f} (rad)",
         axis,
         offset,
     )
@@ -168,7 +168,7 @@ def _phase_shifted(frames: AxisFrames, a: Agreement, late: float, axis: Axis) ->
     moved = Contradiction(
         "gray-origin",
         f"the Gray code of axis {axis} begins {share.rsplit(' ', 1)[0]} of the fringes from where it was described: "
-        f"set gray_origin = {origin * period:.2f}",
+        f"set gray_origin = {origin * period:.2f} (px)",
         axis,
         float(origin * period),
     )
@@ -188,7 +188,7 @@ def too_small(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradictio
     out = [Contradiction("projector-size", size, axis, a.reach_px)]
     if frames.shifts:
         period = frames.shifts[-1][0] * frames.extent / a.reach_px
-        text = f"{seen}: or the fringe period is {period:.3g} px or less: correct period_px"
+        text = f"the fringe period of axis {axis} is {period:.3g} px or less: correct period_px"
         out.append(Contradiction("fringe-period", text, axis, period))
     return out
 

@@ -186,8 +186,8 @@ def _axes_exchanged(
             return (_exchanged_axes("the codes along x fit the projector's rows, and those along y its columns"),)
         which = "phase steps" if with_steps else "Gray frames"
         text = (
-            f"the {which} described as x fit the other frames of y, and those described as y the other frames of x: "
-            f"exchange the {which} of x and y in the description"
+            f"x and y are exchanged in the {which} alone, which fit the other frames of the other axis: exchange the "
+            f"{which} of x and y in the description"
         )
         return (Contradiction("axes-swapped", text, None, None),)
     return ()
@@ -237,15 +237,15 @@ def _unexplained(axis: Axis, a: Agreement, failed: set[str]) -> Contradiction:
     if "bits" in failed:
         seen = f"Gray bit {a.unreadable} of axis {axis} cannot be read though its stripes should be wide"
     elif "rule" in failed:
-        seen = f"{100 * (1 - a.rule):.0f} % of the edges of a Gray bit of axis {axis} contradict the other bits"
+        seen = f"a Gray bit of axis {axis} contradicts the other bits at {100 * (1 - a.rule):.0f} % of its edges"
     elif failed & {"common", "rising", "cell"}:
-        seen = f"the edges of the Gray code of axis {axis} fall at no common phase of the fringes"
+        seen = f"Gray code and fringes of axis {axis} do not fit together: the code's edges fall at no common phase"
     elif failed & {"levels", "level offset"}:
         seen = f"the fringe periods of axis {axis} contradict each other"
     else:
         seen = f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector"
     text = (
-        f"{seen}, and no other order, numbering or size explains it: check that all frames belong to one capture, that "
-        "nothing moved, and the periods, steps and bits of the description"
+        f"{seen}, and no other order, numbering or size of the frames explains it: check that all frames belong to one "
+        "capture, that nothing moved, and the periods, steps and bits of the description"
     )
     return Contradiction("unreadable", text, axis, None)

@@ -91,9 +91,9 @@ def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, 
         images = tuple(i + lag if 0 <= i + lag < n else None for i in range(n))
         count = "one image" if abs(lag) == 1 else f"{abs(lag)} images"
         way = (
-            "behind the projector: let the camera wait longer after each pattern"
+            "late, so that each shows the pattern before its own: let the camera wait longer after each pattern"
             if lag > 0
-            else ("ahead of the projector: the first frame is missing")
+            else "early, so that each shows the pattern after its own: the first frame is missing"
         )
         text = f"all frames are {count} {way}, and capture again, or move the files by {count}"
         yield images, Contradiction("frame-lag", text, None, float(lag)), 0.0
@@ -109,11 +109,13 @@ def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, 
         )
         yield images, Contradiction("frame-lag", text, sequence.frames[k].axis, float(k)), 0.05
         images = (*range(k), None, *range(k, n - 1))
-        text = f"frame {k + 1} is missing, and those that follow come one place too early: add it, or capture again"
+        text = (
+            f"frame {k + 1} is missing, and those that follow come one place too early: add the image, or capture again"
+        )
         yield images, Contradiction("missing-frame", text, sequence.frames[k].axis, float(k)), 0.1
     for k in range(n):
         images = (*range(k), None, *range(k + 1, n))
-        text = f"frame {k + 1} shows something else than described, or another frame's pattern: capture again"
+        text = f"frame {k + 1} does not show the pattern described for it: look at this image, and capture again"
         yield images, Contradiction("duplicate-frame", text, sequence.frames[k].axis, float(k)), 0.2
 
 

@@ -54,9 +54,9 @@ def ghost_suspects(sampled: Fringe) -> list[Suspect]:
         return []
     i = sampled.shift.indices[0]
     if i == 0:
-        seen = f"frame 1 lacks the {100 * share:.0f} % of the image before it that the other frames hold"
+        seen = f"the frames hold {100 * share:.0f} % of the image before them (ghosting), but for frame 1, the first"
     else:
-        seen = f"frame {i + 1} holds {100 * share:.0f} % of the image before it, and so may every frame"
+        seen = f"frame {i + 1} holds {100 * share:.0f} % of the image before it (ghosting), and so may every frame"
     return [
         Suspect(
             i,

@@ -26,7 +26,7 @@ NEAR_DARK = 2.0
 MIN_DECODED = 0.05
 """Share of the illuminated pixels that must decode: of sound captures, also cluttered ones, half and more do."""
 _REASONS = {
-    Reason.SATURATED: ("lie where the camera saturates", "lower the exposure or the gain, and capture again"),
+    Reason.SATURATED: ("are saturated", "lower the exposure or the gain, and capture again"),
     Reason.INCONSISTENT: (
         "contradict themselves or their neighbours",
         "keep the scene and the light still, raise the exposure, and check the description of the frames",
@@ -72,26 +72,28 @@ def check_capture(
 ) -> None:  # fmt: skip
     """Raise InputError where the frames (n, h, w) contradict their description, or next to nothing of them decodes."""
     if found := check_description(sequence, frames):
-        others = "".join(f"; or {c.message}" for c in found[1:] if c.axis == found[0].axis)
+        others = "".join(f". Or else: {c.message}" for c in found[1:] if c.axis == found[0].axis)
         raise InputError(f"{name}: {found[0].message}{others}")
     for axis, phase in phases.items():
         illuminated, decoded = np.count_nonzero(phase.lit), np.count_nonzero(phase.mask)
         if decoded and decoded >= MIN_DECODED * illuminated:
             continue
         if illuminated:
-            share = f"{decoded} of {illuminated} illuminated pixels ({100 * decoded / illuminated:.1f} %) decode"
+            share = (
+                f"{decoded} of {illuminated} illuminated pixels ({100 * decoded / illuminated:.1f} %) give a coordinate"
+            )
             shares = [np.mean(phase.reason[phase.lit] == reason) for reason in _REASONS]
             worst = int(np.argmax(shares))
             seen, cure = list(_REASONS.values())[worst]
-            raise InputError(f"{name}: {share} along {axis}, {100 * shares[worst]:.0f} % {seen}: {cure}")
+            raise InputError(f"{name}: {share} along {axis}; {100 * shares[worst]:.0f} % of them {seen}: {cure}")
         if unexplained := estimate_frame_light(sequence, frames).unexplained:
             raise InputError(
                 f"{name}: no pixel carries a readable {axis} pattern: {describe_disturbance(unexplained)[1]}"
             )
         middle = float(np.median(phase.modulation))
         raise InputError(
-            f"{name}: no pixel carries a readable {axis} pattern (median modulation {middle:.1f} grey levels): raise "
-            "the exposure or the projector's brightness"
+            f"{name}: no pixel carries a readable {axis} pattern (the modulation is {middle:.1f} grey levels in the "
+            "median): raise the exposure or the projector's brightness"
         )
 
 
@@ -116,9 +118,9 @@ def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping
                 messages.append(f"{cause}; pixels of a modulation below {float(least[0]):.1f} are masked")
                 break
             messages.append(
-                f"the {axis} fringes are weak, {modulation:.0f} grey levels in the median, and pixels below "
-                f"{float(least[0]):.1f} are masked: make the patterns brighter (longer exposure, wider aperture, "
-                "nearer projector, darker room)"
+                f"the {axis} fringes are weak for the noise of these frames: their modulation is {modulation:.0f} grey "
+                f"levels in the median, and pixels below {float(least[0]):.1f} are masked; make the patterns brighter "
+                "(longer exposure, wider aperture, nearer projector, darker room)"
             )
             break
     return messages + scatter_warnings(phases)
@@ -130,12 +132,12 @@ def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:
     if worst is None or worst.sigma_scale <= SIGNIFICANT:
         return []
     if measure_scatter(worst).is_compressed:
-        cause, cure = "the images were compressed (blocks of 8 x 8 pixels, as of JPEG)", "record without compression"
+        cause, cure = "the images were compressed (JPEG blocks of 8 x 8 pixels)", "record PNG, TIFF or raw images"
     else:
         cause, cure = "sharpening or compression may be the cause", "switch them off in the camera"
     return [
-        f"neighbouring pixels scatter {worst.sigma_scale:.1f} times as much in {worst.axis} as the camera's noise "
-        f"explains, and the predicted uncertainty includes this: {cause}; {cure}"
+        f"{cause}: along {worst.axis} neighbouring pixels scatter {worst.sigma_scale:.1f} times as much as the "
+        f"camera's noise explains, and the stated uncertainty includes this; {cure}"
     ]
 
 

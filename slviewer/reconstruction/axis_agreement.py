@@ -166,16 +166,17 @@ def check_phases(
     factor = found.ratio if found.ratio > RAISED_RATIO else 1.0
     if factor > 1.0 and not found.is_refused:
         warnings.append(
-            f"{name}: the x and y patterns miss each other by {found.misfit_px:.2f} px by this calibration, and "
-            f"{found.predicted_px:.2f} px is predicted: sigma was raised by a factor of {factor:.1f}; the rig may have "
-            "moved since it was calibrated (run `slviewer check`), or the frames are disturbed"
+            f"{name}: the x and y patterns disagree by {found.misfit_px:.2f} px with this calibration, and noise "
+            f"explains {found.predicted_px:.2f} px: the uncertainty of the points was raised by a factor of "
+            f"{factor:.1f}; the rig may have moved since it was calibrated (run `slviewer check`), or the frames are "
+            "disturbed"
         )
     excess = local_misfit(calibration, pixels, measured, sigma) if factor == 1.0 else None
     if excess is not None:
         warnings.append(
-            f"{name}: in {100 * np.mean(excess > 0):.0f} % of the image the x and y patterns miss each other by up to "
-            f"{excess.max():.2f} px by this calibration, and {found.misfit_px:.2f} px elsewhere: sigma was raised "
-            "there; look for reflections of the projector's light (a glossy table or wall, a shiny part, a deep "
+            f"{name}: in {100 * np.mean(excess > 0):.0f} % of the image the x and y patterns disagree by up to "
+            f"{excess.max():.2f} px (elsewhere {found.misfit_px:.2f} px): the uncertainty of the points there was "
+            "raised; look for reflections of the projector's light (a glossy table or wall, a shiny part, a deep "
             "corner), or for something that moved"
         )
     return CaptureCheck(factor, (*warnings, *_depth_warning(name, found.depths_mm, depth_range)), found, excess)
@@ -307,8 +308,8 @@ def _depth_warning(name: str, depths: np.ndarray, depth_range: tuple[float, floa
 def _contradiction(found: AxisAgreement) -> str:
     if found.misfit_px > max(REFUSED_PX, REFUSED_RATIO * found.predicted_px):
         return (
-            f"by this calibration the x and y patterns miss each other by {found.misfit_px:.1f} px (robust; median "
-            f"{found.median_px:+.1f}, spread {found.spread_px:.1f}), and {found.predicted_px:.2f} px is predicted"
+            f"the x and y patterns disagree by {found.misfit_px:.1f} px with this calibration, and noise explains "
+            f"{found.predicted_px:.2f} px"
         )
     return (
         f"by this calibration {100 * (1 - found.in_front):.0f} % of the points lie behind the camera or the projector"
@@ -329,7 +330,7 @@ def _likely_reason(found: AxisAgreement, rig: StereoRig, pixels: np.ndarray, mea
     if found.misfit_px > explained:
         explained = max(explained, EXPLAINED * found.misfit_px)
     if best < explained:
-        return f"{reason} (then they miss each other by {best:.1f} px)"
+        return f"{reason} (then they disagree by {best:.1f} px)"
     return "the calibration is of another rig, or the rig was moved since: calibrate the rig as it stands"
 
 
@@ -339,13 +340,17 @@ def _hypotheses(
     """What may be wrong, in words, and rig, pixels and coordinates as they would be without."""
     size, image = np.array(rig.projector.size), np.array(rig.camera.size)
     yield (
-        "the axes are exchanged; exchange x and y in the description of the frames",
+        "x and y are exchanged; exchange them in the description of the frames",
         rig, pixels, measured[:, ::-1],
     )  # fmt: skip
     for flip, words in (
         ((True, False), "the x axis is reversed; number the projector's columns from the other end"),
         ((False, True), "the y axis is reversed; number the projector's rows from the other end"),
-        ((True, True), "the projector's image is turned by 180 degrees; number columns and rows from the other end"),
+        (
+            (True, True),
+            "the projector's image is turned by 180 degrees; number columns and rows from the other end, or "
+            "switch off its ceiling mode",
+        ),
     ):
         yield words, rig, pixels, np.where(flip, size - 1 - measured, measured)
     yield (

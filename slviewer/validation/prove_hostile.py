@@ -49,13 +49,13 @@ _WORDS: tuple[tuple[str, frozenset[str]], ...] = (
     (r"fringes are weak", frozenset({"dark"})),
     (r"lamps or a projector that flicker", frozenset({"flicker"})),
     (r"images were compressed", frozenset({"jpeg"})),
-    (r"axes are exchanged", frozenset({"axes-swapped"})),
+    (r"x and y are exchanged", frozenset({"axes-swapped"})),
     (r"axis is reversed|turned by 180", frozenset({"axis-reversed"})),
     (r"calibration is of another rig", frozenset({"other-rig", "moved"})),
 )
 """What messages without a structured cause name, by their facts."""
 _OPEN: tuple[tuple[str, frozenset[str]], ...] = (
-    (r"sigma was raised", frozenset({"other-rig", "moved", "motion"})),
+    (r"uncertainty of the points", frozenset({"other-rig", "moved", "motion"})),
     (r"neighbouring pixels scatter", frozenset({"noise"})),
 )
 """What messages name that leave the cause open: right where it is among them, and never wrong."""

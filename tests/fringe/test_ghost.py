@@ -46,4 +46,4 @@ def test_the_first_frame_of_a_capture_lacks_the_share_of_the_others():
     assert ghost_share(sampled("crosstalk", "severe", "x"))[0] == pytest.approx(0.15, rel=0.25)
     assert ghost_suspects(sampled(axis="x")) == []
     (suspect,) = ghost_suspects(sampled("crosstalk", "severe", "x"))
-    assert suspect.frame == 0 and "lacks" in suspect.sentence
+    assert suspect.frame == 0 and " 1, the first" in suspect.sentence

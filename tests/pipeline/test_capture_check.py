@@ -32,7 +32,7 @@ def test_a_sound_capture_passes(frames: np.ndarray) -> None:
 
 def test_the_most_probable_contradiction_is_the_reason(frames: np.ndarray) -> None:
     wrong = replace(SEQUENCE, gray_origin_px=8.5)
-    with pytest.raises(InputError, match=r"pose_01: .*gray_origin = -0\.[45]\d*; or .*phase_offset = -?3\.1\d"):
+    with pytest.raises(InputError, match=r"pose_01: .*gray_origin = -0\.[45]\d* .*phase_offset = -?3\.1\d"):
         check_capture("pose_01", wrong, frames, decode_frames("pose_01", wrong, frames))
     assert any("gray_origin" in message for message in capture_warnings(wrong, frames))
 
@@ -47,8 +47,8 @@ def seen(decoded: float, otherwise: Reason) -> PhaseMap:
 @pytest.mark.parametrize(
     ("decoded", "otherwise", "facts"),
     [
-        (0.0002, Reason.INCONSISTENT, r"2 of 10000 .*100 % contradict"),
-        (0.03, Reason.SATURATED, r"300 of 10000 .*97 % lie where the camera saturates: lower the exposure"),
+        (0.0002, Reason.INCONSISTENT, r"2 of 10000 .*100 % .*contradict"),
+        (0.03, Reason.SATURATED, r"300 of 10000 .*97 % .*saturated: lower the exposure"),
         (0.0, Reason.DARK, r"no pixel carries a readable x pattern .*raise the exposure"),
         (0.3, Reason.INCONSISTENT, ""),
     ],
@@ -58,8 +58,9 @@ def test_a_capture_of_which_next_to_nothing_decodes_is_refused(
 ) -> None:
     monkeypatch.setattr(capture_phases, "check_description", lambda sequence, frames: ())
     phases = {"x": seen(decoded, otherwise)}
+    frames = np.zeros((len(SEQUENCE.frames), 40, 40), np.uint8)
     if not facts:
-        check_capture("scan", SEQUENCE, np.zeros((0, 1, 1)), phases)
+        check_capture("scan", SEQUENCE, frames, phases)
         return
     with pytest.raises(InputError, match=facts):
-        check_capture("scan", SEQUENCE, np.zeros((0, 1, 1)), phases)
+        check_capture("scan", SEQUENCE, frames, phases)
