@@ -1,16 +1,16 @@
-"""Where the projector sees the plane of the board, for every camera pixel: what lies elsewhere is not the board."""
+"""The board plane's projector coordinates for every camera pixel; a mask of the pixels that agree with it."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-LEAST_FEATURES = 12
+MIN_FEATURES = 12
 """Nine unknowns, and some features more."""
-OUTLYING = 6.0
+OUTLIER_SIGMAS = 6.0
 """Features beyond so many robust sigma were not read on the board."""
-NEAR_PX = 1.0
-NEAR = 4.0
+MIN_TOLERANCE_PX = 1.0
+TOLERANCE_RATIO = 4.0
 """How far from the plane a pixel may be read: this, and so many times what its farthest feature strays. Beyond the
 outermost features, lenses bend the plane several times as much as between them."""
 
@@ -30,43 +30,44 @@ class BoardPlane:
     reach: np.ndarray
 
     @classmethod
-    def through(cls, camera: np.ndarray, projector: np.ndarray, size: tuple[int, int]) -> "BoardPlane | None":
+    def fit(cls, camera: np.ndarray, projector: np.ndarray, size: tuple[int, int]) -> "BoardPlane | None":
         """The plane of features at ``camera`` and ``projector`` pixels, (n, 2) each, in a camera of ``size``.
 
-        Features not read (NaN) or far from what the others say do not count. None where too few are left.
+        Unread features (NaN) and outliers are excluded. None where too few remain.
         """
         centre, radius = (np.array(size) - 1) / 2, float(np.hypot(*size)) / 2
         kept = np.isfinite(projector).all(1) & np.isfinite(camera).all(1)
         found = None
         for _ in range(5):
-            if np.count_nonzero(kept) < LEAST_FEATURES:
+            if np.count_nonzero(kept) < MIN_FEATURES:
                 return None
-            found = cls._fitted(camera[kept], projector[kept], centre, radius)
+            found = cls._fit(camera[kept], projector[kept], centre, radius)
             if found is None:
                 return None
             strays = np.linalg.norm(found.predict(camera[:, 0], camera[:, 1]) - projector, axis=1)
             before = kept
-            kept = strays < np.maximum(OUTLYING * np.median(strays[kept]) / 1.1774, 0.5)
+            kept = strays < np.maximum(OUTLIER_SIGMAS * np.median(strays[kept]) / 1.1774, 0.5)
             if np.array_equal(kept, before):
                 break
         return found
 
     @classmethod
-    def _fitted(
-        cls, camera: np.ndarray, projector: np.ndarray, centre: np.ndarray, radius: float
-    ) -> "BoardPlane | None":
+    def _fit(cls, camera: np.ndarray, projector: np.ndarray, centre: np.ndarray, radius: float) -> "BoardPlane | None":
         bends, step = np.linspace(-0.5, 0.3, 9), 0.1
         best: tuple[float, BoardPlane] | None = None
         for _ in range(3):
             for bend in bends:
-                H, _ = cv2.findHomography(_unbent((camera - centre) / radius, bend), projector)
+                H, _ = cv2.findHomography(_undistort_division((camera - centre) / radius, bend), projector)
                 if H is None:
                     continue
                 plane = cls(H, float(bend), centre, radius, np.zeros(2))
                 strays = plane.predict(camera[:, 0], camera[:, 1]) - projector
                 rms = float(np.sqrt(np.mean(strays**2)))
                 if best is None or rms < best[0]:
-                    best = rms, cls(H, float(bend), centre, radius, NEAR_PX + NEAR * np.abs(strays).max(0))
+                    best = (
+                        rms,
+                        cls(H, float(bend), centre, radius, MIN_TOLERANCE_PX + TOLERANCE_RATIO * np.abs(strays).max(0)),
+                    )
             if best is None:
                 return None
             bends = best[1].bend + np.linspace(-step, step, 7)
@@ -81,10 +82,10 @@ class BoardPlane:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.stack([a / w, b / w], axis=-1)
 
-    def holds(self, coordinate: np.ndarray, along: int, origin: tuple[int, int]) -> np.ndarray:
+    def contains(self, coordinate: np.ndarray, along: int, origin: tuple[int, int]) -> np.ndarray:
         """(h', w') bool: which projector coordinates, at camera pixels from ``origin`` = (u0, v0), lie near the plane.
 
-        ``along`` 0: coordinates are columns; 1: rows. NaN lies nowhere.
+        ``along`` 0: coordinates are columns; 1: rows. False for NaN.
         """
         height, width = coordinate.shape
         expected = self.predict(np.arange(width)[None] + origin[0], np.arange(height)[:, None] + origin[1])
@@ -92,5 +93,5 @@ class BoardPlane:
             return np.asarray(np.abs(coordinate - expected[..., along]) < self.reach[along])
 
 
-def _unbent(normalised: np.ndarray, bend: float) -> np.ndarray:
+def _undistort_division(normalised: np.ndarray, bend: float) -> np.ndarray:
     return normalised / (1 + bend * np.sum(normalised**2, axis=1, keepdims=True))

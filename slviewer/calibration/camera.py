@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.calibration.centres import centroid_shifts
 from slviewer.calibration.diagnosis.poses import FEW_POSES
-from slviewer.calibration.diagnosis.spread_rules import HIGH_REPROJECTION_PX, LITTLE_TILT_DEG, UNCERTAIN
+from slviewer.calibration.diagnosis.spread_rules import HIGH_REPROJECTION_PX, MAX_FOCAL_UNCERTAINTY, MIN_TILT_DEG
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.soundness import MIN_POSES
 from slviewer.calibration.stereo import ITERATIONS, MAX_FOCAL_SIGMA
@@ -18,7 +18,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection
 
-MOST_DISTURBED = 3.0
+MAX_ERROR_RATIO = 3.0
 """Times the usual reprojection error, from which a picture is named: it was blurred, or its board bent or moved."""
 
 
@@ -136,7 +136,7 @@ def _verdict(
         )
     normals = np.array([T[:3, 2] for T in poses])
     spread = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
-    if spread < LITTLE_TILT_DEG:
+    if spread < MIN_TILT_DEG:
         findings.append(
             Finding(
                 "parallel-poses",
@@ -146,7 +146,7 @@ def _verdict(
             )
         )
     share = max(sigma[0] / lens.K[0, 0], sigma[1] / lens.K[1, 1])
-    if not share < UNCERTAIN:
+    if not share < MAX_FOCAL_UNCERTAINTY:
         findings.append(
             Finding(
                 "uncertain",
@@ -165,15 +165,15 @@ def _verdict(
             )
         )
     usual = float(np.median(list(rms.values())))
-    bad = tuple(name for name, px in rms.items() if px > max(MOST_DISTURBED * usual, 0.1))
+    bad = tuple(name for name, px in rms.items() if px > max(MAX_ERROR_RATIO * usual, 0.1))
     if bad:
         findings.append(
             Finding(
                 "outlier",
                 "doubtful",
-                f"in {', '.join(bad)} the reprojection error is more than {MOST_DISTURBED:g} times the usual "
+                f"in {', '.join(bad)} the reprojection error is more than {MAX_ERROR_RATIO:g} times the usual "
                 f"{usual:.2f} px",
-                "look at these pictures, and calibrate again with --exclude",
+                "check these pictures, and calibrate again with --exclude",
                 bad,
             )
         )

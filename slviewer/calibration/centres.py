@@ -19,7 +19,7 @@ CORNERS = 64
 """Of the polygon that stands for a circle."""
 
 
-def calibrate_centred(
+def calibrate_centres(
     observations: Sequence[Observation],
     projector_size: tuple[int, int],
     board: str = "",
@@ -34,7 +34,7 @@ def calibrate_centred(
     """
     stereo = calibrate_stereo(observations, projector_size, board, left_out, strict=strict)
     used = [o for o in observations if o.name in stereo.poses]
-    corrected = centred(used, stereo)
+    corrected = move_to_centres(used, stereo)
     if all(new is old for new, old in zip(corrected, used, strict=True)):
         return stereo, used
     stereo = calibrate_stereo(corrected, projector_size, board, stereo.left_out, strict=strict)
@@ -65,17 +65,17 @@ def centroid_shifts(lens: Lens, T_camera_board: np.ndarray, points: np.ndarray, 
     return np.where(area[:, None] != 0, moment, 0.0) if radius_mm else np.zeros_like(centre)
 
 
-def centred(observations: Sequence[Observation], stereo: StereoModel) -> list[Observation]:
+def move_to_centres(observations: Sequence[Observation], stereo: StereoModel) -> list[Observation]:
     """The same observations with circles at their centres, and their projector coordinates read there.
 
     Poses that ``stereo`` did not use stay as they are, and so do corners and circles that are centred already.
     """
     radii = [o.radius_mm for o in observations if o.radius_mm]
     radius = float(np.median(radii)) if radii else 0.0  # one board: what differs between poses is noise
-    return [_centred(o, stereo, radius) if o.radius_mm and o.name in stereo.poses else o for o in observations]
+    return [_move_to_centres(o, stereo, radius) if o.radius_mm and o.name in stereo.poses else o for o in observations]
 
 
-def _centred(observation: Observation, stereo: StereoModel, radius_mm: float) -> Observation:
+def _move_to_centres(observation: Observation, stereo: StereoModel, radius_mm: float) -> Observation:
     shift = centroid_shifts(stereo.rig.camera, stereo.poses[observation.name], observation.points, radius_mm)
     projector = observation.projector
     if observation.slopes is not None:

@@ -1,10 +1,10 @@
-"""Which pixels of a board say what they see: bright ones, clear of the contrast edges.
+"""Mask of a board's pixels with undisturbed phase: bright ones, clear of the contrast edges.
 
 The camera's lens and pixels mix bright and dark across an edge, and what a bright pixel there says of its phase comes
 from farther inside the bright part: from half a blur's sigma farther where the edge is, a tenth at 1.3 sigma, a
 fortieth at 2 and a hundredth at 2.5, whatever the blur (measured on rendered boards of known truth). Opposite sides of
 a circle err against each other, so that what is left of it in a feature or a smoothed surface is least where 2 sigma
-are left out: beyond, the pixels that are lost cost more in noise.
+are excluded: beyond, the pixels that are lost cost more in noise.
 """
 
 from collections.abc import Callable
@@ -14,15 +14,15 @@ import numpy as np
 
 from slviewer.fringe.phase import PhaseMap
 
-CLEAR_SIGMAS = 2.0
-"""How far from an edge, in standard deviations of its blur, a bright pixel says what it sees."""
-CLEAR_PX = 1.0
+CLEARANCE_SIGMAS = 2.0
+"""How far from an edge, in standard deviations of its blur, a bright pixel's phase is undisturbed."""
+MIN_CLEARANCE_PX = 1.0
 """And at least so many px: where a mask's edge lies is not known better."""
-LEAST_CLEAR = 0.25
+MIN_CLEAR_SHARE = 0.25
 """Share of the bright pixels within half a pitch that must lie clear of contrast edges, or edges are approached."""
 SHARPEST_PX = 12**-0.5
 """An edge that only the pixels blur."""
-BAND = 0.25
+EDGE_BAND = 0.25
 """Pixels whose brightness lies this far from dark and from bright are an edge's; of a Gaussian blur, they lie within
 0.6745 sigma of it."""
 
@@ -35,7 +35,7 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
     strips of a few pixels.
     """
     modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
-    crest = _extreme(cv2.dilate, modulation, pitch)
+    crest = _local_extreme(cv2.dilate, modulation, pitch)
     bright = (modulation > 0.5 * crest) & (modulation > 0)
     dark = cv2.morphologyEx(  # a lone pixel lost to noise is no edge
         (~bright).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
@@ -47,8 +47,8 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
     window = (2 * int(pitch / 2) + 1,) * 2
     around = cv2.blur(bright.astype(np.float32), window)
     for share in (1.0, 0.8, 0.6, 0.3):
-        few = cv2.blur(clear.astype(np.float32), window) < LEAST_CLEAR * around
-        clear |= few & bright & (apart > max(share * CLEAR_SIGMAS * sigma, CLEAR_PX))
+        few = cv2.blur(clear.astype(np.float32), window) < MIN_CLEAR_SHARE * around
+        clear |= few & bright & (apart > max(share * CLEARANCE_SIGMAS * sigma, MIN_CLEARANCE_PX))
     return clear
 
 
@@ -58,12 +58,12 @@ def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
     The area of what is neither dark nor bright, over the length of the edges that it accompanies.
     """
     modulation = np.asarray(phase.modulation, np.float32)
-    crest, trough = (_extreme(of, modulation, pitch) for of in (cv2.dilate, cv2.erode))
+    crest, trough = (_local_extreme(of, modulation, pitch) for of in (cv2.dilate, cv2.erode))
     contrast = crest - trough
     edged = cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # the board's outline is no edge
     edged &= contrast > 0.4 * crest
     level = np.clip((modulation - trough) / np.maximum(contrast, 1e-6), 0, 1)
-    area = np.count_nonzero(edged & (level > BAND) & (level < 1 - BAND))
+    area = np.count_nonzero(edged & (level > EDGE_BAND) & (level < 1 - EDGE_BAND))
     across, down = cv2.Sobel(level, cv2.CV_32F, 1, 0), cv2.Sobel(level, cv2.CV_32F, 0, 1)
     steep = np.maximum(np.hypot(across, down), 1e-6)
     high = level > 0.5
@@ -76,7 +76,7 @@ def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
     return float(np.clip(area / length / (2 * 0.6745), SHARPEST_PX, pitch / 8))
 
 
-def _extreme(of: Callable[..., np.ndarray], modulation: np.ndarray, pitch: float) -> np.ndarray:
+def _local_extreme(of: Callable[..., np.ndarray], modulation: np.ndarray, pitch: float) -> np.ndarray:
     """(h, w): the largest or smallest modulation within a pitch, by ``cv2.dilate`` or ``cv2.erode``."""
     shrink = max(1, int(pitch // 12))
     small = cv2.blur(modulation, (shrink, shrink))[::shrink, ::shrink] if shrink > 1 else modulation

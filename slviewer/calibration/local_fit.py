@@ -4,12 +4,12 @@ import numpy as np
 
 from slviewer.geometry.jit import kernel
 
-ONE_SIDED = 0.35
+MAX_OFF_CENTRE = 0.35
 """A window whose samples lie this far off its middle, in half widths, would extrapolate. Around a chessboard's corner
 two opposite squares are bright, and their middle is the corner."""
 
 
-def local_values(
+def fit_local_values(
     field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic fit around each.
@@ -19,7 +19,7 @@ def local_values(
     (n, 2); NaN where the surroundings are too few (30) or lie on one side only.
     """
     out = np.full((len(pixels), 3), np.nan)
-    _local_fits(
+    _fit_all(
         np.ascontiguousarray(field, np.float64),
         np.ascontiguousarray(weight, np.float64),
         np.ascontiguousarray(pixels, np.float64),
@@ -55,7 +55,7 @@ def _solve_spd(A, b, x):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _local_fits(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
+def _fit_all(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
     height, width = field.shape
     basis = np.empty((1024, 6))
     value = np.empty(1024)
@@ -85,7 +85,7 @@ def _local_fits(field, weight, pixels, radius, out):  # type: ignore[no-untyped-
                     mean_x += x
                     mean_y += y
                     count += 1
-        if count < 30 or np.hypot(mean_x, mean_y) > ONE_SIDED * count:
+        if count < 30 or np.hypot(mean_x, mean_y) > MAX_OFF_CENTRE * count:
             continue
         middle = np.median(value[:count])
         robust[:count] = 1.0

@@ -26,10 +26,10 @@ def fit_rational(phase, z, phase_ref, z_ref, min_poses, coefficients, rms, poses
             poses[v, u], phase_min[v, u], phase_max[v, u] = seen, low, high
             a0 = a1 = a2 = left = found = np.nan
             if seen >= min_poses:
-                a0, a1, a2, _, _ = _solve(a)
+                a0, a1, a2, _, _ = _solve_moments(a)
                 if not np.isnan(a0):
                     _add_gauss_newton(phase, z, v, u, reference, z_ref, a0, a1, a2, a)
-                    b0, b1, b2, explained, found = _solve(a)
+                    b0, b1, b2, explained, found = _solve_moments(a)
                     a0, a1, a2 = a0 + b0, a1 + b1, a2 + b2
                     left = np.sqrt(max(0.0, a[9] - explained) / seen)
             coefficients[0, v, u], coefficients[1, v, u], coefficients[2, v, u] = a0, a1, a2
@@ -87,7 +87,7 @@ def _add_gauss_newton(phase, z, v, u, phase_ref, z_ref, a0, a1, a2, a):
 
 
 @numba.njit
-def _solve(a):
+def _solve_moments(a):
     """(three unknowns, the squares that they explain, condition) by Cholesky of the normalised matrix; NaN without a
     solution."""
     none = np.nan

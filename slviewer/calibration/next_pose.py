@@ -1,4 +1,4 @@
-"""Where the target has been, and where to hold it next: what coverage lacks most.
+"""Coverage of the poses so far, and the next pose that improves it most.
 
 A calibration needs the target in every part of the image, near and far, and tilted in several directions. Poses are
 T_camera_board (4, 4) mm; before a calibration they are approximate, from a nominal lens, which is good enough here.
@@ -21,7 +21,7 @@ THIRDS = ("near", "at middle distance", "far")
 TILTS = ("facing", "top away", "right away", "bottom away", "left away")
 FACING_DEG = 8.0
 """Tilts below count as facing the camera."""
-GOAL = 2
+GOAL_POSES = 2
 """Poses that each third and each tilt should have."""
 CELL_GOAL = 4
 """Poses that each cell should have: a pixel-wise fit takes four at least."""
@@ -49,7 +49,7 @@ class Coverage:
     @property
     def share(self) -> float:
         """0 ... 1: how much of the goal is reached, the image, the depths and the tilts counting alike."""
-        goals = ((self.cells, CELL_GOAL), (self.depths, GOAL), (self.tilts, GOAL))
+        goals = ((self.cells, CELL_GOAL), (self.depths, GOAL_POSES), (self.tilts, GOAL_POSES))
         return float(np.mean([np.minimum(n, goal).mean() / goal for n, goal in goals]))
 
 
@@ -70,7 +70,8 @@ def nominal_lens(size: tuple[int, int], focal_px: float | None = None) -> Lens:
 
 
 def estimated_lens(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]) -> Lens:
-    """A lens from features (n, 3) mm and (n, 2) px of several tilted boards; the nominal one where they tell nothing.
+    """A lens from features (n, 3) mm and (n, 2) px of several tilted boards; the nominal one where they do not
+    determine it.
 
     One focal length, no distortion: enough to place boards with, long before a calibration is possible.
     """
@@ -118,7 +119,7 @@ def coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
 
 def outline_px(board: Board, lens: Lens, T: np.ndarray) -> np.ndarray:
     """(4, 2) px: the board's outline in the image, NaN behind the camera."""
-    return lens.project(_placed(T, board.outline()))
+    return lens.project(_place_board(T, board.outline()))
 
 
 def suggest(
@@ -131,8 +132,8 @@ def suggest(
 ) -> Suggestion:
     """The pose that adds most to what `poses` cover, with the whole board in view.
 
-    `lit(points (n, 3) mm) -> (n,) bool` says which points the projector reaches, where that is known (`projector_reach`
-    learns it). `skip` passes over so many of the best: those that were tried and refused.
+    `illuminated(points (n, 3) mm) -> (n,) bool` says which points the projector reaches, where that is known
+    (`projector_reach` learns it). `skip` passes over so many of the best: those that were tried and refused.
     """
     have = coverage(board, lens, poses)
     taken = [_signature(T, board, have.range_mm) for T in poses]
@@ -141,8 +142,8 @@ def suggest(
         seen, third, tilt = _classify(board, lens, T, have.range_mm)
         lacks = (
             (seen * np.maximum(CELL_GOAL - have.cells, 0)).sum() / (CELL_GOAL * seen.size)
-            + max(GOAL - have.depths[third], 0) / GOAL
-            + max(GOAL - have.tilts[tilt], 0) / GOAL
+            + max(GOAL_POSES - have.depths[third], 0) / GOAL_POSES
+            + max(GOAL_POSES - have.tilts[tilt], 0) / GOAL_POSES
         )
         here = _signature(T, board, have.range_mm)
         apart = min((float(np.linalg.norm(here - other)) for other in taken), default=1.0)
@@ -150,14 +151,14 @@ def suggest(
     if not ranked:
         raise InputError(f"the board {board} cannot be held so that the camera sees all of it: take a smaller board")
     ranked.sort(key=lambda entry: -entry[0])
-    return described(board, lens, ranked[skip % len(ranked)][1])
+    return describe_suggestion(board, lens, ranked[skip % len(ranked)][1])
 
 
-def described(board: Board, lens: Lens, T_camera_board: np.ndarray) -> Suggestion:
+def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) -> Suggestion:
     """A pose as a suggestion: its outline and its words."""
     corners = outline_px(board, lens, T_camera_board)
     _, third, tilt = _classify(board, lens, T_camera_board, depth_range(board, lens))
-    return Suggestion(T_camera_board, corners, _sentence(third, tilt, corners.mean(0), lens.size))
+    return Suggestion(T_camera_board, corners, _describe_pose(third, tilt, corners.mean(0), lens.size))
 
 
 def projector_reach(
@@ -197,10 +198,10 @@ def _candidates(
     middle = (board.points.min(0) + board.points.max(0)) / 2
     width, height = lens.size
     found = []
-    # Until two poses have told where the projector's light falls, the middle of the image is where it is most likely.
+    # Before two poses have shown the projector's field of view, the middle of the image is most likely inside it.
     places = list(product((-1, 0, 1), (-1, 0, 1))) if lit is not None else [(0, 0)]
     for third, tilt, place in product(range(3), range(len(TILTS)), places):
-        R = _tilted(tilt, angle)
+        R = _tilt_rotation(tilt, angle)
         depth = near + (far - near) * (third + 0.5) / 3
         out = np.array([place[0] * width, place[1] * height]) / 2
         for share in np.linspace(1, 0, 11) if place != (0, 0) else (0.0,):
@@ -216,7 +217,7 @@ def _candidates(
 
 
 def _in_view(board: Board, lens: Lens, T: np.ndarray, lit: Callable[[np.ndarray], np.ndarray] | None) -> bool:
-    corners = _placed(T, board.outline())
+    corners = _place_board(T, board.outline())
     pixels = lens.project(corners)
     free = _FREE * lens.size[0]
     if not (np.isfinite(pixels).all() and (pixels > free).all() and (pixels < np.array(lens.size) - 1 - free).all()):
@@ -237,11 +238,11 @@ def _classify(board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]
         inside = (turns > 0).all(1) | (turns < 0).all(1)
     cells = inside.reshape(ROWS, _FINE, COLUMNS, _FINE).mean((1, 3)) >= _CELL_SHARE
     near, far = span
-    third = int(np.clip(3 * (_middle(T, board)[2] - near) / (far - near), 0, 2))
-    return cells, third, _tilt_of(T)
+    third = int(np.clip(3 * (_board_middle(T, board)[2] - near) / (far - near), 0, 2))
+    return cells, third, _classify_tilt(T)
 
 
-def _tilt_of(T: np.ndarray) -> int:
+def _classify_tilt(T: np.ndarray) -> int:
     normal = T[:3, 2] * (1 if T[2, 2] >= 0 else -1)
     if np.degrees(np.arccos(np.clip(normal[2], -1, 1))) < FACING_DEG:
         return 0
@@ -250,27 +251,27 @@ def _tilt_of(T: np.ndarray) -> int:
     return (1 if top > 0 else 3) if abs(top) >= abs(right) else (2 if right > 0 else 4)
 
 
-def _tilted(tilt: int, angle: float) -> np.ndarray:
+def _tilt_rotation(tilt: int, angle: float) -> np.ndarray:
     turns = {0: (0, 0), 1: (-angle, 0), 2: (0, -angle), 3: (angle, 0), 4: (0, angle)}[tilt]
     return cv2.Rodrigues(np.array([turns[0], turns[1], 0.0]))[0]
 
 
 def _signature(T: np.ndarray, board: Board, span: tuple[float, float]) -> np.ndarray:
     """What makes two poses alike: place across, depth and tilt, each about 1 over what is of use."""
-    x, y, z = _middle(T, board)
+    x, y, z = _board_middle(T, board)
     reach = np.ptp(board.points[:, 0]) / 2
     return np.array([x / reach, y / reach, (z - span[0]) / (span[1] - span[0]), *(T[:2, 2] / np.sin(np.radians(25)))])
 
 
-def _middle(T: np.ndarray, board: Board) -> np.ndarray:
-    return _placed(T, ((board.points.min(0) + board.points.max(0)) / 2)[None])[0]
+def _board_middle(T: np.ndarray, board: Board) -> np.ndarray:
+    return _place_board(T, ((board.points.min(0) + board.points.max(0)) / 2)[None])[0]
 
 
-def _placed(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _place_board(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def _sentence(third: int, tilt: int, middle_px: np.ndarray, size: tuple[int, int]) -> str:
+def _describe_pose(third: int, tilt: int, middle_px: np.ndarray, size: tuple[int, int]) -> str:
     across, down = middle_px / np.array(size) - 0.5
     where = [
         word

@@ -1,6 +1,7 @@
-"""What one board pose says: features in both devices, and the smoothed phase over the board (the Letter, step 2).
+"""Observation of one board pose: features in both devices, and the smoothed phase over the board (Letter step 2).
 
-An observation is small whatever the image size, so any number of poses can be held; frames and phase maps are let go.
+An observation is small whatever the image size, so any number of poses fits in memory; frames and phase maps are
+released.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,16 +13,16 @@ import numpy as np
 
 from slviewer.calibration.board_plane import BoardPlane
 from slviewer.calibration.edges import bright_pixels
-from slviewer.calibration.local_fit import local_values
+from slviewer.calibration.local_fit import fit_local_values
 from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
-from slviewer.geometry.splines import SplineSurface, fit_surface
+from slviewer.geometry.splines import SplineSurface, fit_spline
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
-READING = 4
+READING_VERSION = 4
 """How poses are read; what a session keeps of another reading is read anew."""
 SAMPLES = 30_000
 """Pixels that one smoothing fit takes; more change the result by less than the noise."""
@@ -32,9 +33,9 @@ CELLS_PER_WIDTH = 14
 
 COUNT = 4000
 """Blocks kept of one pose: more tell of no finer distortion, and cost the adjustment its time."""
-LARGEST_BLOCK = 5
+MAX_BLOCK_PX = 5
 """Pixels along a block's side at most: over more, a tilted board's perspective bends the phase within the block."""
-LEAST_FILLED = 0.5
+MIN_FILL_SHARE = 0.5
 """Share of a block's pixels that must be bright."""
 
 
@@ -62,11 +63,11 @@ def block_samples(
     """About ``count`` blocks, spread evenly over the pixels (h, w) that are ``bright`` for every captured axis."""
     usable = np.logical_and.reduce(list(bright.values()))
     v, u = np.nonzero(usable)
-    side = int(np.clip(np.sqrt(len(v) / count), 1, LARGEST_BLOCK))
+    side = int(np.clip(np.sqrt(len(v) / count), 1, MAX_BLOCK_PX))
     across = usable.shape[1] // side + 1
     block = (v // side) * across + u // side
     filled = np.bincount(block)
-    kept = np.nonzero(filled >= max(1, LEAST_FILLED * side * side))[0]
+    kept = np.nonzero(filled >= max(1, MIN_FILL_SHARE * side * side))[0]
     if len(kept) > count:
         kept = np.sort(np.random.default_rng(0).choice(kept, count, replace=False))
     inverse = 1.0 / filled[kept]
@@ -218,12 +219,12 @@ def observe(
     box = _bounding_box(inside)
     bright = {axis: bright_pixels(phase, inside, typical_pitch) for axis, phase in phases.items()}
     projector, _ = _projector_pixels(detection, phases, bright, pitch)
-    plane = BoardPlane.through(detection.pixels, projector, (width, height))
+    plane = BoardPlane.fit(detection.pixels, projector, (width, height))
     for axis in phases:
         if plane:  # a hand before the board is none of it
             u0, v0, u1, v1 = box
             seen = phases[axis].coordinate[v0:v1, u0:u1]
-            bright[axis][v0:v1, u0:u1] &= plane.holds(seen, AXES.index(axis), (u0, v0))
+            bright[axis][v0:v1, u0:u1] &= plane.contains(seen, AXES.index(axis), (u0, v0))
         if np.count_nonzero(bright[axis]) < 400:
             raise DetectionError(
                 f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis} pattern: "
@@ -234,8 +235,8 @@ def observe(
     supported = inside.copy()
     weighted = {}
     for axis, phase in phases.items():
-        weighted[axis] = phase.phase[v0:v1, u0:u1], _weight(phase, bright[axis])[v0:v1, u0:u1]
-        supported &= _near(bright[axis], reach=typical_pitch)
+        weighted[axis] = phase.phase[v0:v1, u0:u1], _phase_weight(phase, bright[axis])[v0:v1, u0:u1]
+        supported &= _is_near_bright(bright[axis], reach=typical_pitch)
     surfaces = smooth_axes(weighted, box, width, typical_pitch, smoothing)
     return Observation(
         name=name,
@@ -275,13 +276,13 @@ def _projector_pixels(
     slopes = np.full((len(detection.ids), 2, 2), np.nan)
     for axis, phase in phases.items():
         coordinate = np.where(bright[axis], phase.coordinate, 0.0)
-        weight = _weight(phase, bright[axis])
-        values = local_values(coordinate, weight, detection.pixels, 0.8 * pitch)
+        weight = _phase_weight(phase, bright[axis])
+        values = fit_local_values(coordinate, weight, detection.pixels, 0.8 * pitch)
         projector[:, AXES.index(axis)], slopes[:, AXES.index(axis)] = values
     return projector, slopes
 
 
-def _weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
+def _phase_weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
     """(h, w): one over the phase's variance, of the bright pixels, the largest 1."""
     weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
     return np.asarray(weight / max(float(weight.max()), 1e-30))
@@ -294,13 +295,13 @@ def smooth_axes(
     pitch: float,
     smoothing: Smoothing,
 ) -> dict[Axis, SplineSurface | Polynomial2D]:
-    """`smooth` of each axis' (phase, weight), side by side."""
+    """`smooth_phase` of each axis' (phase, weight), side by side."""
     with ThreadPoolExecutor(max(1, len(weighted))) as threads:
-        found = threads.map(lambda one: smooth(one[0], one[1], box, width, pitch, smoothing), weighted.values())
+        found = threads.map(lambda one: smooth_phase(one[0], one[1], box, width, pitch, smoothing), weighted.values())
         return dict(zip(weighted, found, strict=True))
 
 
-def smooth(
+def smooth_phase(
     phase: np.ndarray,
     weight: np.ndarray,
     box: tuple[int, int, int, int],
@@ -322,10 +323,10 @@ def smooth(
         return fit_polynomial(u, v, values, weights, extent, smoothing.degree, robust=True)
     cell = max(width / CELLS_PER_WIDTH, 1.2 * pitch)
     cells = (max(1, round((u1 - u0) / cell)), max(1, round((v1 - v0) / cell)))
-    return fit_surface(u, v, values, weights, extent, cells, robust=True)
+    return fit_spline(u, v, values, weights, extent, cells, robust=True)
 
 
-def _near(bright: np.ndarray, reach: float) -> np.ndarray:
+def _is_near_bright(bright: np.ndarray, reach: float) -> np.ndarray:
     """(h, w) bool: pixels that have bright ones within ``reach`` px on every side of a closing."""
     step = max(1, int(reach // 8))
     height, width = bright.shape

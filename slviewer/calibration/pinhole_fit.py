@@ -9,13 +9,13 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.fields import Device, undistort
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.unknowns import lens_of
-from slviewer.calibration.splined.volume import is_lit
+from slviewer.calibration.splined.volume import is_supported
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 
 GRID = 80
 """Pixels across the image that the fit takes: several for each cell of a displacement field."""
-LEAST_PIXELS = 50
+MIN_PIXELS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,8 @@ class PinholeFit:
 
 
 def fit_splined(model: SplinedModel) -> tuple[PinholeFit, PinholeFit]:
-    """The fits of a splined model's camera and projector, over the cells that target poses lit, in its own frames."""
+    """The fits of a splined model's camera and projector, over the cells that target poses illuminated, in its own
+    frames."""
     bundle = model.bundle
     camera, projector = (
         _fit_device(device, poses > 0)
@@ -39,21 +40,21 @@ def fit_splined(model: SplinedModel) -> tuple[PinholeFit, PinholeFit]:
     return camera, projector
 
 
-def residuals_of_pixelwise(model: PixelwiseModel, lens: Lens) -> PinholeFit:
+def pixelwise_residuals(model: PixelwiseModel, lens: Lens) -> PinholeFit:
     """By how much a ``lens`` is off the rays (c3, c4) that the pixelwise model has for each camera pixel."""
     coefficients = model.fits[model.depth_axis].coefficients
     step = max(1, coefficients.shape[2] // GRID)
     v, u = np.mgrid[: coefficients.shape[1] : step, : coefficients.shape[2] : step]
     pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
-    return _judge(lens, pixels, coefficients[3:5, v.ravel(), u.ravel()].T)
+    return _measure_residuals(lens, pixels, coefficients[3:5, v.ravel(), u.ravel()].T)
 
 
 def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
     """The lens whose image of the undistorted normalised ``rays`` (n, 2) comes nearest to ``pixels`` (n, 2) px, least
     squares; rows with NaN do not count. Raises InputError where fewer than 50 are left."""
     known = np.isfinite(rays).all(axis=1) & np.isfinite(pixels).all(axis=1)
-    if np.count_nonzero(known) < LEAST_PIXELS:
-        raise InputError(f"{np.count_nonzero(known)} pixels are calibrated: a lens needs at least {LEAST_PIXELS}")
+    if np.count_nonzero(known) < MIN_PIXELS:
+        raise InputError(f"{np.count_nonzero(known)} pixels are calibrated: a lens needs at least {MIN_PIXELS}")
     seen, directions = pixels[known], rays[known]
 
     def lens(numbers: np.ndarray) -> Lens:
@@ -67,10 +68,10 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
     first = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *start.D])
     scale = np.array([K[0, 0], K[1, 1], K[0, 0], K[1, 1], 0.1, 0.1, 0.01, 0.01, 0.1])
     solved = least_squares(residuals, first, x_scale=scale, xtol=1e-12, ftol=1e-12)
-    return _judge(lens(solved.x), pixels, rays)
+    return _measure_residuals(lens(solved.x), pixels, rays)
 
 
-def _judge(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> PinholeFit:
+def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> PinholeFit:
     length = np.linalg.norm(lens.distort(rays) - pixels, axis=1)
     known = np.isfinite(length)
     if not known.any():
@@ -86,5 +87,5 @@ def _fit_device(device: Device, lit: np.ndarray) -> PinholeFit:
     down = np.linspace(0, height - 1, max(2, round(GRID * height / width)))
     u, v = np.meshgrid(across, down)
     pixels = np.column_stack([u.ravel(), v.ravel()])
-    rays = np.where(is_lit(device, pixels, lit)[:, None], undistort(device, pixels), np.nan)
+    rays = np.where(is_supported(device, pixels, lit)[:, None], undistort(device, pixels), np.nan)
     return fit_lens(pixels, rays, lens_of(device))

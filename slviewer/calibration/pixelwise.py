@@ -26,8 +26,8 @@ PLANE_PIXELS = 30_000
 BAND_BYTES = 2**27
 """What the fit holds of all poses at a time: a band of image rows, the narrower the more poses there are."""
 MIN_POSES = 4
-"""Three coefficients and one pose more, so that the fit's RMS says something."""
-REACH = 1.5
+"""Three coefficients and one pose more, so that the fit's RMS is meaningful."""
+MAX_EXTRAPOLATION = 1.5
 """How far beyond the phases it was calibrated with, in lengths of their range, a pixel still measures."""
 
 
@@ -71,7 +71,7 @@ class PixelwiseModel:
         fit = self.fits[phase.axis]
         out = np.empty((*phase.phase.shape, 3), np.float32)
         ratio = phase.period_px / self.periods_px[phase.axis]
-        _evaluate(phase.phase, ratio, fit.coefficients, fit.phase_min, fit.phase_max, REACH, out)
+        _evaluate(phase.phase, ratio, fit.coefficients, fit.phase_min, fit.phase_max, MAX_EXTRAPOLATION, out)
         return out
 
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ class PixelwiseModel:
         return {"periods_px": dict(self.periods_px), "planes": planes, "depth_axis": self.depth_axis}
 
     @classmethod
-    def restored(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "PixelwiseModel":
+    def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "PixelwiseModel":
         """The inverse of ``to_dict`` and ``to_arrays``."""
         keys = PixelFit.__annotations__
         fits = {axis: PixelFit(**{key: arrays[f"{axis}_{key}"] for key in keys}) for axis in data["periods_px"]}
@@ -127,10 +127,10 @@ def calibrate_pixelwise(
     periods = {axis: used[0].periods_px[axis] for axis in axes}
     fits = {axis: _empty_fit(height, width) for axis in axes}
     band = max(1, min(height, BAND_BYTES // (8 * len(used) * width * (len(axes) + 1))))
-    room = np.empty((len(axes) + 1, len(used) * band * width))  # asked for once: new memory is slow at first
+    room = np.empty((len(axes) + 1, len(used) * band * width))  # allocated once: new memory is slow at first
     for first in range(0, height, band):
         rows = slice(first, min(first + band, height))
-        phases, z, rays = _ideal_rows(used, stereo, planes, axes, periods, depth_axis, rows, room)
+        phases, z, rays = _collect_rows(used, stereo, planes, axes, periods, depth_axis, rows, room)
         for axis in axes:
             reference = _reference_phase(stereo, axis, periods[axis], z_ref, rows)
             _fit_rows(phases[axis], z, reference, z_ref, rays, rows, fits[axis])
@@ -196,7 +196,7 @@ def ideal_plane(observation: Observation, stereo: StereoModel, axis: Axis) -> Pl
     return fit_plane(finite)
 
 
-def _ideal_rows(
+def _collect_rows(
     used: Sequence[Observation],
     stereo: StereoModel,
     planes: Mapping[str, Plane],
@@ -206,8 +206,8 @@ def _ideal_rows(
     rows: slice,
     room: np.ndarray,
 ) -> tuple[dict[Axis, np.ndarray], np.ndarray, np.ndarray]:
-    """What all poses say of some image rows: each axis' phase (n, h', w) rad in ``periods``, depth (n, h', w) mm, and
-    sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11). Phases and depth lie in ``room``.
+    """The samples of all poses in some image rows: each axis' phase (n, h', w) rad in ``periods``, depth (n, h', w) mm,
+    and sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11). Phases and depth lie in ``room``.
 
     Stereo's points are moved along the plane's normal onto it (step 4, eq. 13); NaN where a pose's board is not.
     """
@@ -229,7 +229,7 @@ def _ideal_rows(
         for axis in axes:
             np.multiply(smooth[axis], o.periods_px[axis] / periods[axis], out=phases[axis][i][box], where=region)
         plane = planes[o.name]
-        _put_on_plane(
+        _project_onto_plane(
             smooth[depth_axis], region, o.periods_px[depth_axis] / (2 * np.pi), rig.camera.rays(), first, u0,
             rig.R.copy(), rig.t.copy(), rig.projector.parameters, 0 if depth_axis == "x" else 1, extent,
             plane.normal, plane.offset, z[i], sums, first - rows.start,
@@ -284,7 +284,7 @@ def _fit_rows(
 
 
 @kernel(parallel=True)
-def _put_on_plane(  # type: ignore[no-untyped-def]
+def _project_onto_plane(  # type: ignore[no-untyped-def]
     phase, region, px_per_rad, rays, v0, u0, R, t, parameters, row, extent, normal, offset, z, sums, first
 ):
     """Depths of stereo's points moved along the ``normal`` onto their plane; phase and region begin at pixel (u0, v0)

@@ -1,4 +1,4 @@
-"""What target poses must fulfil before a rig can be solved from them, each with its own reason to reject them."""
+"""Conditions that target poses must fulfil before a rig can be solved from them; each raises its own error."""
 
 from collections.abc import Mapping, Sequence
 
@@ -23,7 +23,7 @@ def check_enough(used: Sequence[Observation], left_out: Mapping[str, str]) -> No
 
 
 def check_tilts(used: Sequence[Observation]) -> None:
-    """Parallel boards share their vanishing line and say nothing of the focal length."""
+    """Parallel boards share their vanishing line and do not determine the focal length."""
     spread = nominal_tilt_spread_deg(used)
     if spread < MIN_TILT_SPREAD_DEG:
         raise CalibrationRejected(
@@ -51,7 +51,7 @@ def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
 
 def check_handedness(used: Sequence[Observation]) -> None:
     """Camera and projector see the same side of a board: a mirror image in one of them is no view of it."""
-    mirrored = sum(_turn(o.points, o.camera) * _turn(o.points, o.projector) < 0 for o in used)
+    mirrored = sum(_orientation(o.points, o.camera) * _orientation(o.points, o.projector) < 0 for o in used)
     if mirrored > len(used) / 2:
         raise CalibrationRejected(
             f"in {mirrored} of {len(used)} poses the projector's coordinates are a mirror image of what the camera "
@@ -59,7 +59,7 @@ def check_handedness(used: Sequence[Observation]) -> None:
         )
 
 
-def _turn(points: np.ndarray, pixels: np.ndarray) -> float:
+def _orientation(points: np.ndarray, pixels: np.ndarray) -> float:
     """Positive where x turns into y the same way on the board and in the image."""
     read = np.isfinite(pixels).all(1)
     affine = np.column_stack([points[read, :2], np.ones(np.count_nonzero(read))])

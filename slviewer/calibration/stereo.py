@@ -30,7 +30,7 @@ class StereoModel:
     """A calibrated camera and projector, and how well the poses agree with them.
 
     ``poses`` map board to camera (4, 4); ``pose_rms_px`` holds (camera, projector) reprojection RMS of each pose used;
-    ``residuals_px`` (n, 4) holds camera and projector residuals of each pose's features (NaN: set aside or not read).
+    ``residuals_px`` (n, 4) holds camera and projector residuals of each pose's features (NaN: excluded or not read).
     """
 
     rig: StereoRig
@@ -98,7 +98,7 @@ class StereoModel:
         }
 
     @classmethod
-    def made_elsewhere(cls, rig: StereoRig) -> "StereoModel":
+    def from_rig(cls, rig: StereoRig) -> "StereoModel":
         """A calibration of which only the rig is known: no poses, no residuals, no calibrated depths."""
         return cls(rig, "", ("x", "y"), {}, {}, {}, {}, None, {})
 
@@ -129,9 +129,9 @@ def calibrate_stereo(
 ) -> StereoModel:
     """Pinhole and Brown (k1 k2 p1 p2 k3) for both devices, and their relative pose, from board features.
 
-    Features beyond 6 robust sigma, and poses most of whose features are, are set aside and named. Raises
+    Features beyond 6 robust sigma, and poses most of whose features are, are excluded and named. Raises
     CalibrationRejected where the poses cannot determine the devices: too few, all parallel, or features that
-    contradict the model. Not ``strict``: a solution to look into and not to use, whatever it contradicts; raises only
+    contradict the model. Not ``strict``: a solution for diagnosis only, whatever it contradicts; raises only
     where there is none.
     """
     left_out = dict(left_out or {})
@@ -155,8 +155,8 @@ def calibrate_stereo(
 
     for _ in range(4):
         solution = _Solution.fit(used, [kept[o.name] for o in used], projector_size, strict)
-        outliers = _outliers(solution, used, kept)
-        if not (outliers and strict):  # what is looked into is all of it
+        outliers = _find_outliers(solution, used, kept)
+        if not (outliers and strict):  # a diagnosis keeps all features
             break
         for name, bad in outliers.items():
             kept[name] = kept[name] & ~bad
@@ -303,7 +303,7 @@ def _rms_px(residuals: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
 
 
-def _outliers(
+def _find_outliers(
     solution: _Solution, used: Sequence[Observation], kept: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Per pose, the features still in use that lie beyond ROBUST_SIGMAS of all features, in either device."""

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from slviewer.fringe.phase import Reason
-from slviewer.geometry.jit import fma, less, plus, prefetch, signed
+from slviewer.geometry.jit import add_fixed_width, fma, prefetch, subtract_fixed_width, to_signed
 
 VALID, DARK, SATURATED, INCONSISTENT = (
     np.uint8(r) for r in (Reason.VALID, Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT)
@@ -112,9 +112,9 @@ def fetch(stack, frame, row):
 @numba.njit
 def combined(a, b, c, d):
     """Of the samples (p, q, r, s) of a line of `Steps`: their sum, p - r - q + s, p - r + q - s, and the largest."""
-    ac, bd = less(signed(a), signed(c)), less(signed(b), signed(d))
-    total = plus(plus(signed(a), signed(b)), plus(signed(c), signed(d)))
-    return total, less(ac, bd), plus(ac, bd), max(max(a, b), max(c, d))
+    ac, bd = subtract_fixed_width(to_signed(a), to_signed(c)), subtract_fixed_width(to_signed(b), to_signed(d))
+    total = add_fixed_width(add_fixed_width(to_signed(a), to_signed(b)), add_fixed_width(to_signed(c), to_signed(d)))
+    return total, subtract_fixed_width(ac, bd), add_fixed_width(ac, bd), max(max(a, b), max(c, d))
 
 
 @numba.njit
@@ -131,7 +131,7 @@ def eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
     two, even_e, odd_e, peak_e = combined(e, f, g, h)
     cosine = fma(cos_a, np.float32(even), cos_e * np.float32(even_e))
     sine = fma(sin_a, np.float32(odd), sin_e * np.float32(odd_e))
-    return np.float32(plus(one, two)), cosine, sine, max(peak, peak_e)
+    return np.float32(add_fixed_width(one, two)), cosine, sine, max(peak, peak_e)
 
 
 @numba.njit(inline="always")

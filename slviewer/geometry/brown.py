@@ -1,6 +1,6 @@
-"""The Brown distortion polynomial as compiled functions (Letter eq. 3 and 5): what every lens and kernel uses.
+"""The Brown distortion polynomial as compiled functions (Letter eq. 3 and 5), shared by lenses and kernels.
 
-A lens travels into the kernels as ten numbers, ``parameters = [fx, fy, cx, cy, k1, k2, p1, p2, k3, fold]``, where
+Kernels take a lens as ten numbers, ``parameters = [fx, fy, cx, cy, k1, k2, p1, p2, k3, fold]``, where
 ``fold`` is the squared radius (normalised) at which the radial polynomial stops growing: beyond it one pixel belongs
 to two rays, and nothing past it is ever returned.
 """
@@ -25,7 +25,7 @@ def fold_radius_squared(D: np.ndarray) -> float:
 
 
 @kernel()
-def brown(x, y, parameters):
+def distort_point(x, y, parameters):
     """Distorted normalised (x, y) and the derivatives (dx'/dx, dx'/dy, dy'/dy); the Jacobian is symmetric."""
     k1, k2, p1, p2, k3 = parameters[4], parameters[5], parameters[6], parameters[7], parameters[8]
     r2 = x * x + y * y
@@ -40,16 +40,16 @@ def brown(x, y, parameters):
 
 
 @kernel()
-def unbrown(xd, yd, parameters):
+def undistort_point(xd, yd, parameters):
     """Undistorted normalised (x, y) of a distorted point by damped Newton steps; NaN where it fails or folds over."""
     fold = parameters[9]
     x, y = xd, yd
     r2 = x * x + y * y
-    if r2 >= 0.81 * fold:  # begin inside, where the polynomial still grows
+    if r2 >= 0.81 * fold:  # start inside the fold, where the polynomial still grows
         shrink = np.sqrt(0.81 * fold / r2)
         x *= shrink
         y *= shrink
-    fx, fy, dxx, dxy, dyy = brown(x, y, parameters)
+    fx, fy, dxx, dxy, dyy = distort_point(x, y, parameters)
     ex, ey = xd - fx, yd - fy
     error = ex * ex + ey * ey
     for _ in range(MAX_STEPS):
@@ -63,7 +63,7 @@ def unbrown(xd, yd, parameters):
         damping = 1.0
         while True:  # shorten the step until it stays inside the fold and comes nearer
             nx, ny = x + damping * sx, y + damping * sy
-            fx, fy, dxx, dxy, dyy = brown(nx, ny, parameters)
+            fx, fy, dxx, dxy, dyy = distort_point(nx, ny, parameters)
             ex, ey = xd - fx, yd - fy
             new_error = ex * ex + ey * ey
             if nx * nx + ny * ny < fold and new_error < error:
@@ -81,7 +81,7 @@ def distort_all(normalised, parameters, pixels):
     for i in numba.prange(normalised.shape[0]):
         x, y = normalised[i, 0], normalised[i, 1]
         if x * x + y * y < parameters[9]:
-            xd, yd, _, _, _ = brown(x, y, parameters)
+            xd, yd, _, _, _ = distort_point(x, y, parameters)
             pixels[i, 0] = parameters[0] * xd + parameters[2]
             pixels[i, 1] = parameters[1] * yd + parameters[3]
         else:
@@ -95,7 +95,7 @@ def undistort_all(pixels, parameters, normalised):
     for i in numba.prange(pixels.shape[0]):
         xd = (pixels[i, 0] - parameters[2]) / parameters[0]
         yd = (pixels[i, 1] - parameters[3]) / parameters[1]
-        normalised[i, 0], normalised[i, 1] = unbrown(xd, yd, parameters)
+        normalised[i, 0], normalised[i, 1] = undistort_point(xd, yd, parameters)
 
 
 @kernel(parallel=True)
@@ -108,6 +108,6 @@ def project_all(points, parameters, pixels):
         if z > 0.0:
             x, y = points[i, 0] / z, points[i, 1] / z
             if x * x + y * y < parameters[9]:
-                xd, yd, _, _, _ = brown(x, y, parameters)
+                xd, yd, _, _, _ = distort_point(x, y, parameters)
                 pixels[i, 0] = parameters[0] * xd + parameters[2]
                 pixels[i, 1] = parameters[1] * yd + parameters[3]

@@ -1,6 +1,6 @@
-"""Whether there is a CUDA device to compute with: the one place that decides, asked once, and told once.
+"""Detection of the CUDA device: probed once a process, reported once in the log.
 
-Nothing of CUDA is imported before the driver itself has said that it has a device.
+Nothing of CUDA is imported before the driver itself reports a device.
 """
 
 import ctypes
@@ -16,47 +16,47 @@ import numpy as np
 _LOG = logging.getLogger("slviewer.cuda")
 _LOCK = threading.Lock()
 _NO_DEVICE = 100  # CUDA_ERROR_NO_DEVICE
-_found: list[str | None] = []  # empty until somebody asks
+_cached_name: list[str | None] = []  # empty until the first call of `find_device`
 
 
-def device() -> str | None:
+def find_device() -> str | None:
     """The name of the device that computes; None where there is none, or where it failed before.
 
-    It needs the package numba-cuda (``pip install 'slviewer[cuda]'``); without it, nothing is looked for. A driver
-    that does not work is told in the log, once. ``CUDA_VISIBLE_DEVICES=`` hides the devices, as from any program.
+    It needs the package numba-cuda (``pip install 'slviewer[cuda]'``); without it, no device is searched for. A driver
+    that does not work is logged once. ``CUDA_VISIBLE_DEVICES=`` hides the devices, as from any program.
     """
     with _LOCK:
-        if not _found:
-            _found.append(_look())
-        return _found[0]
+        if not _cached_name:
+            _cached_name.append(_probe_device())
+        return _cached_name[0]
 
 
-def give_up(error: Exception) -> None:
-    """Say that the device failed; from now on there is none."""
+def disable_device(error: Exception) -> None:
+    """Log that the device failed; from now on `find_device` returns None."""
     with _LOCK:
-        if _found != [None]:
+        if _cached_name != [None]:
             _LOG.warning("the CUDA device failed, and the processor takes over: %s", _first_line(error))
-        _found[:] = [None]
+        _cached_name[:] = [None]
 
 
-def frame_room(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array of undefined values; where there is a device, in memory that it copies from and to at full speed."""
-    if device() is not None:
+def allocate_frames(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """Uninitialised array; in page-locked memory where there is a device, for transfers at full speed."""
+    if find_device() is not None:
         from numba import cuda
 
         try:
             return cuda.pinned_array(shape, dtype)
         except Exception as error:
-            give_up(error)
+            disable_device(error)
     return np.empty(shape, dtype)
 
 
-def _look() -> str | None:
+def _probe_device() -> str | None:
     simulated = os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
     if not simulated:
         if importlib.util.find_spec("numba_cuda") is None:
             return None
-        count, reason, level = _asked_driver()
+        count, reason, level = _count_devices()
         if count == 0:
             _LOG.log(level, "no CUDA device is used: %s", reason)
             return None
@@ -74,8 +74,8 @@ def _look() -> str | None:
     return name
 
 
-def _asked_driver() -> tuple[int, str, int]:
-    """How many devices the driver has; if none, why, and whether that is a matter for the log's INFO or WARNING."""
+def _count_devices() -> tuple[int, str, int]:
+    """(number of devices; where it is 0: the reason, and the log level to report it at)."""
     count = ctypes.c_int()
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
@@ -83,7 +83,7 @@ def _asked_driver() -> tuple[int, str, int]:
     except (OSError, AttributeError) as error:
         return 0, f"there is no driver ({_first_line(error)})", logging.INFO
     if code not in (0, _NO_DEVICE):
-        return 0, f"its driver answers with error {code}: install the graphics card's driver anew", logging.WARNING
+        return 0, f"its driver reports error {code}: reinstall the graphics card's driver", logging.WARNING
     return count.value, "the driver has none", logging.INFO
 
 

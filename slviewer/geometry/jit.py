@@ -1,4 +1,4 @@
-"""One decorator for the compiled kernels, whose cache never stands in the way, and never gives back stale code."""
+"""Decorator for the compiled kernels, with a cache that is optional and never returns stale machine code."""
 
 import threading
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from slviewer.geometry.jit_cache import folder_for
+from slviewer.geometry.jit_cache import cache_folder
 
 _LOCK = threading.Lock()
 _SETTINGS: Any = numba.config
@@ -23,10 +23,10 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Calla
     options: dict[str, Any] = {"parallel": parallel, "fastmath": fastmath, "nogil": True}
 
     def compile_lazily(function: Callable[..., Any]) -> Callable[..., Any]:
-        folder = folder_for(function.__module__)
+        folder = cache_folder(function.__module__)
         if folder is None:
             return numba.njit(**options)(function)
-        with _LOCK:  # numba reads the setting while it decorates; others' kernels keep their own place
+        with _LOCK:  # numba reads the setting while it decorates; kernels of other packages keep their own folder
             before, _SETTINGS.CACHE_DIR = _SETTINGS.CACHE_DIR, str(folder)
             try:
                 return numba.njit(cache=True, **options)(function)
@@ -36,10 +36,10 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Calla
     return compile_lazily
 
 
-def _fused(_typing: Any, a: Any, b: Any, c: Any) -> Any:
+def _fused_multiply_add(_typing: Any, a: Any, b: Any, c: Any) -> Any:
     """``a b + c`` of float32, rounded once, in compiled code.
 
-    A compiler that is merely allowed to do so decides anew for code that is kept and for code that was just made, and
+    A compiler that is merely allowed to fuse may decide differently for cached and for newly compiled code, and then
     the last bit differs.
     """
 
@@ -51,11 +51,11 @@ def _fused(_typing: Any, a: Any, b: Any, c: Any) -> Any:
     return numba.float32(numba.float32, numba.float32, numba.float32), build
 
 
-fma: Any = intrinsic(_fused)
+fma: Any = intrinsic(_fused_multiply_add)
 
 
-def _signed(_typing: Any, level: Any) -> Any:
-    """A grey level as a number that holds sums and differences of eight such: int16 of uint8, int32 of uint16."""
+def _to_signed(_typing: Any, level: Any) -> Any:
+    """Grey level as a signed integer of twice the width (uint8 -> int16, uint16 -> int32)."""
 
     def build(_context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.zext(arguments[0], ir.IntType(signature.return_type.bitwidth))
@@ -63,18 +63,18 @@ def _signed(_typing: Any, level: Any) -> Any:
     return numba.types.Integer.from_bitwidth(2 * level.bitwidth, True)(level), build
 
 
-def _plus(_typing: Any, a: Any, b: Any) -> Any:
-    """``a + b``, of integers as wide as both: Python's own grow to 64 bits, of which few fit a register."""
+def _add_fixed_width(_typing: Any, a: Any, b: Any) -> Any:
+    """``a + b`` in the operands' own integer width: numba widens to 64 bits, of which few fit a vector register."""
     return a(a, a), lambda _context, builder, _signature, arguments: builder.add(*arguments)
 
 
-def _less(_typing: Any, a: Any, b: Any) -> Any:
-    """``a - b``, of integers as wide as both."""
+def _subtract_fixed_width(_typing: Any, a: Any, b: Any) -> Any:
+    """``a - b`` in the operands' own integer width."""
     return a(a, a), lambda _context, builder, _signature, arguments: builder.sub(*arguments)
 
 
 def _prefetch(_typing: Any, array: Any, index: Any) -> Any:
-    """Have the cache line of an array's element (one index, in one dimension) brought near; nothing waits for it."""
+    """Prefetch the cache line of a 1-D array's element without waiting for it."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         view = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -88,7 +88,7 @@ def _prefetch(_typing: Any, array: Any, index: Any) -> Any:
     return numba.types.void(array, index), build
 
 
-signed: Any = intrinsic(_signed)
-plus: Any = intrinsic(_plus)
-less: Any = intrinsic(_less)
+to_signed: Any = intrinsic(_to_signed)
+add_fixed_width: Any = intrinsic(_add_fixed_width)
+subtract_fixed_width: Any = intrinsic(_subtract_fixed_width)
 prefetch: Any = intrinsic(_prefetch)

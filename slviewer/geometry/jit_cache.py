@@ -1,6 +1,6 @@
-"""Where the kernels' machine code is kept: a folder a module, named after what the module's sources say.
+"""Cache folders for the kernels' machine code, one a module, named after a hash of the module's sources.
 
-numba itself looks at the file of a kernel alone. A kernel also holds what it calls and the constants it reads from
+numba itself checks the kernel's own file only. A kernel also compiles in what it calls and constants of
 other files, and stale machine code is a wrong answer: so a folder's name carries a hash over the sources of a module
 and of all the package's modules that it imports.
 """
@@ -21,16 +21,16 @@ _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+(slviewer[\w.]*)[ \t]+)?import[ \t]+
 _NAME = re.compile(rb"[\w.]+")
 
 
-def folder_for(module: str) -> Path | None:
-    """The folder for the machine code of a module of this package; None where there is no place to keep any.
+def cache_folder(module: str) -> Path | None:
+    """The folder for the machine code of a module of this package; None where none is writable.
 
-    Those of the same module's earlier sources go.
+    Folders of the same module's earlier sources are deleted.
     """
     try:
-        root = _root()
+        root = _cache_root()
         if root is None:
             return None
-        folder = root / f"{module}-{sources_hash(module)}"
+        folder = root / f"{module}-{hash_sources(module)}"
         if not folder.is_dir():
             for old in root.glob(f"{module}-*"):
                 if old != folder:  # another process may just have made it
@@ -41,25 +41,25 @@ def folder_for(module: str) -> Path | None:
     return folder
 
 
-def sources_hash(module: str) -> str:
-    """A hash of what a module and all modules of the package that it imports say. Raises OSError without sources."""
-    found, ahead = dict[str, bytes](), [module]
+def hash_sources(module: str) -> str:
+    """Hash over the sources of a module and of all package modules it imports. Raises OSError without sources."""
+    digests, ahead = dict[str, bytes](), [module]
     while ahead:
         name = ahead.pop()
-        if name in found:
+        if name in digests:
             continue
-        found[name], imported = _source(name)
+        digests[name], imported = _hash_source(name)
         ahead += imported
     whole = hashlib.blake2b(digest_size=8)
-    for name in sorted(found):
-        whole.update(name.encode() + found[name])
+    for name in sorted(digests):
+        whole.update(name.encode() + digests[name])
     return whole.hexdigest()
 
 
 @cache
-def _source(module: str) -> tuple[bytes, tuple[str, ...]]:
+def _hash_source(module: str) -> tuple[bytes, tuple[str, ...]]:
     """A module's digest, and the modules of the package that its text imports, anywhere in it."""
-    path = _path(module)
+    path = _source_path(module)
     if path is None:
         raise FileNotFoundError(f"{module} has no source file")
     text = path.read_bytes()
@@ -67,24 +67,24 @@ def _source(module: str) -> tuple[bytes, tuple[str, ...]]:
     for where, what in _IMPORT.findall(text):
         names = [name.decode() for name in _NAME.findall(what)]
         named |= {where.decode(), *(f"{where.decode()}.{name}" for name in names)} if where else set(names)
-    imported = (name for name in sorted(named) if name.split(".")[0] == "slviewer" and _path(name) is not None)
+    imported = (name for name in sorted(named) if name.split(".")[0] == "slviewer" and _source_path(name) is not None)
     return hashlib.blake2b(text, digest_size=20).digest(), tuple(imported)
 
 
-def _path(module: str) -> Path | None:
+def _source_path(module: str) -> Path | None:
     """The source file of a module; None where there is none of that name."""
     parts = PACKAGE.parent.joinpath(*module.split("."))
     return next((path for path in (parts.with_suffix(".py"), parts / "__init__.py") if path.is_file()), None)
 
 
 @cache
-def _root() -> Path | None:
-    """The first place that can be written; None where there is none."""
-    return next((place for place in _places() if _usable(place)), None)
+def _cache_root() -> Path | None:
+    """The first candidate folder that can be used; None where there is none."""
+    return next((place for place in _candidate_folders() if _is_private_and_writable(place)), None)
 
 
-def _places() -> Iterator[Path]:
-    """Where machine code may be kept, the best first; two installs never share a folder."""
+def _candidate_folders() -> Iterator[Path]:
+    """Candidate cache folders, the best first; two installs never share a folder."""
     install = hashlib.blake2b(str(PACKAGE).encode(), digest_size=4).hexdigest()
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         yield Path(given, f"slviewer-{install}")
@@ -102,15 +102,15 @@ def _places() -> Iterator[Path]:
     yield Path(tempfile.gettempdir(), f"slviewer-{user}-kernels-{install}")
 
 
-def _usable(place: Path) -> bool:
-    """Whether files can be kept there, and by nobody else: reading the cache runs what it holds."""
+def _is_private_and_writable(place: Path) -> bool:
+    """Whether this user, and no other, can write there: loading the cache runs the code it holds."""
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         place.mkdir(mode=0o700, exist_ok=True)
-        found = place.lstat()
-        if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+        status = place.lstat()
+        if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
             return False
         tempfile.TemporaryFile(dir=place).close()
     except OSError:
         return False
-    return stat.S_ISDIR(found.st_mode)
+    return stat.S_ISDIR(status.st_mode)

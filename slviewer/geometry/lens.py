@@ -100,7 +100,7 @@ class Lens:
         rays.setflags(write=False)
         return rays
 
-    def scaled(self, factor: float) -> "Lens":
+    def resize(self, factor: float) -> "Lens":
         """The same lens at another resolution: pixel centres stay at whole numbers, so c' = (c + 0.5) factor - 0.5."""
         K = self.K.copy()
         K[:2, :2] *= factor

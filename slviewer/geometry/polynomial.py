@@ -1,4 +1,4 @@
-"""A polynomial surface over a part of the image, fitted to scattered values (Letter step 2, as it stands there)."""
+"""A polynomial surface over a part of the image, fitted to scattered values (Letter step 2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.polynomial import chebyshev
 
 from slviewer.errors import InputError
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.robust import reweighted
+from slviewer.geometry.robust import fit_reweighted
 
 Box = tuple[float, float, float, float]
 
@@ -27,17 +27,17 @@ class Polynomial2D:
     def evaluate(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Values at scattered pixels ``u``, ``v``, in their shape; NaN outside the box."""
         u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
-        s, t = _scaled(u, v, self.box)
+        s, t = _normalise_pixels(u, v, self.box)
         values = chebyshev.chebval2d(t, s, self.coefficients)
         return np.where((np.abs(s) <= 1.0) & (np.abs(t) <= 1.0), values, np.nan)
 
     def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
         """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
         height, width = shape
-        s, t = _scaled(origin[0] + np.arange(width), origin[1] + np.arange(height), self.box)
+        s, t = _normalise_pixels(origin[0] + np.arange(width), origin[1] + np.arange(height), self.box)
         rows = chebyshev.chebvander(t, len(self.coefficients) - 1) @ self.coefficients
         out = np.empty(shape)
-        _chebyshev_rows(rows, s, t, out)
+        _evaluate_chebyshev(rows, s, t, out)
         return out
 
 
@@ -53,18 +53,18 @@ def fit_polynomial(
     """Least-squares polynomial of total ``degree`` through ``values`` (n,) at pixels ``u``, ``v`` (n,).
 
     ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1) px, or a size
-    (w, h) for a whole image; samples outside it, not finite, or of weight 0 are left out. ``robust``: Tukey's weights,
-    so that stray values do not pull. Raises InputError where fewer samples than coefficients are left.
+    (w, h) for a whole image; samples outside it, not finite, or of weight 0 are excluded. ``robust``: Tukey's weights,
+    which reject outliers. Raises InputError where fewer samples than coefficients are left.
     """
-    box = as_box(extent)
-    u, v, values, weights = usable(u, v, values, weights, box)
+    box = parse_box(extent)
+    u, v, values, weights = select_valid_samples(u, v, values, weights, box)
     i, j = np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]).T
     if len(values) < len(i):
         raise InputError(
             f"{len(values)} samples are too few for a polynomial of degree {degree} with {len(i)} coefficients: "
-            "lower the degree, or check that the target is lit."
+            "lower the degree, or check that the target is illuminated."
         )
-    s, t = _scaled(u, v, box)
+    s, t = _normalise_pixels(u, v, box)
     design = chebyshev.chebvander(t, degree)[:, i] * chebyshev.chebvander(s, degree)[:, j]
 
     def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,12 +73,12 @@ def fit_polynomial(
         return solution, design @ solution
 
     coefficients = np.zeros((degree + 1, degree + 1))
-    coefficients[i, j] = reweighted(solve, values, weights) if robust else solve(weights)[0]
+    coefficients[i, j] = fit_reweighted(solve, values, weights) if robust else solve(weights)[0]
     return Polynomial2D(coefficients, box)
 
 
-def as_box(extent: Sequence[float]) -> Box:
-    """(u0, v0, u1, v1) px of a box given so, or as an image's (width, height): its pixels with their outer edges."""
+def parse_box(extent: Sequence[float]) -> Box:
+    """(u0, v0, u1, v1) px of a box, or of a whole image given as (width, height), outer pixel edges included."""
     if len(extent) == 2:
         return (-0.5, -0.5, extent[0] - 0.5, extent[1] - 0.5)
     u0, v0, u1, v1 = (float(edge) for edge in extent)
@@ -87,10 +87,10 @@ def as_box(extent: Sequence[float]) -> Box:
     return (u0, v0, u1, v1)
 
 
-def usable(
+def select_valid_samples(
     u: np.ndarray, v: np.ndarray, values: np.ndarray, weights: np.ndarray | None, box: Box
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The samples inside the box that are finite and have weight, as float64 (n,); InputError for unequal lengths."""
+    """The finite samples of positive weight inside the box, as float64 (n,); InputError for unequal lengths."""
     arrays = [np.asarray(a, dtype=np.float64).ravel() for a in (u, v, values)]
     arrays.append(np.ones(len(arrays[2])) if weights is None else np.asarray(weights, dtype=np.float64).ravel())
     u, v, values, w = arrays
@@ -103,13 +103,13 @@ def usable(
     return u[kept], v[kept], values[kept], w[kept]
 
 
-def _scaled(u: np.ndarray, v: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:
+def _normalise_pixels(u: np.ndarray, v: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:
     u0, v0, u1, v1 = box
     return 2.0 * (u - u0) / (u1 - u0) - 1.0, 2.0 * (v - v0) / (v1 - v0) - 1.0
 
 
 @kernel(parallel=True)
-def _chebyshev_rows(rows, s, t, out):
+def _evaluate_chebyshev(rows, s, t, out):
     """out (h, w) from each row's Chebyshev coefficients (h, degree + 1), by Clenshaw's recurrence."""
     for y in numba.prange(out.shape[0]):
         inside = abs(t[y]) <= 1.0

@@ -1,4 +1,4 @@
-"""A plane or a sphere somewhere in a cloud that also holds other things: a start for the least-squares fits."""
+"""RANSAC detection of a plane or a sphere in a cluttered cloud: initial values for the least-squares fits."""
 
 from collections.abc import Callable
 
@@ -8,18 +8,18 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
 
-SAMPLE = 3000
-"""Points that are looked at: the shape must be found, not measured yet."""
+SAMPLE_SIZE = 3000
+"""Points of the subsample that hypotheses are drawn from and scored on."""
 HYPOTHESES = 400
-POLISHED = 12
+REFINED_HYPOTHESES = 12
 """How many of the best hypotheses are refined by least squares before the best is chosen."""
 
 
 def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[Plane, np.ndarray]:
-    """The plane that most points (n, 3) agree with to ``tolerance`` mm, and which they are: (n,) bool.
+    """The plane with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask (n,) bool.
 
-    Looks at a subsample, and ends with least squares over those that agree; the same seed gives the same answer. NaN
-    rows are left out. Raises InputError where nothing flat is found.
+    Draws from a subsample and ends with least squares over all inliers; deterministic for a given seed. NaN rows are
+    excluded. Raises InputError where no plane is detected.
     """
 
     def hypotheses(triples: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -39,10 +39,10 @@ def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[P
 def ransac_sphere(
     points: np.ndarray, tolerance: float, radius: float | None = None, seed: int = 0
 ) -> tuple[Sphere, np.ndarray]:
-    """The sphere that most points (n, 3) agree with to ``tolerance`` mm, and which they are: (n,) bool.
+    """The sphere with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask (n,) bool.
 
-    With ``radius`` (mm) only spheres of about that size are looked for, and the result has it exactly; without, spheres
-    larger than the cloud itself are left out, because any flat patch would pass for one. Otherwise as ``ransac_plane``.
+    With ``radius`` (mm), only spheres of about that size are considered and the result has exactly that radius;
+    without, spheres larger than the cloud are excluded, because any flat patch would fit one.
     """
     finite = np.asarray(points, dtype=np.float64)[np.isfinite(points).all(axis=-1)]
     extent = float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 0.0
@@ -59,7 +59,7 @@ def ransac_sphere(
         return (origin + offset)[sized], radii[sized]
 
     def distances(sample: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        middle = sample.mean(axis=0)  # about which the squares are small, and lose nothing in the difference
+        middle = sample.mean(axis=0)  # centred: the difference of squares loses no digits
         x, c = sample - middle, centre - middle
         squares = np.einsum("ij,ij->i", x, x) + np.einsum("ij,ij->i", c, c)[:, None] - 2.0 * c @ x.T
         result: np.ndarray = np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
@@ -68,7 +68,7 @@ def ransac_sphere(
     def fit(chosen: np.ndarray) -> Sphere:
         sphere = fit_sphere(chosen, radius)
         if not low <= sphere.radius <= high:
-            raise InputError(f"The sphere found has a radius of {sphere.radius:.1f} mm, too large for its cloud.")
+            raise InputError(f"The detected sphere has a radius of {sphere.radius:.1f} mm, too large for its cloud.")
         return sphere
 
     return _search(points, 4, tolerance, seed, hypotheses, distances, fit, "sphere")
@@ -90,10 +90,10 @@ def _search(
     valid = points[finite]
     if len(valid) < 3 * needed:
         raise InputError(
-            f"{len(valid)} points were measured, too few to find a {what} in: check the capture's exposure."
+            f"{len(valid)} points were measured, too few to detect a {what}: check the capture's exposure."
         )
     rng = np.random.default_rng(seed)
-    sample = valid[rng.choice(len(valid), min(SAMPLE, len(valid)), replace=False)]
+    sample = valid[rng.choice(len(valid), min(SAMPLE_SIZE, len(valid)), replace=False)]
     parameters = hypotheses(_minimal_sets(sample, needed, rng))
     # score in slices, so that the table of distances stays small
     scores = np.concatenate(
@@ -104,7 +104,7 @@ def _search(
         or [np.empty(0)]
     )
     best, best_score = None, np.inf
-    for index in np.argsort(scores)[:POLISHED]:
+    for index in np.argsort(scores)[:REFINED_HYPOTHESES]:
         chosen = np.abs(distances(sample, *(p[index : index + 1] for p in parameters))[0]) <= tolerance
         try:
             for _ in range(5):
@@ -119,7 +119,7 @@ def _search(
             best, best_score = shape, score
     if best is None:
         raise InputError(
-            f"No {what} was found among {len(valid)} points to {tolerance:g} mm: "
+            f"No {what} was detected among {len(valid)} points to {tolerance:g} mm: "
             "check that it fills a good part of the view."
         )
     with np.errstate(invalid="ignore"):
@@ -130,9 +130,9 @@ def _search(
 
 
 def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
-    """(HYPOTHESES, size, 3): each a random point and some of its neighbours, from near ones to those a quarter away.
+    """(HYPOTHESES, size, 3): each a random point and some of its nearest 1, 3, 10 or 25 % of the sample.
 
-    A shape that fills a tenth of the cloud holds four points drawn anywhere once in ten thousand draws; four
+    Four points drawn anywhere lie on a shape that fills a tenth of the cloud once in ten thousand draws; four
     neighbours, often.
     """
     seeds = rng.choice(len(sample), HYPOTHESES)

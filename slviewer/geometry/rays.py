@@ -5,7 +5,7 @@ import numpy as np
 
 
 @numba.njit(inline="always")
-def along_rays(x, y, z, points):
+def fill_points(x, y, z, points):
     """Fill ``points`` (w, 3) with (x z, y z, z) of an image row's rays (w,) and depths.
 
     A flat view and indices without a sign: only so does the compiler write three numbers a pixel in wide registers,

@@ -1,4 +1,4 @@
-"""One camera and one projector, and how they stand to each other."""
+"""The stereo rig: one camera, one projector, and the transform between them."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""The spread of residuals that stray values do not move, and least squares in which those values have no say."""
+"""Robust standard deviation of residuals, and least squares reweighted against outliers."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -9,23 +9,23 @@ Solution = TypeVar("Solution")
 
 
 def robust_sigma(residuals: np.ndarray) -> float:
-    """1.4826 times the median absolute deviation: normal residuals' standard deviation, stray ones or not."""
+    """1.4826 times the median absolute deviation: the standard deviation of normal residuals, robust to outliers."""
     return float(1.4826 * np.median(np.abs(residuals - np.median(residuals))))
 
 
 def tukey_weights(residuals: np.ndarray, sigma: float) -> np.ndarray:
-    """Tukey's biweight at 4.685 sigma (95 % efficient on normal residuals): 0 beyond, so an outlier pulls no more."""
+    """Tukey's biweight at 4.685 sigma (95 % efficient on normal residuals): 0 beyond."""
     scaled = np.minimum(np.abs(residuals) / (4.685 * sigma), 1.0)
     weights: np.ndarray = (1.0 - scaled**2) ** 2
     return weights
 
 
-def reweighted(
+def fit_reweighted(
     solve: Callable[[np.ndarray], tuple[Solution, np.ndarray]], values: np.ndarray, weights: np.ndarray
 ) -> Solution:
     """Iteratively reweighted least squares with Tukey's weights.
 
-    ``solve(weights)`` gives a solution and its fitted values (n,); ``values`` (n,) are what they should be, and
+    ``solve(weights)`` returns a solution and its fitted values (n,); ``values`` (n,) are the observations, and
     ``weights`` (n,) one over the variance of each, known up to a factor. Ends when the fit moves by less than a
     hundredth of the residuals' robust sigma.
     """

@@ -1,16 +1,13 @@
-"""Planes and spheres fitted to points: least squares of the orthogonal distances, with stray points set aside."""
+"""Planes and spheres fitted to points: least squares of the orthogonal distances."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
 
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.robust import robust_sigma
 
-FLAT = 4.0
-"""A patch is a sphere's only if its height over a plane is at least this many times the RMS left by the sphere fit."""
+MIN_CAP_HEIGHT_RATIO = 4.0
+"""A patch is fitted by a sphere only if its height over a plane is at least this many times the fit's RMS residual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,23 +32,16 @@ class Sphere:
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed radial distances (...) mm of points (..., 3), positive outside."""
-        return _lengths(np.asarray(points, dtype=np.float64) - self.centre) - self.radius
-
-
-class Shape(Protocol):
-    def distance(self, points: np.ndarray) -> np.ndarray: ...
-
-
-AnyShape = TypeVar("AnyShape", bound=Shape)
+        return _norms(np.asarray(points, dtype=np.float64) - self.centre) - self.radius
 
 
 def fit_plane(points: np.ndarray, weights: np.ndarray | None = None) -> Plane:
-    """Total least squares plane of points (n, 3) mm (Letter eq. 12), through their moments; NaN rows are left out.
+    """Total least squares plane of points (n, 3) mm (Letter eq. 12), through their moments; NaN rows are excluded.
 
     ``weights``: (n,), one over each point's variance. Raises InputError for fewer than three points, and for points on
-    one line or in a clump, which lie on no one plane.
+    one line or in a clump, which define no plane.
     """
-    points, kept = _finite(points, 3, "a plane")
+    points, kept = _select_finite(points, 3, "a plane")
     w = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)[kept]
     if not w.sum() > 0:
         raise InputError("All points of a plane fit have weight 0: give at least three of them a positive weight.")
@@ -69,12 +59,12 @@ def fit_plane(points: np.ndarray, weights: np.ndarray | None = None) -> Plane:
 
 
 def fit_sphere(points: np.ndarray, radius: float | None = None) -> Sphere:
-    """Sphere of least orthogonal distances to points (n, 3) mm, with the radius held if given; NaN rows are left out.
+    """Sphere of least orthogonal distances to points (n, 3) mm, with the radius fixed if given; NaN rows are excluded.
 
     Levenberg-Marquardt from the algebraic fit. Raises InputError for fewer than four points, and for a patch that is
-    flat: exactly, or as far as its noise lets one see.
+    flat, exactly or within its noise.
     """
-    points, _ = _finite(points, 4, "a sphere")
+    points, _ = _select_finite(points, 4, "a sphere")
     origin = points.mean(axis=0)
     points = points - origin  # better conditioned, and the size of the patch sets the scale
     spread = np.linalg.eigvalsh(points.T @ points / len(points))
@@ -85,37 +75,13 @@ def fit_sphere(points: np.ndarray, radius: float | None = None) -> Sphere:
         raise flat
     centre, start = _algebraic_sphere(points)
     centre, r, rms = _refine_sphere(points, centre, start if radius is None else radius, radius is not None)
-    if not (np.isfinite(r) and 2.0 * np.sqrt(spread[1] * spread[2]) / r > FLAT * rms):  # height of the cap: a^2 / 2r
+
+    if not (np.isfinite(r) and 2.0 * np.sqrt(spread[1] * spread[2]) / r > MIN_CAP_HEIGHT_RATIO * rms):
         raise flat
     return Sphere(centre + origin, r)
 
 
-def robust_fit(
-    fit: Callable[[np.ndarray], AnyShape], points: np.ndarray, k: float = 5.0
-) -> tuple[AnyShape, np.ndarray]:
-    """The shape, and which of the points (n, 3) it was fitted to: (n,) bool, False for NaN rows.
-
-    Fits, sets aside the points beyond ``k`` robust sigma (1.4826 MAD of all residuals), and repeats until the set is
-    stable. Stands up to stray points as long as they are few: start with ``ransac_*`` in a cloud of other things.
-    """
-    points = np.asarray(points, dtype=np.float64)
-    finite = np.isfinite(points).all(axis=-1)
-    inliers = finite
-    shape = fit(points[inliers])
-    for _ in range(50):
-        residuals = shape.distance(points)
-        middle = np.median(residuals[finite])
-        # exact points have no spread: rounding must not set any of them aside
-        reach = max(k * robust_sigma(residuals[finite]), 1e-9 * float(np.abs(points[finite]).max()))
-        kept = finite & (np.abs(residuals - middle) <= reach)
-        if np.array_equal(kept, inliers):
-            break
-        inliers = kept
-        shape = fit(points[inliers])
-    return shape, inliers
-
-
-def _finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarray, np.ndarray]:
+def _select_finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarray, np.ndarray]:
     """The finite rows as float64, and which they are; InputError for another shape or too few of them."""
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -128,7 +94,7 @@ def _finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarray, np.n
     return (points if kept.all() else points[kept]), kept
 
 
-def _lengths(vectors: np.ndarray) -> np.ndarray:
+def _norms(vectors: np.ndarray) -> np.ndarray:
     """Lengths (...) of vectors (..., 3): `numpy.linalg.norm` along a short axis takes several times as long."""
     lengths: np.ndarray = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
     return lengths
@@ -151,7 +117,7 @@ def _refine_sphere(
 
     def misfit(c: np.ndarray, r: float) -> tuple[np.ndarray, np.ndarray, float]:
         offsets = points - c
-        lengths = _lengths(offsets)
+        lengths = _norms(offsets)
         residuals = lengths - r
         return offsets / np.maximum(lengths, 1e-300)[:, None], residuals, float(residuals @ residuals)
 

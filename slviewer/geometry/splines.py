@@ -14,8 +14,8 @@ from scipy.linalg import solveh_banded
 
 from slviewer.errors import InputError
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.polynomial import Polynomial2D, as_box, fit_polynomial, usable
-from slviewer.geometry.robust import reweighted
+from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial, parse_box, select_valid_samples
+from slviewer.geometry.robust import fit_reweighted
 
 TREND_DEGREE = 3
 """Of a cell's weight: holds coefficients that no sample reaches at the trend, and hardly pulls where samples are."""
@@ -58,7 +58,7 @@ class SplineSurface:
         return out
 
 
-def fit_surface(
+def fit_spline(
     u: np.ndarray,
     v: np.ndarray,
     values: np.ndarray,
@@ -71,24 +71,25 @@ def fit_surface(
     """Cubic B-spline surface through ``values`` (n,) at pixels ``u``, ``v`` (n,), by penalised least squares.
 
     ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1) px, or a size
-    (w, h) for a whole image; samples outside it, not finite, or of weight 0 are left out. ``cells``: (across, down).
+    (w, h) for a whole image; samples outside it, not finite, or of weight 0 are excluded. ``cells``: (across, down).
     ``smooth``: weight of the squared second differences of the coefficients, relative to a mean cell's data: at 1e-3
     a wave of four cells loses 1 % of its height, and cells without samples are held by their neighbours. ``robust``:
-    Tukey's weights, so that stray values (contrast edges, 2 pi spikes) do not pull.
+    Tukey's weights, so that outliers (contrast edges, 2 pi spikes) do not pull.
 
     Raises InputError where fewer samples are left than the trend has coefficients, or for no cells.
     """
-    box = as_box(extent)
+    box = parse_box(extent)
     nx, ny = cells
     if nx < 1 or ny < 1:
-        raise InputError(f"A surface of {nx}x{ny} cells was asked for: at least one each way is needed.")
-    u, v, values, weights = usable(u, v, values, weights, box)
+        raise InputError(f"A surface of {nx}x{ny} cells was requested: at least one each way is needed.")
+    u, v, values, weights = select_valid_samples(u, v, values, weights, box)
     trend = fit_polynomial(u, v, values, weights, box, TREND_DEGREE, robust)
     rest = values - trend.evaluate(u, v)
     cells_u, basis_u = _basis(u, box[0], box[2], nx)
     cells_v, basis_v = _basis(v, box[1], box[3], ny)
     reached = len(np.unique(cells_v * nx + cells_u))
-    prior = (weights.sum() / reached) * (smooth * _second_differences(nx + 3, ny + 3) + RIDGE * _unit(nx + 3, ny + 3))
+    shape = nx + 3, ny + 3
+    prior = (weights.sum() / reached) * (smooth * _second_differences(*shape) + RIDGE * _identity(*shape))
 
     def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         band = prior.copy()
@@ -98,7 +99,7 @@ def fit_surface(
         coefficients = solution.reshape(ny + 3, nx + 3)
         return coefficients, _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients)
 
-    return SplineSurface(trend, reweighted(solve, rest, weights) if robust else solve(weights)[0])
+    return SplineSurface(trend, fit_reweighted(solve, rest, weights) if robust else solve(weights)[0])
 
 
 def _basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
@@ -115,7 +116,7 @@ def _bandwidth(columns: int) -> int:
     return 3 * columns + 3
 
 
-def _unit(columns: int, rows: int) -> np.ndarray:
+def _identity(columns: int, rows: int) -> np.ndarray:
     """The identity in lower banded form."""
     band = np.zeros((_bandwidth(columns) + 1, columns * rows))
     band[0] = 1.0

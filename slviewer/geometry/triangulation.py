@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.brown import brown
+from slviewer.geometry.brown import distort_point
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rig import StereoRig
 
@@ -16,7 +16,7 @@ MAX_STEPS = 25
 CHUNK = 1024
 MARGIN = 0.1
 """A point may fall outside the projector's image by this share of its width and height: a calibration's own error is
-smaller, and what lies further out was never lit."""
+smaller, and points further out were never illuminated."""
 
 
 def triangulate(
@@ -62,8 +62,8 @@ def depth_per_px(rig: StereoRig, axis: Literal["x", "y"], z: np.ndarray) -> np.n
     """
     _check_map(rig, z, "depths")
     slopes = np.empty(np.size(z))
-    rays, depths = _read_only(rig.camera.rays().reshape(-1, 2)), _read_only(np.asarray(z).reshape(-1))
-    _slope_all(rays, depths, rig.R.copy(), rig.t.copy(), rig.projector.parameters, _row(axis), slopes)
+    rays, depths = _as_read_only(rig.camera.rays().reshape(-1, 2)), _as_read_only(np.asarray(z).reshape(-1))
+    _coordinate_slopes(rays, depths, rig.R.copy(), rig.t.copy(), rig.projector.parameters, _axis_row(axis), slopes)
     with np.errstate(divide="ignore"):
         return np.abs(1.0 / slopes).reshape(np.shape(z))
 
@@ -84,19 +84,19 @@ def _solve(rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Liter
     z = np.empty(len(rays))
     extent = np.array(rig.projector.size, dtype=np.float64)
     _triangulate_all(
-        _read_only(rays),
-        _read_only(coordinate),
+        _as_read_only(rays),
+        _as_read_only(coordinate),
         rig.R.copy(),
         rig.t.copy(),
         rig.projector.parameters,
-        _row(axis),
+        _axis_row(axis),
         extent,
         z,
     )
     return z
 
 
-def _row(axis: str) -> int:
+def _axis_row(axis: str) -> int:
     if axis not in ("x", "y"):
         raise InputError(f"The axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows).")
     return 0 if axis == "x" else 1
@@ -111,7 +111,7 @@ def _check_map(rig: StereoRig, values: np.ndarray, what: str) -> None:
         )
 
 
-def _read_only(values: np.ndarray) -> np.ndarray:
+def _as_read_only(values: np.ndarray) -> np.ndarray:
     """Contiguous float64 that the kernels may read: one array type, so that they compile once."""
     view = np.ascontiguousarray(values, dtype=np.float64).view()
     view.setflags(write=False)
@@ -133,7 +133,7 @@ def _projection(z, a0, a1, a2, t, parameters, row):
         return np.nan, np.nan, np.nan, np.nan, np.nan
     dx = (a0 * t[2] - t[0] * a2) * inverse * inverse
     dy = (a1 * t[2] - t[1] * a2) * inverse * inverse
-    xd, yd, dxx, dxy, dyy = brown(x, y, parameters)
+    xd, yd, dxx, dxy, dyy = distort_point(x, y, parameters)
     u, v = parameters[0] * xd + parameters[2], parameters[1] * yd + parameters[3]
     if row == 0:
         return u, v, parameters[0] * (dxx * dx + dxy * dy), parameters[0] * dx, x
@@ -144,7 +144,7 @@ def _projection(z, a0, a1, a2, t, parameters, row):
 def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
     """(depth of one ray, undistorted minus distorted normalised coordinate there); NaN as ``triangulate`` says.
 
-    ``shift``: a guess of the latter.
+    ``shift``: initial value of the latter.
     """
     a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
     a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
@@ -163,7 +163,7 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
             size = extent[1 - row]
             if not -0.5 - MARGIN * size <= other <= (1.0 + MARGIN) * size - 0.5:
                 return np.nan, 0.0
-            # where distortion turns the coordinate back along the ray, two depths share it: neither is an answer
+            # where distortion turns the coordinate back along the ray, two depths share it: ambiguous, so invalid
             return (z if slope * straight > 0.0 else np.nan), undistorted - reading
         if not np.isfinite(error) or slope == 0.0:
             return np.nan, 0.0
@@ -198,7 +198,7 @@ def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
 
 
 @kernel(parallel=True)
-def _slope_all(rays, depths, R, t, parameters, row, slopes):
+def _coordinate_slopes(rays, depths, R, t, parameters, row, slopes):
     for i in numba.prange(depths.shape[0]):
         uc, vc = rays[i, 0], rays[i, 1]
         a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]

@@ -9,7 +9,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.figures import narrowest
 from slviewer.evaluation.fit import SET_ASIDE_SIGMA, SET_ASIDE_WARNING
-from slviewer.geometry.robust import reweighted, robust_sigma
+from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.inspection.features import Feature, Kind
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.starts import as_plane, as_sphere, start
@@ -268,7 +268,7 @@ def _bent(plane: Feature, points: np.ndarray) -> float:
         fitted = basis @ np.linalg.lstsq(basis * root[:, None], heights * root, rcond=None)[0]
         return fitted, fitted
 
-    return robust_sigma(heights - reweighted(solve, heights, np.ones(len(heights))))
+    return robust_sigma(heights - fit_reweighted(solve, heights, np.ones(len(heights))))
 
 
 def _refuse_unsure(kind: Kind, feature: Feature, spread: Spread) -> None:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.calibration.splined.bundle import Bundle
-from slviewer.calibration.splined.uncertainty import beyond
-from slviewer.calibration.splined.volume import BestMotion, Volume, looked, working_volume
+from slviewer.calibration.splined.uncertainty import extrapolation_factor
+from slviewer.calibration.splined.volume import BestMotion, Volume, view_pixels, working_volume
 from slviewer.fringe.sequence import Axis
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -93,7 +93,7 @@ def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: 
     the points were enlarged after their reconstruction, and ``scale_sigma`` the standard uncertainty of that factor."""
     rig = bundle.state.rig
     reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
-    motion = BestMotion.of(reference.points)
+    motion = BestMotion.fit(reference.points)
     moved = motion.weights.T @ bundle.point_jacobian(axis, reference.pixels, reference.z).toarray()
 
     def shared(points: np.ndarray, answers: np.ndarray) -> np.ndarray:
@@ -101,11 +101,11 @@ def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: 
         pixels = _pixels(bundle, places)
         jacobian = bundle.point_jacobian(axis, pixels, places[:, 2])
         jacobian.data[~np.isfinite(jacobian.data)] = 0.0
-        volume = Volume(pixels, places[:, 2], *looked(rig, pixels, places[:, 2]))
-        weighed = (answers * (scale * beyond(bundle, volume))[None, :, None]).reshape(len(answers), -1)
-        free = weighed @ jacobian - (weighed @ motion.at(places)) @ moved
+        volume = Volume(pixels, places[:, 2], *view_pixels(rig, pixels, places[:, 2]))
+        weighed = (answers * (scale * extrapolation_factor(bundle, volume))[None, :, None]).reshape(len(answers), -1)
+        free = weighed @ jacobian - (weighed @ motion.displace(places)) @ moved
         larger = np.einsum("pni,ni->p", answers, scale_sigma * (places - motion.centre))
-        return np.vstack([np.asarray(bundle.whitened(np.asarray(free)), np.float64), larger])
+        return np.vstack([np.asarray(bundle.whiten(np.asarray(free)), np.float64), larger])
 
     return shared
 
@@ -117,12 +117,12 @@ def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
     # the rays of a coarse grid give a start that is linear in the normalised point
     u, v = np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 7))
     grid = np.column_stack([u.ravel(), v.ravel()])
-    rays = looked(rig, grid, np.ones(len(grid)))[0]
+    rays = view_pixels(rig, grid, np.ones(len(grid)))[0]
     known = np.isfinite(rays).all(axis=1)
     linear = np.linalg.lstsq(rays[known], grid[known], rcond=None)[0]
     pixels = points / points[:, 2:] @ linear
     for _ in range(6):
-        seen = looked(rig, pixels, points[:, 2])[0]
+        seen = view_pixels(rig, pixels, points[:, 2])[0]
         wrong = np.nan_to_num(points - seen) / points[:, 2:]
         pixels = pixels + wrong[:, :2] @ linear[:2]
     return pixels

@@ -6,7 +6,7 @@ from typing import Any
 
 from slviewer.calibration.diagnosis.attempt import Attempt, attempt_stereo
 from slviewer.calibration.diagnosis.evidence import Evidence
-from slviewer.calibration.diagnosis.rules import judged
+from slviewer.calibration.diagnosis.rules import judge_evidence
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.stereo import StereoModel
@@ -47,7 +47,7 @@ def attempt_poses(
     """Calibrate stereo from ``count`` target poses as they are read, and judge it; ``left_out`` as in ``attempt``."""
     if contradiction := contradicting(sequence):
         evidence = Evidence(str(board), sequence.projector, (), contradiction=contradiction)
-        return Attempt(judged(evidence), evidence, None, (), dict(left_out))
+        return Attempt(judge_evidence(evidence), evidence, None, (), dict(left_out))
     observations: list[Observation] = []
     evidence_of_poses = []
     refused = dict(left_out)

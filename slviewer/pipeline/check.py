@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from slviewer.calibration.drift.check import Drift, check_drift
-from slviewer.calibration.drift.floor import Reference, refer
+from slviewer.calibration.drift.reference import DriftReference, build_reference
 from slviewer.calibration.drift.view import DriftView
 from slviewer.calibration.observe import Smoothing, observe
 from slviewer.calibration.stereo import StereoModel
@@ -93,7 +93,7 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
         board = Board.parse(stereo.board)
         observation = observe(capture, board, detect(board, capture_texture(shot, frames)), phases, _smoothing(store))
         progress(0.3, "what the calibration's own poses say")
-        drift = check_drift(_reference(store, stereo, capture), DriftView.of(observation))
+        drift = check_drift(_reference(store, stereo, capture), DriftView.from_observation(observation))
         progress(0.95, "saving")
         calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
         before = tuple(checked for checked in history(store) if checked.calibration == calibration)
@@ -105,12 +105,12 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
     return CheckResult(found, before)
 
 
-def _reference(store: Session, stereo: StereoModel, capture: str) -> Reference:
+def _reference(store: Session, stereo: StereoModel, capture: str) -> DriftReference:
     """What the calibration's poses but for the capture say; kept, for it takes many seconds and does not change."""
     if store.state_of(REFERENCE) == "fresh" and capture not in stereo.poses:
-        return Reference.restored(stereo.rig, store.load_result(REFERENCE)[1])
+        return DriftReference.from_arrays(stereo.rig, store.load_result(REFERENCE)[1])
     poses = [name for name in stereo.poses if name != capture]
-    reference = refer(stereo.rig, [DriftView.of(o) for o in load_observations(store, poses)])
+    reference = build_reference(stereo.rig, [DriftView.from_observation(o) for o in load_observations(store, poses)])
     if capture not in stereo.poses:
         meta = {"inputs": store.input_hashes("calibration/stereo", *poses)}
         store.save_result(REFERENCE, meta, reference.to_arrays())

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from slviewer import __version__
-from slviewer.calibration.pinhole_fit import fit_splined, residuals_of_pixelwise
+from slviewer.calibration.pinhole_fit import fit_splined, pixelwise_residuals
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
@@ -86,7 +86,7 @@ def write_calibration_file(store: Session, path: Path, model: str) -> str:
             },
         )
     elif isinstance(fitted, PixelwiseModel):
-        fits = {"camera": residuals_of_pixelwise(fitted, rig.camera)}
+        fits = {"camera": pixelwise_residuals(fitted, rig.camera)}
     T = _moved(rig.T_projector_camera, factor)
     depths = fitted.bundle.depth_range_mm if isinstance(fitted, SplinedModel) else stereo.depth_range_mm
     poses = fitted.bundle.poses if isinstance(fitted, SplinedModel) else tuple(stereo.poses)
@@ -164,7 +164,7 @@ def _splined(model: SplinedModel) -> dict[str, np.ndarray]:
     )
     arrays = {"about": np.array(about), "rays": model.rays}
     for axis in model.axes:
-        fast = model.compiled(axis)
+        fast = model.fast_axis(axis)
         arrays |= {
             f"{axis}_coefficients": fast.coefficients,
             f"{axis}_centre_px": np.array(fast.centre),

@@ -116,7 +116,7 @@ def _check_captures(
     for capture in store.captures():
         if len(capture.sequence.axes) < 2 or (capture.size, capture.sequence.projector_size) != (camera, projector):
             continue
-        check = check_phases(capture.name, decode_capture(capture), StereoModel.made_elsewhere(rig))
+        check = check_phases(capture.name, decode_capture(capture), StereoModel.from_rig(rig))
         for message in check.warnings:
             warn(message)
         if check.agreement is not None:

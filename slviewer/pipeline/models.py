@@ -25,8 +25,8 @@ VALIDATION = "calibration/validation"
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
 _RESTORED: dict[str, Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], Model]] = {
-    "pixelwise": PixelwiseModel.restored,
-    "splined": SplinedModel.restored,
+    "pixelwise": PixelwiseModel.from_arrays,
+    "splined": SplinedModel.from_arrays,
 }
 
 
@@ -90,7 +90,7 @@ def load_stereo(store: Session) -> StereoModel:
     rig = StereoRig(
         Lens(m["K_camera"], m["D_camera"], camera), Lens(m["K_projector"], m["D_projector"], projector), m["R"], m["T"]
     )
-    return StereoModel.made_elsewhere(rig)
+    return StereoModel.from_rig(rig)
 
 
 def load_calibration(session: SessionLike, model: str | None = None, *, accept_rejected: bool = False) -> Model:

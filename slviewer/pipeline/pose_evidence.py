@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import PoseEvidence
-from slviewer.calibration.diagnosis.frames import axis_evidence, mean_turn, moved_px, white_displaced
-from slviewer.calibration.diagnosis.numbering import seen_grid
+from slviewer.calibration.diagnosis.frames import fit_mean_turn, measure_axis, measure_motion_px, measure_white_delay
+from slviewer.calibration.diagnosis.numbering import detect_grid_size
 from slviewer.calibration.observe import Observation, pitch_px
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.phase import PhaseMap
@@ -40,14 +40,14 @@ def examine(
     return PoseEvidence(
         name=name,
         refused=refused,
-        grid=seen_grid(board, texture) if found is None else None,
-        axes={axis: axis_evidence(sequence, frames, phase, on_board) for axis, phase in phases.items()},
+        grid=detect_grid_size(board, texture) if found is None else None,
+        axes={axis: measure_axis(sequence, frames, phase, on_board) for axis, phase in phases.items()},
         suspects=tuple(suspects[i] for i in sorted(suspects)),
-        displaced=white_displaced(sequence, frames),
+        displaced=measure_white_delay(sequence, frames),
         moved_px=np.nan
         if found is None
-        else moved_px(sequence, frames, found.pixels, float(np.median(pitch_px(board, found)))),
-        turn=None if seen is None else mean_turn(seen.camera, seen.projector),
+        else measure_motion_px(sequence, frames, found.pixels, float(np.median(pitch_px(board, found)))),
+        turn=None if seen is None else fit_mean_turn(seen.camera, seen.projector),
         contradictions=check_description(sequence, frames) if refused else (),
     )
 

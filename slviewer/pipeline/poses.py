@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import PoseEvidence
-from slviewer.calibration.observe import READING, Observation, Smoothing, observe
+from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing, observe
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -75,7 +75,7 @@ def judge(
     meta = {
         "target": str(board),
         "smoothing": _settings(smoothing),
-        "reading": READING,
+        "reading": READING_VERSION,
         "refused": judged.refused,
         "inputs": {capture.name: capture.hash},
     }
@@ -90,7 +90,7 @@ def known(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judg
     if store.state_of(result) != "fresh":
         return None
     meta = store.load_result(result, only=())[0]
-    if (meta["target"], meta["smoothing"], meta.get("reading")) != (str(board), _settings(smoothing), READING):
+    if (meta["target"], meta["smoothing"], meta.get("reading")) != (str(board), _settings(smoothing), READING_VERSION):
         return None
     if meta["refused"]:
         return Judged(name, None, meta["refused"])

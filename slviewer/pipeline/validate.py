@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from slviewer.calibration.centres import centred
+from slviewer.calibration.centres import move_to_centres
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
 from slviewer.calibration.splined.model import calibrate_splined
@@ -62,7 +62,7 @@ def validate(
             raise InputError(
                 f"the session no longer holds what {', '.join(missing)} said: run `slviewer calibrate` again"
             )
-        found = cross_validate(centred(kept, stereo), stereo, names, folds, progress)
+        found = cross_validate(move_to_centres(kept, stereo), stereo, names, folds, progress)
         for model, why in found.failed.items():
             warn(f"{model} is not judged: {why}")
         judged = [f"calibration/{name}" for name in found.models if name in available(store)]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.frames import gamma_of, second_harmonic
+from slviewer.calibration.diagnosis.frames import gamma_from_harmonic, measure_second_harmonic
 from slviewer.errors import InputError
 from slviewer.fringe.layout import layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
@@ -115,7 +115,7 @@ def _room_light(fits: Sequence[FrameResiduals]) -> Check:
 def _response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]) -> Check:
     remedy = "Straighten the projector's response, or use more steps."
     suspects = [s.sentence for fit in fits for s in fit.suspects if s.fault in _RESPONSE_FAULTS]
-    harmonics = {axis: second_harmonic(sequence, frames, axis) for axis in sequence.axes}
+    harmonics = {axis: measure_second_harmonic(sequence, frames, axis) for axis in sequence.axes}
     known = {axis: value for axis, value in harmonics.items() if np.isfinite(value)}
     if suspects:
         said = "; ".join(dict.fromkeys(suspects))
@@ -124,7 +124,7 @@ def _response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[Fram
         why = "fewer than five phase steps, or too few pixels that see fringes"
         return Check("gamma", "unknown", f"The response cannot be measured: {why}.", "", {})
     axis = max(known, key=lambda each: abs(known[each]))
-    gamma, steps = gamma_of(known[axis]), layout(sequence, axis).steps
+    gamma, steps = gamma_from_harmonic(known[axis]), layout(sequence, axis).steps
     shown = np.linspace(0, 255, 18)
     seen = (shown / 255) ** gamma
     curved, error = nonlinearity(shown, seen), harmonic_error_rad(shown, seen, steps)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slviewer.calibration.pixelwise import REACH, PixelwiseModel
+from slviewer.calibration.pixelwise import MAX_EXTRAPOLATION, PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of, spike_rules, waves
@@ -230,7 +230,7 @@ def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.D
         low, high = fit.phase_min.astype(float), fit.phase_max.astype(float)
         seen = np.isfinite(low) & np.isfinite(high)
         middle = float(np.median(0.5 * (low + high)[seen])) if seen.any() else 0.0
-        margin = REACH * (high - low)
+        margin = MAX_EXTRAPOLATION * (high - low)
         bounds = np.stack([low - margin - middle, high + margin - middle]).astype(np.float32)
         c0, c1, c2, c3, c4 = fit.coefficients
         scale = 1 + c2 * middle
@@ -241,7 +241,7 @@ def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.D
 
 def _splined(model: SplinedModel, axis: Axis, period_px: float) -> kernels.Depths:
     """The compiled form; pixels that look where no target pose was are masked."""
-    fast = model.compiled(axis)
+    fast = model.fast_axis(axis)
     c = np.concatenate([fast.coefficients, model.rays.astype(np.float32)])
     per_mm = (fast.held.shape[2] - 1) / (fast.far - fast.near)
     bounds = np.empty((0, 0, 0), np.float32)

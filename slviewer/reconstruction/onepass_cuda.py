@@ -26,7 +26,7 @@ def one_pass(sequence: PatternSequence, model: Fast, axis: Axis) -> OnePass:
 
     Raises InputError as `OnePass` does; so does a stereo calibration where there is no device, see `has_pass`.
     """
-    if cuda_device.device() is not None:
+    if cuda_device.find_device() is not None:
         return CudaPass(sequence, model, axis)  # type: ignore[arg-type]
     return OnePass(sequence, model, axis)  # type: ignore[arg-type]
 
@@ -34,7 +34,7 @@ def one_pass(sequence: PatternSequence, model: Fast, axis: Axis) -> OnePass:
 def has_pass(model: object) -> TypeGuard[Fast]:
     """Whether `one_pass` measures with a calibration here: pixelwise and splined always, stereo on a CUDA device."""
     if isinstance(model, StereoModel):
-        return cuda_device.device() is not None
+        return cuda_device.find_device() is not None
     return isinstance(model, PixelwiseModel | SplinedModel)
 
 
@@ -43,7 +43,7 @@ class CudaPass(OnePass):
     """`OnePass` on a CUDA device, for stereo calibrations too; for one thread at a time.
 
     Coefficients stay on the device, frames go there once, and maps come back when spikes are mended. Frames and scans
-    in memory from `cuda_device.frame_room` travel at full speed. Should the device fail, the processor goes on.
+    in memory from `cuda_device.allocate_frames` travel at full speed. Should the device fail, the processor goes on.
     """
 
     _card: "Card | None" = field(init=False, repr=False, default=None)
@@ -86,11 +86,11 @@ class CudaPass(OnePass):
 
     def _scan(self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None, mended: bool) -> PassResult:
         frames, scan = self._begun(frames, light, out)
-        if cuda_device.device() is not None:
+        if cuda_device.find_device() is not None:
             try:
                 return self._on_card(frames, scan, mended)
             except Exception as error:  # of the driver, the compiler, or memory: whatever it is, there is a processor
-                cuda_device.give_up(error)
+                cuda_device.disable_device(error)
         self._card = None
         if isinstance(self.model, StereoModel):
             return self._defined(frames, scan)
@@ -126,7 +126,7 @@ class CudaPass(OnePass):
         )  # fmt: skip
 
     def _room(self, dtype: np.dtype, light: LightLevels) -> PassResult:
-        phase, sigma_z, modulation = (cuda_device.frame_room(self.shape, np.float32) for _ in range(3))
-        points, reason = cuda_device.frame_room((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
-        grey = cuda_device.frame_room(self.shape, dtype)
+        phase, sigma_z, modulation = (cuda_device.allocate_frames(self.shape, np.float32) for _ in range(3))
+        points, reason = cuda_device.allocate_frames((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
+        grey = cuda_device.allocate_frames(self.shape, dtype)
         return PassResult(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, grey, light)

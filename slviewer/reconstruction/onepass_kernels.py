@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from slviewer.calibration.splined.remainder import correct, located
+from slviewer.calibration.splined.correction_grid import add_corrections, locate_layers
 from slviewer.fringe.kernels import ROWS, period
 from slviewer.fringe.kernels_coded import coded_rows
 from slviewer.fringe.kernels_levels import levels_rows
 from slviewer.geometry.jit import fma, kernel
-from slviewer.geometry.rays import along_rays
+from slviewer.geometry.rays import fill_points
 
 
 class Order(NamedTuple):
@@ -116,7 +116,7 @@ def _pixelwise(first, last, background, depths, scale, per_step, maps):
             z[x] = depth if (s >= least[x]) & (s <= largest[x]) & (depth > zero) else none
             slope = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
             sigma[x] = slope * np.sqrt(fma(noise_b, A[x], noise_a))
-        along_rays(ray_x, ray_y, z, points)
+        fill_points(ray_x, ray_y, z, points)
 
 
 @kernel()
@@ -140,12 +140,12 @@ def _splined(first, last, background, depths, scale, per_step, maps):
             both = np.divide(one, below * contrast)  # one division for two
             per = contrast * both
             rational = fma(c1[x], s, c0[x]) * per
-            inside, cell[x], rest[x] = located(rational, near, per_mm, deepest)
+            inside, cell[x], rest[x] = locate_layers(rational, near, per_mm, deepest)
             z[x] = rational if inside else none
             slope = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
             sigma[x] = slope * np.sqrt(fma(noise_b, A[x], noise_a))
-        correct(z, cell, rest, grid, depths.step, row)
-        along_rays(ray_x, ray_y, z, points)
+        add_corrections(z, cell, rest, grid, depths.step, row)
+        fill_points(ray_x, ray_y, z, points)
 
 
 @kernel()

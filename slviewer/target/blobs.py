@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-SMALLEST_PX = 12
-"""Pixels in the smallest blob whose shape says anything."""
-LONGEST = 4.0
-"""Length over width of a blob beyond which it is no circle seen at a usable slant."""
-ROUGHEST = 0.88
+MIN_AREA_PX = 12
+"""Area of the smallest blob whose shape can be judged."""
+MAX_ELONGATION = 4.0
+"""Length over width of a blob beyond which it is no circle at a usable slant."""
+MIN_ROUNDNESS = 0.88
 """Least roundness of what may be a circle."""
 
 
@@ -29,11 +29,11 @@ class Blobs:
         """(n,) area over that of the ellipse with the same second moments: 1 for ellipses, 0.955 for rectangles."""
         return np.asarray(self.areas / (4 * np.pi * np.sqrt(np.linalg.det(self.covariances))))
 
-    def chosen(self, which: np.ndarray) -> "Blobs":
+    def select(self, which: np.ndarray) -> "Blobs":
         """Some of the blobs, by index or mask."""
         return Blobs(self.centres[which], self.areas[which], self.covariances[which], self.inverted)
 
-    def scaled(self, scale: np.ndarray) -> "Blobs":
+    def rescale(self, scale: np.ndarray) -> "Blobs":
         """The same blobs in an image that is (2,) ``scale`` times as wide and as high, by pixel centres."""
         centres = (self.centres + 0.5) * scale - 0.5
         return Blobs(centres, self.areas * scale.prod(), self.covariances * np.outer(scale, scale), self.inverted)
@@ -48,13 +48,13 @@ def find_blobs(grey: np.ndarray, pitch: float, inverted: bool) -> Iterator[Blobs
     circles.
     """
     image = cv2.GaussianBlur(255 - grey if inverted else grey, (3, 3), 0)
-    for binarise in (_by_extremes, _by_mean):
+    for binarise in (_threshold_by_extremes, _threshold_by_mean):
         for share in (0.5, 1.0, 0.25, 0.125):
             if share * pitch >= 8:
-                yield _elliptical(binarise(image, share * pitch), inverted)
+                yield _select_ellipses(binarise(image, share * pitch), inverted)
 
 
-def _by_extremes(image: np.ndarray, window: float) -> np.ndarray:
+def _threshold_by_extremes(image: np.ndarray, window: float) -> np.ndarray:
     """(h, w) uint8: 1 where darker than the middle of the neighbourhood's darkest and brightest."""
     size = image.shape[::-1]
     factor = min(1.0, 16.0 / window)
@@ -69,20 +69,20 @@ def _by_extremes(image: np.ndarray, window: float) -> np.ndarray:
     return np.asarray(image < (cv2.resize(middle, size) if factor < 1 else middle), np.uint8)
 
 
-def _by_mean(image: np.ndarray, window: float) -> np.ndarray:
+def _threshold_by_mean(image: np.ndarray, window: float) -> np.ndarray:
     """(h, w) uint8: 1 where darker than the neighbourhood's mean by a twelfth of it and by 4 grey levels."""
     reach = 2 * round(window * 0.75) + 1
     mean = cv2.blur(image, (reach, reach))
     return np.asarray(image < cv2.subtract(mean, np.maximum(mean // 12, 4)), np.uint8)
 
 
-def _elliptical(mask: np.ndarray, inverted: bool) -> Blobs:
-    """The blobs of a mask that are as full as an ellipse, and lie clear of the image's border."""
+def _select_ellipses(mask: np.ndarray, inverted: bool) -> Blobs:
+    """The blobs of a mask that fill their ellipse and do not touch the image's border."""
     height, width = mask.shape
     _, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=cv2.CV_32S)
     left, top, across, down, area = stats.T
-    plausible = (area >= SMALLEST_PX) & (area <= height * width / 8) & (area >= 0.25 * across * down)
-    plausible &= (across <= LONGEST * down) & (down <= LONGEST * across)
+    plausible = (area >= MIN_AREA_PX) & (area <= height * width / 8) & (area >= 0.25 * across * down)
+    plausible &= (across <= MAX_ELONGATION * down) & (down <= MAX_ELONGATION * across)
     plausible &= (left > 0) & (top > 0) & (left + across < width) & (top + down < height)
     plausible[0] = False
     number = np.cumsum(plausible, dtype=np.int32) - 1
@@ -98,4 +98,4 @@ def _elliptical(mask: np.ndarray, inverted: bool) -> Blobs:
     covariances[:, 1, 1] = np.bincount(label, dv * dv, count) / n + 1 / 12
     covariances[:, 0, 1] = covariances[:, 1, 0] = np.bincount(label, du * dv, count) / n
     found = Blobs(centres[plausible], n, covariances, inverted)
-    return found.chosen(found.roundness > ROUGHEST)
+    return found.select(found.roundness > MIN_ROUNDNESS)

@@ -66,7 +66,7 @@ class Board:
         if self.kind == "charuco":
             self._check_markers()
         elif self.marker_mm or self.dictionary:
-            raise InputError(f"a {self.kind} board has no markers: leave out marker and dictionary")
+            raise InputError(f"a {self.kind} board has no markers: omit marker and dictionary")
 
     def _check_markers(self) -> None:
         if not self.marker_mm:
@@ -93,7 +93,7 @@ class Board:
 
     @classmethod
     def parse(cls, notation: str) -> "Board":
-        """The board that a notation such as ``circles:21x16:9`` describes; InputError says what is wrong with it."""
+        """The board that a notation such as ``circles:21x16:9`` describes; InputError otherwise."""
         kind, *fields = notation.strip().split(":")
         kind = kind.strip().lower()
         if kind not in get_args(Kind):
@@ -111,17 +111,17 @@ class Board:
         size = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", fields[0])
         if not size:
             raise InputError(f"board '{notation}': '{fields[0]}' is not columns x rows, as in '{example}'")
-        pitch = _millimetres(notation, fields[1], example)
-        marker = _millimetres(notation, fields[2], example) if len(fields) > 2 else 0.0
+        pitch = _parse_millimetres(notation, fields[1], example)
+        marker = _parse_millimetres(notation, fields[2], example) if len(fields) > 2 else 0.0
         dictionary = fields[3].strip().upper() if len(fields) > 3 else ""
         return cls(cast(Kind, kind), int(size[1]), int(size[2]), pitch, marker, dictionary)
 
     def __str__(self) -> str:
-        fields = [self.kind, f"{self.columns}x{self.rows}", _number(self.pitch_mm)]
+        fields = [self.kind, f"{self.columns}x{self.rows}", _parse_number(self.pitch_mm)]
         if self.kind == "charuco":
             plain = self.dictionary == DEFAULT_DICTIONARY
             if not plain or self.marker_mm != DEFAULT_MARKER * self.pitch_mm:
-                fields.append(_number(self.marker_mm))
+                fields.append(_parse_number(self.marker_mm))
             if not plain:
                 fields.append(self.dictionary)
         return ":".join(fields)
@@ -144,7 +144,7 @@ class Board:
     def outline(self, margin_mm: float | None = None) -> np.ndarray:
         """(4, 3) float64 mm: a rectangle around the features, from top left over top right to bottom left.
 
-        ``margin_mm`` beyond the outermost features; by default as much as surely belongs to the board: half a pitch
+        ``margin_mm`` beyond the outermost features; by default what is part of the board for certain: half a pitch
         for circles, 0.95 of a square for a chessboard's inner corners, the whole sheet of squares for ChArUco.
         """
         if margin_mm is None:
@@ -155,11 +155,11 @@ class Board:
         return np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
 
 
-def _number(value: float) -> str:
+def _parse_number(value: float) -> str:
     return repr(float(value)).removesuffix(".0")
 
 
-def _millimetres(notation: str, text: str, example: str) -> float:
+def _parse_millimetres(notation: str, text: str, example: str) -> float:
     try:
         length = float(text)
     except ValueError:

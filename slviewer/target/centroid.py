@@ -4,19 +4,19 @@ import numpy as np
 
 from slviewer.target.blobs import Blobs
 
-SOFT_PX = 2.5
+EDGE_WIDTH_PX = 2.5
 """How far, in px, the camera's PSF carries a circle's edge outwards."""
 RING_PX = 5.0
 """Width of the ring beyond the soft edge from which the paper's brightness is read."""
-CORE = 0.6
-"""Share of a bright circle's radius that is surely free of its edge."""
-FIRST_GATE = 0.35
+CORE_RADIUS = 0.6
+"""Share of a bright circle's radius that its blurred edge does not reach."""
+INITIAL_GATE = 0.35
 """Share of the circle's contrast by which the ground's brightness may vary around it: light that falls by half over
 one circle."""
 GATE_SIGMAS = 4.0
-FLAT = 0.04
+FLATNESS = 0.04
 """Pixels of the ring belong to the ground within so many standard deviations of it, or this share of the contrast."""
-SMALLEST_RING = 8
+MIN_RING_PIXELS = 8
 """Pixels that a plane through the ring needs."""
 
 
@@ -54,8 +54,8 @@ def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
 def _centroid(
     image: np.ndarray, centre: np.ndarray, covariance: np.ndarray, gap: float, inverted: bool
 ) -> tuple[float, float]:
-    soft = min(SOFT_PX, 0.3 * gap)
-    reach = 2 * np.sqrt(np.diag(covariance)) + min(SOFT_PX + RING_PX, gap - soft) + 1
+    soft = min(EDGE_WIDTH_PX, 0.3 * gap)
+    reach = 2 * np.sqrt(np.diag(covariance)) + min(EDGE_WIDTH_PX + RING_PX, gap - soft) + 1
     u0, v0 = np.maximum(np.floor(centre - reach), 0).astype(int)
     u1, v1 = np.minimum(np.ceil(centre + reach) + 1, image.shape[::-1]).astype(int)
     patch = image[v0:v1, u0:u1].astype(np.float64)
@@ -63,13 +63,13 @@ def _centroid(
     (a, b), (_, c) = np.linalg.inv(covariance) / 4
     radius = np.sqrt(a * du * du + 2 * b * du * dv + c * dv * dv)  # 1 on the edge
     beyond = np.hypot(du, dv) * (1 - 1 / np.maximum(radius, 1e-6))  # px from the edge, outwards
-    ring = (beyond > soft) & (beyond < min(SOFT_PX + RING_PX, gap - soft))
-    if np.count_nonzero(ring) < SMALLEST_RING:
+    ring = (beyond > soft) & (beyond < min(EDGE_WIDTH_PX + RING_PX, gap - soft))
+    if np.count_nonzero(ring) < MIN_RING_PIXELS:
         return np.nan, np.nan
     within = beyond < soft
-    ground = _ground(du, dv, patch, ring, _quantile(patch[radius < CORE], 0.5))
+    ground = _fit_paper_level(du, dv, patch, ring, _quantile(patch[radius < CORE_RADIUS], 0.5))
     if inverted:
-        light = _plane(du, dv, patch, radius < CORE)
+        light = _fit_plane(du, dv, patch, radius < CORE_RADIUS)
         ink = (patch - ground) / np.maximum(light, 1.0)
     else:
         ink = 1 - patch / np.maximum(ground, 1.0)
@@ -80,26 +80,26 @@ def _centroid(
     return float(centre[0] + ink @ du[within] / total), float(centre[1] + ink @ dv[within] / total)
 
 
-def _ground(du: np.ndarray, dv: np.ndarray, patch: np.ndarray, ring: np.ndarray, ink: float) -> np.ndarray:
+def _fit_paper_level(du: np.ndarray, dv: np.ndarray, patch: np.ndarray, ring: np.ndarray, ink: float) -> np.ndarray:
     """(h, w): the plane through the brightness next to a circle, of the ring's pixels that show no edge or blob.
 
     Where not all of the ring lies on one plane, the ground is what differs most from the circle's own level ``ink``:
-    begun with the quarter of the ring that does, pixels count that lie on one plane within the noise.
+    starting with that quarter of the ring, the pixels within the noise of one plane are fitted.
     """
-    plane = _plane(du, dv, patch, ring)
+    plane = _fit_plane(du, dv, patch, ring)
     levels = patch[ring]
     ground = _quantile(levels, 0.75 if ink < _quantile(levels, 0.5) else 0.25)
     contrast = abs(ground - ink)
-    if np.abs(levels - plane[ring]).max() < FLAT * contrast:
+    if np.abs(levels - plane[ring]).max() < FLATNESS * contrast:
         return plane
-    near = ring & (np.abs(patch - ground) < FIRST_GATE * contrast)
+    near = ring & (np.abs(patch - ground) < INITIAL_GATE * contrast)
     for _ in range(2):
-        if np.count_nonzero(near) < SMALLEST_RING:
+        if np.count_nonzero(near) < MIN_RING_PIXELS:
             return plane
-        plane = _plane(du, dv, patch, near)
+        plane = _fit_plane(du, dv, patch, near)
         off = np.abs(patch - plane)
-        near = ring & (off < max(GATE_SIGMAS * 1.4826 * _quantile(off[near], 0.5), FLAT * contrast))
-    return _plane(du, dv, patch, near) if np.count_nonzero(near) >= SMALLEST_RING else plane
+        near = ring & (off < max(GATE_SIGMAS * 1.4826 * _quantile(off[near], 0.5), FLATNESS * contrast))
+    return _fit_plane(du, dv, patch, near) if np.count_nonzero(near) >= MIN_RING_PIXELS else plane
 
 
 def _quantile(values: np.ndarray, share: float) -> float:
@@ -108,7 +108,7 @@ def _quantile(values: np.ndarray, share: float) -> float:
     return float(np.partition(values, k)[k])
 
 
-def _plane(du: np.ndarray, dv: np.ndarray, values: np.ndarray, where: np.ndarray) -> np.ndarray:
+def _fit_plane(du: np.ndarray, dv: np.ndarray, values: np.ndarray, where: np.ndarray) -> np.ndarray:
     """(h, w): the plane through the chosen values, by least squares."""
     A = np.stack([np.ones(int(np.count_nonzero(where))), du[where], dv[where]], axis=1)
     c = np.linalg.lstsq(A, values[where], rcond=None)[0]

@@ -1,17 +1,17 @@
-"""Find the inner corners of a ChArUco board: its markers tell which corners they are, so that some are enough."""
+"""Detect the inner corners of a ChArUco board; its markers identify them, so that a part of the board is enough."""
 
 import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
-from slviewer.target.images import SEARCH_PX, BoardImage, advice, resized
+from slviewer.target.images import SEARCH_PX, BoardImage, light_advice, resize_image
 from slviewer.target.numbering import check_grid
 from slviewer.target.saddle import refine_corners
 
-FEWEST = 8
+MIN_CORNERS = 8
 """Corners that a pose needs."""
-ENOUGH = 0.8
+SUFFICIENT_SHARE = 0.8
 """Share of the corners with which the search ends; with fewer it goes on in larger images."""
 
 
@@ -22,31 +22,31 @@ def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
 
 
 def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndarray]:
-    """((n, 2) float64 px, (n,) int ids) of the corners seen; raises DetectionError with how many were seen."""
+    """((n, 2) float64 px, (n,) int ids) of the detected corners; raises DetectionError with their number."""
     detector = cv2.aruco.CharucoDetector(opencv_board(board))
     first = min(1.0, SEARCH_PX / max(image.grey.shape))
     best: tuple[np.ndarray, np.ndarray] | None = None
     markers = 0
     for factor in dict.fromkeys((first / 2, first, 1.0)):
-        small = resized(image.grey, factor)
+        small = resize_image(image.grey, factor)
         corners, ids, _, marker_ids = detector.detectBoard(small)
         markers = max(markers, 0 if marker_ids is None else len(marker_ids))
         if ids is not None and len(ids) and (best is None or len(ids) > len(best[1])):
             pixels = (np.reshape(corners, (-1, 2)).astype(float) + 0.5) / factor - 0.5
             best = pixels, np.ravel(ids).astype(int)
-        if best is not None and len(best[1]) >= ENOUGH * len(board.points):
+        if best is not None and len(best[1]) >= SUFFICIENT_SHARE * len(board.points):
             break
-    if best is not None and len(best[1]) >= FEWEST:
+    if best is not None and len(best[1]) >= MIN_CORNERS:
         pixels, ids = best
         points = board.points[ids][:, :2]
         pixels, good = refine_corners(image.deep, pixels, points, board.pitch_mm, board.marker_mm)
         best = pixels[good], ids[good]
     seen = 0 if best is None else len(best[1])
-    if best is None or seen < FEWEST:
+    if best is None or seen < MIN_CORNERS:
         there = board.columns * board.rows // 2
         raise DetectionError(
-            f"{seen} of {len(board.points)} corners and {markers} of {there} markers of {board} found, and "
-            f"a pose needs {FEWEST}: {advice(image.grey)}"
+            f"{seen} of {len(board.points)} corners and {markers} of {there} markers of {board} detected, and "
+            f"a pose needs {MIN_CORNERS}: {light_advice(image.grey)}"
         )
     check_grid(board, *best, "corners")
     return best

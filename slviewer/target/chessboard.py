@@ -1,35 +1,35 @@
-"""Find the inner corners of a chessboard."""
+"""Detect the inner corners of a chessboard."""
 
 import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
-from slviewer.target.images import SEARCH_PX, BoardImage, advice, evenly_lit, resized
-from slviewer.target.numbering import check_grid, upright
+from slviewer.target.images import SEARCH_PX, BoardImage, flatten_light, light_advice, resize_image
+from slviewer.target.numbering import check_grid, select_upright
 from slviewer.target.saddle import refine_corners
 
 
 def detect_chessboard(board: Board, image: BoardImage) -> np.ndarray:
-    """(n, 2) float64 px of every inner corner; raises DetectionError with how many were seen.
+    """(n, 2) float64 px of every inner corner; raises DetectionError with the number detected.
 
     A board whose columns + rows are odd is numbered so that its top-left square is dark.
     """
     doubt: DetectionError | None = None
-    for find in (_quick, _from_largest, _classic):
+    for find in (_detect_by_sectors, _detect_in_largest, _detect_by_squares):
         grid = find(board, image.grey)
         if grid is not None:
             try:
-                return _verified(board, image, grid)
+                return _verify_grid(board, image, grid)
             except DetectionError as error:
                 doubt = doubt or error
-    raise DetectionError(_not_found(board, image.grey)) if doubt is None or _larger(board, image.grey) else doubt
+    raise (DetectionError(_failure(board, image.grey)) if doubt is None or _detect_larger(board, image.grey) else doubt)
 
 
-def _verified(board: Board, image: BoardImage, grid: np.ndarray) -> np.ndarray:
+def _verify_grid(board: Board, image: BoardImage, grid: np.ndarray) -> np.ndarray:
     """(n, 2) px, refined and numbered, of a grid (rows, columns, 2) that may run any way; raises DetectionError."""
-    # the finders' own order may be mirrored; all that is kept of it is what lies beside what
-    if _turn(grid) < 0:
+    # the detectors' own order may be mirrored; only the neighbourhood relation is used
+    if _orientation(grid) < 0:
         grid = grid[:, ::-1]
     pixels, good = refine_corners(image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm)
     if not good.all():
@@ -39,16 +39,16 @@ def _verified(board: Board, image: BoardImage, grid: np.ndarray) -> np.ndarray:
         )
     check_grid(board, pixels, np.arange(len(pixels)), "corners")
     grid = pixels.reshape(grid.shape)
-    first_is_dark = _first_is_dark(image.deep, grid)
+    first_is_dark = _is_first_square_dark(image.deep, grid)
     _refuse_larger(board, image.deep, grid)
-    numberings = _numberings(np.arange(len(pixels)).reshape(grid.shape[:2]), first_is_dark)
-    return np.asarray(pixels[upright(board, pixels, numberings)])
+    numberings = _list_numberings(np.arange(len(pixels)).reshape(grid.shape[:2]), first_is_dark)
+    return np.asarray(pixels[select_upright(board, pixels, numberings)])
 
 
-def _quick(board: Board, grey: np.ndarray) -> np.ndarray | None:
+def _detect_by_sectors(board: Board, grey: np.ndarray) -> np.ndarray | None:
     """(rows, columns, 2) px by OpenCV's sector-based search, which needs to be no more than a pixel or two right."""
     full = min(1.0, SEARCH_PX / max(grey.shape))
-    even = evenly_lit(grey)
+    even = flatten_light(grey)
     thorough = cv2.CALIB_CB_EXHAUSTIVE
     for source, factor, flags in (
         (even, full / 2, 0),
@@ -57,65 +57,67 @@ def _quick(board: Board, grey: np.ndarray) -> np.ndarray | None:
         (even, full, thorough),
         (grey, full, 0),
     ):
-        found, corners = cv2.findChessboardCornersSB(resized(source, factor), board.features, flags=flags)
+        found, corners = cv2.findChessboardCornersSB(resize_image(source, factor), board.features, flags=flags)
         if found:
-            return _in_full(corners, factor).reshape(board.rows, board.columns, 2)
+            return _to_full_image(corners, factor).reshape(board.rows, board.columns, 2)
     return None
 
 
-def _largest(grey: np.ndarray) -> np.ndarray | None:
+def _detect_largest(grey: np.ndarray) -> np.ndarray | None:
     """(rows, columns, 2) px: the largest grid of corners of any chessboard, if there is one of 3x3 or more."""
     factor = min(1.0, SEARCH_PX / max(grey.shape)) / 2
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
-    found, corners, cells = cv2.findChessboardCornersSBWithMeta(resized(evenly_lit(grey), factor), (3, 3), flags)
-    return _in_full(corners, factor).reshape(*cells.shape[:2], 2) if found else None
+    flattened = resize_image(flatten_light(grey), factor)
+    found, corners, cells = cv2.findChessboardCornersSBWithMeta(flattened, (3, 3), flags)
+    return _to_full_image(corners, factor).reshape(*cells.shape[:2], 2) if found else None
 
 
-def _from_largest(board: Board, grey: np.ndarray) -> np.ndarray | None:
+def _detect_in_largest(board: Board, grey: np.ndarray) -> np.ndarray | None:
     """(rows, columns, 2) px: the largest grid, laid along the board's rows, if it has the board's size."""
-    largest = _largest(grey)
+    largest = _detect_largest(grey)
     if largest is None or sorted(largest.shape[:2]) != sorted(board.features):
         return None
     return largest if largest.shape[0] == board.rows else largest.transpose(1, 0, 2)
 
 
-def _larger(board: Board, grey: np.ndarray) -> bool:
-    largest = _largest(grey)
+def _detect_larger(board: Board, grey: np.ndarray) -> bool:
+    largest = _detect_largest(grey)
     return largest is not None and largest[..., 0].size > len(board.points)
 
 
-def _classic(board: Board, grey: np.ndarray) -> np.ndarray | None:
+def _detect_by_squares(board: Board, grey: np.ndarray) -> np.ndarray | None:
     """(rows, columns, 2) px by OpenCV's older search, which goes from square to square."""
     factor = min(1.0, SEARCH_PX / max(grey.shape)) / 2
-    found, corners = cv2.findChessboardCorners(resized(grey, factor), board.features)
-    return _in_full(corners, factor).reshape(board.rows, board.columns, 2) if found else None
+    found, corners = cv2.findChessboardCorners(resize_image(grey, factor), board.features)
+    return _to_full_image(corners, factor).reshape(board.rows, board.columns, 2) if found else None
 
 
-def _in_full(corners: np.ndarray, factor: float) -> np.ndarray:
+def _to_full_image(corners: np.ndarray, factor: float) -> np.ndarray:
     """Pixels of the full image from those of an image ``factor`` times its size."""
     return (corners.astype(float) + 0.5) / factor - 0.5
 
 
-def _turn(grid: np.ndarray) -> float:
+def _orientation(grid: np.ndarray) -> float:
     """Positive where the step along a row turns clockwise in the image into the step along a column."""
     (a, b), (c, d) = (np.diff(grid, axis=axis).mean((0, 1)) for axis in (1, 0))
     return float(a * d - b * c)
 
 
-def _not_found(board: Board, grey: np.ndarray) -> str:
-    """What the operator reads: the largest chessboard that can be seen, if any, and what to do."""
-    largest = _largest(grey)
+def _failure(board: Board, grey: np.ndarray) -> str:
+    """Message for the operator: the largest chessboard detected, if any, and what to do."""
+    largest = _detect_largest(grey)
     if largest is None:
-        return f"no chessboard found where {board} has {len(board.points)} corners: {advice(grey)}"
+        return f"no chessboard detected where {board} has {len(board.points)} corners: {light_advice(grey)}"
     rows, columns = largest.shape[:2]
     if rows * columns <= len(board.points):
-        return f"{rows * columns} of {len(board.points)} corners of {board} found ({columns}x{rows}): {advice(grey)}"
-    return f"a chessboard of {columns}x{rows} inner corners found where {board} is expected: check its columns and rows"
+        count = f"{rows * columns} of {len(board.points)} corners of {board} detected ({columns}x{rows})"
+        return f"{count}: {light_advice(grey)}"
+    return f"a chessboard of {columns}x{rows} inner corners detected, {board} expected: check its columns and rows"
 
 
-def _first_is_dark(image: np.ndarray, grid: np.ndarray) -> bool:
+def _is_first_square_dark(image: np.ndarray, grid: np.ndarray) -> bool:
     """Whether the square beyond the first corner is dark; raises DetectionError where squares do not alternate."""
-    colours = crossing(image, grid, np.gradient(grid, axis=1), np.gradient(grid, axis=0))
+    colours = corner_polarity(image, grid, np.gradient(grid, axis=1), np.gradient(grid, axis=0))
     rows, columns = colours.shape
     colours = colours * np.where(np.indices(colours.shape).sum(0) % 2, -1, 1)
     good = max(np.count_nonzero(colours > 0), np.count_nonzero(colours < 0))
@@ -132,7 +134,7 @@ def _refuse_larger(board: Board, image: np.ndarray, grid: np.ndarray) -> None:
     for side in range(4):
         turned = np.rot90(grid, side)
         beyond = 3 * turned[0] - 3 * turned[1] + turned[2]
-        seen = crossing(image, beyond, np.gradient(beyond, axis=0), turned[0] - beyond)
+        seen = corner_polarity(image, beyond, np.gradient(beyond, axis=0), turned[0] - beyond)
         if np.count_nonzero(seen) > 0.5 * len(seen) and (np.diff(seen[seen != 0]) != 0).mean() > 0.5:
             raise DetectionError(
                 f"the chessboard goes on beyond the {board.columns}x{board.rows} inner corners of {board}: "
@@ -140,7 +142,7 @@ def _refuse_larger(board: Board, image: np.ndarray, grid: np.ndarray) -> None:
             )
 
 
-def _numberings(order: np.ndarray, first_is_dark: bool) -> list[np.ndarray]:
+def _list_numberings(order: np.ndarray, first_is_dark: bool) -> list[np.ndarray]:
     """The orders (rows, columns) of the corners, turned, that the colours of the squares allow; flattened."""
     rows, columns = order.shape
     dark: list[np.ndarray] = []
@@ -153,11 +155,11 @@ def _numberings(order: np.ndarray, first_is_dark: bool) -> list[np.ndarray]:
     return dark or bright
 
 
-LEAST_CONTRAST = 1.12
+MIN_CONTRAST = 1.12
 """Bright over dark squares around a corner."""
 
 
-def crossing(image: np.ndarray, corners: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+def corner_polarity(image: np.ndarray, corners: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
     """(...,) int8: +1 where the square towards -x, -y of a corner is dark, -1 where bright, 0 where no squares meet.
 
     ``corners``, ``across``, ``down`` (..., 2) px: the corner, and the steps to the next ones along x and y. The two
@@ -165,15 +167,15 @@ def crossing(image: np.ndarray, corners: np.ndarray, across: np.ndarray, down: n
     to be judged is 0 as well.
     """
     offsets = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
-    levels = np.stack([_levels(image, corners + 0.3 * (a * across + b * down)) for a, b in offsets])
+    levels = np.stack([_sample_levels(image, corners + 0.3 * (a * across + b * down)) for a, b in offsets])
     main, other = levels[:2], levels[2:]
     with np.errstate(invalid="ignore"):
-        dark = main.max(0) * LEAST_CONTRAST < other.min(0)
-        bright = other.max(0) * LEAST_CONTRAST < main.min(0)
+        dark = main.max(0) * MIN_CONTRAST < other.min(0)
+        bright = other.max(0) * MIN_CONTRAST < main.min(0)
     return dark.astype(np.int8) - bright.astype(np.int8)
 
 
-def _levels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def _sample_levels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Grey levels of a slightly blurred image at pixels (..., 2), NaN outside."""
     height, width = image.shape
     flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2), np.float32)

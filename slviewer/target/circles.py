@@ -1,4 +1,4 @@
-"""Detect a grid of circles, dark on bright or bright on dark, among whatever else the image shows."""
+"""Detect a grid of circles, dark on bright or bright on dark, in a cluttered image."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,26 +10,26 @@ from slviewer.errors import DetectionError
 from slviewer.target.blobs import Blobs, find_blobs
 from slviewer.target.board import Board
 from slviewer.target.centroid import refine_centres
-from slviewer.target.images import SEARCH_PX, BoardImage, advice, resized
-from slviewer.target.lattice import ALIKE, NEAR, Lattice, complete_lattice, grow_lattices, lay_pattern
-from slviewer.target.mark import marked_numbering
-from slviewer.target.numbering import MOST_OFF, OUTLYING, check_grid, upright
+from slviewer.target.images import SEARCH_PX, BoardImage, light_advice, resize_image
+from slviewer.target.lattice import AREA_RATIO, NODE_RADIUS, Lattice, complete_lattice, grow_lattices, match_pattern
+from slviewer.target.mark import numbering_by_mark
+from slviewer.target.numbering import MAX_GRID_OFFSET, MAX_GRID_OFFSET_SIGMAS, check_grid, select_upright
 from slviewer.target.planar import GridMap, fit_grid_map, fit_homography, jacobians
 
-GOOD_PART = 1 / 3
+CLUTTER_FREE_SHARE = 1 / 3
 """Share of the board's circles in one lattice that no clutter has."""
-ROUND = 0.97
+SQUARE_LIMIT_ROUNDNESS = 0.97
 """Roundness between that of squares, 0.955, and of circles well resolved, 0.985 and more on real photographs."""
-PARTLY_COVERED = 0.96
+WHOLE_CIRCLE_ROUNDNESS = 0.96
 """Roundness below which a piece of a circle is missing."""
-WELL_SHAPED_PX = 60.0
+MIN_SHAPE_AREA_PX = 60.0
 """Area of a circle from which on its roundness can be judged."""
-RESOLVED_PX = 80.0
-"""Area of a circle beyond which more pixels do not help to find it."""
-BEYOND = 1 / 3
+RESOLVED_AREA_PX = 80.0
+"""Area of a circle beyond which more pixels do not improve detection."""
+CONTINUATION_SHARE = 1 / 3
 """Share of one more row or column of circles with which the board is larger than stated."""
-MUCH_LARGER = 2.0
-"""Area in the image over that of a second board of the same kind, from which on the larger one is meant."""
+DOMINANT_AREA_RATIO = 2.0
+"""Area in the image over that of a second board of the same kind, from which on the larger one is selected."""
 
 
 @dataclass(frozen=True)
@@ -55,26 +55,26 @@ class _Grid:
 
 
 def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float, bool]:
-    """((n, 2) float64 px of every circle, their radius in mm, whether the board's mark was seen); raises DetectionError
-    with how many circles were."""
+    """((n, 2) float64 px of every circle, their radius in mm, whether the board's mark was detected); raises
+    DetectionError with how many circles were."""
     tried: list[_Attempt] = []
-    for attempt in _attempts(board, image.grey):
+    for attempt in _binarise_all(board, image.grey):
         tried.append(attempt)
-        grids = [grid for lattice in attempt.lattices if (grid := _grid(board, lattice, attempt.blobs, image))]
+        grids = [grid for lattice in attempt.lattices if (grid := _match_board(board, lattice, attempt.blobs, image))]
         if grids:
-            return _measured(board, image, _only_one(board, grids))
+            return _measure(board, image, _select_board(board, grids))
     most = max(tried, key=_size_of_largest, default=None)
-    if most is not None and _size_of_largest(most) > GOOD_PART * len(board.points):
+    if most is not None and _size_of_largest(most) > CLUTTER_FREE_SHARE * len(board.points):
         # what one binarisation lacks, another may have: reflections and shadows cover parts of the board
         inverted = most.blobs.inverted
-        pool = _pooled(most.blobs, [attempt.blobs for attempt in tried if attempt.blobs.inverted == inverted])
-        grid = _grid(board, complete_lattice(max(most.lattices, key=_nodes), pool), pool, image)
+        pool = _pool_blobs(most.blobs, [attempt.blobs for attempt in tried if attempt.blobs.inverted == inverted])
+        grid = _match_board(board, complete_lattice(max(most.lattices, key=_count_nodes), pool), pool, image)
         if grid:
-            return _measured(board, image, grid)
-    raise DetectionError(_not_detected(board, image, most))
+            return _measure(board, image, grid)
+    raise DetectionError(_failure(board, image, most))
 
 
-def _nodes(lattice: Lattice) -> int:
+def _count_nodes(lattice: Lattice) -> int:
     return len(lattice.nodes)
 
 
@@ -82,11 +82,11 @@ def _size_of_largest(attempt: _Attempt) -> int:
     return max((len(lattice.nodes) for lattice in attempt.lattices), default=0)
 
 
-def _attempts(board: Board, grey: np.ndarray) -> Iterator[_Attempt]:
+def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Attempt]:
     """Binarisations at the search resolution, then coarser, where noise averages out, then in the full image; at last
-    twice as large, if circles of a few pixels have been seen.
+    twice as large, if circles of a few pixels were detected.
 
-    Once a good part of the board has been seen, its circles are known to be dark or bright, and to be large enough for
+    Once a third of the board is detected, its circles are known to be dark or bright, and to be large enough for
     the search resolution or not, and what remains to be tried is little.
     """
     first = min(1.0, SEARCH_PX / max(grey.shape))
@@ -95,37 +95,37 @@ def _attempts(board: Board, grey: np.ndarray) -> Iterator[_Attempt]:
     for factor in dict.fromkeys((first, first / 2, 1.0, 2.0)):
         if (resolved and factor > first) or (len(colours) > 1 and factor > 1):
             return
-        small = resized(grey, factor)
+        small = resize_image(grey, factor)
         scale = np.array(grey.shape[::-1]) / np.array(small.shape[::-1])
         pitch = max(small.shape) / (min(board.columns, board.rows) - 1)
         for inverted in colours:
             for blobs in find_blobs(small, pitch, inverted):
                 lattices = list(grow_lattices(blobs))
                 for lattice in lattices:
-                    if len(lattice.nodes) > GOOD_PART * len(board.points):
+                    if len(lattice.nodes) > CLUTTER_FREE_SHARE * len(board.points):
                         colours = [inverted]
-                        resolved |= float(np.median(blobs.areas[lattice.blobs])) > RESOLVED_PX
-                yield _Attempt(blobs.scaled(scale), lattices)
+                        resolved |= float(np.median(blobs.areas[lattice.blobs])) > RESOLVED_AREA_PX
+                yield _Attempt(blobs.rescale(scale), lattices)
             if colours == [inverted]:
                 break
 
 
-def _grid(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage) -> _Grid | None:
+def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage) -> _Grid | None:
     """The board in a lattice, if all of it is there; raises DetectionError where the grid is larger than the board."""
-    if len(lattice.nodes) <= GOOD_PART * len(board.points):
+    if len(lattice.nodes) <= CLUTTER_FREE_SHARE * len(board.points):
         return None
     for candidate in (lattice, complete_lattice(lattice, blobs)):
         places: dict[bytes, list[np.ndarray]] = {}
-        for numbering in lay_pattern(board, candidate):
+        for numbering in match_pattern(board, candidate):
             places.setdefault(np.sort(numbering).tobytes(), []).append(numbering)
         fitting = [
             (numberings, seen)
             for numberings in places.values()
-            if (seen := _fit(board, blobs.chosen(numberings[0]))) is not None
+            if (seen := _fit_map(board, blobs.select(numberings[0]))) is not None
         ]
         if fitting:
             numberings, seen = fitting[0]
-            if len(fitting) > 1 or _goes_on(board, seen, blobs, numberings[0]):
+            if len(fitting) > 1 or _grid_continues(board, seen, blobs, numberings[0]):
                 raise DetectionError(
                     f"{len(candidate.nodes)} circles in one grid detected where {board} has {len(board.points)}: "
                     "check the board's columns and rows"
@@ -134,8 +134,8 @@ def _grid(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage) -> _G
     return None
 
 
-def _fit(board: Board, blobs: Blobs) -> GridMap | None:
-    """Where the board's circles are seen, if these blobs lie in a grid and are alike in size; else None."""
+def _fit_map(board: Board, blobs: Blobs) -> GridMap | None:
+    """The map from board to image, if these blobs form a grid and are alike in size; else None."""
     points = board.points[:, :2] / board.pitch_mm
     try:
         seen = fit_grid_map(points, blobs.centres, robust=True)
@@ -143,34 +143,34 @@ def _fit(board: Board, blobs: Blobs) -> GridMap | None:
         return None
     pitch = seen.pitch_px(points)
     size = np.sqrt(blobs.areas) / np.maximum(pitch, 1e-9)
-    alike = np.abs(np.log(size / np.median(size))) < np.log(ALIKE) / 2
-    return seen if (alike & (np.linalg.norm(seen.residuals, axis=1) < NEAR * pitch)).all() else None
+    alike = np.abs(np.log(size / np.median(size))) < np.log(AREA_RATIO) / 2
+    return seen if (alike & (np.linalg.norm(seen.residuals, axis=1) < NODE_RADIUS * pitch)).all() else None
 
 
-def _goes_on(board: Board, seen: GridMap, blobs: Blobs, numbering: np.ndarray) -> bool:
+def _grid_continues(board: Board, seen: GridMap, blobs: Blobs, numbering: np.ndarray) -> bool:
     """Whether circles of the grid's size lie where one more row or column of it would be.
 
     A blob is one of the grid only if it lies as near to its place as the grid's own circles do, of which the place is
-    an extrapolation; most of what happens to lie beside a board does not.
+    an extrapolation; most clutter beside a board does not.
     """
     points = board.points[:, :2] / board.pitch_mm
     size = float(np.median(np.sqrt(blobs.areas[numbering]) / np.maximum(seen.pitch_px(points), 1e-9)))
     others = np.delete(np.arange(len(blobs.centres)), numbering)
     if not len(others):
         return False
-    for side in _sides(board):
+    for side in _neighbouring_rows(board):
         pitch = seen.pitch_px(side)
         apart = np.linalg.norm(seen.to_image(side)[:, None] - blobs.centres[others][None], axis=2)
         nearest = apart.argmin(1)
-        gate = np.maximum(MOST_OFF * pitch, 2 * OUTLYING * seen.sigma_px)
+        gate = np.maximum(MAX_GRID_OFFSET * pitch, 2 * MAX_GRID_OFFSET_SIGMAS * seen.sigma_px)
         ratio = np.sqrt(blobs.areas[others[nearest]]) / np.maximum(size * pitch, 1e-9)
         on = (pitch > 0) & (apart.min(1) < gate) & (np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(1.25))
-        if np.count_nonzero(on) >= max(2.0, BEYOND * len(side)):
+        if np.count_nonzero(on) >= max(2.0, CONTINUATION_SHARE * len(side)):
             return True
     return False
 
 
-def _sides(board: Board) -> list[np.ndarray]:
+def _neighbouring_rows(board: Board) -> list[np.ndarray]:
     """Where one more row or column of circles would be at each side, (k, 2) in pitches."""
     columns, rows = board.features
     i, j = np.arange(rows), np.arange(columns)
@@ -183,10 +183,10 @@ def _sides(board: Board) -> list[np.ndarray]:
     return [side.astype(float) for side in (above, below, left, right)]
 
 
-def _only_one(board: Board, grids: list[_Grid]) -> _Grid:
-    """The board that is meant; raises DetectionError where two may be."""
+def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
+    """The grid that is the board; raises DetectionError where two may be."""
     grids = sorted(grids, key=lambda grid: -grid.area_px)
-    if len(grids) > 1 and grids[0].area_px < MUCH_LARGER * grids[1].area_px:
+    if len(grids) > 1 and grids[0].area_px < DOMINANT_AREA_RATIO * grids[1].area_px:
         (a, b), (c, d) = (grid.blobs.centres[grid.numberings[0]].mean(0) for grid in grids[:2])
         raise DetectionError(
             f"{len(grids)} boards {board} detected, around pixels {a:.0f}, {b:.0f} and {c:.0f}, {d:.0f}: "
@@ -195,19 +195,19 @@ def _only_one(board: Board, grids: list[_Grid]) -> _Grid:
     return grids[0]
 
 
-def _measured(board: Board, image: BoardImage, grid: _Grid) -> tuple[np.ndarray, float, bool]:
-    marked = marked_numbering(board, image.deep, grid.blobs.centres, grid.numberings)
-    order = upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
-    blobs = grid.blobs.chosen(order)
+def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[np.ndarray, float, bool]:
+    marked = numbering_by_mark(board, image.deep, grid.blobs.centres, grid.numberings)
+    order = select_upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
+    blobs = grid.blobs.select(order)
     _refuse_misshapen(board, blobs)
-    return _centres(board, image, blobs), _radius(board, blobs), marked is not None
+    return _refine_centres(board, image, blobs), _measure_radius(board, blobs), marked is not None
 
 
 def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
-    large = blobs.areas > WELL_SHAPED_PX
-    if large.all() and np.median(blobs.roundness) < ROUND:
+    large = blobs.areas > MIN_SHAPE_AREA_PX
+    if large.all() and np.median(blobs.roundness) < SQUARE_LIMIT_ROUNDNESS:
         raise DetectionError(f"a grid of squares detected where {board} has circles: check the board's kind")
-    covered = np.count_nonzero(large & (blobs.roundness < PARTLY_COVERED))
+    covered = np.count_nonzero(large & (blobs.roundness < WHOLE_CIRCLE_ROUNDNESS))
     if covered:
         raise DetectionError(
             f"{covered} of {len(blobs.areas)} circles are partly covered, or reflect: "
@@ -215,7 +215,7 @@ def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
         )
 
 
-def _centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:
+def _refine_centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:
     pixels = refine_centres(image.deep, blobs)
     lost = np.isnan(pixels).any(1)
     if lost.any():
@@ -227,14 +227,14 @@ def _centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:
     return pixels
 
 
-def _radius(board: Board, blobs: Blobs) -> float:
-    """mm, by the areas of the blobs and how large a square millimetre is where they lie."""
+def _measure_radius(board: Board, blobs: Blobs) -> float:
+    """Radius in mm, from the areas of the blobs and the local scale of the board's map."""
     points = board.points[:, :2]
     scale = np.linalg.det(jacobians(fit_homography(points, blobs.centres), points))
     return float(np.sqrt(np.median(blobs.areas / scale) / np.pi))
 
 
-def _pooled(first: Blobs, others: list[Blobs]) -> Blobs:
+def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
     """The blobs of several binarisations, each circle once, as the ``first`` has it where it does."""
     pool = first
     for blobs in others:
@@ -249,12 +249,12 @@ def _pooled(first: Blobs, others: list[Blobs]) -> Blobs:
     return pool
 
 
-def _not_detected(board: Board, image: BoardImage, most: _Attempt | None) -> str:
-    """What the operator reads: how many circles of how many, what lies around them, and what to do."""
+def _failure(board: Board, image: BoardImage, most: _Attempt | None) -> str:
+    """Message for the operator: circles detected of how many, other blobs around them, and what to do."""
     total = len(board.points)
     if most is None or _size_of_largest(most) < 6:
-        return f"no grid of circles detected where {board} has {total}: {advice(image.grey)}"
-    lattice = max(most.lattices, key=_nodes)
+        return f"no grid of circles detected where {board} has {total}: {light_advice(image.grey)}"
+    lattice = max(most.lattices, key=_count_nodes)
     seen = len(lattice.nodes)
     longer, shorter = lattice.extent
     others = len(most.blobs.centres) - seen
@@ -274,4 +274,4 @@ def _not_detected(board: Board, image: BoardImage, most: _Attempt | None) -> str
     sides = [side for side, gap in gaps.items() if gap < step]
     if sides:
         facts.append(f"up to the {' and the '.join(sides)} border of the image")
-    return f"{', '.join(facts)}: {advice(image.grey)}"
+    return f"{', '.join(facts)}: {light_advice(image.grey)}"

@@ -1,4 +1,4 @@
-"""Find a board in an image, numbered as its points are, or say why it cannot be measured."""
+"""Detect a board in an image, numbered as its points are, or raise an error that says why it cannot be measured."""
 
 from dataclasses import dataclass
 
@@ -18,10 +18,10 @@ from slviewer.target.planar import fit_homography, to_image
 class Detection:
     """``pixels`` (n, 2) float64 px, and ``ids`` (n,) int: which of ``board.points`` each one is.
 
-    All of them in order for grids of circles and chessboards, those that were seen for ChArUco. A circle's pixel is the
-    centroid of its image, which perspective and distortion move away from the image of its centre (some hundredths of
-    a pixel; it grows with the square of the radius): ``radius_mm``, 0 for corners, is there to correct that.
-    ``marked``: the mark beside the first circle was seen, so that the numbering is the board's own at any turn.
+    All of them in order for grids of circles and chessboards, those that were detected for ChArUco. A circle's pixel is
+    the centroid of its image, which perspective and distortion move away from the image of its centre (some hundredths
+    of a pixel; it grows with the square of the radius): ``radius_mm``, 0 for corners, is there to correct that.
+    ``marked``: the mark beside the first circle was detected, so that the numbering is the board's own at any turn.
     """
 
     pixels: np.ndarray
@@ -34,11 +34,11 @@ def detect(board: Board, image: np.ndarray) -> Detection:
     """The board's features in an image (h, w), or (h, w, 3) RGB, uint8 or uint16.
 
     The numbering's x axis turns clockwise into its y axis in the image, always. A symmetric board is numbered from its
-    mark (``slviewer.target.mark``); where none is seen, ``slviewer.target.numbering`` says which numbering is taken.
-    Raises DetectionError, whose message says what was seen and what to do, rather than return a grid with a feature
-    missing, misplaced or shifted.
+    mark (``slviewer.target.mark``); where none is detected, the rule of ``slviewer.target.numbering`` selects the
+    numbering. Raises DetectionError, whose message states what was detected and what to do, rather than return a grid
+    with a feature missing, misplaced or shifted.
     """
-    board_image = BoardImage.of(image)
+    board_image = BoardImage.from_image(image)
     if board.kind == "charuco":
         pixels, ids = detect_charuco(board, board_image)
         return Detection(pixels, ids)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 MM_PER_POINT = 25.4 / 72
 LARGEST_PDF_MM = 14_400 * MM_PER_POINT
 """Side of the largest page that PDF viewers accept."""
-ARC = 0.5522847498
+ARC_CONTROL = 0.5522847498
 """Handles of a quarter circle's Bezier curve over its radius; the curve leaves the circle by 0.03 % of it at most."""
 
 
@@ -45,7 +45,7 @@ class Drawing:
         scale = 1 / MM_PER_POINT
         lines = [f"{scale:.10f} 0 0 {-scale:.10f} 0 {self.height * scale:.6f} cm"]
         for x, y, r in self.circles:
-            h = ARC * r
+            h = ARC_CONTROL * r
             lines += [
                 f"{_mm(x + r)} {_mm(y)} m",
                 _curve(x + r, y + h, x + h, y + r, x, y + r),

@@ -20,7 +20,7 @@ class BoardImage:
     deep: np.ndarray
 
     @classmethod
-    def of(cls, image: np.ndarray) -> "BoardImage":
+    def from_image(cls, image: np.ndarray) -> "BoardImage":
         """From (h, w), or (h, w, 3) RGB, uint8 or uint16; raises InputError."""
         image = np.asarray(image)
         flat = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
@@ -38,14 +38,14 @@ class BoardImage:
         return cls(np.ascontiguousarray(grey), image.astype(np.float32))
 
 
-def advice(grey: np.ndarray) -> str:
+def light_advice(grey: np.ndarray) -> str:
     """What the operator should try, by how bright the image is."""
     saturated = float(np.mean(grey[::4, ::4] == 255))
     exposure = f"lower the exposure ({saturated:.0%} of the image is saturated), or " if saturated > 0.02 else ""
-    return f"{exposure}move the board so that all of it is in view, evenly lit and in focus"
+    return f"{exposure}move the board so that all of it is in view, evenly illuminated and in focus"
 
 
-def resized(image: np.ndarray, factor: float) -> np.ndarray:
+def resize_image(image: np.ndarray, factor: float) -> np.ndarray:
     """The image at ``factor`` of its size: averaged if smaller, interpolated if larger."""
     if factor == 1:
         return image
@@ -54,7 +54,7 @@ def resized(image: np.ndarray, factor: float) -> np.ndarray:
     )
 
 
-def evenly_lit(grey: np.ndarray) -> np.ndarray:
+def flatten_light(grey: np.ndarray) -> np.ndarray:
     """(h, w) uint8: the image over the brightest of each neighbourhood, a seventh of it wide: paper becomes white."""
     factor = 64 / max(grey.shape)
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)

@@ -15,15 +15,15 @@ from slviewer.target.blobs import Blobs
 from slviewer.target.board import Board
 from slviewer.target.planar import fit_grid_map
 
-REACH = 0.27
+PREDICTION_RADIUS = 0.27
 """How far, in steps, a neighbour may lie from where its predecessors point."""
-ALIKE = 2.2
+AREA_RATIO = 2.2
 """Ratio of areas up to which neighbouring blobs count as alike."""
-NEAR = 0.15
+NODE_RADIUS = 0.15
 """How far, in pitches, a blob may lie from the node that the map of the whole lattice predicts."""
 COMPLETIONS = 4
 """Rows that a lattice may gain at each side beyond those that it was grown to."""
-LONGEST = 200
+MAX_SIDE_NODES = 200
 """Nodes of a lattice along one side."""
 SEEDS = 60
 """Lattices that are grown before an attempt gives up."""
@@ -52,13 +52,13 @@ class Lattice:
 
 
 def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
-    """Lattices of like blobs, begun in the most regular neighbourhoods; each blob belongs to one at most."""
+    """Lattices of like blobs, grown from the most regular neighbourhoods; each blob belongs to one at most."""
     if len(blobs.centres) < 6:
         return
     tree = cKDTree(blobs.centres)
     free = np.ones(len(blobs.centres), bool)
     grown = 0
-    for seed, first, second in _seeds(tree, blobs):
+    for seed, first, second in _list_seeds(tree, blobs):
         if not free[seed]:
             continue
         lattice = _grow(tree, blobs, free, seed, first, second)
@@ -70,9 +70,9 @@ def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
 
 
 def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
-    """The lattice with every blob in it that lies where its map puts a node, without those that lie elsewhere.
+    """The lattice with every blob that lies at a node predicted by its map, without those that do not.
 
-    Growing from neighbour to neighbour ends at a gap, and may be led astray by what lies beside a grid; the map of all
+    Growing from neighbour to neighbour ends at a gap, and may follow clutter beside a grid; the map of all
     nodes together is not.
     """
     for _ in range(COMPLETIONS):
@@ -81,14 +81,15 @@ def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
         except DetectionError:
             return lattice
         low, high = lattice.nodes.min(0) - 1, lattice.nodes.max(0) + 1
-        if (high - low).max() > LONGEST:
+        if (high - low).max() > MAX_SIDE_NODES:
             return lattice
         nodes = np.stack(np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)), -1).reshape(-1, 2)
         pitch = seen.pitch_px(nodes.astype(float))
         typical = np.median(np.sqrt(blobs.areas[lattice.blobs]) / np.maximum(seen.pitch_px(lattice.nodes * 1.0), 1e-9))
         apart, nearest = cKDTree(blobs.centres).query(seen.to_image(nodes.astype(float)))
         ratio = np.sqrt(blobs.areas[nearest]) / np.maximum(typical * pitch, 1e-9)
-        on = (pitch > 0) & (apart < NEAR * pitch) & (np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(ALIKE) / 2)
+        is_alike = np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(AREA_RATIO) / 2
+        on = (pitch > 0) & (apart < NODE_RADIUS * pitch) & is_alike
         _, first = np.unique(np.where(on, nearest, -1 - np.arange(len(nodes))), return_index=True)
         chosen = np.sort(first[on[first]])
         if len(chosen) < 6:
@@ -100,7 +101,7 @@ def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
     return lattice
 
 
-def lay_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
+def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
     """Every numbering of the board's features by the lattice's blobs, (n,) indices each; empty where some are missing.
 
     Numberings of the same blobs are the board's rotational symmetries; different sets of blobs mean that the lattice
@@ -128,13 +129,13 @@ def lay_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
     return []
 
 
-def _seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """(blob, step, step) where like neighbours lie opposite each other in two directions, the most regular first."""
     centres, areas = blobs.centres, blobs.areas
     _, near = tree.query(centres, k=min(NEIGHBOURS, len(centres)))
     near = near[:, 1:]
-    alike = np.abs(np.log(areas[near] / areas[:, None])) < np.log(ALIKE)
-    first = np.argsort(~alike, axis=1, kind="stable")[:, :8]  # the nearest eight of its size, past what lies between
+    alike = np.abs(np.log(areas[near] / areas[:, None])) < np.log(AREA_RATIO)
+    first = np.argsort(~alike, axis=1, kind="stable")[:, :8]  # the nearest eight of its size, ignoring others between
     near, alike = np.take_along_axis(near, first, axis=1), np.take_along_axis(alike, first, axis=1)
     step = centres[near] - centres[:, None]
     length = np.linalg.norm(step, axis=2)
@@ -158,7 +159,7 @@ def _seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.ndarra
 
 
 def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.ndarray, second: np.ndarray) -> Lattice:
-    """The lattice around a seed: each node looks for its four neighbours where its known ones point."""
+    """The lattice around a seed: each node's four neighbours are searched where its known ones predict them."""
     centres, areas = blobs.centres, blobs.areas
     at = {(0, 0): seed}
     steps = {(0, 0): (first, second)}
@@ -182,8 +183,8 @@ def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.nd
                     diagonal = at.get((i + di + side * dj, j + dj + side * di))
                     if beside is not None and diagonal is not None:
                         step = centres[diagonal] - centres[beside]
-            found = _nearest_alike(
-                tree, here + step, REACH * float(np.hypot(*step)), areas, areas[at[node]], free, taken
+            found = _nearest_of_size(
+                tree, here + step, PREDICTION_RADIUS * float(np.hypot(*step)), areas, areas[at[node]], free, taken
             )
             if found is None:
                 continue
@@ -195,11 +196,13 @@ def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.nd
     return Lattice(np.array(list(at)), np.array(list(at.values())))
 
 
-def _nearest_alike(
+def _nearest_of_size(
     tree: cKDTree, place: np.ndarray, reach: float, areas: np.ndarray, area: float, free: np.ndarray, taken: set[int]
 ) -> int | None:
     distances, indices = tree.query(place, k=3, distance_upper_bound=reach)
     for distance, index in zip(distances, indices, strict=True):
-        if np.isfinite(distance) and free[index] and index not in taken and 1 / ALIKE < areas[index] / area < ALIKE:
+        if not np.isfinite(distance) or not free[index] or index in taken:
+            continue
+        if 1 / AREA_RATIO < areas[index] / area < AREA_RATIO:
             return int(index)
     return None

@@ -1,9 +1,10 @@
 """The mark that orients a board of circles: a dot beside its first circle.
 
 A symmetric grid looks the same turned by 180 degrees. The dot lies outside the grid, on the first circle's diagonal, so
-far from it that neither detecting nor measuring circles meets it; half as wide as a circle, it is never taken for one.
+far from it that neither detecting nor measuring circles meets it; half as wide as a circle, it is never detected as
+one.
 
-Whatever else lies beside a board (a screw, a label, something warm in a thermal image) is no mark: only a dot counts
+Other objects beside a board (a screw, a label, a warm spot in a thermal image) are no mark: only a dot counts
 that has the place, the size, the polarity and the contrast of the printed one, on the paper of the board.
 """
 
@@ -15,23 +16,23 @@ import numpy as np
 from slviewer.target.board import Board
 from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_image
 
-PLACE = 5 / 8
+OFFSET = 5 / 8
 RADIUS = 1 / 8
-QUIET = 1 / 8
+PAPER_WIDTH = 1 / 8
 """How far the dot lies left of and above the first circle, its radius and the paper around it, in distances between
 neighbouring circles."""
-NEAREST = 16
-"""Circles that predict the dot's place in the image; farther ones know less of the lens there."""
-CUT_OFF = 0.3
+PREDICTING_CIRCLES = 16
+"""Circles that predict the dot's place in the image; farther ones predict the local distortion less well."""
+MAX_CUT_OFF = 0.3
 """Share of the paper around a dot that may lie outside the image."""
-SEEN = 0.4
+PRESENT = 0.4
 ABSENT = 0.2
 """Contrast of a dot over a circle's, above which it is there, and below which it is not."""
-MOST_OFF = 0.4
+MAX_OFFSET = 0.4
 """Distance of the dot's centroid from its place, in its radii: what a lens adds to a prediction over one pitch."""
 SIZES = (0.6, 1.5)
 """Radius at half contrast over the printed one, from the smallest to the largest that blur and ink make of it."""
-LEAST_PAPER = 0.5
+MAX_PAPER_CHANGE = 0.5
 """The paper around a dot may differ from that around the first circle by this share of the circle's contrast."""
 _RADII = np.linspace(0.0, 2.2, 12)
 _ANGLES = 20
@@ -50,51 +51,51 @@ def mark_of(board: Board) -> Mark | None:
     """Where a board's mark is printed; None for chessboards and ChArUco."""
     if board.kind not in ("circles", "acircles"):
         return None
-    apart = neighbours_mm(board)
-    return Mark(-PLACE * apart, -PLACE * apart, RADIUS * apart)
+    apart = neighbour_distance_mm(board)
+    return Mark(-OFFSET * apart, -OFFSET * apart, RADIUS * apart)
 
 
-def neighbours_mm(board: Board) -> float:
+def neighbour_distance_mm(board: Board) -> float:
     """Distance between a circle and its nearest neighbour."""
     return board.pitch_mm * (2**0.5 if board.kind == "acircles" else 1.0)
 
 
-def marked_numbering(
+def numbering_by_mark(
     board: Board, image: np.ndarray, centres: np.ndarray, numberings: list[np.ndarray]
 ) -> np.ndarray | None:
-    """Of equally valid numberings, (n,) indices into ``centres`` (m, 2) px, the one beside whose first circle the mark
-    lies; None where none or several have something there.
+    """Of equally valid numberings, (n,) indices into ``centres`` (m, 2) px, the one whose first circle has
+    the mark beside it; None where none or several have.
 
     ``image`` (h, w) float32.
     """
     mark = mark_of(board)
     if mark is None:
         return None
-    dots = [_dot(board, mark, image, centres[order]) for order in numberings]
+    dots = [_detect_dot(board, mark, image, centres[order]) for order in numberings]
     contrasts = np.array([contrast for contrast, _ in dots])
     best = int(np.argmax(contrasts))
     others = np.delete(contrasts, best)
-    return numberings[best] if contrasts[best] > SEEN and dots[best][1] and (others < ABSENT).all() else None
+    return numberings[best] if contrasts[best] > PRESENT and dots[best][1] and (others < ABSENT).all() else None
 
 
-def _dot(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray) -> tuple[float, bool]:
+def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray) -> tuple[float, bool]:
     """(How much the mark's place differs from the paper around it, over how much the first circle does; whether a dot
     lies there that may be the mark)."""
     points = board.points[:, :2]
     centre = np.array([mark.x, mark.y])
-    near = np.argsort(np.linalg.norm(points - centre, axis=1))[:NEAREST]
+    near = np.argsort(np.linalg.norm(points - centre, axis=1))[:PREDICTING_CIRCLES]
     H = fit_homography(points[near], pixels[near])
     bent = fit_grid_map(points / board.pitch_mm, pixels).to_image(centre[None] / board.pitch_mm)[0]
     if not np.linalg.det(jacobians(H, centre[None]))[0] > 0:
         return 0.0, False
     shift = np.eye(3)
     shift[:2, 2] = bent - to_image(H, centre[None])[0]
-    dot = _profile(image, shift @ H, centre, mark.radius)
-    circle = _profile(image, H, points[0], 2 * mark.radius)
+    dot = _measure_profile(image, shift @ H, centre, mark.radius)
+    circle = _measure_profile(image, H, points[0], 2 * mark.radius)
     if dot is None or circle is None or abs(circle.contrast) < 0.05:
         return 0.0, False
-    same_paper = abs(dot.paper - circle.paper) < LEAST_PAPER * abs(circle.paper - circle.ink)
-    is_mark = dot.off < MOST_OFF and SIZES[0] < dot.size < SIZES[1] and same_paper and dot.is_alone
+    same_paper = abs(dot.paper - circle.paper) < MAX_PAPER_CHANGE * abs(circle.paper - circle.ink)
+    is_mark = dot.off < MAX_OFFSET and SIZES[0] < dot.size < SIZES[1] and same_paper and dot.is_alone
     return dot.contrast / circle.contrast, is_mark
 
 
@@ -112,8 +113,8 @@ class _Profile:
     is_alone: bool
 
 
-def _profile(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float) -> _Profile | None:
-    """Of what lies around a point of the board, out to 2.2 radii; None where too little of it is in the image.
+def _measure_profile(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float) -> _Profile | None:
+    """Profile around a point of the board, out to 2.2 radii; None where too little of it is in the image.
 
     For paper counts the fifth of the outer rings that is least like it: an edge that runs through is no dot.
     """
@@ -125,7 +126,7 @@ def _profile(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float
         image, pixels[:, 0], pixels[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
     ).reshape(len(_RADII), _ANGLES)
     inner, outer = levels[_RADII <= 0.6], levels[_RADII >= 1.8]
-    if np.isnan(inner).any() or np.isnan(outer).mean() > CUT_OFF:
+    if np.isnan(inner).any() or np.isnan(outer).mean() > MAX_CUT_OFF:
         return None
     own = float(inner.mean())
     ring = np.nanmean(outer, axis=0) if np.isfinite(outer).all() else outer[np.isfinite(outer)]

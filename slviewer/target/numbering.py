@@ -1,6 +1,6 @@
-"""Which way round a board is numbered, and whether the numbered grid is one that a flat board can show.
+"""Orientation of a board's numbering, and the check that the numbered grid is the image of a flat board.
 
-Where no mark tells (``slviewer.target.mark``), a board that looks the same turned by 180 degrees (symmetric circles,
+Without a mark (``slviewer.target.mark``), a board that looks the same turned by 180 degrees (symmetric circles,
 asymmetric circles with an even number of rows, chessboards whose columns + rows are even) is numbered with its x axis
 to the right in the image: of the two numberings, the one whose x axis points more along (2, 1) px, right and a little
 down. So an upright board counts from its top-left feature, a board whose rows run vertically counts from the top right,
@@ -14,16 +14,16 @@ from slviewer.errors import DetectionError
 from slviewer.target.board import Board
 from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_image
 
-MOST_OFF = 0.08
+MAX_GRID_OFFSET = 0.08
 """How far, in pitches, a feature may lie from the grid that all features together describe."""
-OUTLYING = 8.0
+MAX_GRID_OFFSET_SIGMAS = 8.0
 """The same in robust standard deviations; hand-held paper boards reach 6."""
-MOST_BENT = 0.6
+MAX_BEND = 0.6
 """How far, in pitches, a lens may bend the grid."""
 
 
-def upright(board: Board, pixels: np.ndarray, numberings: list[np.ndarray]) -> np.ndarray:
-    """Of equally valid numberings, (n,) indices into ``pixels`` (m, 2), the one that the rule above chooses."""
+def select_upright(board: Board, pixels: np.ndarray, numberings: list[np.ndarray]) -> np.ndarray:
+    """Of equally valid numberings, (n,) indices into ``pixels`` (m, 2), the one selected by the rule above."""
     preferred = np.array([1.0, 0.0] if len(numberings) == 4 else [2.0, 1.0])
     return max(numberings, key=lambda order: float(x_direction(board, pixels[order]) @ preferred))
 
@@ -36,7 +36,7 @@ def x_direction(board: Board, pixels: np.ndarray) -> np.ndarray:
 
 
 def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> None:
-    """Raises DetectionError unless the features lie, one by one, where a flat board behind a real lens shows them.
+    """Raises DetectionError unless the features lie, one by one, where a real lens images a flat board's.
 
     A homography must explain them up to a lens's distortion, which is smooth (``planar.GridMap``). The numbering must
     be right-handed.
@@ -46,14 +46,14 @@ def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> 
     H = fit_homography(points, pixels)
     areas = np.linalg.det(jacobians(H, points))
     if areas.max() <= 0:
-        raise DetectionError(f"the {what} appear mirrored: show the board to the camera directly, not in a mirror")
+        raise DetectionError(f"the {what} appear mirrored: point the camera at the board, not at a mirror")
     pitch = np.sqrt(np.maximum(areas, 1e-9))
-    if (np.linalg.norm(pixels - to_image(H, points), axis=1) > MOST_BENT * pitch).any():
+    if (np.linalg.norm(pixels - to_image(H, points), axis=1) > MAX_BEND * pitch).any():
         raise DetectionError(f"the {what} detected do not lie on a flat grid: {advice}")
     fitted = fit_grid_map(points, pixels)
     off = np.linalg.norm(fitted.residuals, axis=1)
-    limit = OUTLYING * fitted.sigma_px
-    wrong = off > np.clip(limit, np.maximum(0.3, 0.01 * pitch), np.maximum(0.5, MOST_OFF * pitch))
+    limit = MAX_GRID_OFFSET_SIGMAS * fitted.sigma_px
+    wrong = off > np.clip(limit, np.maximum(0.3, 0.01 * pitch), np.maximum(0.5, MAX_GRID_OFFSET * pitch))
     if wrong.any():
         worst = int(np.argmax(off / pitch))
         u, v = pixels[worst]

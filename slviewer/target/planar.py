@@ -19,7 +19,7 @@ def fit_homography(points: np.ndarray, pixels: np.ndarray, robust: bool = False)
     """
     H = cv2.findHomography(points, pixels, cv2.LMEDS if robust else 0)[0] if len(points) >= 4 else None
     if H is None or abs(np.linalg.det(H)) < 1e-12:
-        raise DetectionError(f"the {len(points)} features found lie on one line: turn the board towards the camera")
+        raise DetectionError(f"the {len(points)} detected features lie on one line: turn the board towards the camera")
     return np.asarray(H * np.sign(points.mean(0) @ H[2, :2] + H[2, 2]))
 
 
@@ -36,8 +36,8 @@ def jacobians(H: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class GridMap:
-    """Where a flat grid of features is seen: a homography ``H`` from pitches to pixels, plus a polynomial of the place
-    on the board, which is how a lens bends it.
+    """Map from a flat grid of features to the image: a homography ``H`` from pitches to pixels, plus a polynomial of
+    the place on the board, which is how a lens bends it.
 
     ``residuals`` (n, 2) px of the features that it was fitted to, ``sigma_px`` the robust standard deviation of their
     lengths.
@@ -53,7 +53,7 @@ class GridMap:
 
     def to_image(self, points: np.ndarray) -> np.ndarray:
         """(n, 2) px of points (n, 2) in pitches; beyond the features as far as the polynomial can be trusted."""
-        return to_image(self.H, points) + _terms(points, self.low, self.span, self.degree) @ self.coefficients
+        return to_image(self.H, points) + _monomials(points, self.low, self.span, self.degree) @ self.coefficients
 
     def pitch_px(self, points: np.ndarray) -> np.ndarray:
         """(n,) px: the side of a square of one pitch, at points (n, 2) in pitches; 0 behind the camera."""
@@ -69,7 +69,7 @@ def fit_grid_map(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -
     H = fit_homography(points, pixels, robust)
     low, span = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-9)
     degree = 3 if len(points) >= 25 else 1
-    terms = _terms(points, low, span, degree)
+    terms = _monomials(points, low, span, degree)
     bent = pixels - to_image(H, points)
     weight = np.ones(len(points))
     for _ in range(8 if robust else 1):
@@ -81,7 +81,7 @@ def fit_grid_map(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -
     return GridMap(H, low, span, degree, coefficients, residuals, sigma)
 
 
-def _terms(points: np.ndarray, low: np.ndarray, span: np.ndarray, degree: int) -> np.ndarray:
+def _monomials(points: np.ndarray, low: np.ndarray, span: np.ndarray, degree: int) -> np.ndarray:
     """(n, m): the monomials up to a degree, of points (n, 2) scaled to -1 to 1 over the features."""
     x, y = (2 * (points - low) / span - 1).T
     return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)

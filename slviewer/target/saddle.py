@@ -10,15 +10,15 @@ from scipy.special import erf
 
 from slviewer.target.planar import fit_homography, jacobians
 
-FARTHEST_PX = 11
-"""Largest half width of a window; what lies farther tells about the lens rather than about the corner."""
+MAX_HALF_WIDTH_PX = 11
+"""Largest half width of a window; farther pixels measure the lens rather than the corner."""
 EDGE_SHARE = 0.4
 """How far, in squares, a corner's window follows the edges."""
-MISFIT = 0.15
-RELATIVE_MISFIT = 3.0
+MAX_MISFIT = 0.15
+MAX_RELATIVE_MISFIT = 3.0
 """A corner's grey levels may leave the model by this share of its contrast, or by this much more than most do."""
 ITERATIONS = 15
-SETTLED_PX = 1e-3
+CONVERGENCE_PX = 1e-3
 
 
 def refine_corners(
@@ -32,7 +32,7 @@ def refine_corners(
     H = fit_homography(points, pixels)
     to_px = jacobians(H, points) * pitch
     sides = np.linalg.norm(to_px, axis=1)
-    reach = int(np.clip(round(EDGE_SHARE * float(np.median(sides))), 3, FARTHEST_PX))
+    reach = int(np.clip(round(EDGE_SHARE * float(np.median(sides))), 3, MAX_HALF_WIDTH_PX))
     span = np.arange(-reach, reach + 1)
     middle = np.rint(pixels).astype(int)
     u, v = (middle[:, k, None] + o.ravel() for k, o in enumerate(np.meshgrid(span, span)))
@@ -44,7 +44,7 @@ def refine_corners(
     free = 0.8 * (1 - marker / pitch) / 2 if marker else EDGE_SHARE
     weight = (inside & (board.max(2) < EDGE_SHARE) & (board.min(2) < free)).astype(float)
     moved, misfit = _fit(offset, grey, weight, to_px)
-    good = misfit < np.maximum(MISFIT, RELATIVE_MISFIT * np.median(misfit))
+    good = misfit < np.maximum(MAX_MISFIT, MAX_RELATIVE_MISFIT * np.median(misfit))
     good &= np.linalg.norm(moved, axis=1) < reach
     return pixels + moved, good
 
@@ -53,7 +53,7 @@ def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.nda
     """((n, 2) px from the start to the crossing, (n,) rms misfit over the contrast), by damped Gauss-Newton on all
     corners at once.
 
-    Unknowns of each corner: its place (2), the angles of the edges' normals (2), the blur's sigma, the plane of the
+    Unknowns of each corner: its position (2), the angles of the edges' normals (2), the blur's sigma, the plane of the
     light (3), kappa.
     """
     n = len(offset)
@@ -62,10 +62,10 @@ def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.nda
     q[:, 4] = 1.0
     q[:, 5] = (weight * grey).sum(1) / np.maximum(weight.sum(1), 1)
     q[:, 8] = 0.1
-    model, J = _model(q, offset)
+    model, J = _evaluate_model(q, offset)
     q[:, 8] = 0.6 * np.where((weight * (grey - q[:, 5, None]) * J[..., 8]).sum(1) < 0, -1, 1)
     damping = np.full(n, 1e-3)
-    model, J = _model(q, offset)
+    model, J = _evaluate_model(q, offset)
     cost = (weight * (grey - model) ** 2).sum(1)
     for _ in range(ITERATIONS):
         J *= weight[..., None]
@@ -75,10 +75,10 @@ def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.nda
         diagonal += damping[:, None] * diagonal + 1e-6
         trial = q + np.linalg.solve(A, b)[..., 0]
         trial[:, 4] = np.clip(trial[:, 4], 0.25, 8.0)
-        trial_model, trial_J = _model(trial, offset)
+        trial_model, trial_J = _evaluate_model(trial, offset)
         trial_cost = (weight * (grey - trial_model) ** 2).sum(1)
         better = trial_cost < cost
-        settled = (~better | (np.abs(trial - q)[:, :2].max(1) < SETTLED_PX)).all()
+        settled = (~better | (np.abs(trial - q)[:, :2].max(1) < CONVERGENCE_PX)).all()
         damping = np.where(better, damping * 0.1, np.minimum(damping * 10, 1e6))
         q = np.where(better[:, None], trial, q)
         cost = np.where(better, trial_cost, cost)
@@ -90,7 +90,7 @@ def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.nda
     return q[:, :2], misfit / np.maximum(np.abs(q[:, 5] * q[:, 8]), 1e-6)
 
 
-def _model(q: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _evaluate_model(q: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """((n, m) grey levels, (n, m, 9) their derivatives) of corners ``q`` (n, 9) at offsets (n, m, 2) px."""
     x, y = offset[..., 0] - q[:, 0, None], offset[..., 1] - q[:, 1, None]
     sigma = q[:, 4, None]

@@ -9,11 +9,11 @@ from slviewer.errors import InputError
 from slviewer.target.board import Board
 from slviewer.target.charuco import opencv_board
 from slviewer.target.drawing import LARGEST_PDF_MM, Drawing
-from slviewer.target.mark import PLACE, QUIET, RADIUS, mark_of, neighbours_mm
+from slviewer.target.mark import OFFSET, PAPER_WIDTH, RADIUS, mark_of, neighbour_distance_mm
 
 CIRCLE_SHARE = 0.5
 """Diameter of a printed circle over the distance to its nearest neighbour."""
-FOOT_MM = 12.0
+FOOTER_MM = 12.0
 """Strip below the board for the scale bar and the text."""
 
 
@@ -29,7 +29,7 @@ def write_sheet(board: Board, path: Path | str, margin_mm: float | None = None) 
     suffix = path.suffix.lower()
     if suffix not in (".pdf", ".svg"):
         raise InputError(f"a sheet cannot be written as '{path.name}': give a name that ends in .pdf or .svg")
-    drawing = draw(board, margin_mm)
+    drawing = draw_board(board, margin_mm)
     if suffix == ".pdf" and max(drawing.width, drawing.height) > LARGEST_PDF_MM:
         raise InputError(
             f"a page of {drawing.width:.0f}x{drawing.height:.0f} mm is more than a PDF can hold "
@@ -42,11 +42,11 @@ def write_sheet(board: Board, path: Path | str, margin_mm: float | None = None) 
         raise InputError(f"'{path}' cannot be written ({error.strerror}): choose another place") from error
 
 
-def draw(board: Board, margin_mm: float | None = None) -> Drawing:
+def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
     """The board on its page."""
     mark = mark_of(board)
-    radius = CIRCLE_SHARE / 2 * neighbours_mm(board)
-    room = (PLACE + RADIUS + QUIET) * neighbours_mm(board) - radius if mark else board.pitch_mm / 2
+    radius = CIRCLE_SHARE / 2 * neighbour_distance_mm(board)
+    room = (OFFSET + RADIUS + PAPER_WIDTH) * neighbour_distance_mm(board) - radius if mark else board.pitch_mm / 2
     margin = max(10.0, room) if margin_mm is None else margin_mm
     if not margin >= 0:
         raise InputError(f"a margin of {margin} mm is not possible: give 0 or more")
@@ -54,26 +54,26 @@ def draw(board: Board, margin_mm: float | None = None) -> Drawing:
     first = np.array([margin + beyond, margin + beyond])
     extent = np.ptp(board.points[:, :2], axis=0) + 2 * (margin + beyond)
     width, bottom = max(float(extent[0]), 40.0), float(extent[1])
-    drawing = Drawing(width, bottom + FOOT_MM)
+    drawing = Drawing(width, bottom + FOOTER_MM)
     if mark:
         drawing.circles = [(x, y, radius) for x, y in (board.points[:, :2] + first).tolist()]
         if margin >= room:
             drawing.circles.append((first[0] + mark.x, first[1] + mark.y, mark.radius))
     else:
-        drawing.rectangles = [(x + first[0], y + first[1], w, h) for x, y, w, h in _squares(board)]
-    _add_foot(board, drawing, bottom)
+        drawing.rectangles = [(x + first[0], y + first[1], w, h) for x, y, w, h in _black_squares(board)]
+    _add_footer(board, drawing, bottom)
     return drawing
 
 
-def _squares(board: Board) -> list[tuple[float, float, float, float]]:
+def _black_squares(board: Board) -> list[tuple[float, float, float, float]]:
     """(x, y, width, height) mm of what is black, from the first inner corner; the top-left square is."""
     p = board.pitch_mm
     columns, rows = board.features
     dark = [((j - 1) * p, (i - 1) * p, p, p) for i in range(rows + 1) for j in range(columns + 1) if (i + j) % 2 == 0]
-    return dark + _markers(board) if board.kind == "charuco" else dark
+    return dark + _marker_cells(board) if board.kind == "charuco" else dark
 
 
-def _markers(board: Board) -> list[tuple[float, float, float, float]]:
+def _marker_cells(board: Board) -> list[tuple[float, float, float, float]]:
     """The black cells of the markers, those side by side in one piece."""
     charuco = opencv_board(board)
     dictionary = charuco.getDictionary()
@@ -91,8 +91,8 @@ def _markers(board: Board) -> list[tuple[float, float, float, float]]:
     return black
 
 
-def _add_foot(board: Board, drawing: Drawing, top: float) -> None:
-    """A scale bar, of 100 mm where the page is wide enough, and what to mind when printing."""
+def _add_footer(board: Board, drawing: Drawing, top: float) -> None:
+    """A scale bar, of 100 mm where the page is wide enough, and printing instructions."""
     left = 5.0
     length = next(bar for bar in (100, 50, 20) if bar <= drawing.width - 2 * left)
     for x in range(0, length + 1, 10):

@@ -13,7 +13,7 @@ import numpy as np
 
 from slviewer.calibration.observe import Observation, Smoothing, smooth_axes
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel, calibrate_pixelwise
-from slviewer.calibration.splined.compiled import CELLS_ACROSS, DEPTHS, Compiled
+from slviewer.calibration.splined.compiled import DEPTHS, GRID_CELLS_ACROSS, CompiledAxis
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import render
@@ -262,7 +262,7 @@ def _fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, f
     return seconds, held
 
 
-def _made_up(compiled: Compiled, rays: np.ndarray) -> SplinedModel:
+def _made_up(compiled: CompiledAxis, rays: np.ndarray) -> SplinedModel:
     """A splined model of which there is only what one pass reads."""
     model = object.__new__(SplinedModel)
     vars(model).update(rays=rays, _compiled={"x": compiled})
@@ -282,7 +282,7 @@ def _file(cloud: Cloud) -> Row:
     return row(f"write {np.count_nonzero(keep) / 1e6:.2f} M points as PLY", seconds, len(content) / 1e6, least)
 
 
-def _calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, Compiled, np.ndarray]:
+def _calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledAxis, np.ndarray]:
     """Coefficients of a plausible rig: their values do not change the time."""
     height, width = shape
     v, u = np.mgrid[:height, :width] / width
@@ -290,8 +290,8 @@ def _calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, Compiled, np.
     c = np.stack([300 + 16 * u, 1.3 * ones, -2e-4 * ones, (u - 0.5) / 2, (v - 0.4) / 2])
     fit = PixelFit(c, np.zeros((3, *shape), np.float32), np.full(shape, 25, np.uint16), 30 * ones, 250 * ones, ones)
     near, far = 200.0, 1000.0
-    step = max(2, -(-width // CELLS_ACROSS))
+    step = max(2, -(-width // GRID_CELLS_ACROSS))
     grid = np.zeros(((height - 1) // step + 2, (width - 1) // step + 2, DEPTHS), np.float32)
     centred = np.stack([500 + 16 * u, 0.45 * ones, -1e-4 * ones]).astype(np.float32)
-    compiled = Compiled(centred, 455.5, grid, grid, step, near, far)
+    compiled = CompiledAxis(centred, 455.5, grid, grid, step, near, far)
     return PixelwiseModel({"x": fit}, {"x": PERIOD_PX}, {}, "x"), compiled, c[3:].astype(np.float32)

@@ -23,14 +23,14 @@ def gpu_rows(
 ) -> list[dict[str, Any]]:
     """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, mended, with the copies there and
     back; nothing without a device."""
-    name = cuda_device.device()
+    name = cuda_device.find_device()
     if name is None:
         return []
     one = CudaPass(sequence, model, "x")
-    here = cuda_device.frame_room(frames.shape, frames.dtype)
+    here = cuda_device.allocate_frames(frames.shape, frames.dtype)
     here[:] = frames
     scan = one.run(here)
-    if cuda_device.device() is None:  # it failed, and that was told
+    if cuda_device.find_device() is None:  # it failed, and that was told
         return []
     alone, least, moved = _kernel_alone(one, here, scan.light)
     whole = median(lambda: one.run(here, scan.light, scan), TIMES)

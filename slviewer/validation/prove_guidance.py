@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slviewer.calibration.centres import calibrate_centred
+from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.errors import InputError
@@ -146,7 +146,7 @@ def prove_guidance(
             begun = perf_counter()
             observations, predicted = _guided(bench, told) if way == "guided" else (_drawn(bench, told), np.nan)
             told(0.9, "calibrating")
-            stereo, centred = calibrate_centred(observations, bench.rig.projector.size, str(BOARD))
+            stereo, centred = calibrate_centres(observations, bench.rig.projector.size, str(BOARD))
             figures = _measured(calibrate_splined(centred, stereo), targets)
             outcomes.append(
                 Outcome(way, bench.rig.seed, len(observations), *figures, predicted, perf_counter() - begun)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slviewer.calibration.centres import calibrate_centred
+from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.observe import observe
 from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.errors import InputError
@@ -233,7 +233,7 @@ def _calibrated(rig: SimulatedRig, board: Board, targets: Mapping[str, Scene], p
         found = detect(board, texture(both, frames))
         observations.append(observe(name, board, found, decode_frames(name, both, frames)))
     progress(0.8, "calibrating")
-    stereo, observations = calibrate_centred(observations, rig.projector.size, TARGET)
+    stereo, observations = calibrate_centres(observations, rig.projector.size, TARGET)
     return calibrate_splined(observations, stereo)
 
 

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from slviewer.calibration.centres import calibrate_centred
+from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.observe import Observation, observe
 from slviewer.calibration.pixelwise import calibrate_pixelwise
 from slviewer.calibration.splined.model import calibrate_splined
@@ -127,7 +127,7 @@ def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = un
         observations.append(_seen(name, rig, scene, board, both, numbers[name]))
     rendered = perf_counter()
     progress(0.8 * len(targets) / total, f"{case.name}: calibrating")
-    stereo, observations = calibrate_centred(observations, rig.projector.size, TARGET)
+    stereo, observations = calibrate_centres(observations, rig.projector.size, TARGET)
     models: dict[str, Model] = {"stereo": stereo}
     models["pixelwise"] = calibrate_pixelwise(observations, stereo)
     adjusting = perf_counter()

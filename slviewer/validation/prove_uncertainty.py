@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
-from slviewer.calibration.splined.uncertainty import sigma_of
+from slviewer.calibration.splined.uncertainty import volume_sigmas
 from slviewer.calibration.splined.unknowns import Arrangement
-from slviewer.calibration.splined.volume import Volume, better_axis, looked, motion_free, sigma_3d, working_volume
+from slviewer.calibration.splined.volume import Volume, depth_axis, motion_free, sigma_3d, view_pixels, working_volume
 from slviewer.errors import CalibrationRejected
 from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
@@ -139,12 +139,12 @@ def compare_with_truth(name: str, model: SplinedModel, true: SimulatedRig) -> Ho
     bundle, rig = model.bundle, model.rig
     columns, rows, depths = GRID
     volume = working_volume(rig, bundle.depth_range_mm, columns=columns, rows=rows, depths=depths)
-    axis = better_axis(rig, volume)
+    axis = depth_axis(rig, volume)
     errors = true_errors(true, rig, volume, axis)
     known = np.isfinite(errors).all(axis=1)
     volume = Volume(*(each[known] for each in (volume.pixels, volume.z, volume.points, volume.projector)))
     supported = volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
-    predicted = sigma_of(bundle, axis, volume)
+    predicted = volume_sigmas(bundle, axis, volume)
     missed = sigma_3d(motion_free(errors[known].reshape(1, -1), volume.points, supported))
     return Honesty(name, predicted, missed, supported)
 
@@ -158,9 +158,9 @@ def true_errors(true: SimulatedRig, rig: Arrangement, volume: Volume, axis: Axis
     measured = true.project(really)[:, row]
     z = volume.z.copy()
     for _ in range(6):  # Newton, the slope from a step of a ten-thousandth
-        here, there = (looked(rig, volume.pixels, depths)[1][:, row] for depths in (z, 1.0001 * z))
+        here, there = (view_pixels(rig, volume.pixels, depths)[1][:, row] for depths in (z, 1.0001 * z))
         z = z + 1e-4 * z * (measured - here) / (there - here)
-    return looked(rig, volume.pixels, z)[0] - really
+    return view_pixels(rig, volume.pixels, z)[0] - really
 
 
 def _joined(rigs: tuple[Honesty, ...], what: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from slviewer.devices.capture import settle
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.geometry.cuda_device import frame_room
+from slviewer.geometry.cuda_device import allocate_frames
 
 
 @dataclass(eq=False)
@@ -100,7 +100,7 @@ class Stream:
         with self._condition:
             found = self._free.pop() if self._free else None
         if found is None or found.shape != shape or found.dtype != dtype:
-            return frame_room(shape, dtype)
+            return allocate_frames(shape, dtype)
         return found
 
     def _give(self, shot: LiveCapture) -> None:

@@ -9,17 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.calibration.guidance.choosing import Guidance, guide
-from slviewer.calibration.guidance.coarse_rig import Expected, GuidanceBench
-from slviewer.calibration.guidance.rough import LEAST_POSES as LEAST_FOR_A_RIG
-from slviewer.calibration.guidance.rough import rough_rig
+from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceBench
+from slviewer.calibration.guidance.initial_rig import MIN_POSES as LEAST_FOR_A_RIG
+from slviewer.calibration.guidance.initial_rig import estimate_rig
+from slviewer.calibration.guidance.pose_selection import Guidance, suggest_poses
 from slviewer.calibration.next_pose import (
     Coverage,
     Suggestion,
     approximate_pose,
     coverage,
     depth_range,
-    described,
+    describe_suggestion,
     estimated_lens,
     nominal_lens,
     projector_reach,
@@ -93,7 +93,7 @@ def plan(
         assert stereo is not None
         known = stereo.rig, dict(stereo.poses)
     else:
-        rough = rough_rig(
+        rough = estimate_rig(
             [f.points for f in seen], [f.camera for f in seen], [f.projector for f in seen], (camera, projector)
         )
         if rough is not None:
@@ -104,16 +104,16 @@ def plan(
     covered = coverage(board, lens, list(poses.values()))
     guidance: Guidance | None = None
     if known is not None:
-        expected = Expected().with_noise(np.array([f.noise_px for f in seen]) / projector[0])
+        expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in seen]) / projector[0])
         try:
-            guidance = guide(GuidanceBench(known[0], board, expected), list(poses.values()))
+            guidance = suggest_poses(GuidanceBench(known[0], board, expected), list(poses.values()))
         except (InputError, np.linalg.LinAlgError):  # devices that share no view: what covers most may mend it
             guidance = None
     if guidance is None:
         return PosePlan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
     T = guidance.poses[refused % len(guidance.poses)]
     next_mm = guidance.sigma_next_mm
-    return PosePlan(lens, poses, covered, described(board, lens, T), usual, guidance.sigma_mm, next_mm)
+    return PosePlan(lens, poses, covered, describe_suggestion(board, lens, T), usual, guidance.sigma_mm, next_mm)
 
 
 def takes_time(features: Mapping[str, PoseFeatures], stereo: StereoModel | None, camera: tuple[int, int]) -> bool:

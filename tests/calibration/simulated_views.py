@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.observe import CELLS_PER_WIDTH, Observation
-from slviewer.geometry.splines import fit_surface
+from slviewer.geometry.splines import fit_spline
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.rig import SimulatedRig
@@ -45,7 +45,7 @@ def seen(rig: SimulatedRig, pose: Pose, name: str, axes=("x", "y"), camera_px=0.
     box = (u0 - 0.5, v0 - 0.5, u1 - 0.5, v1 - 0.5)
     cells = tuple(max(1, round(length * CELLS_PER_WIDTH / width)) for length in (u1 - u0, v1 - v0))
     surfaces = {
-        axis: fit_surface(u, v, 2 * np.pi * coordinate[:, i] / PERIOD, None, box, cells)
+        axis: fit_spline(u, v, 2 * np.pi * coordinate[:, i] / PERIOD, None, box, cells)
         for i, axis in enumerate(("x", "y"))
         if axis in axes
     }

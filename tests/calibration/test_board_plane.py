@@ -36,7 +36,7 @@ def in_projector(points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("tilt", [0.0, 20.0])
 def test_a_wide_lens_keeps_the_board_and_loses_the_hand(tilt: float) -> None:
     features, outline, hand = board(tilt), board(tilt, margin=0.5), board(tilt, nearer_mm=40.0)
-    plane = BoardPlane.through(in_camera(features), in_projector(features), SIZE)
+    plane = BoardPlane.fit(in_camera(features), in_projector(features), SIZE)
     assert plane is not None
     for points, near in ((features, 1.0), (outline, 1.0), (hand, 0.0)):
         off = np.abs(plane.predict(*in_camera(points).T) - in_projector(points))
@@ -46,23 +46,23 @@ def test_a_wide_lens_keeps_the_board_and_loses_the_hand(tilt: float) -> None:
 
 def test_features_misread_do_not_count() -> None:
     camera, projector = in_camera(board(10.0)), in_projector(board(10.0))
-    clean = BoardPlane.through(camera, projector, SIZE)
+    clean = BoardPlane.fit(camera, projector, SIZE)
     projector[5] += 30.0
     projector[40] = np.nan
-    spoiled = BoardPlane.through(camera, projector, SIZE)
+    spoiled = BoardPlane.fit(camera, projector, SIZE)
     assert clean is not None and spoiled is not None
     assert np.abs(spoiled.predict(200.0, 150.0) - clean.predict(200.0, 150.0)).max() < 0.5
     assert (spoiled.reach < 2 * clean.reach).all()
-    assert BoardPlane.through(camera[:9], projector[:9], SIZE) is None
+    assert BoardPlane.fit(camera[:9], projector[:9], SIZE) is None
 
 
 def test_a_map_is_judged_pixel_by_pixel() -> None:
-    plane = BoardPlane.through(in_camera(board(0.0)), in_projector(board(0.0)), SIZE)
+    plane = BoardPlane.fit(in_camera(board(0.0)), in_projector(board(0.0)), SIZE)
     assert plane is not None
     u, v = np.meshgrid(np.arange(150, 190), np.arange(100, 120))
     rows = plane.predict(u, v)[..., 1]
     rows[3, 4], rows[5, 6] = rows[3, 4] + plane.reach[1] + 0.1, np.nan
-    holds = plane.holds(rows, 1, (150, 100))
+    holds = plane.contains(rows, 1, (150, 100))
     assert holds.sum() == holds.size - 2 and not holds[3, 4] and not holds[5, 6]
 
 

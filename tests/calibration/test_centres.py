@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
 
-from slviewer.calibration.centres import calibrate_centred, centred, centroid_shifts
+from slviewer.calibration.centres import calibrate_centres, centroid_shifts, move_to_centres
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
@@ -93,11 +93,13 @@ def test_a_calibration_from_centroids_finds_the_centres() -> None:
         slopes = np.tile([[0.8, 0.02], [-0.01, 1.5]], (len(shift), 1, 1))
         projector = o.projector + np.einsum("nij,nj->ni", slopes, shift)
         seen.append(replace(o, camera=o.camera + shift, projector=projector, slopes=slopes, radius_mm=RADIUS))
-    stereo, corrected = calibrate_centred(seen, PROJECTOR, str(BOARD))
+    stereo, corrected = calibrate_centres(seen, PROJECTOR, str(BOARD))
     before = max(np.abs(o.camera - exact[o.name].camera).max() for o in seen)
     left = max(np.abs(o.camera - exact[o.name].camera).max() for o in corrected)
     assert before > 0.02 and left < before / 50
     assert max(np.abs(o.projector - exact[o.name].projector).max() for o in corrected) < before / 25
     raw = calibrate_stereo(seen, PROJECTOR, str(BOARD))
     assert stereo.reprojection_rms_px["camera"] < raw.reprojection_rms_px["camera"] / 10
-    assert all(new is old for new, old in zip(centred(corrected, stereo), corrected, strict=True)), "once is enough"
+    assert all(new is old for new, old in zip(move_to_centres(corrected, stereo), corrected, strict=True)), (
+        "once is enough"
+    )

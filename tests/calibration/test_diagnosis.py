@@ -10,9 +10,9 @@ from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
 
 from slviewer.calibration.diagnosis.attempt import Attempt, attempt_stereo
 from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
-from slviewer.calibration.diagnosis.frames import gamma_of, mean_turn
-from slviewer.calibration.diagnosis.numbering import misnumbered
-from slviewer.calibration.diagnosis.rules import judged
+from slviewer.calibration.diagnosis.frames import fit_mean_turn, gamma_from_harmonic
+from slviewer.calibration.diagnosis.numbering import describe_misnumbering
+from slviewer.calibration.diagnosis.rules import judge_evidence
 from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
 from slviewer.calibration.observe import Observation
 from slviewer.fringe.contradiction import Contradiction
@@ -34,7 +34,7 @@ def pose(number: int, **change: object) -> PoseEvidence:
 
 
 def causes(*poses: PoseEvidence, **more: object) -> tuple[str, ...]:
-    return judged(Evidence("circles:21x16:9", (912, 1140), poses, tilt_spread_deg=30.0, **more)).causes
+    return judge_evidence(Evidence("circles:21x16:9", (912, 1140), poses, tilt_spread_deg=30.0, **more)).causes
 
 
 def observations(count: int = 20) -> list[Observation]:
@@ -88,7 +88,7 @@ def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None
     found = attempt(poses)
     cause = {"noise": "outlier", "bent": "outlier", "moved": "moved"}.get(order, "board-numbering")
     assert found.verdict.causes == (cause,) and found.verdict.findings[0].poses == ("pose_04",)
-    assert found.verdict.level == "good"  # it is left out
+    assert found.verdict.level == "good"  # it is excluded
     assert list(found.left_out) == ["pose_04"] and "pose" in found.left_out["pose_04"]
     assert found.stereo is not None and base.stereo is not None
     assert found.stereo.baseline_mm == pytest.approx(base.stereo.baseline_mm, rel=2e-3)
@@ -105,7 +105,7 @@ def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> Non
     assert found.stereo is not None and found.stereo.reprojection_rms_px["stereo"] > 2
     assert found.verdict.findings[0].sentence.startswith("the reprojection error is")
     exchanged = [dataclasses.replace(o, projector=o.projector[:, ::-1]) for o in observations(6)]
-    evidence = [PoseEvidence(o.name, turn=mean_turn(o.camera, o.projector)) for o in exchanged]
+    evidence = [PoseEvidence(o.name, turn=fit_mean_turn(o.camera, o.projector)) for o in exchanged]
     found = attempt_stereo(exchanged, evidence, PROJECTOR, BOARD)
     assert found.verdict.level == "rejected" and found.verdict.causes[0] == "axes-swapped"
     assert found.stereo is None or np.isfinite(found.stereo.reprojection_rms_px["stereo"])
@@ -120,7 +120,7 @@ def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> Non
     ],
 )
 def test_a_mirror_image_is_explained(turn: tuple, cause: str, word: str) -> None:
-    verdict = judged(Evidence("circles:21x16:9", (912, 1140), tuple(pose(k, turn=turn) for k in range(6))))
+    verdict = judge_evidence(Evidence("circles:21x16:9", (912, 1140), tuple(pose(k, turn=turn) for k in range(6))))
     assert verdict.causes == (cause,) and verdict.level == "rejected" and word in verdict.reason
 
 
@@ -153,21 +153,21 @@ def test_gamma_from_its_harmonic() -> None:
     phase = 2 * np.pi * np.arange(360) / 360
     light = (0.5 + 0.5 * np.cos(phase)) ** 2.2
     first, second = (np.mean(light * np.cos(m * phase)) for m in (1, 2))
-    assert gamma_of(second / first) == pytest.approx(2.2, abs=1e-6)
+    assert gamma_from_harmonic(second / first) == pytest.approx(2.2, abs=1e-6)
     assert causes(*(pose(k, axes={"x": axis(harmonic=0.28)}) for k in range(8))) == ("gamma",)
 
 
 def test_features_numbered_otherwise_are_seen_through_any_lens() -> None:
     seen = observations(1)[0]
-    assert misnumbered(BOARD, seen.points, seen.camera) == ""
+    assert describe_misnumbering(BOARD, seen.points, seen.camera) == ""
     r2 = np.sum(((seen.camera - 200) / 200) ** 2, axis=1, keepdims=True)
     barrel = 200 + (seen.camera - 200) * (1 - 0.25 * r2)  # some 25 % at the rim
-    assert misnumbered(BOARD, seen.points, barrel) == ""
+    assert describe_misnumbering(BOARD, seen.points, barrel) == ""
     index = np.arange(99).reshape(9, 11)
     for order, word in ((index.T, "transposed"), (np.roll(index, -1, 0), "row"), (np.roll(index, 1, 1), "column")):
-        assert word in misnumbered(BOARD, seen.points, barrel[order.ravel()])
+        assert word in describe_misnumbering(BOARD, seen.points, barrel[order.ravel()])
     shuffled = np.random.default_rng(3).permutation(99)
-    assert misnumbered(BOARD, seen.points, seen.camera[shuffled]) == "mixed up"
+    assert describe_misnumbering(BOARD, seen.points, seen.camera[shuffled]) == "mixed up"
 
 
 def test_evidence_and_verdicts_survive_saving() -> None:

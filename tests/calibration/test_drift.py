@@ -9,7 +9,7 @@ import pytest
 from simulated_views import BOARD, moved, poses, seen
 
 from slviewer.calibration.drift.check import Drift, check_drift
-from slviewer.calibration.drift.floor import LEAST_POSES, Reference, refer
+from slviewer.calibration.drift.reference import MIN_POSES, DriftReference, build_reference
 from slviewer.calibration.drift.view import DriftView
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
@@ -29,14 +29,14 @@ def later() -> list[Pose]:
 def reference():
     observations = [seen(RIG, pose, f"pose_{i}") for i, pose in enumerate(poses(RIG, 20, seed=3))]
     model = calibrate_stereo(observations, RIG.projector.size, str(BOARD))
-    found = refer(model.rig, [DriftView.of(o) for o in observations if o.name in model.poses])
-    kept = Reference.restored(model.rig, found.to_arrays())  # as a session keeps it
+    found = build_reference(model.rig, [DriftView.from_observation(o) for o in observations if o.name in model.poses])
+    kept = DriftReference.from_arrays(model.rig, found.to_arrays())  # as a session keeps it
     assert kept.sigmas == found.sigmas
     return kept
 
 
 def checked(reference, rig, i, name="later", **how) -> Drift:
-    return check_drift(reference, DriftView.of(seen(rig, later()[i], f"{name}_{i}", **how)))
+    return check_drift(reference, DriftView.from_observation(seen(rig, later()[i], f"{name}_{i}", **how)))
 
 
 def test_an_unmoved_rig_raises_no_alarm(reference):
@@ -98,6 +98,6 @@ def test_an_answer_survives_json(reference):
 
 
 def test_too_few_poses_set_no_floor(reference):
-    views = [DriftView.of(seen(RIG, pose, "few")) for pose in later()[: LEAST_POSES - 1]]
-    with pytest.raises(InputError, match=f"{LEAST_POSES} are needed"):
-        refer(reference.rig, views)
+    views = [DriftView.from_observation(seen(RIG, pose, "few")) for pose in later()[: MIN_POSES - 1]]
+    with pytest.raises(InputError, match=f"{MIN_POSES} are needed"):
+        build_reference(reference.rig, views)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slviewer.calibration.edges import CLEAR_PX, CLEAR_SIGMAS, bright_pixels, edge_blur_px
+from slviewer.calibration.edges import CLEARANCE_SIGMAS, MIN_CLEARANCE_PX, bright_pixels, edge_blur_px
 from slviewer.fringe.phase import PhaseMap
 
 PITCH = 30.0
@@ -44,9 +44,9 @@ def test_pixels_within_some_sigma_of_an_edge_are_left_out(sigma: float) -> None:
     distance = distance_from_circles()
     clear = bright_pixels(seen(distance > 0, sigma), INSIDE, PITCH)
     well_inside = INSIDE & np.roll(INSIDE, (8, 8), (0, 1)) & np.roll(INSIDE, (-8, -8), (0, 1))
-    reach = CLEAR_SIGMAS * np.hypot(sigma, 12**-0.5)
+    reach = CLEARANCE_SIGMAS * np.hypot(sigma, 12**-0.5)
     assert not clear[distance < reach - 0.6].any()  # which side of a pixel's middle an edge runs is not known
-    assert clear[well_inside & (distance > max(reach, CLEAR_PX) + 1.2)].all()
+    assert clear[well_inside & (distance > max(reach, MIN_CLEARANCE_PX) + 1.2)].all()
 
 
 def test_where_edges_are_everywhere_the_clearest_pixels_are_kept() -> None:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from splined_rig import BOARD, poses, rig
 
-from slviewer.calibration.guidance import choosing
-from slviewer.calibration.guidance.choosing import guide, predicted_sigma
-from slviewer.calibration.guidance.coarse_rig import Expected, GuidanceBench
-from slviewer.calibration.guidance.information import Information, Sight
-from slviewer.calibration.guidance.rough import rough_rig
+from slviewer.calibration.guidance import pose_selection
+from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceBench
+from slviewer.calibration.guidance.information import Information, Sensitivity
+from slviewer.calibration.guidance.initial_rig import estimate_rig
+from slviewer.calibration.guidance.pose_selection import predicted_sigma, suggest_poses
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
 from slviewer.wizard.pose_plan import LEAST_POSES, PoseFeatures, plan
@@ -16,7 +16,7 @@ from slviewer.wizard.pose_plan import LEAST_POSES, PoseFeatures, plan
 
 @pytest.fixture(autouse=True)
 def few_trials(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choosing, "TRIALS", 16)
+    monkeypatch.setattr(pose_selection, "TRIALS", 16)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def seen(true) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def known(true, seen) -> tuple[StereoRig, list[np.ndarray]]:
-    found = rough_rig(*zip(*seen[:6], strict=True), (true.camera.size, true.projector.size))
+    found = estimate_rig(*zip(*seen[:6], strict=True), (true.camera.size, true.projector.size))
     assert found is not None
     return found
 
@@ -55,15 +55,15 @@ def test_few_poses_tell_where_things_will_be_seen(true, seen, known) -> None:
         assert np.abs(stereo.camera.project(X) - camera).max() < 0.5
         assert np.abs(stereo.project(X) - projector).max() < 5
     sizes = true.camera.size, true.projector.size
-    assert rough_rig(*zip(*seen[:2], strict=True), sizes) is None
+    assert estimate_rig(*zip(*seen[:2], strict=True), sizes) is None
     points, camera, projector = (list(a) for a in zip(*seen[:4], strict=True))
-    assert rough_rig(points, camera, projector[1:] + projector[:1], sizes) is None  # of other poses
+    assert estimate_rig(points, camera, projector[1:] + projector[:1], sizes) is None  # of other poses
 
 
 def test_the_gain_of_a_pose_is_what_it_will_bring(bench, known) -> None:
-    sight = Sight.of(bench, depth_range(BOARD, bench.stereo.camera))
+    sight = Sensitivity.from_bench(bench, depth_range(BOARD, bench.stereo.camera))
     rows = bench.rows(np.array(known[1]))
-    before, after = (Information.of(bench, rows[:n], sight) for n in (5, 6))
+    before, after = (Information.from_rows(bench, rows[:n], sight) for n in (5, 6))
     gain = before.gain(rows[5])
     assert gain == pytest.approx(before.variances.mean() - after.variances.mean(), rel=1e-3) and gain > 0
     assert (after.variances <= before.variances * (1 + 1e-6)).all()
@@ -73,7 +73,7 @@ def test_guided_poses_are_seen_and_know_more_than_others(true, bench, known) -> 
     had = known[1][:3]
     sigmas = []
     for _ in range(3):
-        found = guide(bench, had)
+        found = suggest_poses(bench, had)
         assert found is not None and found.sigma_next_mm < found.sigma_mm
         sigmas.append(found.sigma_mm)
         had = [*had, found.poses[0]]
@@ -87,7 +87,7 @@ def test_guided_poses_are_seen_and_know_more_than_others(true, bench, known) -> 
 
 
 def test_noise_that_was_seen_is_expected() -> None:
-    usual = Expected()
+    usual = ExpectedNoise()
     assert usual.with_noise(np.array([np.nan, np.nan])) == usual
     noisy = usual.with_noise(3 * usual.sample * np.array([1.0, np.nan, 1.0]))
     assert noisy.sample == pytest.approx(3 * usual.sample) and noisy.feature == pytest.approx(3 * usual.feature)

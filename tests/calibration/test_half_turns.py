@@ -7,8 +7,8 @@ import pytest
 from splined_rig import BOARD, aligned_error, coarse_knots, observation, phase_map, poses, rig
 
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.splined.adjust import adjust
-from slviewer.calibration.splined.half_turns import may_be_turned, opposite
+from slviewer.calibration.splined.adjust import adjust_bundle
+from slviewer.calibration.splined.half_turns import is_numbering_ambiguous, opposite_features
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.simulation.boards import BoardShape
@@ -57,20 +57,24 @@ def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
         known = np.isfinite(clouds[0][..., 2]) & np.isfinite(clouds[1][..., 2])
         assert known.sum() > 20_000
         assert np.sqrt(np.mean(aligned_error(*(cloud[known][::11] for cloud in clouds)) ** 2)) < 0.002
-    again = type(found.bundle).restored(found.bundle.to_dict(), found.bundle.to_arrays())
+    again = type(found.bundle).from_arrays(found.bundle.to_dict(), found.bundle.to_arrays())
     assert again.turned == found.bundle.turned
 
 
 def test_marked_poses_are_never_turned(mixed, true) -> None:
     marked = [replace(each, marked=i in TURNED) for i, each in enumerate(mixed)]
-    found = adjust(marked, calibrate_stereo(marked, true.projector.size, str(BOARD)))
+    found = adjust_bundle(marked, calibrate_stereo(marked, true.projector.size, str(BOARD)))
     assert set(found.turned) == {each.name for i, each in enumerate(mixed) if i not in TURNED}
 
 
 def test_boards_that_may_be_turned() -> None:
-    assert may_be_turned("circles:21x16:9") and may_be_turned("acircles:4x11:20")
-    assert not may_be_turned("charuco:8x6:30") and not may_be_turned("chessboard:9x7:20") and not may_be_turned("")
-    partner = opposite(BOARD.points)
+    assert is_numbering_ambiguous("circles:21x16:9") and is_numbering_ambiguous("acircles:4x11:20")
+    assert (
+        not is_numbering_ambiguous("charuco:8x6:30")
+        and not is_numbering_ambiguous("chessboard:9x7:20")
+        and not is_numbering_ambiguous("")
+    )
+    partner = opposite_features(BOARD.points)
     assert partner is not None and np.array_equal(partner, np.arange(len(BOARD.points))[::-1])
-    assert opposite(Board.parse("acircles:4x11:20").points) is None, "its last row would start elsewhere"
-    assert opposite(Board.parse("acircles:4x10:20").points) is not None
+    assert opposite_features(Board.parse("acircles:4x11:20").points) is None, "its last row would start elsewhere"
+    assert opposite_features(Board.parse("acircles:4x10:20").points) is not None

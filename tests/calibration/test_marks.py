@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slviewer.calibration.diagnosis.numbering import consistent_marks
+from slviewer.calibration.diagnosis.numbering import reconcile_marks
 from slviewer.calibration.observe import Observation
 from slviewer.target.board import Board
 
@@ -23,7 +23,7 @@ def pose(name: str, marked: bool, turned: bool = False) -> Observation:
 @pytest.mark.parametrize("turned", [False, True])
 def test_what_a_minority_takes_for_a_mark_is_none(turned: bool) -> None:
     poses = [pose(f"pose_{k}", marked=k < 3, turned=turned and k < 3) for k in range(8)]
-    numbered, warning = consistent_marks(BOARD, poses)
+    numbered, warning = reconcile_marks(BOARD, poses)
     assert [o.name for o in numbered] == [o.name for o in poses] and not any(o.marked for o in numbered)
     for each in numbered:
         np.testing.assert_array_equal(each.camera, PLACES)
@@ -34,4 +34,4 @@ def test_what_a_minority_takes_for_a_mark_is_none(turned: bool) -> None:
 def test_poses_that_agree_stay_as_they_are() -> None:
     for marked in (6, 0):
         poses = [pose(f"pose_{k}", marked=k < marked, turned=k < marked) for k in range(8)]
-        assert consistent_marks(BOARD, poses) == (poses, "")
+        assert reconcile_marks(BOARD, poses) == (poses, "")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slviewer.calibration.local_fit import local_values
+from slviewer.calibration.local_fit import fit_local_values
 
 
 def field_with_a_dark_disc(noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -21,7 +21,7 @@ def truth(u: float, v: float) -> float:
 
 def test_the_centre_is_read_from_the_ring_around_it() -> None:
     field, weight = field_with_a_dark_disc()
-    value, slopes = local_values(field, weight, np.array([[44.3, 39.6]]), np.array([25.0]))
+    value, slopes = fit_local_values(field, weight, np.array([[44.3, 39.6]]), np.array([25.0]))
     assert value[0] == pytest.approx(truth(44.3, 39.6), abs=1e-6)
     along = [truth(44.8, 39.6) - truth(43.8, 39.6), truth(44.3, 40.1) - truth(44.3, 39.1)]
     np.testing.assert_allclose(slopes[0], along, atol=1e-6)
@@ -30,12 +30,12 @@ def test_the_centre_is_read_from_the_ring_around_it() -> None:
 def test_noise_averages_and_strays_do_not_pull() -> None:
     field, weight = field_with_a_dark_disc(0.3)
     field[30:50:7, 60:66] += 18.0
-    value = local_values(field, weight, np.array([[44.3, 39.6]]), np.array([25.0]))[0][0]
+    value = fit_local_values(field, weight, np.array([[44.3, 39.6]]), np.array([25.0]))[0][0]
     assert 1e-6 < abs(value - truth(44.3, 39.6)) < 0.06
 
 
 def test_nan_where_the_surroundings_lie_on_one_side() -> None:
     field, weight = field_with_a_dark_disc()
     weight[:, :46] = 0
-    value, slopes = local_values(field, weight, np.array([[44.3, 39.6]]), np.array([25.0]))
+    value, slopes = fit_local_values(field, weight, np.array([[44.3, 39.6]]), np.array([25.0]))
     assert np.isnan(value[0]) and np.isnan(slopes[0]).all()

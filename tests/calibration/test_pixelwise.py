@@ -89,7 +89,7 @@ def test_a_capture_of_another_fringe_period_measures_the_same(model: PixelwiseMo
 
 
 def test_it_survives_saving(model: PixelwiseModel) -> None:
-    again = PixelwiseModel.restored(model.to_dict(), model.to_arrays())
+    again = PixelwiseModel.from_arrays(model.to_dict(), model.to_arrays())
     phase, _ = phase_of_plane(600.0)
     assert np.array_equal(again.points(phase), model.points(phase), equal_nan=True)
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from splined_rig import BOARD, PERIOD, SAMPLE_PX, observation, poses, rig
 
-from slviewer.calibration.diagnosis.capture_rules import period, rippled
+from slviewer.calibration.diagnosis.capture_rules import find_ripple, find_wrong_period
 from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
-from slviewer.calibration.diagnosis.ripple import Ripple, phase_ripple
-from slviewer.calibration.diagnosis.solution import solution_evidence
+from slviewer.calibration.diagnosis.ripple import Ripple, measure_ripple
+from slviewer.calibration.diagnosis.solution import measure_solution
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict, judge_splined
 from slviewer.calibration.observe import Observation, Samples
-from slviewer.calibration.splined.residual_noise import Noise, measured_noise
+from slviewer.calibration.splined.residual_noise import Noise, estimate_noise
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 
 
@@ -36,15 +36,15 @@ def with_ripple(o: Observation, px: float, waves: int) -> Observation:
 
 @pytest.mark.parametrize("waves", [1, 3, 4])
 def test_a_ripple_is_measured_beside_what_lenses_leave(seen, stereo, waves: int) -> None:
-    clean = phase_ripple(seen, stereo)
+    clean = measure_ripple(seen, stereo)
     assert set(clean) == {"x", "y"} and max(r.rms_px for r in clean.values()) < 0.5 * SAMPLE_PX
-    for found in phase_ripple([with_ripple(o, 0.05, waves) for o in seen], stereo).values():
+    for found in measure_ripple([with_ripple(o, 0.05, waves) for o in seen], stereo).values():
         assert found.waves == waves and found.noise_px == pytest.approx(SAMPLE_PX)
         assert found.rms_px == pytest.approx(0.05, rel=0.1)
 
 
 def evidence(seen, stereo, ripple: dict, steps: int, period_seen: float = PERIOD) -> Evidence:
-    solution = replace(solution_evidence(seen, stereo), ripple=ripple)
+    solution = replace(measure_solution(seen, stereo), ripple=ripple)
     axes = {axis: AxisEvidence(PERIOD, steps, 1.0, 0.0, np.nan, period_seen) for axis in "xy"}
     turn = ((1.0, 0.0), (0.0, 1.0))
     return Evidence(
@@ -53,26 +53,26 @@ def evidence(seen, stereo, ripple: dict, steps: int, period_seen: float = PERIOD
 
 
 def test_as_many_waves_as_steps_are_gamma_and_few_are_changing_light(seen, stereo) -> None:
-    (found,) = rippled(evidence(seen, stereo, {"x": Ripple(0.4, 3, 0.4, 0.1)}, 3))
+    (found,) = find_ripple(evidence(seen, stereo, {"x": Ripple(0.4, 3, 0.4, 0.1)}, 3))
     assert (found.cause, found.severity) == ("gamma", "doubtful")
     assert "repeats 3 times" in found.sentence and "0.40 px" in found.sentence and "0.10 px" in found.sentence
-    (found,) = rippled(evidence(seen, stereo, {"x": Ripple(0.4, 1, 0.4, 0.1)}, 8))
+    (found,) = find_ripple(evidence(seen, stereo, {"x": Ripple(0.4, 1, 0.4, 0.1)}, 8))
     assert (found.cause, found.severity) == ("residuals", "doubtful") and "exposure" in found.text()
-    assert not list(rippled(evidence(seen, stereo, {"x": Ripple(0.02, 3, 0.02, 0.1)}, 3)))
+    assert not list(find_ripple(evidence(seen, stereo, {"x": Ripple(0.02, 3, 0.02, 0.1)}, 3)))
 
 
 def test_a_ripple_is_not_taken_for_another_period(seen, stereo) -> None:
     """By 0.17 px the code seems to begin elsewhere in the fringe."""
-    assert [f.cause for f in period(evidence(seen, stereo, {}, 3, 13.4))] == ["fringe-period"]
-    assert not list(period(evidence(seen, stereo, {"x": Ripple(0.27, 3, 0.27, 0.1)}, 3, 13.4)))
+    assert [f.cause for f in find_wrong_period(evidence(seen, stereo, {}, 3, 13.4))] == ["fringe-period"]
+    assert not list(find_wrong_period(evidence(seen, stereo, {"x": Ripple(0.27, 3, 0.27, 0.1)}, 3, 13.4)))
 
 
 def test_residuals_beyond_noise_are_doubtful_and_never_good() -> None:
     rng = np.random.default_rng(0)
     sigma = np.full((4000, 2), 0.03)
-    sound = measured_noise(rng.normal(0, 0.01, (500, 2)), rng.normal(0, sigma), sigma)
+    sound = estimate_noise(rng.normal(0, 0.01, (500, 2)), rng.normal(0, sigma), sigma)
     assert max(sound.ratio) < 1.1 and judge_splined(Verdict(), sound).level == "good"
-    scattered = measured_noise(rng.normal(0, 0.01, (500, 2)), rng.normal(0, sigma * (1, 10)), sigma)
+    scattered = estimate_noise(rng.normal(0, 0.01, (500, 2)), rng.normal(0, sigma * (1, 10)), sigma)
     assert scattered.ratio[0] < 1.1 and scattered.ratio[1] == pytest.approx(10, rel=0.06)
     verdict = judge_splined(Verdict(), scattered)
     assert verdict.level == "doubtful" and verdict.causes == ("residuals",) and "in y, 0.3" in verdict.reason

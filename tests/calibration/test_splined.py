@@ -7,7 +7,7 @@ import pytest
 from splined_rig import BOARD, PERIOD, aligned_error, coarse_knots, observation, phase_map, poses, rig, surface
 
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.splined.adjust import adjust
+from slviewer.calibration.splined.adjust import adjust_bundle
 from slviewer.calibration.splined.board_shape import board_frame, board_heights
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
@@ -84,7 +84,7 @@ def test_weights_come_from_the_residuals(model) -> None:
 
 def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(model, seen, stereo, true) -> None:
     moved = observation(true, poses(true, 12)[5], "pose_05", SHAPE, moved_mm=0.5)
-    bundle = adjust([moved if o.name == "pose_05" else o for o in seen], stereo)
+    bundle = adjust_bundle([moved if o.name == "pose_05" else o for o in seen], stereo)
     assert list(bundle.left_out) == ["pose_05"] and "moved" in bundle.left_out["pose_05"]
     z = np.full(true.camera.size[::-1], 600.0)
     phase = phase_map(true, z)
@@ -96,7 +96,7 @@ def test_poses_read_with_more_noise_count_less_and_do_not_pass_for_moved(seen, s
     rng = np.random.default_rng(1)
     noisy = ("pose_02", "pose_07")
     read = [replace(o, camera=o.camera + rng.normal(0, 0.02, o.camera.shape)) if o.name in noisy else o for o in seen]
-    bundle = adjust(read, stereo)
+    bundle = adjust_bundle(read, stereo)
     assert not bundle.left_out
     assert all(bundle.fits[name].camera_trust > 0.65 for name in noisy)
     assert bundle.noise.camera_px < 0.013  # that of the others
@@ -104,7 +104,7 @@ def test_poses_read_with_more_noise_count_less_and_do_not_pass_for_moved(seen, s
 
 def test_where_no_pose_looked_points_are_masked_unless_asked_for(seen, stereo, true) -> None:
     left = [replace(o, samples=_left_of(o, 0.6 * true.camera.size[0])) for o in seen]
-    model = SplinedModel(adjust(left, stereo))
+    model = SplinedModel(adjust_bundle(left, stereo))
     phase = phase_map(true, np.full(true.camera.size[::-1], 600.0))
     width = true.camera.size[0]
     masked, all_of_it = model.points(phase)[..., 2], model.points(phase, supported=False)[..., 2]
@@ -123,7 +123,7 @@ def _left_of(o: Observation, limit: float):
 def test_what_is_saved_comes_back_the_same(model, true) -> None:
     import json
 
-    again = SplinedModel.restored(json.loads(json.dumps(model.to_dict())), model.to_arrays())
+    again = SplinedModel.from_arrays(json.loads(json.dumps(model.to_dict())), model.to_arrays())
     phase = phase_map(true, np.full(true.camera.size[::-1], 600.0))
     assert np.array_equal(model.points(phase), again.points(phase), equal_nan=True)
     assert np.array_equal(model.bundle.factor, again.bundle.factor)
@@ -133,9 +133,9 @@ def test_what_is_saved_comes_back_the_same(model, true) -> None:
 def test_poses_of_one_axis_are_refused_with_what_is_missing(seen, stereo, true) -> None:
     single = [observation(true, p, f"pose_{i:02d}", axes=("x",)) for i, p in enumerate(poses(true, 4))]
     with pytest.raises(InputError, match=r"0 target poses hold both .* axis x alone.*patterns of x and of y"):
-        adjust(single, stereo)
+        adjust_bundle(single, stereo)
     with pytest.raises(InputError, match="without samples"):
-        adjust([replace(o, samples=None) for o in seen], stereo)
+        adjust_bundle([replace(o, samples=None) for o in seen], stereo)
 
 
 def test_a_scan_of_another_period_or_of_the_wrong_size(model, true) -> None:

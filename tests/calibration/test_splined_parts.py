@@ -4,10 +4,17 @@ import numpy as np
 import pytest
 from splined_rig import BOARD, aligned_error, coarse_knots, observation, phase_map, poses, rig, surface
 
-from slviewer.calibration.splined.adjust import adjust, gathered
-from slviewer.calibration.splined.fields import Device, displacement, image_of, ray_of, roughness, undisplaced
+from slviewer.calibration.splined.adjust import adjust_bundle, gather_data
+from slviewer.calibration.splined.fields import (
+    Device,
+    displacement,
+    distort_to_pixel,
+    remove_displacement,
+    roughness,
+    undistort_pixel,
+)
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.calibration.splined.normal import normal_equations, predicted
+from slviewer.calibration.splined.normal import normal_equations, predict_observations
 from slviewer.calibration.splined.unknowns import State, lens_of
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
@@ -32,7 +39,7 @@ def stereo(seen, true):
 
 @pytest.fixture(scope="module")
 def model(seen, stereo):
-    return SplinedModel(adjust(seen, stereo))
+    return SplinedModel(adjust_bundle(seen, stereo))
 
 
 def bent(state: State, rng: np.random.Generator) -> State:
@@ -42,16 +49,16 @@ def bent(state: State, rng: np.random.Generator) -> State:
     step[at.height : at.offsets] = rng.normal(0, 0.05, at.offsets - at.height)
     step[at.offsets : at.rig] = rng.normal(0, 0.02, at.rig - at.offsets)
     step[at.camera_field :] = rng.normal(0, 0.3, at.size - at.camera_field)
-    return state.moved(step)
+    return state.step(step)
 
 
 def test_every_derivative_agrees_with_differences(seen, stereo) -> None:
     rng = np.random.default_rng(0)
     few = [type(o)(**{**vars(o), "samples": _every(o.samples, 30)}) for o in seen[:3]]
-    names, data, _ = gathered(few, stereo)
-    state = bent(State.start(stereo, names, len(data.points)), rng)
+    names, data, _ = gather_data(few, stereo)
+    state = bent(State.from_stereo(stereo, names, len(data.points)), rng)
     at = state.layout
-    residuals = tuple(rng.normal(size=p.shape) for p in predicted(state, data))
+    residuals = tuple(rng.normal(size=p.shape) for p in predict_observations(state, data))
     weights = tuple(rng.random(r.shape) for r in residuals)
     A, b = normal_equations(state, data, residuals, weights)
     A = np.triu(A) + np.triu(A, 1).T
@@ -66,7 +73,9 @@ def test_every_derivative_agrees_with_differences(seen, stereo) -> None:
     def change(k: int) -> np.ndarray:
         step = np.zeros(at.size)
         step[k] = size[k]
-        ahead, behind = (np.concatenate([p.ravel() for p in predicted(state.moved(s), data)]) for s in (step, -step))
+        ahead, behind = (
+            np.concatenate([p.ravel() for p in predict_observations(state.step(s), data)]) for s in (step, -step)
+        )
         return (ahead - behind) / (2 * size[k])
 
     J = np.array([change(k) for k in chosen])
@@ -84,7 +93,7 @@ def test_a_displacement_and_its_inverse(true) -> None:
     device = Device(np.zeros(10), rng.normal(0, 0.5, (2, 23, 29)), np.array([400.0, 300.0]))
     basis = np.zeros((4, 4))
     for u, v in rng.uniform([-3, -3], [403, 303], (50, 2)):
-        x, y = undisplaced(device, u, v, basis)
+        x, y = remove_displacement(device, u, v, basis)
         du, dv, *_ = displacement(device, x, y, basis)
         assert abs(x + du - u) + abs(y + dv - v) < 1e-9
     assert np.isclose(basis[0].sum(), 1) and np.isclose(basis[1].sum(), 0)
@@ -127,9 +136,9 @@ def test_depth_noise_follows_from_the_phase_noise(model, true) -> None:
 def column(state: State, pixel: np.ndarray, depth: float) -> float:
     """The projector column of what a camera pixel sees at a depth."""
     basis = np.zeros((4, 4))
-    ray = np.array([*ray_of(state.rig.camera, *pixel, basis), 1.0])
+    ray = np.array([*undistort_pixel(state.rig.camera, *pixel, basis), 1.0])
     X = state.rig.R @ (ray * depth) + state.rig.t
-    return float(image_of(state.rig.projector, X[0] / X[2], X[1] / X[2], basis)[0])
+    return float(distort_to_pixel(state.rig.projector, X[0] / X[2], X[1] / X[2], basis)[0])
 
 
 def exact_point(state: State, pixel: np.ndarray, coordinate: float, guess: float) -> np.ndarray:
@@ -138,7 +147,7 @@ def exact_point(state: State, pixel: np.ndarray, coordinate: float, guess: float
     for _ in range(20):
         slope = (column(state, pixel, depth + 0.1) - column(state, pixel, depth - 0.1)) / 0.2
         depth -= (column(state, pixel, depth) - coordinate) / slope
-    return np.array([*ray_of(state.rig.camera, *pixel, np.zeros((4, 4))), 1.0]) * depth
+    return np.array([*undistort_pixel(state.rig.camera, *pixel, np.zeros((4, 4))), 1.0]) * depth
 
 
 def test_points_answer_to_the_unknowns_as_differences_say(model) -> None:
@@ -153,7 +162,7 @@ def test_points_answer_to_the_unknowns_as_differences_say(model) -> None:
     step = np.concatenate([np.zeros(at.rig), rig_step])
     coordinate = [column(bundle.state, pixel, depth) for pixel, depth in zip(pixels, z, strict=True)]
     ahead, behind = (
-        np.array([exact_point(bundle.state.moved(s), *given) for given in zip(pixels, coordinate, z, strict=True)])
+        np.array([exact_point(bundle.state.step(s), *given) for given in zip(pixels, coordinate, z, strict=True)])
         for s in (step, -step)
     )
     assert np.allclose((ahead - behind).ravel() / 2, J @ rig_step, rtol=1e-4, atol=1e-9)
@@ -181,7 +190,7 @@ def test_the_covariance_predicts_true_errors_once_rigid_motion_is_removed(model,
     for k, axis in enumerate(np.eye(3)):
         motion[:, :, 3 + k] = np.cross(axis, centred)
     M = np.linalg.qr(motion.reshape(-1, 6))[0]
-    spread = model.bundle.whitened(J - M @ (M.T @ J))
+    spread = model.bundle.whiten(J - M @ (M.T @ J))
     predicted_rms = np.sqrt(np.mean(np.sum(spread**2, axis=0)))
     actual_rms = np.sqrt(np.mean(aligned_error(P, T) ** 2))
     assert 0.5 < predicted_rms / actual_rms < 2.0

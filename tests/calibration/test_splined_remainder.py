@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from slviewer.calibration.splined.remainder import correct
+from slviewer.calibration.splined.correction_grid import add_corrections
 
 
 @numba.njit
 def _corrected(z: np.ndarray, cell: np.ndarray, rest: np.ndarray, grid: np.ndarray, step: int, row: int) -> None:
-    correct(z, cell, rest, grid, step, row)
+    add_corrections(z, cell, rest, grid, step, row)
 
 
 @pytest.mark.parametrize("layers", [1, 2, 9], ids=["one layer", "two neighbours", "any"])

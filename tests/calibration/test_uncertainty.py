@@ -6,13 +6,18 @@ from splined_rig import BOARD, coarse_knots, observation, phase_map, poses, rig 
 
 from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
-from slviewer.calibration.splined.uncertainty import beyond, persistence, sigma_map, volume_sigma
+from slviewer.calibration.splined.uncertainty import (
+    compute_sigma_map,
+    extrapolation_factor,
+    persistence_ratio,
+    summarise_volume_sigma,
+)
 from slviewer.calibration.splined.volume import (
     BestMotion,
-    better_axis,
+    depth_axis,
     motion_free,
+    select_visible,
     sigma_3d,
-    volume_at,
     working_volume,
 )
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
@@ -53,7 +58,7 @@ def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_c
     assert volume.z.min() < 0.9 * near and volume.z.max() > 1.1 * far
     assert {0.0, width - 1} <= set(volume.pixels[:, 0]) and {0.0, height - 1} <= set(volume.pixels[:, 1])
     assert (volume.projector > -0.51).all() and (volume.projector < model.rig.projector.size).all()
-    assert better_axis(model.rig, volume) == "x"
+    assert depth_axis(model.rig, volume) == "x"
     supported = volume.supported(model.rig, *lit(model))
     assert 0.5 < supported.mean() <= 1
     with pytest.raises(InputError, match="leave no volume"):
@@ -91,14 +96,14 @@ def test_it_is_as_wrong_as_it_says(model, true) -> None:
 
 def test_the_frame_would_overstate_it(model) -> None:
     volume = working_volume(model.rig, model.bundle.depth_range_mm)
-    whitened = model.bundle.whitened(model.bundle.point_jacobian("x", volume.pixels, volume.z))
+    whitened = model.bundle.whiten(model.bundle.point_jacobian("x", volume.pixels, volume.z))
     shape = sigma_3d(motion_free(whitened, volume.points, volume.supported(model.rig, *lit(model))))
     assert np.median(sigma_3d(whitened)) > 10 * np.median(shape)
 
 
 def test_the_volume_is_summed_up_before_anything_is_scanned(model) -> None:
     figures = model.summary()["sigma_volume_mm"]
-    assert figures == volume_sigma(model.bundle)
+    assert figures == summarise_volume_sigma(model.bundle)
     assert 0.001 < figures["median"] < figures["p95"] < figures["worst"]
     assert 0.5 < figures["supported"] < 1 and figures["axis"] == "x"
     assert "3D uncertainty at" in model.text()
@@ -111,27 +116,29 @@ def test_a_smooth_field_goes_on_farther_than_independent_differences_do() -> Non
     size = np.array([400.0, 300.0])
     rough = rng.normal(size=(2, 23, 29))
     waves = np.sin(2 * np.pi * np.arange(29) / 14)[None, None, :] * np.ones((2, 23, 1))
-    assert persistence(Device(np.zeros(10), rough, size), lit) == 1
-    assert 2 < persistence(Device(np.zeros(10), waves, size), lit) < 3
-    assert persistence(Device(np.zeros(10), waves, size), np.zeros((20, 26), bool)) == 1
+    assert persistence_ratio(Device(np.zeros(10), rough, size), lit) == 1
+    assert 2 < persistence_ratio(Device(np.zeros(10), waves, size), lit) < 3
+    assert persistence_ratio(Device(np.zeros(10), waves, size), np.zeros((20, 26), bool)) == 1
 
 
 def test_the_map_says_at_each_pixel_what_the_covariance_says_there(model) -> None:
     bundle, (near, far) = model.bundle, model.depths_mm
-    nodes = sigma_map(bundle, "x", near, far)
+    nodes = compute_sigma_map(bundle, "x", near, far)
     width, height = (int(n) for n in model.rig.camera.size)
     rng = np.random.default_rng(1)
     pixels = np.column_stack([rng.integers(0, width, 200), rng.integers(0, height, 200)]).astype(float)
-    volume = volume_at(model.rig, pixels, rng.uniform(0.9, 1.1, 200) * 600)
+    volume = select_visible(model.rig, pixels, rng.uniform(0.9, 1.1, 200) * 600)
     reference = working_volume(model.rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
-    motion = BestMotion.of(reference.points, reference.supported(model.rig, *lit(model)))
-    fitted = bundle.whitened(bundle.point_jacobian("x", reference.pixels, reference.z)) @ motion.weights
-    exact = bundle.whitened(bundle.point_jacobian("x", volume.pixels, volume.z)[2::3])
-    exact = np.linalg.norm(exact - fitted @ motion.at(volume.points)[2::3].T, axis=0) * beyond(bundle, volume)
+    motion = BestMotion.fit(reference.points, reference.supported(model.rig, *lit(model)))
+    fitted = bundle.whiten(bundle.point_jacobian("x", reference.pixels, reference.z)) @ motion.weights
+    exact = bundle.whiten(bundle.point_jacobian("x", volume.pixels, volume.z)[2::3])
+    exact = np.linalg.norm(exact - fitted @ motion.displace(volume.points)[2::3].T, axis=0) * extrapolation_factor(
+        bundle, volume
+    )
     points = np.full((height, width, 3), np.nan, np.float32)
     u, v = volume.pixels.astype(int).T
     points[v, u] = volume.points
-    found = nodes.at(points)
+    found = nodes.interpolate(points)
     assert np.array_equal(np.isfinite(found), np.isfinite(points[..., 2]))
     ratio = found[v, u] / exact
     assert 0.9 < np.median(ratio) < 1.2 and np.percentile(ratio, 5) > 0.7 and np.percentile(ratio, 95) < 1.6
@@ -182,7 +189,7 @@ def test_what_is_fitted_is_as_sure_as_the_calibrations_covariance_says(model) ->
     found = distance(points[0], points[1], *ends)
     # a distance does not know of rigid motions: it is the same with them left in
     along = (points[1] - points[0]) / np.linalg.norm(points[1] - points[0])
-    whitened = bundle.whitened(bundle.point_jacobian("x", pixels, z)).astype(np.float64)
+    whitened = bundle.whiten(bundle.point_jacobian("x", pixels, z)).astype(np.float64)
     assert found.sigma == pytest.approx(np.linalg.norm(whitened @ np.concatenate([-along, along])), rel=0.02)
     assert 0 < found.sigma < 0.2 and all(np.sqrt(np.trace(end.covariance)) < 0.2 for end in ends)
     larger = splined_shared(bundle, "x", 1.5)(1.5 * points[:1], np.eye(3)[:, None])

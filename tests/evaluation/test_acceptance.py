@@ -48,7 +48,7 @@ def true_model(longer: float = 0.0) -> StereoModel:
         Lens(np.array(record[name]["K"]), np.array(record[name]["D"]), tuple(record[name]["size"]))
         for name in ("camera", "projector")
     ]
-    return StereoModel.made_elsewhere(StereoRig(*lenses, np.array(record["R"]), np.array(record["t"]) * (1 + longer)))
+    return StereoModel.from_rig(StereoRig(*lenses, np.array(record["R"]), np.array(record["t"]) * (1 + longer)))
 
 
 RIG = true_model().rig

@@ -55,7 +55,7 @@ class Stretched:
     name, axes = "stretched", ("x", "y")
 
     def __init__(self, true: StereoRig, scale: float = 1.0, ripple_mm: float = 0.0):
-        self.model, self.scale, self.ripple_mm = StereoModel.made_elsewhere(true), scale, ripple_mm
+        self.model, self.scale, self.ripple_mm = StereoModel.from_rig(true), scale, ripple_mm
 
     def points(self, phase: PhaseMap) -> np.ndarray:
         points = self.scale * self.model.points(phase).astype(float)

@@ -67,7 +67,7 @@ def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, t
     assert (value, hits) == ("10", "1")
 
 
-PLACE = "from slviewer.geometry.jit_cache import folder_for; print(folder_for('slviewer.caller'))"
+PLACE = "from slviewer.geometry.jit_cache import cache_folder; print(cache_folder('slviewer.caller'))"
 
 
 def test_places_are_tried_in_turn_and_old_code_goes(install: Path, tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_every_way_to_import_counts(line: str, install: Path, monkeypatch: pytes
     hashes = set()
     for factor in (3, 5, 3):
         (install / "slviewer" / "helper.py").write_text(f"FACTOR = {factor}\n")
-        jit_cache._source.cache_clear()
-        hashes.add(jit_cache.sources_hash("slviewer.other"))
-    jit_cache._source.cache_clear()
+        jit_cache._hash_source.cache_clear()
+        hashes.add(jit_cache.hash_sources("slviewer.other"))
+    jit_cache._hash_source.cache_clear()
     assert len(hashes) == 2

@@ -78,12 +78,12 @@ def test_rays_are_shared_and_protected(lens: Lens) -> None:
 
 
 def test_scaled_keeps_what_a_pixel_sees(lens: Lens) -> None:
-    half = lens.scaled(0.5)
+    half = lens.resize(0.5)
     assert half.size == (200, 150)
     points = np.array([[30.0, -20, 600], [0, 0, 500]])
     # four pixels become one: the outer edges stay where they were
     assert np.allclose(half.project(points) + 0.5, (lens.project(points) + 0.5) / 2, atol=1e-9)
-    assert np.allclose(half.scaled(2).K, lens.K)
+    assert np.allclose(half.resize(2).K, lens.K)
 
 
 def test_dict_round_trip(lens: Lens) -> None:

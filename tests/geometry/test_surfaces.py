@@ -5,7 +5,7 @@ import pytest
 
 from slviewer.errors import InputError
 from slviewer.geometry.polynomial import fit_polynomial
-from slviewer.geometry.splines import fit_surface
+from slviewer.geometry.splines import fit_spline
 
 SHAPE = (300, 400)
 BOX = (60.0, 40.0, 360.0, 260.0)
@@ -37,7 +37,7 @@ def grids() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("noise", "stray", "robust"), [(0.0, 0.0, False), (0.01, 0.0, True), (0.01, 0.04, True)])
 def test_spline_keeps_local_distortion(noise: float, stray: float, robust: bool) -> None:
-    surface = fit_surface(*samples(noise=noise, stray=stray), None, BOX, cells=(12, 10), robust=robust)
+    surface = fit_spline(*samples(noise=noise, stray=stray), None, BOX, cells=(12, 10), robust=robust)
     grid = surface.evaluate_grid(SHAPE)
     smooth, local, inside = grids()
     assert np.array_equal(np.isfinite(grid), inside)
@@ -54,7 +54,7 @@ def test_weights_and_invalid_samples() -> None:
     values[::4] += 3
     weights[::4] = 0
     values[1::4] = np.nan
-    grid = fit_surface(u, v, values, weights, BOX).evaluate_grid(SHAPE)
+    grid = fit_spline(u, v, values, weights, BOX).evaluate_grid(SHAPE)
     smooth, local, inside = grids()
     assert np.abs((grid - smooth - local)[inside]).max() < 0.02
 
@@ -62,7 +62,7 @@ def test_weights_and_invalid_samples() -> None:
 def test_cells_without_samples_are_held() -> None:
     u, v, values = samples()
     hole = np.hypot(u - 210, v - 150) < 45
-    grid = fit_surface(u[~hole], v[~hole], values[~hole], None, BOX, robust=True).evaluate_grid(SHAPE)
+    grid = fit_spline(u[~hole], v[~hole], values[~hole], None, BOX, robust=True).evaluate_grid(SHAPE)
     smooth, local, inside = grids()
     assert np.abs((grid - smooth - local)[inside]).max() < 5 * LOCAL_RAD
 
@@ -71,7 +71,7 @@ def test_cells_without_samples_are_held() -> None:
 def test_grid_window_and_scattered_pixels_agree(kind: str) -> None:
     u, v, values = samples(3_000)
     fitted = (
-        fit_surface(u, v, values, None, BOX) if kind == "spline" else fit_polynomial(u, v, values, None, BOX, degree=7)
+        fit_spline(u, v, values, None, BOX) if kind == "spline" else fit_polynomial(u, v, values, None, BOX, degree=7)
     )
     grid = fitted.evaluate_grid(SHAPE)
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -88,7 +88,7 @@ def test_polynomials_are_reproduced() -> None:
     for fitted in (
         fit_polynomial(u, v, values, None, BOX, 5),
         fit_polynomial(u, v, values, None, (400, 300), 5, robust=True),  # the samples cover a part of the box only
-        fit_surface(u, v, values, None, BOX),
+        fit_spline(u, v, values, None, BOX),
     ):
         assert np.abs(fitted.evaluate_grid(SHAPE) - truth)[inside].max() < 1e-6
 
@@ -109,10 +109,10 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match="too few"):
         fit_polynomial(u, v, values, None, BOX, 12)
     with pytest.raises(InputError, match="too few"):
-        fit_surface(u, v, np.full(30, np.nan), None, BOX)
+        fit_spline(u, v, np.full(30, np.nan), None, BOX)
     with pytest.raises(InputError, match="equal numbers"):
-        fit_surface(u, v, values[:-1], None, BOX)
+        fit_spline(u, v, values[:-1], None, BOX)
     with pytest.raises(InputError, match="empty"):
-        fit_surface(u, v, values, None, (10, 10, 5, 20))
+        fit_spline(u, v, values, None, (10, 10, 5, 20))
     with pytest.raises(InputError, match="cells"):
-        fit_surface(u, v, values, None, BOX, cells=(0, 4))
+        fit_spline(u, v, values, None, BOX, cells=(0, 4))

@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 from wizard_page import SIZE, Opened, button
 
-from slviewer.calibration.guidance import choosing
+from slviewer.calibration.guidance import pose_selection
 from slviewer.gui.app import App
 from slviewer.wizard import acquisition
 from slviewer.wizard.operator import Operator
@@ -22,7 +22,7 @@ def calm() -> Iterator[None]:
     """Fewer previews, and fewer places tried before one is suggested: a browser draws beside them, in software."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(acquisition, "PREVIEWS_PER_S", 2.0)
-        patch.setattr(choosing, "TRIALS", 20)
+        patch.setattr(pose_selection, "TRIALS", 20)
         yield
 
 

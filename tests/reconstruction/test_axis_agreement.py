@@ -50,7 +50,7 @@ def phases(found: np.ndarray, axes: str = "xy") -> dict:
 
 
 def by(rig: StereoRig) -> StereoModel:
-    return StereoModel.made_elsewhere(rig)
+    return StereoModel.from_rig(rig)
 
 
 def turned(true: StereoRig, mrad: tuple[float, float, float]) -> StereoRig:

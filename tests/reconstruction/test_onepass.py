@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
-from slviewer.calibration.splined.compiled import Compiled
+from slviewer.calibration.splined.compiled import CompiledAxis
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.fringe.decode import texture
@@ -66,14 +66,14 @@ def splined():
     held[2, 3:5] = np.nan
     model = object.__new__(SplinedModel)
     rays = np.stack([(u - 75) / 300, (v - 30) / 300])
-    vars(model).update(rays=rays, _compiled={"x": Compiled(c, 155.5, grid, held, step, 500.0, 600.0)})
+    vars(model).update(rays=rays, _compiled={"x": CompiledAxis(c, 155.5, grid, held, step, 500.0, 600.0)})
     return model
 
 
 def points_of(model, phase):
     if isinstance(model, PixelwiseModel):
         return model.points(phase), model.sigma_z(phase, None)
-    fast, per_rad = model.compiled("x"), phase.period_px / (2 * np.pi)
+    fast, per_rad = model.fast_axis("x"), phase.period_px / (2 * np.pi)
     points = fast.depth(phase.phase, per_rad, model.rays.astype(np.float32), True)
     return points, fast.depth_per_px(phase.phase, per_rad) * np.float32(per_rad) * phase.sigma_phase
 

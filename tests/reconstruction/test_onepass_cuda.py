@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
-from slviewer.calibration.splined.compiled import Compiled
+from slviewer.calibration.splined.compiled import CompiledAxis
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
@@ -63,7 +63,7 @@ def splined():
     held[2, 3, :5] = np.nan
     model = object.__new__(SplinedModel)
     rays = np.stack([(U - 10) / 300, (V - 7) / 300])
-    vars(model).update(rays=rays, _compiled={"x": Compiled(c, 155.5, grid, held, 6, 500.0, 600.0)})
+    vars(model).update(rays=rays, _compiled={"x": CompiledAxis(c, 155.5, grid, held, 6, 500.0, 600.0)})
     return model
 
 
@@ -71,7 +71,7 @@ def stereo():
     camera = Lens([[320, 0, 9.5], [0, 320, 6.5], [0, 0, 1]], [-0.1, 0.05, 1e-3, -1e-3, 0], (WIDTH, HEIGHT))
     projector = Lens([[1900, 0, 455], [0, 1950, 570], [0, 0, 1]], [-0.05, 0.02, 5e-4, 8e-4, 0.01], PROJECTOR)
     R = np.array([[np.cos(0.3), 0, -np.sin(0.3)], [0, 1, 0], [np.sin(0.3), 0, np.cos(0.3)]])
-    return StereoModel.made_elsewhere(StereoRig(camera, projector, R, [60.0, 2.0, 30.0]))
+    return StereoModel.from_rig(StereoRig(camera, projector, R, [60.0, 2.0, 30.0]))
 
 
 MODELS = {"pixelwise": pixelwise, "splined": splined, "stereo": stereo}
@@ -121,7 +121,7 @@ def scans_to(folder):
             again = one.run(frames, replace(scan.light, white=1023.0), scan)
             assert again.light.white == 4095 and again.points is scan.points
             np.testing.assert_array_equal(again.points, before)
-        assert cuda_device.device() is not None
+        assert cuda_device.find_device() is not None
         maps = {key: value for key, value in vars(scan).items() if isinstance(value, np.ndarray)}
         np.savez(folder / f"{number}.npz", **maps)
     bench_gpu.TIMES = bench_gpu.AHEAD = 1
@@ -132,7 +132,7 @@ def scans_to(folder):
         one._card = SimpleNamespace(dtype=frames.dtype, load=lambda frames: 1 / 0)
         scan = one.run(frames)
         np.savez(folder / f"failed {model.name}.npz", points=scan.points, phase=scan.phase)
-        assert cuda_device.device() is None and not has_pass(stereo())
+        assert cuda_device.find_device() is None and not has_pass(stereo())
     (folder / "said.json").write_text(json.dumps(said))
 
 
@@ -143,7 +143,7 @@ def scans(request, tmp_path_factory):
         if importlib.util.find_spec("numba.cuda") is None:
             pytest.skip("numba has no CUDA simulator here: pip install 'slviewer[cuda]'")
         there = {"NUMBA_ENABLE_CUDASIM": "1"}
-    elif cuda_device.device() is None:
+    elif cuda_device.find_device() is None:
         pytest.skip("there is no CUDA device here")
     here = Path(__file__)
     code = (
@@ -159,7 +159,7 @@ def points_of(model, phase):
     if model.name != "splined":
         points = model.points(phase)
         return points, model.sigma_z(phase, points)
-    fast, per_rad = model.compiled("x"), phase.period_px / (2 * np.pi)
+    fast, per_rad = model.fast_axis("x"), phase.period_px / (2 * np.pi)
     points = fast.depth(phase.phase, per_rad, model.rays.astype(np.float32), True)
     return points, fast.depth_per_px(phase.phase, per_rad) * np.float32(per_rad) * phase.sigma_phase
 
@@ -201,7 +201,7 @@ def test_a_device_that_fails_is_told_once_and_the_processor_goes_on(scans):
 
 
 def test_without_a_device_all_is_the_processors(monkeypatch, caplog):
-    monkeypatch.setattr(cuda_device, "_found", [])
+    monkeypatch.setattr(cuda_device, "_cached_name", [])
     broken = SimpleNamespace(cuInit=lambda flags: 803)  # as if the kernel's module were another version's
     monkeypatch.setattr(cuda_device.ctypes, "CDLL", lambda name: broken)
     real = importlib.util.find_spec
@@ -211,10 +211,10 @@ def test_without_a_device_all_is_the_processors(monkeypatch, caplog):
     assert has_pass(splined()) and not has_pass(stereo()) and not has_pass(None)
     with pytest.raises(InputError, match="stereo calibration measures no cloud in one pass"):
         one_pass(SEQUENCES["p18"], stereo(), "x")
-    room = cuda_device.frame_room((3, 2, 2), np.uint16)
+    room = cuda_device.allocate_frames((3, 2, 2), np.uint16)
     assert room.shape == (3, 2, 2) and room.dtype == np.uint16
     (said,) = caplog.messages
-    assert said.startswith("no CUDA device is used: its driver answers with error 803")
+    assert said.startswith("no CUDA device is used: its driver reports error 803")
 
 
 def test_a_look_for_a_driver_loads_nothing_else():

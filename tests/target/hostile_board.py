@@ -7,7 +7,7 @@ import numpy as np
 from rendered_board import View
 
 from slviewer.target.board import Board
-from slviewer.target.mark import neighbours_mm
+from slviewer.target.mark import neighbour_distance_mm
 
 Disc = tuple[float, float, float, float]
 """Centre (x, y) and radius in pitches of the board's plane, and its albedo."""
@@ -68,7 +68,7 @@ def blobs_around(board: Board, seed: int, count: int, sheet: float = 0.6, like: 
     """Dark discs about as large as the board's circles, scattered beyond the edge of a sheet ``sheet`` pitches wide."""
     rng = np.random.default_rng(seed)
     low, high = (f(board.points[:, :2], axis=0) / board.pitch_mm for f in (np.min, np.max))
-    near = neighbours_mm(board) / board.pitch_mm
+    near = neighbour_distance_mm(board) / board.pitch_mm
     discs: list[Disc] = []
     while len(discs) < count:
         x, y = rng.uniform(low - 4, high + 4)
@@ -84,6 +84,6 @@ def lattice_around(board: Board, seed: int, share: float, jitter: float = 0.0) -
     rng = np.random.default_rng(seed)
     points = board.points[:, :2] / board.pitch_mm
     row = points[points[:, 1] == 0] - (0, 2 if board.kind == "acircles" else 1)
-    radius = 0.25 * neighbours_mm(board) / board.pitch_mm
+    radius = 0.25 * neighbour_distance_mm(board) / board.pitch_mm
     chosen = row[: max(1, round(share * len(row)))] + rng.uniform(-jitter, jitter, (max(1, round(share * len(row))), 2))
     return tuple((float(x), float(y), float(radius), 0.08) for x, y in chosen)

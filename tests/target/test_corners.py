@@ -56,7 +56,7 @@ def test_a_symmetric_chessboard_is_numbered_from_the_left(roll: float) -> None:
 
 
 def test_hidden_corners_are_counted_not_guessed() -> None:
-    with pytest.raises(DetectionError, match=r"of 63 corners of chessboard:9x7:20 found"):
+    with pytest.raises(DetectionError, match=r"of 63 corners of chessboard:9x7:20 detected"):
         detect(CHESSBOARD, replace(SMALL, hide=(-30, -30, 190, 10)).render(CHESSBOARD))
 
 
@@ -95,7 +95,7 @@ def test_a_hidden_part_of_a_charuco_board_leaves_the_rest() -> None:
 
 def test_too_few_charuco_corners_are_refused() -> None:
     board = Board.parse("charuco:7x5:20")
-    with pytest.raises(DetectionError, match=r"of 24 corners and \d+ of 17 markers .* found, and a pose needs 8"):
+    with pytest.raises(DetectionError, match=r"of 24 corners and \d+ of 17 markers .* detected, and a pose needs 8"):
         detect(board, replace(SMALL, hide=(-30, -30, 90, 90)).render(board))
 
 

@@ -13,7 +13,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import detect
 from slviewer.target.drawing import Drawing
 from slviewer.target.mark import mark_of
-from slviewer.target.sheet import draw, write_sheet
+from slviewer.target.sheet import draw_board, write_sheet
 
 NOTATIONS = ["circles:5x4:9", "acircles:4x5:20", "chessboard:6x5:12.345", "charuco:6x5:20"]
 SVG = "{http://www.w3.org/2000/svg}"
@@ -70,7 +70,7 @@ def test_distances_are_exact_to_a_micrometre(notation: str, suffix: str, tmp_pat
     path = tmp_path / "new" / f"board{suffix}"
     write_sheet(board, path)
     size, circles, rectangles = (svg_shapes if suffix == ".svg" else pdf_shapes)(path)
-    wanted = draw(board)
+    wanted = draw_board(board)
     np.testing.assert_allclose(size, (wanted.width, wanted.height), atol=1e-3)
     np.testing.assert_allclose(circles.reshape(-1, 3), np.array(wanted.circles).reshape(-1, 3), atol=1e-3)
     np.testing.assert_allclose(rectangles, wanted.rectangles, atol=1e-3)
@@ -85,21 +85,21 @@ def test_distances_are_exact_to_a_micrometre(notation: str, suffix: str, tmp_pat
 
 def test_a_narrow_margin_has_no_mark_and_a_wide_one_leaves_paper_around_it() -> None:
     board = Board.parse("circles:5x4:40")
-    assert len(draw(board, margin_mm=20.0).circles) == 20
-    x, y, r = draw(board).circles[-1]
-    assert len(draw(board).circles) == 21 and min(x, y) - r >= r
+    assert len(draw_board(board, margin_mm=20.0).circles) == 20
+    x, y, r = draw_board(board).circles[-1]
+    assert len(draw_board(board).circles) == 21 and min(x, y) - r >= r
 
 
 def test_circles_are_half_the_distance_between_neighbours() -> None:
-    assert draw(Board.parse("circles:5x4:9")).circles[0][2] == pytest.approx(9 / 4)
-    assert draw(Board.parse("acircles:4x5:20")).circles[0][2] == pytest.approx(20 * 2**0.5 / 4)
+    assert draw_board(Board.parse("circles:5x4:9")).circles[0][2] == pytest.approx(9 / 4)
+    assert draw_board(Board.parse("acircles:4x5:20")).circles[0][2] == pytest.approx(20 * 2**0.5 / 4)
 
 
 @pytest.mark.parametrize(
     ("notation", "length"), [("circles:21x16:9", 100), ("circles:5x4:9", 50), ("circles:3x3:1", 20)]
 )
 def test_the_scale_bar_is_as_long_as_it_says(notation: str, length: int) -> None:
-    drawing = draw(Board.parse(notation))
+    drawing = draw_board(Board.parse(notation))
     assert max(w for _, _, w, h in drawing.rectangles if h < 0.5) == length
     assert f"the bar is {length} mm long" in drawing.texts[0][3]
     assert all(x + w <= drawing.width and y + h <= drawing.height for x, y, w, h in drawing.rectangles)
@@ -120,7 +120,7 @@ def rasterised(drawing: Drawing) -> np.ndarray:
 @pytest.mark.parametrize("notation", [*NOTATIONS, "chessboard:6x4:10", "charuco:5x6:20:15:DICT_4X4_50"])
 def test_a_printed_board_is_found_with_its_numbers(notation: str) -> None:
     board = Board.parse(notation)
-    drawing = draw(board)
+    drawing = draw_board(board)
     detection = detect(board, rasterised(drawing))
     corner = drawing.circles[0][:2] if drawing.circles else (10 + board.pitch_mm,) * 2
     expected = (board.points[:, :2] + corner) * 4 - 0.5

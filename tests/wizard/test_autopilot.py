@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from slviewer.calibration.guidance import choosing
+from slviewer.calibration.guidance import pose_selection
 from slviewer.errors import Cancelled
 from slviewer.pipeline.measurements import quantities_of
 from slviewer.session.ply import read_ply
@@ -33,7 +33,7 @@ def acts() -> list[str]:
 def operator(tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
     folder = tmp_path_factory.mktemp("flight") / "session"
     with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG) as operator:
-        patch.setattr(choosing, "TRIALS", 20)  # the best of fewer poses does
+        patch.setattr(pose_selection, "TRIALS", 20)  # the best of fewer poses does
         patch.setattr(acquisition, "PREVIEWS_PER_S", 2.0)  # nobody looks
         Autopilot(operator, poses=8, before=acts.append).run()
         yield operator

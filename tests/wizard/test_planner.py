@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slviewer.calibration.next_pose import coverage, described, nominal_lens
+from slviewer.calibration.next_pose import coverage, describe_suggestion, nominal_lens
 from slviewer.target.board import Board
 from slviewer.wizard.planner import Planner, PlanRequest
 from slviewer.wizard.pose_plan import PosePlan
@@ -22,7 +22,7 @@ def plan_of(poses: tuple[str, ...], sigma: float | None = None, depth: float = 6
     T[2, 3] = depth
     placed = dict.fromkeys(poses, T)
     return PosePlan(
-        lens, placed, coverage(BOARD, lens, [T] * len(poses)), described(BOARD, lens, T), 0.03, sigma, sigma
+        lens, placed, coverage(BOARD, lens, [T] * len(poses)), describe_suggestion(BOARD, lens, T), 0.03, sigma, sigma
     )
 
 

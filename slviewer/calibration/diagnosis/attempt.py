@@ -1,4 +1,4 @@
-"""A stereo calibration that is judged: what may spoil it is kept out of the fit, and what came of it gets a verdict."""
+"""Stereo calibration with diagnosis: exclude unfit poses, calibrate, and judge the result."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slviewer.calibration.centres import calibrate_centred
+from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
-from slviewer.calibration.diagnosis.numbering import consistent_marks, misnumbered
-from slviewer.calibration.diagnosis.poses import most_moved_px, unfit
-from slviewer.calibration.diagnosis.rules import judged
-from slviewer.calibration.diagnosis.solution import solution_evidence
+from slviewer.calibration.diagnosis.numbering import describe_misnumbering, reconcile_marks
+from slviewer.calibration.diagnosis.poses import motion_limit_px, reason_to_exclude
+from slviewer.calibration.diagnosis.rules import judge_evidence
+from slviewer.calibration.diagnosis.solution import measure_solution
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.soundness import MIN_POSES, nominal_tilt_spread_deg
@@ -22,9 +22,9 @@ from slviewer.target.board import Board
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of it. ``stereo``: the calibration; of a rejected one what there is to look into, None for nothing.
+    """Result of an attempt. ``stereo``: the calibration; of a rejected one the solution to inspect, None without one.
     ``observations``: the poses that it used, circles at their centres. ``left_out``: the others, and why.
-    ``warning``: what else the operator should know.
+    ``warning``: a further message for the operator.
     """
 
     verdict: Verdict
@@ -42,22 +42,23 @@ def attempt_stereo(
     board: Board,
     left_out: Mapping[str, str] | None = None,
 ) -> Attempt:
-    """Calibrate from the poses that were read, and judge it by what all ``poses`` say, also those that were not.
+    """Calibrate from the readable poses, and judge the result by the evidence of all ``poses``, unreadable ones
+    included.
 
-    ``left_out``: poses kept out beforehand, and why.
+    ``left_out``: poses excluded beforehand, and why.
     """
-    observations, warning = consistent_marks(board, observations)
-    poses = [_numbered(pose, board, observations) for pose in poses]
-    set_aside = _set_aside(poses, observations)
+    observations, warning = reconcile_marks(board, observations)
+    poses = [_check_numbering(pose, board, observations) for pose in poses]
+    set_aside = _exclude_unfit(poses, observations)
     kept = [o for o in observations if o.name not in set_aside]
     out = {**(left_out or {}), **set_aside}
     refusal = ""
     stereo: StereoModel | None
     try:
-        stereo, used = calibrate_centred(kept, projector, str(board), out)
+        stereo, used = calibrate_centres(kept, projector, str(board), out)
     except CalibrationRejected as error:
         refusal = str(error)
-        stereo, used = _whatever_there_is(kept, projector, board, out)
+        stereo, used = _solve_unchecked(kept, projector, board, out)
     evidence = Evidence(
         board=str(board),
         projector=projector,
@@ -65,38 +66,39 @@ def attempt_stereo(
         set_aside=set_aside,
         refusal=refusal,
         tilt_spread_deg=nominal_tilt_spread_deg(kept),
-        solution=None if stereo is None else solution_evidence(kept, stereo),
+        solution=None if stereo is None else measure_solution(kept, stereo),
     )
-    verdict = judged(evidence)
+    verdict = judge_evidence(evidence)
     left_out = dict(stereo.left_out if stereo else out)
-    for finding in verdict.findings:  # which knows more of a pose than the fit that found it out
+    for finding in verdict.findings:  # the finding is more specific than the fit's reason
         if finding.cause in ("moved", "outlier", "board-numbering") and len(finding.poses) == 1:
             left_out |= {name: finding.text() for name in finding.poses if name in left_out and name not in out}
     return Attempt(verdict, evidence, stereo, tuple(used), left_out, warning)
 
 
-def _whatever_there_is(
+def _solve_unchecked(
     observations: Sequence[Observation], projector: tuple[int, int], board: Board, left_out: Mapping[str, str]
 ) -> tuple[StereoModel | None, list[Observation]]:
-    """A solution to look into, and the poses it used; none where it is no rig at all."""
+    """An unchecked solution for diagnosis, and the poses it used; (None, []) where it is no valid rig."""
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of boards that lie behind a device
-            stereo, used = calibrate_centred(observations, projector, str(board), left_out, strict=False)
+            stereo, used = calibrate_centres(observations, projector, str(board), left_out, strict=False)
     except CalibrationRejected:
         return None, []
     seen = all(np.isfinite(px) for px in stereo.reprojection_rms_px.values())
     return (stereo, used) if seen and stereo.depth_range_mm is not None else (None, [])
 
 
-def _numbered(pose: PoseEvidence, board: Board, observations: Sequence[Observation]) -> PoseEvidence:
+def _check_numbering(pose: PoseEvidence, board: Board, observations: Sequence[Observation]) -> PoseEvidence:
     seen = next((o for o in observations if o.name == pose.name), None)
-    return pose if seen is None else replace(pose, numbering=misnumbered(board, seen.points, seen.camera))
+    return pose if seen is None else replace(pose, numbering=describe_misnumbering(board, seen.points, seen.camera))
 
 
-def _set_aside(poses: Sequence[PoseEvidence], observations: Sequence[Observation]) -> dict[str, str]:
-    """Poses that were read and must not count; none where few would be left: it is no fault of single poses then."""
+def _exclude_unfit(poses: Sequence[PoseEvidence], observations: Sequence[Observation]) -> dict[str, str]:
+    """Readable poses to exclude, with reasons; none where too few would remain: the fault is then common to all
+    poses."""
     read = {o.name for o in observations}
-    limit = most_moved_px(poses)
-    out = {pose.name: why for pose in poses if pose.name in read and (why := unfit(pose, limit))}
+    limit = motion_limit_px(poses)
+    out = {pose.name: why for pose in poses if pose.name in read and (why := reason_to_exclude(pose, limit))}
     return out if len(read) - len(out) >= max(MIN_POSES, len(read) / 2) else {}

@@ -6,23 +6,23 @@ from collections.abc import Iterator
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import Evidence
-from slviewer.calibration.diagnosis.frames import gamma_of
-from slviewer.calibration.diagnosis.poses import MOST, ORDER, frame_order, severity, was_refused, where
+from slviewer.calibration.diagnosis.frames import gamma_from_harmonic
+from slviewer.calibration.diagnosis.poses import COMMON_SHARE, ORDERS, frame_order, list_poses, severity_of, was_refused
 from slviewer.calibration.diagnosis.verdict import CAUSES, Cause, Finding, Severity
 
 MAX_SATURATED = 0.12
-SPOILT_BY_SATURATION = 0.3
+REJECTED_SATURATED = 0.3
 MAX_GAMMA = 1.5
-PERIOD_OFF = 0.04
+MAX_PERIOD_ERROR = 0.04
 PERIOD_SIGMAS = 4.0
 ASPECTS = (0.5, 1.0, 2.0)
 """Of square pixels, and of the diamond pixels of some DMDs."""
-ASPECT_OFF = 0.05
-_SEEN_IN_POSES = ("axes-swapped", "axis-reversed", "saturation")
-_EXPLAINED = ("projector-size", "fringe-period", "unreadable")
+MAX_ASPECT_ERROR = 0.05
+_CAUSES_IN_POSES = ("axes-swapped", "axis-reversed", "saturation")
+_SYMPTOMS = ("projector-size", "fringe-period", "unreadable")
 
-CODE_BEGINS_PX = 0.5
-"""Beside column 0: where most Gray codes begin, and by where that is seen in the fringe its period is judged."""
+CODE_ORIGIN_PX = 0.5
+"""px from column 0: the origin of most Gray codes, whose phase gives the fringe's true period."""
 RIPPLE_PEAK = 2.0
 """Times the RMS of a ripple: about its largest value, by which the phase there may be off."""
 
@@ -34,19 +34,23 @@ _ORDER_REMEDY: dict[Cause, str] = {
 }
 
 
-def frame_faults(e: Evidence) -> Iterator[Finding]:
+def find_frame_faults(e: Evidence) -> Iterator[Finding]:
     """Frames that lag, are lost or out of order, by what most explains them."""
     orders = {pose.name: order for pose in e.poses if (order := frame_order(pose))}
-    for cause in ORDER:
+    for cause in ORDERS:
         names = tuple(name for name, order in orders.items() if order == cause)
         if names:
             mended = all(name in e.set_aside or was_refused(e, name) for name in names)
             yield Finding(
-                cause, severity(e, names, mended), f"{where(e, names)} {ORDER[cause]}", _ORDER_REMEDY[cause], names
+                cause,
+                severity_of(e, names, mended),
+                f"{list_poses(e, names)} {ORDERS[cause]}",
+                _ORDER_REMEDY[cause],
+                names,
             )
 
 
-def saturation(e: Evidence) -> Iterator[Finding]:
+def find_saturation(e: Evidence) -> Iterator[Finding]:
     """Boards that clip."""
     shares = {pose.name: max((a.saturated for a in pose.axes.values()), default=0.0) for pose in e.poses}
     names = tuple(name for name, share in shares.items() if share > MAX_SATURATED)
@@ -54,29 +58,29 @@ def saturation(e: Evidence) -> Iterator[Finding]:
         return
     usual = float(np.median([shares[name] for name in names]))
     severity: Severity = "doubtful" if len(names) > 0.25 * len(e.poses) else "note"
-    if len(names) >= MOST * len(e.poses) and (usual > SPOILT_BY_SATURATION or e.solution is None):
+    if len(names) >= COMMON_SHARE * len(e.poses) and (usual > REJECTED_SATURATED or e.solution is None):
         severity = "rejected"
     yield Finding(
         "saturation",
         severity,
-        f"{where(e, names)} {100 * usual:.0f} % of the board's lit pixels are saturated",
+        f"{list_poses(e, names)} {100 * usual:.0f} % of the board's illuminated pixels are saturated",
         "lower the exposure or the gain until white stays below the camera's full scale, and capture again",
         names,
     )
 
 
-def mirrored(e: Evidence) -> Iterator[Finding]:
-    """Axes exchanged or reversed: the projector sees a mirror image of what the camera sees."""
+def find_mirroring(e: Evidence) -> Iterator[Finding]:
+    """Axes exchanged or reversed: the projector coordinates are a mirror image of the camera's."""
     turns = [(pose.name, np.array(pose.turn)) for pose in e.poses if pose.turn is not None and not frame_order(pose)]
     turned = [(name, turn) for name, turn in turns if np.linalg.det(turn) < 0]
-    if len(turned) <= MOST * len(turns):
+    if len(turned) <= COMMON_SHARE * len(turns):
         return
     mean = np.mean([turn / np.linalg.norm(turn, axis=1, keepdims=True) for _, turn in turned], axis=0)
     names = tuple(name for name, _ in turned)
     seen = (
         f"in {len(turned)} of {len(turns)} poses the projector's coordinates are a mirror image of what the camera sees"
     )
-    if mirror_kind(mean) == "axes-swapped":
+    if classify_mirroring(mean) == "axes-swapped":
         yield Finding(
             "axes-swapped",
             "rejected",
@@ -97,21 +101,21 @@ def mirrored(e: Evidence) -> Iterator[Finding]:
         )
 
 
-def mirror_kind(turn: np.ndarray) -> Cause:
+def classify_mirroring(turn: np.ndarray) -> Cause:
     """Of a mirrored (2, 2) turn from camera to projector: which exchange leaves devices that stand upright."""
     reversed_, swapped = abs(turn[0, 0]) + abs(turn[1, 1]), abs(turn[0, 1]) + abs(turn[1, 0])
     return "axes-swapped" if swapped > reversed_ else "axis-reversed"
 
 
-def period(e: Evidence) -> Iterator[Finding]:
+def find_wrong_period(e: Evidence) -> Iterator[Finding]:
     """A fringe period that is not the one described."""
     if e.contradiction:
         sentence, _, remedy = e.contradiction.partition(": ")
-        yield Finding("fringe-period", "rejected", sentence, remedy or "mend the sequence's description")
+        yield Finding("fringe-period", "rejected", sentence, remedy or "correct the sequence's description")
         return
-    if any(mirrored(e)):  # whatever the code says, it is not of this axis, or from its other end
+    if any(find_mirroring(e)):  # the code is of another axis, or from its other end
         return
-    if _aliased_gamma(e):  # it moves the phase at which the code begins
+    if _aliased_gamma_poses(e):  # it moves the phase at which the code begins
         return
     sound = [pose for pose in e.poses if not frame_order(pose)]
     wrong = {}
@@ -124,14 +128,14 @@ def period(e: Evidence) -> Iterator[Finding]:
         middle = float(np.median(seen))
         sigma = 1.4826 * 1.2533 * float(np.median(np.abs(seen - middle))) / np.sqrt(len(seen))
         if (
-            abs(middle / said - 1) > PERIOD_OFF
+            abs(middle / said - 1) > MAX_PERIOD_ERROR
             and abs(middle - said) > PERIOD_SIGMAS * sigma
-            and CODE_BEGINS_PX * abs(said / middle - 1) > RIPPLE_PEAK * ripple_px(e)
+            and CODE_ORIGIN_PX * abs(said / middle - 1) > RIPPLE_PEAK * ripple_px(e)
         ):
             wrong[axis] = (said, middle)
     if wrong:
         both = " and ".join(
-            f"{axis}: {seen:.1f} px seen, {said:g} px described" for axis, (said, seen) in wrong.items()
+            f"{axis}: {seen:.1f} px measured, {said:g} px described" for axis, (said, seen) in wrong.items()
         )
         yield Finding(
             "fringe-period",
@@ -142,30 +146,32 @@ def period(e: Evidence) -> Iterator[Finding]:
         )
     elif e.solution is not None and e.solution.aspect > 0 and not e.tilts_undetermined:
         ratio = min((e.solution.aspect / a for a in ASPECTS), key=lambda r: abs(np.log(r)))
-        if abs(ratio - 1) > ASPECT_OFF:
+        if abs(ratio - 1) > MAX_ASPECT_ERROR:
             yield Finding(
                 "fringe-period",
                 "doubtful",
                 f"the projector's rows appear {e.solution.aspect:.2f} times as dense as its columns, as no pixels are",
-                "compare the fringe period of each axis with its description, and let the projector scale nothing",
+                "compare the fringe period of each axis with its description, and turn off the projector's scaling",
             )
 
 
-def description(e: Evidence) -> Iterator[Finding]:
-    """Frames that contradict their description in what no other rule sees in the poses together."""
+def find_wrong_description(e: Evidence) -> Iterator[Finding]:
+    """Contradictions between frames and description that no other rule explains."""
     first = {pose.name: pose.contradictions[0] for pose in e.poses if pose.contradictions and not frame_order(pose)}
     for cause in dict.fromkeys(contradiction.cause for contradiction in first.values()):
-        if cause not in CAUSES or cause in _SEEN_IN_POSES:
+        if cause not in CAUSES or cause in _CAUSES_IN_POSES:
             continue
         # Codes beyond the projector may be those of another axis or of another period.
-        if cause in _EXPLAINED and (any(mirrored(e)) or any(f.severity == "rejected" for f in period(e))):
+        if cause in _SYMPTOMS and (
+            any(find_mirroring(e)) or any(f.severity == "rejected" for f in find_wrong_period(e))
+        ):
             continue
         names = tuple(name for name, contradiction in first.items() if contradiction.cause == cause)
         sentence, _, remedy = first[names[0]].message.rpartition(": ")
-        yield Finding(cause, severity(e, names, mended=True), f"{where(e, names)} {sentence}", remedy, names)
+        yield Finding(cause, severity_of(e, names, mended=True), f"{list_poses(e, names)} {sentence}", remedy, names)
 
 
-def board_size(e: Evidence) -> Iterator[Finding]:
+def find_wrong_board_size(e: Evidence) -> Iterator[Finding]:
     """A board of other columns and rows than those given, in most of the poses."""
     kind, _, rest = e.board.partition(":")
     seen = Counter(pose.grid for pose in e.poses if pose.grid is not None and pose.refused)
@@ -173,7 +179,7 @@ def board_size(e: Evidence) -> Iterator[Finding]:
         return
     grid, count = seen.most_common(1)[0]
     given = rest.split(":")[0]
-    if count < MOST * len(e.poses) or sorted(map(int, given.split("x"))) == sorted(grid):
+    if count < COMMON_SHARE * len(e.poses) or sorted(map(int, given.split("x"))) == sorted(grid):
         return
     yield Finding(
         "board-size",
@@ -190,7 +196,7 @@ def ripple_px(e: Evidence) -> float:
     return max((found.rms_px for found in e.solution.ripple.values()), default=0.0) if e.solution else 0.0
 
 
-def rippled(e: Evidence) -> Iterator[Finding]:
+def find_ripple(e: Evidence) -> Iterator[Finding]:
     """Residuals that repeat with the fringe and exceed the samples' noise: the light is no cosine of the pattern."""
     found = {axis: r for axis, r in (e.solution.ripple if e.solution else {}).items() if r.rms_px > r.noise_px}
     if not found:
@@ -215,23 +221,23 @@ def rippled(e: Evidence) -> Iterator[Finding]:
             "residuals",
             "doubtful",
             f"{seen}, as where exposure or light changes from frame to frame",
-            "lock exposure, gain and white balance, switch off room light, and capture again",
+            "lock exposure, gain and white balance, switch off ambient light, and capture again",
         )
 
 
-def _aliased_gamma(e: Evidence) -> tuple[str, ...]:
+def _aliased_gamma_poses(e: Evidence) -> tuple[str, ...]:
     """Poses in which gamma shifts the phase of three or four steps; empty unless they are most of them."""
     names = tuple(pose.name for pose in e.poses if any(s.fault == "gamma" for s in pose.suspects))
-    return names if len(names) > MOST * len(e.poses) else ()
+    return names if len(names) > COMMON_SHARE * len(e.poses) else ()
 
 
-def gamma(e: Evidence) -> Iterator[Finding]:
+def find_gamma(e: Evidence) -> Iterator[Finding]:
     """Light that does not grow evenly with the grey level."""
-    if names := _aliased_gamma(e):
+    if names := _aliased_gamma_poses(e):
         yield Finding(
             "gamma",
             "doubtful",
-            f"{where(e, names)} the light does not grow evenly with the grey level (gamma), which so few phase steps "
+            f"{list_poses(e, names)} the light does not grow evenly with the grey level (gamma), which few phase steps "
             "do not average out: the phase was corrected as far as this could be measured",
             "set the projector's gamma to 1, or let the preflight make light linear, and take eight phase steps or "
             "more",
@@ -241,7 +247,7 @@ def gamma(e: Evidence) -> Iterator[Finding]:
     ratios = [a.harmonic for p in e.poses if not frame_order(p) for a in p.axes.values() if np.isfinite(a.harmonic)]
     if not ratios:
         return
-    exponent = gamma_of(float(np.median(ratios)))
+    exponent = gamma_from_harmonic(float(np.median(ratios)))
     if 1 / MAX_GAMMA < exponent < MAX_GAMMA:
         return
     steps = min(a.steps for p in e.poses for a in p.axes.values() if np.isfinite(a.harmonic))

@@ -1,4 +1,4 @@
-"""What is known of each pose, and of the calibration made from them, before anyone says what is wrong."""
+"""Evidence of each pose and of the calibration made from them, before it is judged."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -15,7 +15,7 @@ from slviewer.fringe.suspect import Suspect
 
 @dataclass(frozen=True)
 class AxisEvidence:
-    """What the frames of one axis say. NaN where they do not.
+    """Measurements from the frames of one axis; NaN where not measurable.
 
     ``period_px`` as described; ``period_seen_px`` by where the Gray code's edges fall in the phase. ``saturated``:
     share of the board's illuminated pixels (of all, where no board was detected) that clip. ``harmonic``: second
@@ -32,7 +32,7 @@ class AxisEvidence:
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """What one capture of the target says of itself.
+    """Evidence of one capture of the target.
 
     ``refused``: why its board or its phase could not be read; empty where they could. ``grid``: columns and rows of the
     circles that were seen, where the board that was given could not be laid over them. ``displaced``: how many frames
@@ -56,8 +56,8 @@ class PoseEvidence:
     def to_json(self) -> dict[str, Any]:
         """Plain values; NaN as None."""
         data = asdict(self)
-        data["moved_px"] = _plain(self.moved_px)
-        data["axes"] = {name: {k: _plain(v) for k, v in axis.items()} for name, axis in data["axes"].items()}
+        data["moved_px"] = _to_plain(self.moved_px)
+        data["axes"] = {name: {k: _to_plain(v) for k, v in axis.items()} for name, axis in data["axes"].items()}
         return data
 
     @classmethod
@@ -81,8 +81,8 @@ class PoseEvidence:
 
 
 @dataclass(frozen=True)
-class Strayed:
-    """A pose that the fit left out: residuals in px, RMS, by the calibration that the others gave."""
+class ExcludedPose:
+    """A pose that the fit excluded: residuals in px, RMS, by the calibration that the others gave."""
 
     camera_px: float
     projector_px: float
@@ -90,7 +90,7 @@ class Strayed:
 
 @dataclass(frozen=True)
 class SolutionEvidence:
-    """What the calibration made from the poses says of itself.
+    """Evidence of a stereo calibration and of the poses it excluded.
 
     ``focal_sigma``: relative uncertainty of the focal lengths; ``tilt_spread_deg``: the largest angle between two
     boards; ``empty_corners`` of the image, by name, that no pose reached and the projector lights; ``aspect`` fy / fx
@@ -99,7 +99,7 @@ class SolutionEvidence:
     """
 
     used: tuple[str, ...]
-    strayed: Mapping[str, Strayed]
+    strayed: Mapping[str, ExcludedPose]
     reprojection_px: float
     usual_px: tuple[float, float]
     focal_sigma: Mapping[str, float]
@@ -112,9 +112,10 @@ class SolutionEvidence:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All of it. ``refusal``: why no calibration could be made, or why one that was made is none; empty otherwise.
-    ``contradiction``: why the sequence's description cannot be true. ``board`` in its notation. ``set_aside``: poses
-    kept out of the fit, and why. ``tilt_spread_deg``: roughly the largest angle between two boards, before any fit.
+    """All evidence of a calibration. ``refusal``: why no calibration could be made, or why one that was made is none;
+    empty otherwise. ``contradiction``: why the sequence's description cannot be true. ``board`` in its notation.
+    ``set_aside``: poses excluded from the fit, and why. ``tilt_spread_deg``: roughly the largest angle between two
+    boards, before any fit.
     """
 
     board: str
@@ -128,8 +129,8 @@ class Evidence:
 
     @property
     def tilts_undetermined(self) -> bool:
-        """Whether the boards are so nearly parallel that a fit, where there is one, found angles and focal lengths that
-        nothing determines."""
+        """Whether the boards are so nearly parallel that a fit's angles and focal lengths are
+        undetermined."""
         return self.tilt_spread_deg < MIN_TILT_SPREAD_DEG
 
     @property
@@ -138,5 +139,5 @@ class Evidence:
         return tuple(pose for pose in self.poses if not pose.refused)
 
 
-def _plain(value: float) -> float | None:
+def _to_plain(value: float) -> float | None:
     return None if isinstance(value, float) and not np.isfinite(value) else value

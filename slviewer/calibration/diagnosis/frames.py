@@ -1,4 +1,4 @@
-"""What the frames of one capture say about the light, the patterns, and the order in which they were taken."""
+"""Evidence from the frames of one capture: light, patterns, and frame order."""
 
 import cv2
 import numpy as np
@@ -13,20 +13,20 @@ from slviewer.fringe.residual_sample import FEWEST, spread_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 ORIGIN_ROWS = 150
-"""Lines of the image along which the Gray code's edges are looked at."""
-LEAST_ORIGIN_PX = 0.2
-"""A Gray code that begins nearer to a column's middle says nothing of the period."""
-_PLACES = 4000  # in a turn, at which the code is thought to begin
-_TOP = 0.97  # of the edges that the best place explains
-_WHITE = 0.8  # of the brightest that a pixel was seen: a frame that reaches it nearly everywhere is white
-_NEARLY = 0.97
-_BRIGHT = 0.5  # of the brightest pixels: lit by the projector
+"""Image lines along which the Gray code's edges are located."""
+MIN_ORIGIN_PX = 0.2
+"""px: a Gray code whose origin is nearer to a column's middle does not determine the period."""
+_ORIGIN_CANDIDATES = 4000  # candidate origins a turn
+_BEST_SHARE = 0.97  # of the edges that the best origin explains
+_WHITE_LEVEL = 0.8  # of the brightest that a pixel was seen: a frame that reaches it nearly everywhere is white
+_WHITE_SHARE = 0.97
+_ILLUMINATED_LEVEL = 0.5  # of the brightest pixels: illuminated by the projector
 
 
-def axis_evidence(
+def measure_axis(
     sequence: PatternSequence, stack: np.ndarray, phase: PhaseMap, board: np.ndarray | None
 ) -> AxisEvidence:
-    """What the frames of one axis say. ``board`` (h, w) bool: the pixels of the board, where it was found."""
+    """Evidence of one axis' frames. ``board`` (h, w) bool: the detected board's pixels, None for the whole image."""
     valid = phase.reason == Reason.VALID
     where = np.ones(phase.reason.shape, bool) if board is None else board
     lit = (phase.reason != Reason.DARK) & where
@@ -37,12 +37,12 @@ def axis_evidence(
         steps=phase.steps,
         readable=np.count_nonzero(valid & where) / max(1.0, seen),
         saturated=np.count_nonzero(saturated) / max(1.0, seen),
-        harmonic=second_harmonic(sequence, stack, phase.axis),
-        period_seen_px=period_seen(sequence, stack, phase.axis),
+        harmonic=measure_second_harmonic(sequence, stack, phase.axis),
+        period_seen_px=measure_period(sequence, stack, phase.axis),
     )
 
 
-def second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
+def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
     """The second harmonic of the finest fringe over the first, signed: positive where light grows ever faster with the
     grey level, as gamma makes it. NaN where five steps or more do not show it, or too few pixels see fringes.
     """
@@ -70,25 +70,25 @@ def second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
     return float(np.sum(along) / np.sum(strength))
 
 
-def period_seen(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
+def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
     """px: the fringe period for which the Gray code would begin where the description says that it does.
 
     The code's edges show at which phase it begins, and that place, in px, is known beforehand. NaN without a Gray code
     beside a phase shift, where it begins too near to a column's middle, or where the frames are in no order.
     """
     found = layout(sequence, axis)
-    if not (found.shifts and found.gray) or abs(found.gray_origin_px) < LEAST_ORIGIN_PX:
+    if not (found.shifts and found.gray) or abs(found.gray_origin_px) < MIN_ORIGIN_PX:
         return np.nan
     size = stack.shape[2 if axis == "y" else 1]
     step = max(1, size // ORIGIN_ROWS)
     thin = np.ascontiguousarray(stack[:, :, ::step] if axis == "y" else stack[:, ::step])
-    begin = _code_begins(found, thin, white_level(stack, sequence.select(axis)))
+    begin = _measure_code_origin(found, thin, white_level(stack, sequence.select(axis)))
     turns = found.gray_origin_px / found.period_px
     ratio = turns / begin if np.isfinite(begin) and abs(begin) > 1e-3 else np.nan
     return float(found.period_px * ratio) if 0.1 < ratio < 10 else np.nan
 
 
-def _code_begins(found: Layout, stack: np.ndarray, white: float) -> float:
+def _measure_code_origin(found: Layout, stack: np.ndarray, white: float) -> float:
     """Turns, -0.5 ... 0.5, of the phase at which each code begins; NaN where the edges do not agree.
 
     An edge lies somewhere between the phases of two neighbouring pixels: the place that lies in the most of such
@@ -114,31 +114,31 @@ def _code_begins(found: Layout, stack: np.ndarray, white: float) -> float:
     if len(begin) < MIN_EDGES or np.mean(length > 0) < MIN_RISING:
         return np.nan
     begin, length = begin[length > 0], length[length > 0]
-    places = np.linspace(-np.pi, np.pi, _PLACES, endpoint=False)
-    start = np.mod((begin + np.pi) / (2 * np.pi), 1.0) * _PLACES
-    held = np.zeros(3 * _PLACES)
+    places = np.linspace(-np.pi, np.pi, _ORIGIN_CANDIDATES, endpoint=False)
+    start = np.mod((begin + np.pi) / (2 * np.pi), 1.0) * _ORIGIN_CANDIDATES
+    held = np.zeros(3 * _ORIGIN_CANDIDATES)
     np.add.at(held, np.ceil(start).astype(int), 1.0)
-    np.add.at(held, np.floor(start + length / (2 * np.pi) * _PLACES).astype(int) + 1, -1.0)
-    count = np.cumsum(held).reshape(3, _PLACES).sum(0)
+    np.add.at(held, np.floor(start + length / (2 * np.pi) * _ORIGIN_CANDIDATES).astype(int) + 1, -1.0)
+    count = np.cumsum(held).reshape(3, _ORIGIN_CANDIDATES).sum(0)
     if count.max() < MIN_CONCENTRATION * len(begin):
         return np.nan
-    best = np.exp(1j * places)[count > _TOP * count.max()]
+    best = np.exp(1j * places)[count > _BEST_SHARE * count.max()]
     return float(np.angle(best.mean()) / (2 * np.pi))
 
 
-def white_displaced(sequence: PatternSequence, stack: np.ndarray) -> int:
-    """By how many frames the white ones came late (positive) or early; 0 where they came in time, or cannot be told.
+def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:
+    """By how many frames the white ones came late (positive) or early; 0 where in time or undecidable.
 
-    Only a white frame that was shown beside patterns tells: after it, whatever is shown may be white too.
+    Only a white frame next to pattern frames is decisive: what follows the last one may be white too.
     """
     rows = spread_rows(*stack.shape[1:])
     frames = stack[:, rows].reshape(len(stack), -1)
     brightest = frames.max(0)
-    lit = brightest > _BRIGHT * float(np.quantile(brightest, 0.98))
+    lit = brightest > _ILLUMINATED_LEVEL * float(np.quantile(brightest, 0.98))
     if np.count_nonzero(lit) < FEWEST:
         return 0
     frames, brightest = frames[:, lit], brightest[lit]
-    white = np.mean(frames >= _WHITE * brightest, axis=1) > _NEARLY
+    white = np.mean(frames >= _WHITE_LEVEL * brightest, axis=1) > _WHITE_SHARE
     shown = [frame.kind in ("white", "texture") for frame in sequence.frames]
     for i, should in enumerate(shown):
         if not should:
@@ -151,12 +151,12 @@ def white_displaced(sequence: PatternSequence, stack: np.ndarray) -> int:
     return 0
 
 
-def moved_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, pitch: float) -> float:
+def measure_motion_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, pitch: float) -> float:
     """px by which features at ``pixels`` (n, 2) moved, in the median, between the frames of one axis and the other's.
 
     ``pitch`` px is their distance. NaN where only one axis was captured, or the images cannot be compared.
     """
-    scenes = [image for axis in sequence.axes if (image := _scene(sequence, stack, axis)) is not None]
+    scenes = [image for axis in sequence.axes if (image := _scene_image(sequence, stack, axis)) is not None]
     if len(scenes) < 2 or len(pixels) < 4:
         return np.nan
     top = max(1.0, *(float(np.percentile(image[::4, ::4], 99.5)) for image in scenes))
@@ -172,7 +172,7 @@ def moved_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, p
     return float(np.median(np.linalg.norm(shift, axis=1))) if len(shift) >= 4 else np.nan
 
 
-def _scene(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarray | None:
+def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarray | None:
     """(h, w) float32: the scene in even light, from the frames of one axis alone; None where they give none."""
     found = layout(sequence, axis)
     frames = list(found.shifts[-1].indices) if found.shifts else []
@@ -186,12 +186,12 @@ def _scene(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarr
     return total / len(frames)
 
 
-def gamma_of(harmonic: float) -> float:
+def gamma_from_harmonic(harmonic: float) -> float:
     """The exponent whose power of a cosine has this ratio of second harmonic to first."""
     return float((1 + 2 * harmonic) / (1 - harmonic))
 
 
-def mean_turn(camera: np.ndarray, projector: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]] | None:
+def fit_mean_turn(camera: np.ndarray, projector: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """(2, 2): how the projector's pixels (n, 2) change with the camera's (n, 2), in the mean; None for too few."""
     read = np.isfinite(camera).all(1) & np.isfinite(projector).all(1)
     if np.count_nonzero(read) < 4:

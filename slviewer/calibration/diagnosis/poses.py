@@ -1,4 +1,4 @@
-"""What is wrong with single poses, and which must not be calibrated from."""
+"""Faults of single poses, and which poses must be excluded."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -9,17 +9,17 @@ from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.verdict import Cause, Finding, Severity
 from slviewer.fringe.suspect import LIGHT_FAULTS
 
-MOST = 0.5
-"""What is seen in so many of the poses is no accident of one."""
+COMMON_SHARE = 0.5
+"""Share of the poses from which on a fault is common, not that of single poses."""
 FEW_POSES = 6
-"""Fewer are too few to be sure of a calibration."""
+"""Poses below which a calibration without the faulty ones stays doubtful."""
 MOVED_PX = (0.12, 0.3)
 """A board that moved by less did not, by more did; in between, one that moved several times as much as it usually does.
 """
-_UNUSUAL = 5.0
-_STRAYS = 4.0  # times the usual residual, beyond which a device disagrees
+_MOTION_RATIO = 5.0
+_RESIDUAL_RATIO = 4.0  # times the usual residual, beyond which a device disagrees
 
-ORDER: dict[Cause, str] = {
+ORDERS: dict[Cause, str] = {
     "frame-lag": "the camera is one image behind the projector",
     "missing-frame": "a frame is missing, and those that follow came too early",
     "frame-order": "frames show patterns that are not theirs",
@@ -27,30 +27,28 @@ ORDER: dict[Cause, str] = {
 """The ways in which frames are out of order, in words."""
 
 
-def unfit(pose: PoseEvidence, most_moved_px: float) -> str:
-    """Why a pose whose board was read must not be calibrated from; empty where it may."""
+def reason_to_exclude(pose: PoseEvidence, limit_px: float) -> str:
+    """Reason to exclude a pose whose board was read; empty where it is fit."""
     order = frame_order(pose)
     if order:
         sentence = next((s.sentence for s in pose.suspects if s.fault not in (*LIGHT_FAULTS, "strange")), "")
-        return f"its frames are out of order ({sentence or ORDER[order]}): take the pose again"
-    if pose.moved_px > most_moved_px:
-        return (
-            f"the board moved by {pose.moved_px:.2f} px while it was captured: hold it still, and take the pose again"
-        )
+        return f"its frames are out of order ({sentence or ORDERS[order]}): capture the pose again"
+    if pose.moved_px > limit_px:
+        return f"the board moved by {pose.moved_px:.2f} px during capture: hold it still, and capture the pose again"
     if pose.numbering:
-        return f"its features are {pose.numbering}: uncover the whole board, and take the pose again"
+        return f"its features are {pose.numbering}: uncover the whole board, and capture the pose again"
     return ""
 
 
-def most_moved_px(poses: Sequence[PoseEvidence]) -> float:
-    """By how much a board may seem to move that stood still, among these poses."""
+def motion_limit_px(poses: Sequence[PoseEvidence]) -> float:
+    """px: apparent motion of a board that stood still, estimated from these poses."""
     moved = [pose.moved_px for pose in poses if np.isfinite(pose.moved_px)]
-    return float(np.clip(_UNUSUAL * np.median(moved), *MOVED_PX)) if moved else MOVED_PX[1]
+    return float(np.clip(_MOTION_RATIO * np.median(moved), *MOVED_PX)) if moved else MOVED_PX[1]
 
 
 def frame_order(pose: PoseEvidence) -> Cause | None:
     """How the frames of a pose are out of order, if they are."""
-    orders: dict[str, Cause] = {cause: cause for cause in ORDER} | {"duplicate-frame": "frame-order"}
+    orders: dict[str, Cause] = {cause: cause for cause in ORDERS} | {"duplicate-frame": "frame-order"}
     for contradiction in pose.contradictions[:1]:
         if contradiction.cause in orders:
             return orders[contradiction.cause]
@@ -62,10 +60,10 @@ def frame_order(pose: PoseEvidence) -> Cause | None:
     return "frame-order" if faults["late"] + faults["early"] + faults["swapped"] else None
 
 
-def single_poses(e: Evidence) -> Iterator[Finding]:
+def find_faulty_poses(e: Evidence) -> Iterator[Finding]:
     """Poses that are misnumbered, moved, or disagree with the others."""
     told: dict[Cause, dict[str, str]] = {"board-numbering": {}, "moved": {}, "outlier": {}}
-    most_moved = most_moved_px(e.poses)
+    most_moved = motion_limit_px(e.poses)
     for pose in e.poses:
         if frame_order(pose):
             continue
@@ -76,7 +74,9 @@ def single_poses(e: Evidence) -> Iterator[Finding]:
     for name, stray in e.solution.strayed.items() if e.solution else ():
         if name in e.set_aside or any(name in poses for poses in told.values()):
             continue
-        camera, projector = (_STRAYS * max(usual, 0.02) for usual in e.solution.usual_px) if e.solution else (0.0, 0.0)
+        camera, projector = (
+            (_RESIDUAL_RATIO * max(usual, 0.02) for usual in e.solution.usual_px) if e.solution else (0.0, 0.0)
+        )
         if stray.camera_px < camera and stray.projector_px > projector:
             told["moved"][name] = (
                 f"{name}: what the projector shows lies {min(stray.projector_px, 999):.1f} px from where the camera "
@@ -91,20 +91,20 @@ def single_poses(e: Evidence) -> Iterator[Finding]:
         if poses:
             names = tuple(poses)
             sentence = "; ".join(list(poses.values())[:3]) + (f"; and {len(poses) - 3} more" if len(poses) > 3 else "")
-            how = severity(e, names, mended=e.solution is not None)
-            yield Finding(cause, how, f"{sentence}; left out", _REMEDIES[cause], names)
+            how = severity_of(e, names, mended=e.solution is not None)
+            yield Finding(cause, how, f"{sentence}; excluded", _REMEDIES[cause], names)
 
 
 _REMEDIES: dict[Cause, str] = {
-    "board-numbering": "uncover the whole board, and take the pose again",
-    "moved": "hold the board still until all frames are taken, and take the pose again",
-    "outlier": "look at its picture, and take the pose again",
+    "board-numbering": "uncover the whole board, and capture the pose again",
+    "moved": "hold the board still until all frames are taken, and capture the pose again",
+    "outlier": "look at its picture, and capture the pose again",
 }
 
 
-def severity(e: Evidence, names: tuple[str, ...], mended: bool) -> Severity:
-    """How bad it is that these poses are faulty; ``mended``: they do not count."""
-    if len(names) >= MOST * len(e.poses):
+def severity_of(e: Evidence, names: tuple[str, ...], mended: bool) -> Severity:
+    """How bad it is that these poses are faulty; ``repaired``: they do not count."""
+    if len(names) >= COMMON_SHARE * len(e.poses):
         return "rejected"
     left = len(e.solution.used) if e.solution else 0
     return "note" if mended and left >= FEW_POSES and len(names) <= 0.25 * len(e.poses) else "doubtful"
@@ -115,7 +115,7 @@ def was_refused(e: Evidence, name: str) -> bool:
     return any(pose.name == name and pose.refused for pose in e.poses)
 
 
-def where(e: Evidence, names: tuple[str, ...]) -> str:
+def list_poses(e: Evidence, names: tuple[str, ...]) -> str:
     """In which poses, in words."""
     if len(names) == len(e.poses):
         return "in every pose"

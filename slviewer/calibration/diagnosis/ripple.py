@@ -15,13 +15,13 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import fit_polynomial
 
-WAVES = 8
-"""A period: the most that are looked for; four and fewer samples a wave would tell nothing."""
+MAX_WAVES = 8
+"""A period: the most that are searched for; four and fewer samples a wave would tell nothing."""
 DEGREE = 6
-"""Of the polynomial in camera pixels that takes what the lenses leave out of a pose's residuals."""
+"""Of the polynomial in camera pixels that takes what the lenses exclude of a pose's residuals."""
 OUTLIER_SIGMAS = 5.0
-LEAST_SAMPLES = 500
-LEAST_SEEN = 0.15
+MIN_SAMPLES = 500
+MIN_RESPONSE = 0.15
 """Of a wave's amplitude, that must be left of it in the mean over a sample's block."""
 
 
@@ -36,23 +36,23 @@ class Ripple:
     noise_px: float
 
 
-def phase_ripple(observations: Sequence[Observation], stereo: StereoModel) -> dict[Axis, Ripple]:
+def measure_ripple(observations: Sequence[Observation], stereo: StereoModel) -> dict[Axis, Ripple]:
     """The ripple of each axis over the samples of all poses that the calibration used; axes without fringes, or with
     too few samples, are not in it."""
     residuals: dict[Axis, list[np.ndarray]] = {axis: [] for axis in AXES}
     for o in observations:
         if o.samples is None or o.name not in stereo.poses:
             continue
-        smooth_free = _smooth_free(o, stereo)
+        smooth_free = _detrend_residuals(o, stereo)
         for column, axis in enumerate(AXES):
             if axis in smooth_free and o.periods_px[axis] > 2.0:
                 turns = o.samples.projector[:, column] / o.periods_px[axis]
-                block = np.broadcast_to(_block(o.samples.camera, turns), (len(turns), 3))
+                block = np.broadcast_to(_block_periods(o.samples.camera, turns), (len(turns), 3))
                 residuals[axis].append(np.column_stack([turns, smooth_free[axis], o.samples.sigma[:, column], block]))
-    return {axis: found for axis, rows in residuals.items() if rows and (found := _ripple(np.concatenate(rows)))}
+    return {axis: found for axis, rows in residuals.items() if rows and (found := _fit_ripple(np.concatenate(rows)))}
 
 
-def _smooth_free(o: Observation, stereo: StereoModel) -> Mapping[Axis, np.ndarray]:
+def _detrend_residuals(o: Observation, stereo: StereoModel) -> Mapping[Axis, np.ndarray]:
     """(n,) px an axis: measured less predicted projector coordinates of a pose's samples, without their smooth part."""
     assert o.samples is not None
     T = stereo.poses[o.name]
@@ -75,7 +75,7 @@ def _smooth_free(o: Observation, stereo: StereoModel) -> Mapping[Axis, np.ndarra
     return found
 
 
-def _block(camera: np.ndarray, turns: np.ndarray) -> np.ndarray:
+def _block_periods(camera: np.ndarray, turns: np.ndarray) -> np.ndarray:
     """(3,): periods a camera pixel, along the image's columns and its rows, and how many pixels a side a sample's block
     has; the mean over them flattens a ripple."""
     known = np.isfinite(turns)
@@ -87,24 +87,24 @@ def _block(camera: np.ndarray, turns: np.ndarray) -> np.ndarray:
     return np.array([abs(slopes[0]), abs(slopes[1]), max(1.0, round(side))])
 
 
-def _ripple(rows: np.ndarray) -> Ripple | None:
+def _fit_ripple(rows: np.ndarray) -> Ripple | None:
     rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < LEAST_SAMPLES:
+    if len(rows) < MIN_SAMPLES:
         return None
     turns, residual, sigma = rows.T[:3]
     spread = 1.4826 * float(np.median(np.abs(residual)))
     kept = np.abs(residual) < OUTLIER_SIGMAS * max(spread, 1e-9)
     turns, residual, block = turns[kept], residual[kept], rows[kept, 3:]
-    waves = np.arange(1, WAVES + 1)
+    waves = np.arange(1, MAX_WAVES + 1)
     angle = 2 * np.pi * turns[:, None] * waves
-    flattened = np.ones((len(turns), WAVES))
+    flattened = np.ones((len(turns), MAX_WAVES))
     for slope in (block[:, :1], block[:, 1:2]):  # the mean of a wave over equally spaced pixels
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.sinc(block[:, 2:] * slope * waves) / np.sinc(slope * waves)
         flattened *= np.nan_to_num(mean)
-    flattened[:, np.median(np.abs(flattened), axis=0) < LEAST_SEEN] = 0.0
+    flattened[:, np.median(np.abs(flattened), axis=0) < MIN_RESPONSE] = 0.0
     design = np.hstack([flattened * np.cos(angle), flattened * np.sin(angle)])
-    solved = np.linalg.lstsq(design, residual, rcond=None)[0].reshape(2, WAVES)
+    solved = np.linalg.lstsq(design, residual, rcond=None)[0].reshape(2, MAX_WAVES)
     # less what independent noise gives: a variance of 2 s^2 / n in each coefficient
     power = np.maximum(np.sum(solved**2, axis=0) / 2 - 2 * spread**2 / len(residual), 0.0)
     strongest = int(np.argmax(power))

@@ -7,31 +7,31 @@ then single poses; then how the poses are spread. A finding that rejects explain
 from collections.abc import Callable, Iterator
 
 from slviewer.calibration.diagnosis.capture_rules import (
-    board_size,
-    description,
-    frame_faults,
-    gamma,
-    mirrored,
-    period,
-    rippled,
-    saturation,
+    find_frame_faults,
+    find_gamma,
+    find_mirroring,
+    find_ripple,
+    find_saturation,
+    find_wrong_board_size,
+    find_wrong_description,
+    find_wrong_period,
 )
 from slviewer.calibration.diagnosis.evidence import Evidence
-from slviewer.calibration.diagnosis.poses import single_poses
-from slviewer.calibration.diagnosis.spread_rules import corners, parallel, too_few, uncertain
+from slviewer.calibration.diagnosis.poses import find_faulty_poses
+from slviewer.calibration.diagnosis.spread_rules import find_corners, find_parallel, find_too_few, find_uncertain
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 
 Rule = Callable[[Evidence], Iterator[Finding]]
 
 STAGES: tuple[tuple[Rule, ...], ...] = (
-    (frame_faults, saturation),
-    (mirrored, period, description, board_size),
-    (single_poses, gamma, rippled, too_few, parallel, corners, uncertain),
+    (find_frame_faults, find_saturation),
+    (find_mirroring, find_wrong_period, find_wrong_description, find_wrong_board_size),
+    (find_faulty_poses, find_gamma, find_ripple, find_too_few, find_parallel, find_corners, find_uncertain),
 )
 
 
-def judged(evidence: Evidence) -> Verdict:
-    """What is to be said of a calibration, the root cause first."""
+def judge_evidence(evidence: Evidence) -> Verdict:
+    """The verdict on a calibration, root cause first."""
     found: list[Finding] = []
     for stage in STAGES:
         found += [finding for rule in stage for finding in rule(evidence)]
@@ -39,6 +39,6 @@ def judged(evidence: Evidence) -> Verdict:
             return Verdict.of(found)
     if evidence.refusal:
         sentence, _, remedy = evidence.refusal.partition(": ")
-        remedy = remedy or "take the poses again, and look at each before the next"
+        remedy = remedy or "capture the poses again, and check each before the next"
         found.append(Finding("residuals", "rejected", sentence, remedy))
     return Verdict.of(found)

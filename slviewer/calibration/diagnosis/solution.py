@@ -1,27 +1,27 @@
-"""What a stereo calibration, and the poses it left out, say of themselves."""
+"""Evidence of a stereo calibration and of the poses it excluded."""
 
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
-from slviewer.calibration.diagnosis.evidence import SolutionEvidence, Strayed
-from slviewer.calibration.diagnosis.ripple import phase_ripple
+from slviewer.calibration.diagnosis.evidence import ExcludedPose, SolutionEvidence
+from slviewer.calibration.diagnosis.ripple import measure_ripple
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 
 CORNERS = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
 CORNER_SHARE = (1 / 4, 1 / 3)
 """Of the image's width and height, that a corner takes up."""
-LIT = 0.6
-"""Share of a corner that the projector must reach for poses to be asked for there."""
-EMPTY = 0.3
+ILLUMINATED_SHARE = 0.6
+"""Share of a corner that the projector must reach for poses to be requested there."""
+EMPTY_SHARE = 0.3
 """A corner of which the poses cover less than so much of what the projector reaches is empty."""
-_GRID = 12  # places along each side of a corner that are looked at
+_GRID = 12  # places along each side of a corner that are examined
 
 
-def solution_evidence(observations: Sequence[Observation], stereo: StereoModel) -> SolutionEvidence:
-    """``observations``: all that the fit was given, those that it left out included."""
+def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -> SolutionEvidence:
+    """``observations``: all that the fit was given, those that it excluded included."""
     used = [o for o in observations if o.name in stereo.poses]
     K = stereo.rig.projector.K
     width, height = stereo.rig.projector.size
@@ -30,7 +30,7 @@ def solution_evidence(observations: Sequence[Observation], stereo: StereoModel) 
     camera, projector = np.array([stereo.pose_rms_px[o.name] for o in used]).T
     return SolutionEvidence(
         used=tuple(stereo.poses),
-        strayed={o.name: strayed(o, stereo) for o in observations if o.name not in stereo.poses},
+        strayed={o.name: measure_excluded(o, stereo) for o in observations if o.name not in stereo.poses},
         reprojection_px=stereo.reprojection_rms_px["stereo"],
         usual_px=(float(np.median(camera)), float(np.median(projector))),
         focal_sigma={
@@ -38,29 +38,30 @@ def solution_evidence(observations: Sequence[Observation], stereo: StereoModel) 
             "projector": stereo.focal_sigma_px["projector"] / float(min(np.diag(K)[:2])),
         },
         tilt_spread_deg=float(np.degrees(np.arccos(cosines.min()))),
-        empty_corners=empty_corners(used, stereo),
+        empty_corners=find_empty_corners(used, stereo),
         aspect=float(K[1, 1] / K[0, 0]),
         centre_off=(float(K[0, 2] / (width - 1) - 0.5), float(K[1, 2] / (height - 1) - 0.5)),
-        ripple=phase_ripple(used, stereo),
+        ripple=measure_ripple(used, stereo),
     )
 
 
-def strayed(observation: Observation, stereo: StereoModel) -> Strayed:
-    """How far a pose that was left out lies from what the others make of the rig; inf where it has no place at all."""
+def measure_excluded(observation: Observation, stereo: StereoModel) -> ExcludedPose:
+    """Residuals of an excluded pose under the calibration from the others; inf where its pose cannot be solved."""
     camera = stereo.rig.camera
     seen = np.isfinite(observation.camera).all(1)
     if np.count_nonzero(seen) < 6:
-        return Strayed(np.inf, np.inf)
+        return ExcludedPose(np.inf, np.inf)
     found, rotation, t = cv2.solvePnP(
         observation.points[seen], observation.camera[seen], camera.K, camera.D, flags=cv2.SOLVEPNP_ITERATIVE
     )
     if not found:
-        return Strayed(np.inf, np.inf)
+        return ExcludedPose(np.inf, np.inf)
     X = observation.points @ cv2.Rodrigues(rotation)[0].T + t.ravel()
-    return Strayed(_rms(camera.project(X) - observation.camera), _rms(stereo.rig.project(X) - observation.projector))
+    misfits = camera.project(X) - observation.camera, stereo.rig.project(X) - observation.projector
+    return ExcludedPose(*map(_rms, misfits))
 
 
-def empty_corners(observations: Sequence[Observation], stereo: StereoModel) -> tuple[str, ...]:
+def find_empty_corners(observations: Sequence[Observation], stereo: StereoModel) -> tuple[str, ...]:
     """The corners of the image that no board reached, of those that the projector lights at the boards' depths."""
     width, height = stereo.rig.camera.size
     if stereo.depth_range_mm is None:
@@ -72,18 +73,18 @@ def empty_corners(observations: Sequence[Observation], stereo: StereoModel) -> t
             for share, size, side in zip(CORNER_SHARE, (width, height), (right, bottom), strict=True)
         ]
         pixels = np.stack(np.meshgrid(*along), axis=-1).reshape(-1, 2)
-        lit = _lit(pixels, stereo)
-        if lit.mean() < LIT:
+        lit = _is_illuminated(pixels, stereo)
+        if lit.mean() < ILLUMINATED_SHARE:
             continue
         covered = np.zeros(len(pixels), bool)
         for o in observations:
-            covered |= _covers(o, pixels)
-        if covered[lit].mean() < EMPTY:
+            covered |= _is_covered(o, pixels)
+        if covered[lit].mean() < EMPTY_SHARE:
             empty.append(name)
     return tuple(empty)
 
 
-def _lit(pixels: np.ndarray, stereo: StereoModel) -> np.ndarray:
+def _is_illuminated(pixels: np.ndarray, stereo: StereoModel) -> np.ndarray:
     """(n,) bool: whether the projector reaches what the camera's pixels see, at most of the boards' depths."""
     near, far = stereo.depth_range_mm or (0.0, 0.0)
     rays = stereo.rig.camera.undistort(pixels)
@@ -96,7 +97,7 @@ def _lit(pixels: np.ndarray, stereo: StereoModel) -> np.ndarray:
     return np.asarray(np.sum(reached, axis=0) >= 2)
 
 
-def _covers(observation: Observation, pixels: np.ndarray) -> np.ndarray:
+def _is_covered(observation: Observation, pixels: np.ndarray) -> np.ndarray:
     u0, v0, u1, v1 = observation.box
     u, v = np.rint(pixels).astype(int).T
     inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)

@@ -8,12 +8,12 @@ from slviewer.calibration.diagnosis.verdict import Finding
 from slviewer.calibration.soundness import MIN_POSES, MIN_TILT_SPREAD_DEG
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
 
-LITTLE_TILT_DEG = 12.0
-UNCERTAIN = 0.02
+MIN_TILT_DEG = 12.0
+MAX_FOCAL_UNCERTAINTY = 0.02
 HIGH_REPROJECTION_PX = 1.0
 
 
-def too_few(e: Evidence) -> Iterator[Finding]:
+def find_too_few(e: Evidence) -> Iterator[Finding]:
     """Fewer poses than a calibration needs."""
     count = len(e.solution.used) if e.solution else len([p for p in e.usable if p.name not in e.set_aside])
     if count >= FEW_POSES:
@@ -28,11 +28,11 @@ def too_few(e: Evidence) -> Iterator[Finding]:
     )
 
 
-def parallel(e: Evidence) -> Iterator[Finding]:
+def find_parallel(e: Evidence) -> Iterator[Finding]:
     """Boards that are all tilted alike."""
     solved = None if e.tilts_undetermined else e.solution
     spread = solved.tilt_spread_deg if solved else e.tilt_spread_deg
-    if not spread < LITTLE_TILT_DEG or len(e.usable) < MIN_POSES:
+    if not spread < MIN_TILT_DEG or len(e.usable) < MIN_POSES:
         return
     rejected = spread < MIN_TILT_SPREAD_DEG or solved is None or bool(e.refusal)
     yield Finding(
@@ -44,7 +44,7 @@ def parallel(e: Evidence) -> Iterator[Finding]:
     )
 
 
-def corners(e: Evidence) -> Iterator[Finding]:
+def find_corners(e: Evidence) -> Iterator[Finding]:
     """Corners of the image that no pose reached."""
     if e.solution is not None and e.solution.empty_corners:
         corners = e.solution.empty_corners
@@ -58,7 +58,7 @@ def corners(e: Evidence) -> Iterator[Finding]:
         )
 
 
-def uncertain(e: Evidence) -> Iterator[Finding]:
+def find_uncertain(e: Evidence) -> Iterator[Finding]:
     """What the poses leave uncertain, or does not fit; of residuals so large, uncertainty is a consequence."""
     if e.solution is None:
         return
@@ -71,7 +71,7 @@ def uncertain(e: Evidence) -> Iterator[Finding]:
             "check that the board is flat, in focus and held still, and look at the poses with the largest residuals",
         )
     for device, share in e.solution.focal_sigma.items():
-        if not share < UNCERTAIN:
+        if not share < MAX_FOCAL_UNCERTAINTY:
             yield Finding(
                 "uncertain",
                 "doubtful" if misfit or share < MAX_FOCAL_SIGMA else "rejected",

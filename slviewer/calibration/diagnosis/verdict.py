@@ -1,4 +1,4 @@
-"""What is said of a calibration: good, doubtful or rejected, why, and what to do."""
+"""Verdict on a calibration: good, doubtful or rejected, its causes, and remedies."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -8,7 +8,8 @@ from slviewer.calibration.splined.residual_noise import Noise
 
 Level = Literal["good", "doubtful", "rejected"]
 Severity = Literal["note", "doubtful", "rejected"]
-"""A note is mended already, as by leaving a pose out; what is doubtful may be used with care; what is rejected may not.
+"""A note is repaired already, as by leaving a pose out; what is doubtful may be used with care; what is rejected may
+not.
 """
 Cause = Literal[
     "frame-lag",
@@ -43,7 +44,7 @@ CAUSES: tuple[Cause, ...] = get_args(Cause)
 
 @dataclass(frozen=True)
 class Finding:
-    """One cause: ``sentence`` says what was seen, ``remedy`` what to do, ``poses`` where it was seen."""
+    """One cause: ``sentence``: the observation; ``remedy``: what to do; ``poses``: where it was observed."""
 
     cause: Cause
     severity: Severity
@@ -97,7 +98,7 @@ class Verdict:
 
     @property
     def reason(self) -> str:
-        """The root cause and its remedy; empty where nothing was found."""
+        """The root cause and its remedy; empty without findings."""
         return self.findings[0].text() if self.findings else ""
 
     def text(self) -> str:
@@ -120,7 +121,7 @@ DOUBTFUL_RATIO = 4.0
 """Of residuals over predicted noise. On clean rigs, whose lenses bend as no polynomial does, it is 0.5 to 1.1, and 0.8
 on real Gray code. A block of 5 by 5 camera pixels whose noise is fully alike, as after demosaicing or compression,
 scatters by up to five times what is predicted of independent pixels: in part, as such noise is, by less than four."""
-EXPLAINING = ("gamma", "saturation", "moved", "frame-lag", "frame-order", "missing-frame")
+EXPLAINING_CAUSES = ("gamma", "saturation", "moved", "frame-lag", "frame-order", "missing-frame")
 REJECTED_RATIO = 25.0
 REJECTED_PX = 1.0
 """Beyond both the phases contradict the geometry, whatever the noise: a column more or less than was measured."""
@@ -128,13 +129,13 @@ REJECTED_PX = 1.0
 
 def judge_splined(verdict: Verdict, noise: Noise) -> Verdict:
     """The verdict with what the joint adjustment's residuals add to it; a cause that explains them is known already
-    where one of ``EXPLAINING`` was found."""
+    where one of ``EXPLAINING_CAUSES`` was found."""
     ratios: Mapping[str, float] = dict(zip("xy", noise.ratio, strict=True))
     axis = max(ratios, key=lambda name: ratios[name])
     ratio, px = ratios[axis], noise.sample_px["xy".index(axis)]
     if ratio < DOUBTFUL_RATIO:
         return verdict
-    known = [finding.cause for finding in verdict.findings if finding.cause in EXPLAINING]
+    known = [finding.cause for finding in verdict.findings if finding.cause in EXPLAINING_CAUSES]
     because = f" (probable cause: {known[0]}, named above)" if known else ""
     rejected = ratio > REJECTED_RATIO and px > REJECTED_PX
     finding = Finding(

@@ -1,6 +1,6 @@
-"""Is a saved calibration still good? One capture of its board answers.
+"""Drift check: whether a saved calibration is still valid, from one capture of its board.
 
-What is looked at is the projector's place relative to the camera: a turn about its own centre, and a shift of that
+What is examined is the projector's place relative to the camera: a turn about its own centre, and a shift of that
 centre. Flatness would not show it: a projector turned by 0.1 mrad measures flat boards as flat as before, and bends
 space by 700 ppm. A turn or shift along the epipolar lines makes the board seem larger or smaller than it is; one across
 them moves the pattern off its epipolar lines.
@@ -13,19 +13,19 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import f as fisher
 
-from slviewer.calibration.drift.floor import PoseChange, Reference
+from slviewer.calibration.drift.reference import DriftReference, PoseChange
 from slviewer.calibration.drift.view import DriftView
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 
 FALSE_ALARMS = 1e-4
-"""How often a projector that has not moved may be said to have: it is asked before every day's work."""
+"""False-alarm probability of one check; a check precedes every day's work."""
 BOARD_PPM = 5.0
 """How much the board itself may have grown since: half a kelvin of steel."""
-MISFIT = 3.0
+MAX_MISFIT_RATIO = 3.0
 """What no movement explains may be so many times what it was in the calibration's worst pose."""
 TURN_MRAD, SHIFT_MM = 0.05, 0.010
-"""Changes that must be seen."""
+"""Changes that must be detectable."""
 Verdict = Literal["still good", "recalibrate"]
 _MOVES = (
     ("turn about its x axis (nod)", "rows", "y"),
@@ -39,7 +39,7 @@ _MOVES = (
 
 @dataclass(frozen=True)
 class Drift:
-    """What one capture of the board says of a calibration; sigma is one standard deviation.
+    """Result of the drift check; sigma is one standard deviation.
 
     ``turn_mrad``, ``shift_mm``: (3) each, about and along the projector's own axes. ``chance`` that a projector which
     has not moved seems to have moved as much. ``seen_alone``: the size of each of the six from which on it would be
@@ -77,8 +77,8 @@ class Drift:
         lines = [
             f"{self.capture}: {answer}",
             f"  the board seems {self.scale_ppm:+.0f} +- {self.scale_sigma_ppm:.0f} ppm larger than it is; {across}",
-            f"  projector turned by {_three(self.turn_mrad, self.turn_sigma_mrad, '.3f')} mrad about its x, y, z",
-            f"  and shifted by {_three(shifts, shift_sigmas, '.0f')} um;"
+            f"  projector turned by {_format_xyz(self.turn_mrad, self.turn_sigma_mrad, '.3f')} mrad about its x, y, z",
+            f"  and shifted by {_format_xyz(shifts, shift_sigmas, '.0f')} um;"
             f" baseline {1e3 * self.baseline_mm:+.0f} +- {1e3 * self.baseline_sigma_mm:.0f} um",
             "  a pan and a shift along x look nearly alike, as do a nod and a shift along y: their sum is known far "
             "better than each",
@@ -101,14 +101,14 @@ class Drift:
         return cls(**plain)
 
 
-def check_drift(reference: Reference, view: DriftView) -> Drift:
+def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     """The verdict on a calibration from one later view of its board.
 
     Raises InputError where the view shows no axis that the calibration has.
     """
     if not view.axes:
         raise InputError(f"{view.name}: no axis of the pattern could be read on the board: light the whole board")
-    found = reference.ask(view)
+    found = reference.estimate_change(view)
     own = reference.answers
     growth = BOARD_PPM * 1e-6
     C = found.covariance(reference.sigmas) + growth**2 * np.outer(found.by_growth, found.by_growth)
@@ -123,13 +123,13 @@ def check_drift(reference: Reference, view: DriftView) -> Drift:
     along = np.concatenate([np.zeros(3), reference.rig.t / np.linalg.norm(reference.rig.t)])
     reasons = []
     worst = max(a.misfit_px for a in own)
-    if found.misfit_px > MISFIT * worst:
+    if found.misfit_px > MAX_MISFIT_RATIO * worst:
         reasons.append(
             f"the board lies {found.misfit_px:.3f} px off what any movement of the projector explains (in the poses of "
             f"the calibration {worst:.3f} px at most): was a lens refocused, the board moved, or is it another one?"
         )
     elif about > limit:
-        reasons.append(_explained(found, information, about, along))
+        reasons.append(_list_movements(found, information, about, along))
         if abs(found.scale) > 3 * scale_sigma:
             reasons.append(
                 f"the board seems {1e6 * found.scale:+.0f} ppm larger than it is (+- {1e6 * scale_sigma:.0f})"
@@ -143,10 +143,10 @@ def check_drift(reference: Reference, view: DriftView) -> Drift:
         axes=view.axes,
         verdict="recalibrate" if reasons else "still good",
         reasons=tuple(reasons),
-        turn_mrad=_plain(1e3 * found.change[:3]),
-        turn_sigma_mrad=_plain(1e3 * sigmas[:3]),
-        shift_mm=_plain(found.change[3:]),
-        shift_sigma_mm=_plain(sigmas[3:]),
+        turn_mrad=_to_floats(1e3 * found.change[:3]),
+        turn_sigma_mrad=_to_floats(1e3 * sigmas[:3]),
+        shift_mm=_to_floats(found.change[3:]),
+        shift_sigma_mm=_to_floats(sigmas[3:]),
         baseline_mm=float(along @ found.change),
         baseline_sigma_mm=float(np.sqrt(along @ C @ along)),
         scale_ppm=1e6 * found.scale,
@@ -155,12 +155,12 @@ def check_drift(reference: Reference, view: DriftView) -> Drift:
         across_sigma_px=across_sigma,
         misfit_px=found.misfit_px,
         chance=chance,
-        seen_alone=_plain(seen_alone),
-        unseen=(*_unseen(seen_alone, view.axes), "camera and projector that moved together: that changes nothing"),
+        seen_alone=_to_floats(seen_alone),
+        unseen=(*_list_undetermined(seen_alone, view.axes), "common motion of both devices (harmless)"),
     )
 
 
-def _explained(found: PoseChange, information: np.ndarray, about: float, along: np.ndarray) -> str:
+def _list_movements(found: PoseChange, information: np.ndarray, about: float, along: np.ndarray) -> str:
     """The single movements that explain the change nearly as well as any, with their sizes."""
     moves = np.vstack([np.eye(6), along])  # (7, 6); a longer baseline is the last
     names = [*(name for name, _, _ in _MOVES), "change of the baseline"]
@@ -172,10 +172,10 @@ def _explained(found: PoseChange, information: np.ndarray, about: float, along: 
         if share[i] > 0.9 * share.max():
             form, unit = (".4f", "mrad") if i < 3 else (".1f", "um")
             words.append(f"a {names[i]} by {1e3 * sizes[i]:+{form}} +- {1e3 * sigmas[i]:{form}} {unit}")
-    return f"the projector has moved, as by {' or '.join(words)} ({100 * share.max():.0f} % of what is seen)"
+    return f"the projector has moved, as by {' or '.join(words)} ({100 * share.max():.0f} % of the change)"
 
 
-def _unseen(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str]:
+def _list_undetermined(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str]:
     limits = [TURN_MRAD] * 3 + [SHIFT_MM] * 3
     told = []
     for i, ((move, lines, axis), limit) in enumerate(zip(_MOVES, limits, strict=True)):
@@ -191,9 +191,9 @@ def _unseen(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str]:
     return told
 
 
-def _three(values: Sequence[float], sigmas: Sequence[float], form: str) -> str:
+def _format_xyz(values: Sequence[float], sigmas: Sequence[float], form: str) -> str:
     return ", ".join(f"{value:+{form}} +- {sigma:{form}}" for value, sigma in zip(values, sigmas, strict=True))
 
 
-def _plain(values: np.ndarray) -> tuple[float, ...]:
+def _to_floats(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in values)

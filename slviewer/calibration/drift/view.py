@@ -1,8 +1,8 @@
-"""One view of the board, made linear: what the board's pose, the projector's place and the lenses' errors do to it.
+"""One view of the board, linearised in the board's pose, the projector's pose and the lens errors.
 
 A view is a calibration pose or a later capture of the same board: its features in the camera, and the projector's
-coordinates at a grid of the board's pixels. All that is looked for is small (tenths of a pixel), so that derivatives at
-the calibration and at the pose that the camera sees are enough.
+coordinates at a grid of the board's pixels. All that is searched for is small (tenths of a pixel), so that derivatives
+at the calibration and at the pose that the camera sees are enough.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class DriftView:
     projector: np.ndarray
 
     @classmethod
-    def of(cls, observation: Observation) -> "DriftView":
+    def from_observation(cls, observation: Observation) -> "DriftView":
         """The view that an observation of the board holds."""
         u0, v0, _, _ = observation.box
         v, u = np.nonzero(observation.region)
@@ -61,7 +61,7 @@ class DriftView:
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class DisplacementField:
     """A cubic B-spline displacement field over an image of ``size`` px: ``cells`` (across, down)."""
 
     size: tuple[int, int]
@@ -77,7 +77,9 @@ class Field:
 
     def basis(self, pixels: np.ndarray) -> sp.csr_array:
         """(n, unknowns): how the coefficients act at pixels (n, 2)."""
-        (i, wu), (j, wv) = (_cubic((pixels[:, k] + 0.5) * self.cells[k] / self.size[k], self.cells[k]) for k in (0, 1))
+        (i, wu), (j, wv) = (
+            _splines_at((pixels[:, k] + 0.5) * self.cells[k] / self.size[k], self.cells[k]) for k in (0, 1)
+        )
         columns = (j[:, None] + np.arange(4))[:, :, None] * (self.cells[0] + 3) + (i[:, None] + np.arange(4))[:, None]
         values = wv[:, :, None] * wu[:, None]
         rows = np.repeat(np.arange(len(pixels)), 16)
@@ -96,7 +98,7 @@ class Field:
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class LinearView:
     """A view's equations ``residuals = pose a + change b + shared c``, a row an observed number (px).
 
     ``kinds`` (k,): the index into KINDS of each row. ``pose`` (k, 6): the board's; ``change`` (k, 6): the projector's
@@ -120,9 +122,9 @@ class Linear:
         return np.asarray(np.isfinite(self.residuals) & np.isfinite(self.change).all(1))
 
 
-def linear(rig: StereoRig, view: DriftView) -> Linear:
+def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
     """The equations of a view, at the pose that the camera alone gives."""
-    T = _pose(rig, view)
+    T = _solve_pose(rig, view)
     middle = view.points.mean(0)
 
     def model(at: np.ndarray, moved: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -135,12 +137,12 @@ def linear(rig: StereoRig, view: DriftView) -> Linear:
         return rig.camera.project(points @ R.T + t), rig.projector.project(turned)
 
     steps = np.diag(np.r_[STEPS, STEPS, 1e-4])
-    columns = [_flat(*(a - b for a, b in zip(model(s), model(-s), strict=True))) / (2 * s.sum()) for s in steps]
+    columns = [_flatten(*(a - b for a, b in zip(model(s), model(-s), strict=True))) / (2 * s.sum()) for s in steps]
     features, samples = model(np.zeros(13))
     J = np.stack(
         [(model(np.zeros(13), 0.1 * e)[1] - model(np.zeros(13), -0.1 * e)[1]) / 0.2 for e in np.eye(2)], 2
     )  # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
-    camera, projector = Field(rig.camera.size), Field(rig.projector.size)
+    camera, projector = DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)
     on_features, at_pixels = camera.basis(view.camera), camera.basis(view.pixels)
     on_samples = projector.basis(np.nan_to_num(samples))
     n, m = len(view.camera), len(view.pixels)
@@ -162,10 +164,10 @@ def linear(rig: StereoRig, view: DriftView) -> Linear:
     )
     towards = np.stack([columns[3 + k][2 * n :].reshape(2, m).T for k in range(3)], 2) @ T[:3, 2]  # along the normal
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    return Linear(
+    return LinearView(
         view.name,
         np.repeat([0, 1, 2], [2 * n, m, m]),
-        _flat(view.camera - features, view.projector - samples),
+        _flatten(view.camera - features, view.projector - samples),
         np.stack(columns[:6], 1),
         np.stack(columns[6:12], 1),
         columns[12],
@@ -174,12 +176,12 @@ def linear(rig: StereoRig, view: DriftView) -> Linear:
     )
 
 
-def _flat(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
+def _flatten(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
     """Values in the order of KINDS: all of the camera's, the projector's columns, its rows."""
     return np.concatenate([camera.ravel(), projector[:, 0], projector[:, 1]])
 
 
-def _cubic(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
+def _splines_at(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """Each place's cell (n,), clipped to the image, and its four cubic B-spline weights (n, 4)."""
     x = np.clip(x, 0.0, cells)
     cell = np.minimum(x.astype(np.int64), cells - 1)
@@ -188,7 +190,7 @@ def _cubic(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
     return cell, np.stack([g**3, 3 * f**3 - 6 * f**2 + 4, 3 * g**3 - 6 * g**2 + 4, f**3], 1) / 6.0
 
 
-def _pose(rig: StereoRig, view: DriftView) -> np.ndarray:
+def _solve_pose(rig: StereoRig, view: DriftView) -> np.ndarray:
     """(4, 4) T_camera_board from the camera alone."""
     rays = rig.camera.undistort(view.camera)
     try:

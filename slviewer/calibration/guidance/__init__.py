@@ -1,1 +1,1 @@
-"""Where a calibration needs the board next, and how sure it would be: from information that poses would add."""
+"""Suggest the next board poses: predicted uncertainty from the information that candidate poses would add."""

@@ -1,4 +1,4 @@
-"""What poses know together, how sure that makes points of the working volume, and what one more pose would add."""
+"""Information of poses: the uncertainty it leaves in the working volume, and the gain of one more pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,25 +9,27 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 from slviewer.calibration.guidance.coarse_rig import GuidanceBench
 from slviewer.calibration.splined.posterior import point_rows
 from slviewer.calibration.splined.unknowns import State
-from slviewer.calibration.splined.volume import Volume, better_axis, motion_free, working_volume
+from slviewer.calibration.splined.volume import Volume, depth_axis, motion_free, working_volume
 
 NEGLIGIBLE = 1e-4
 """Of the points' mean variance, that gains need not tell."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class Sensitivity:
     """The working volume, and how its points' errors that no rigid motion explains answer to the unknowns."""
 
     volume: Volume
     jacobian: np.ndarray
 
     @classmethod
-    def of(cls, bench: GuidanceBench, depths_mm: tuple[float, float], columns: int = 9, rows: int = 7) -> "Sight":
+    def from_bench(
+        cls, bench: GuidanceBench, depths_mm: tuple[float, float], columns: int = 9, rows: int = 7
+    ) -> "Sensitivity":
         """``depths_mm``: nearest and farthest that boards are held at."""
         volume = working_volume(bench.rig, depths_mm, columns=columns, rows=rows)
         state = State(bench.rig, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((len(bench.points), 2)))
-        rows_of = point_rows(state, better_axis(bench.rig, volume), volume.pixels, volume.z).toarray()
+        rows_of = point_rows(state, depth_axis(bench.rig, volume), volume.pixels, volume.z).toarray()
         known = np.isfinite(rows_of).all(axis=1).reshape(-1, 3).all(axis=1)
         volume = Volume(volume.pixels[known], volume.z[known], volume.points[known], volume.projector[known])
         rows_of = rows_of.reshape(len(known), 3, -1)[known].reshape(3 * len(volume.z), -1)
@@ -50,7 +52,7 @@ class Information:
     counts: np.ndarray
 
     @classmethod
-    def of(cls, bench: GuidanceBench, rows: Sequence[np.ndarray], sight: Sight) -> "Information":
+    def from_rows(cls, bench: GuidanceBench, rows: Sequence[np.ndarray], sight: Sensitivity) -> "Information":
         """From what each pose tells (see ``GuidanceBench.rows``)."""
         A = bench.prior()
         if len(rows):

@@ -9,31 +9,31 @@ from scipy.linalg import cho_solve, lapack
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.board_shape import board_frame
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
-from slviewer.calibration.splined.half_turns import half_turned, may_be_turned, turned_over
-from slviewer.calibration.splined.normal import Data, normal_equations, predicted
+from slviewer.calibration.splined.half_turns import detect_half_turns, is_numbering_ambiguous, renumber_poses
+from slviewer.calibration.splined.normal import PoseData, normal_equations, predict_observations
 from slviewer.calibration.splined.prior import Prior
-from slviewer.calibration.splined.residual_noise import Noise, measured_noise, own_sigmas, pose_trust, robust_weights
+from slviewer.calibration.splined.residual_noise import Noise, estimate_noise, pose_sigmas, pose_trust, robust_weights
 from slviewer.calibration.splined.unknowns import State
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 
 MIN_POSES = 3
-MOST_STEPS = 30
+MAX_STEPS = 30
 LEAST_DAMPING, DAMPING_STEP, MOST_DAMPING = 1e-6, 10.0, 10.0
 """Of the information's diagonal: what is added to it where full steps fail."""
-CONVERGED = 0.02
+CONVERGENCE_SIGMAS = 0.02
 """Sigmas that the predictions of all observations still move by, RMS: a fiftieth of their noise."""
 FIRST_STRENGTH = 10.0
 """1/px^2: displacements of some tenths of a pixel."""
 STRENGTH_STEPS = 3
 """Updates of the priors: near their fixed point after two, and inside the support the result hardly depends on them."""
-LEAST_SAMPLES = 3
-"""Of one pose in a cell of a field, and the pose has lit it."""
-LEAST_TRUST = 0.5
+MIN_SAMPLES = 3
+"""Of one pose in a cell of a field, and the pose has illuminated it."""
+MIN_TRUST = 0.5
 """Of a pose's features or samples: below, the pose contradicts the others."""
 
 
-def gathered(observations: Sequence[Observation], stereo: StereoModel) -> tuple[list[str], Data, np.ndarray]:
+def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tuple[list[str], PoseData, np.ndarray]:
     """Names of the poses, what they observed, and the samples' predicted noise (m, 2) px.
 
     Raises InputError where poses lack an axis or were read before samples were kept.
@@ -56,7 +56,7 @@ def gathered(observations: Sequence[Observation], stereo: StereoModel) -> tuple[
     def starts(lengths: list[int]) -> np.ndarray:
         return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
 
-    data = Data(
+    data = PoseData(
         starts([len(o.points) for o in both]),
         feature.ravel().astype(np.int64),
         np.ascontiguousarray(np.concatenate([o.camera for o in both])),
@@ -69,36 +69,36 @@ def gathered(observations: Sequence[Observation], stereo: StereoModel) -> tuple[
     return [o.name for o in both], data, np.concatenate([s.sigma for s in samples])
 
 
-def adjust(
+def adjust_bundle(
     observations: Sequence[Observation], stereo: StereoModel, progress: Callable[[float], None] | None = None
 ) -> Bundle:
     """The joint adjustment of all poses that the stereo calibration used.
 
-    Raises InputError as ``gathered`` does, and CalibrationRejected where it does not converge or poses contradict
+    Raises InputError as ``gather_data`` does, and CalibrationRejected where it does not converge or poses contradict
     each other.
     """
-    names, data, sample_sigma = gathered(observations, stereo)
-    state = State.start(stereo, names, len(data.points))
+    names, data, sample_sigma = gather_data(observations, stereo)
+    state = State.from_stereo(stereo, names, len(data.points))
     layout = state.layout
-    prior = Prior.of(state, data)
+    prior = Prior.build(state, data)
     strengths = [FIRST_STRENGTH, FIRST_STRENGTH]
     aside = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
-    certain = np.array([name in marked or not may_be_turned(stereo.board) for name in names])
+    certain = np.array([name in marked or not is_numbering_ambiguous(stereo.board) for name in names])
     turned = np.zeros(len(names), bool)
     updates, count, damping = 0, 0, 0.0
     residuals = _residuals(state, data)
-    for step in range(1, MOST_STEPS + 1):
+    for step in range(1, MAX_STEPS + 1):
         if step == 3:  # before such poses seem to contradict the others
-            turned = half_turned(state, data, residuals[0], certain)
-            state, data = turned_over(state, data, turned)
+            turned = detect_half_turns(state, data, residuals[0], certain)
+            state, data = renumber_poses(state, data, turned)
             residuals = _residuals(state, data)
-        noise = measured_noise(*residuals, sample_sigma)
+        noise = estimate_noise(*residuals, sample_sigma)
         sigmas = _sigmas(residuals, noise, sample_sigma, data)
         weights = robust_weights(*residuals, sigmas)
         if step > 2:
-            aside |= (pose_trust(weights, sigmas, data) < LEAST_TRUST).any(axis=1)
-        _silence(weights, aside, data)
+            aside |= (pose_trust(weights, sigmas, data) < MIN_TRUST).any(axis=1)
+        _zero_weights(weights, aside, data)
         A, b = normal_equations(state, data, residuals, weights)
         prior.add(A, b, state, strengths)
         undamped = A.copy()
@@ -106,32 +106,32 @@ def adjust(
         count = int(sum(np.count_nonzero(w) for w in weights))
         cost = partial(_cost, weights=weights, prior=prior, strengths=strengths)
         system = undamped, b, _inverse(factor)(b)
-        state, residuals, move, damping = _advance(state, residuals, data, cost, system, damping)
+        state, residuals, move, damping = _take_step(state, residuals, data, cost, system, damping)
         moved = float(np.sqrt(max(move @ b, 0.0) / count))
         if progress:
             progress(step / (step + 3))
         if moved < 0.3 and updates < STRENGTH_STEPS:
-            strengths = prior.better(strengths, state, _inverse(factor))
+            strengths = prior.update_strengths(strengths, state, _inverse(factor))
             updates += 1
-        elif moved < CONVERGED:
+        elif moved < CONVERGENCE_SIGMAS:
             break
     else:
         raise CalibrationRejected(
-            f"the joint adjustment still moves by {moved:.2f} sigma after {MOST_STEPS} steps: look at the stereo "
-            "calibration's residuals, leave out poses that stand out, and add some that reach into the corners"
+            f"the joint adjustment still moves by {moved:.2f} sigma after {MAX_STEPS} steps: check the stereo "
+            "calibration's residuals, exclude poses that stand out, and add some that reach into the corners"
         )
     if np.count_nonzero(~aside) < MIN_POSES:
         raise CalibrationRejected(
             f"{np.count_nonzero(aside)} of {len(names)} poses contradict the others: capture the board anew, at rest"
         )
-    fits = _fits(names, residuals, _sigmas(residuals, noise, sample_sigma, data), data)
+    fits = _fit_statistics(names, residuals, _sigmas(residuals, noise, sample_sigma, data), data)
     left_out = {
         name: f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera, "
         f"{fits[name].projector_trust:.2f} in the projector): was the board moved during the capture?"
         for name, out in zip(names, aside, strict=True)
         if out
     }
-    camera_poses, projector_poses = _lit(state, weights, data)
+    camera_poses, projector_poses = _count_poses(state, weights, data)
     return Bundle(
         state=state,
         poses=tuple(names),
@@ -140,17 +140,17 @@ def adjust(
         strengths=(strengths[0], strengths[1]),
         fits=fits,
         left_out=left_out,
-        depth_range_mm=_depths(state, data, aside),
+        depth_range_mm=_depth_range(state, data, aside),
         camera_poses=camera_poses,
         projector_poses=projector_poses,
-        packed_factor=_packed(factor[layout.rig :, layout.rig :]),
+        packed_factor=_pack_factor(factor[layout.rig :, layout.rig :]),
         steps=step,
         turned=tuple(name for name, over in zip(names, turned, strict=True) if over),
     )
 
 
-def _residuals(state: State, data: Data) -> tuple[np.ndarray, np.ndarray]:
-    features, samples = predicted(state, data)
+def _residuals(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+    features, samples = predict_observations(state, data)
     return data.feature_px - features, data.projector_px - samples
 
 
@@ -168,10 +168,10 @@ def _cost(
     return 0.5 * total + prior.cost(state, strengths)
 
 
-def _advance(
+def _take_step(
     state: State,
     residuals: tuple[np.ndarray, np.ndarray],
-    data: Data,
+    data: PoseData,
     cost: Callable[[State, tuple[np.ndarray, np.ndarray]], float],
     system: tuple[np.ndarray, np.ndarray, np.ndarray],
     damping: float,
@@ -192,7 +192,7 @@ def _advance(
             A = information.copy()
             A[rig, rig] *= 1 + damping
             move = _inverse(_cholesky(A))(b)
-        after = state.moved(move)
+        after = state.step(move)
         new = _residuals(after, data)
         if cost(after, new) <= before * (1 + 1e-9):  # False for NaN
             return after, new, move, damping
@@ -210,7 +210,7 @@ def _cholesky(A: np.ndarray) -> np.ndarray:
     return np.asarray(factor)
 
 
-def _packed(factor: np.ndarray) -> np.ndarray:
+def _pack_factor(factor: np.ndarray) -> np.ndarray:
     return np.asarray(factor[np.tri(len(factor), dtype=bool)], np.float32)
 
 
@@ -220,22 +220,22 @@ def _inverse(factor: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _sigmas(
-    residuals: tuple[np.ndarray, np.ndarray], noise: Noise, sample_sigma: np.ndarray, data: Data
+    residuals: tuple[np.ndarray, np.ndarray], noise: Noise, sample_sigma: np.ndarray, data: PoseData
 ) -> tuple[np.ndarray, np.ndarray]:
-    return own_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
+    return pose_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
 
 
-def _silence(weights: tuple[np.ndarray, np.ndarray], aside: np.ndarray, data: Data) -> None:
+def _zero_weights(weights: tuple[np.ndarray, np.ndarray], aside: np.ndarray, data: PoseData) -> None:
     for w, start in zip(weights, (data.feature_from, data.sample_from), strict=True):
         for i in np.nonzero(aside)[0]:
             w[start[i] : start[i + 1]] = 0.0
 
 
-def _fits(
+def _fit_statistics(
     names: Sequence[str],
     residuals: tuple[np.ndarray, np.ndarray],
     sigmas: tuple[np.ndarray, np.ndarray],
-    data: Data,
+    data: PoseData,
 ) -> dict[str, PoseFit]:
     fresh = robust_weights(*residuals, sigmas)
     trust = pose_trust(fresh, sigmas, data)
@@ -250,7 +250,7 @@ def _fits(
     return fits
 
 
-def _depths(state: State, data: Data, aside: np.ndarray) -> tuple[float, float]:
+def _depth_range(state: State, data: PoseData, aside: np.ndarray) -> tuple[float, float]:
     """Nearest and farthest depth of a feature, mm."""
     pose = np.repeat(np.arange(len(aside)), np.diff(data.feature_from))
     z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature]) + state.t_board[pose, 2]
@@ -258,8 +258,9 @@ def _depths(state: State, data: Data, aside: np.ndarray) -> tuple[float, float]:
     return float(z.min()), float(z.max())
 
 
-def _lit(state: State, weights: tuple[np.ndarray, np.ndarray], data: Data) -> tuple[np.ndarray, np.ndarray]:
-    """How many poses lit each cell of the camera's field and of the projector's, (rows, columns) uint16 each."""
+def _count_poses(state: State, weights: tuple[np.ndarray, np.ndarray], data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+    """How many poses illuminated each cell of the camera's field and of the projector's, (rows, columns) uint16
+    each."""
     counts = []
     for device, pixels in ((state.rig.camera, data.sample_px), (state.rig.projector, data.projector_px)):
         rows, columns = (n - 3 for n in device.coefficients.shape[1:])
@@ -270,6 +271,6 @@ def _lit(state: State, weights: tuple[np.ndarray, np.ndarray], data: Data) -> tu
             u, v = pixels[first:last][seen].T
             extent = [[-0.5, height - 0.5], [-0.5, width - 0.5]]
             found, _, _ = np.histogram2d(v, u, bins=(rows, columns), range=extent)
-            total += (found >= LEAST_SAMPLES).astype(np.uint16)
+            total += (found >= MIN_SAMPLES).astype(np.uint16)
         counts.append(total)
     return counts[0], counts[1]

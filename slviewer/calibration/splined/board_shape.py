@@ -8,11 +8,11 @@ import numpy as np
 
 from slviewer.geometry.jit import kernel
 
-DEGREES = np.array([(i, total - i) for total in (2, 3, 4) for i in range(total, -1, -1)])
+HEIGHT_DEGREES = np.array([(i, total - i) for total in (2, 3, 4) for i in range(total, -1, -1)])
 """(12, 2): of the polynomials in x and y."""
-TERMS = len(DEGREES)
-HEIGHT_SIGMA_MM = np.array([{2: 0.3, 3: 0.1, 4: 0.05}[i + j] for i, j in DEGREES.tolist()])
-"""(12,): how far boards depart from a plane, before any is seen."""
+HEIGHT_TERMS = len(HEIGHT_DEGREES)
+HEIGHT_SIGMA_MM = np.array([{2: 0.3, 3: 0.1, 4: 0.05}[i + j] for i, j in HEIGHT_DEGREES.tolist()])
+"""(12,): prior standard deviation of a board's departure from a plane."""
 OFFSET_SIGMA_MM = 0.03
 """Of a printed feature along x and along y."""
 GAUGE_MM = 1e-6

@@ -18,7 +18,7 @@ from slviewer.fringe.sequence import Axis
 
 @dataclass(frozen=True)
 class PoseFit:
-    """One pose: RMS px of its features in the camera and of its samples in the projector (outliers set aside), and how
+    """One pose: RMS px of its features in the camera and of its samples in the projector (outliers excluded), and how
     far each is trusted, 0 ... 1; undisturbed ones reach 0.8."""
 
     camera_rms_px: float
@@ -32,8 +32,8 @@ class Bundle:
     """The unknowns of ``poses``, and their information.
 
     ``points`` (f, 3) mm: the board's features, whose offsets the state has. ``strengths`` 1/px^2: of the camera's and
-    the projector's prior. ``left_out``: poses set aside, with the reason. ``camera_poses`` and ``projector_poses``:
-    how many poses lit each cell of the fields (rows, columns). ``turned``: poses whose board was numbered from the
+    the projector's prior. ``left_out``: poses excluded, with the reason. ``camera_poses`` and ``projector_poses``: how
+    many poses illuminated each cell of the fields (rows, columns). ``turned``: poses whose board was numbered from the
     other end, and is no more.
 
     ``packed_factor``: the lower triangle of ``factor``, row by row, float32.
@@ -70,7 +70,7 @@ class Bundle:
         """
         return point_rows(self.state, axis, pixels, z)
 
-    def whitened(self, jacobian: sp.csr_matrix | np.ndarray) -> np.ndarray:
+    def whiten(self, jacobian: sp.csr_matrix | np.ndarray) -> np.ndarray:
         """(unknowns, m) Y with Y.T @ Y the covariance of what has ``jacobian`` (m, unknowns) by the rig's unknowns."""
         dense = jacobian if isinstance(jacobian, np.ndarray) else jacobian.toarray()
         right = np.asarray(dense, self.factor.dtype).T
@@ -111,7 +111,7 @@ class Bundle:
         }
 
     @classmethod
-    def restored(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Bundle":
+    def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Bundle":
         """The inverse of ``to_dict`` and ``to_arrays``."""
         devices = [
             Device(*(np.ascontiguousarray(arrays[f"{name}_{key}"]) for key in Device._fields))

@@ -13,28 +13,28 @@ from os import cpu_count
 import numpy as np
 from scipy.ndimage import binary_erosion
 
-from slviewer.calibration.splined.fields import image_of, ray_of
-from slviewer.calibration.splined.remainder import evaluate
+from slviewer.calibration.splined.correction_grid import evaluate
+from slviewer.calibration.splined.fields import distort_to_pixel, undistort_pixel
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 
-CELLS_ACROSS = 100
+GRID_CELLS_ACROSS = 100
 """Of the grid, over the image's width: 16 px of 1600."""
 DEPTHS = 65
-MOST_CORRECTED = 0.02
+MAX_CORRECTION = 0.02
 """Of the depths between: beyond, the coordinate hardly moves with depth, or turns back, and measures none."""
-LEAST_MOVED = 0.005
+MIN_SLOPE = 0.005
 """px a mm: a coordinate that moves less with depth measures no depth; the noise of a pixel would be many mm."""
 MARGIN = 0.25
 """Of the projector's size: how far beyond its image the lens model is still followed along a ray."""
 
 
 @dataclass(frozen=True, eq=False)
-class Compiled:
+class CompiledAxis:
     """One axis. ``coefficients`` (3, h, w) float32 for the coordinate less ``centre`` px; ``grid`` (nv, nu, nz) float32
     mm, ``step`` px and (far - near)/(nz - 1) mm apart from pixel (0, 0) and ``near``; ``held`` is ``grid`` with NaN
-    where camera or projector cells were never lit. NaN where a ray meets the projector at no depth, or where
+    where camera or projector cells were never illuminated. NaN where a ray meets the projector at no depth, or where
     depth hardly moves the coordinate."""
 
     coefficients: np.ndarray
@@ -66,54 +66,54 @@ def pixel_rays(rig: Arrangement) -> np.ndarray:
     """(2, h, w) float64: the undistorted normalised point that each camera pixel sees."""
     width, height = (int(n) for n in rig.camera.size)
     rays = np.empty((2, height, width))
-    _by_rows(height, lambda rows: _rays(rig.camera, rows, rays))
+    _split_rows(height, lambda rows: _fill_rays(rig.camera, rows, rays))
     return rays
 
 
 def compile_axis(
     rig: Arrangement, axis: Axis, rays: np.ndarray, depths: tuple[float, float], lit: tuple[np.ndarray, np.ndarray]
-) -> Compiled:
-    """The fast form of one axis between two ``depths`` mm; ``lit``: the camera's and the projector's cells (rows,
-    columns) bool that target poses lit."""
+) -> CompiledAxis:
+    """The fast form of one axis between two ``depths`` mm; ``illuminated``: the camera's and the projector's cells
+    (rows, columns) bool that target poses illuminated."""
     near, far = depths
     row = 0 if axis == "x" else 1
     width, height = (int(n) for n in rig.camera.size)
     centre = (float(rig.projector.size[row]) - 1) / 2
     coefficients = np.empty((3, height, width), np.float32)
-    _by_rows(height, lambda rows: _rational(rig, row, centre, near, far, rays, rows, coefficients))
-    step = max(2, -(-width // CELLS_ACROSS))
+    _split_rows(height, lambda rows: _fit_rational(rig, row, centre, near, far, rays, rows, coefficients))
+    step = max(2, -(-width // GRID_CELLS_ACROSS))
     shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
     grid, known = np.full(shape, np.nan, np.float32), np.zeros(shape, np.bool_)
-    _by_rows(shape[0], lambda rows: _corrections(rig, row, centre, near, far, step, *lit, rows, grid, known))
+    _split_rows(shape[0], lambda rows: _tabulate(rig, row, centre, near, far, step, *lit, rows, grid, known))
     # a pixel needs its eight nodes: growing the known by one node gives each pixel about its own answer
     unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
     held = np.where(unknown, np.float32(np.nan), grid)
-    return Compiled(coefficients, centre, grid, held, step, near, far)
+    return CompiledAxis(coefficients, centre, grid, held, step, near, far)
 
 
-def _by_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
+def _split_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
     lanes = max(1, min(cpu_count() or 1, rows))
     with ThreadPoolExecutor(lanes) as threads:
         list(threads.map(lambda lane: work(np.arange(lane, rows, lanes)), range(lanes)))
 
 
 @kernel()
-def _rays(camera, rows, rays):
+def _fill_rays(camera, rows, rays):
     basis = np.zeros((4, 4))
     for v in rows:
         for u in range(rays.shape[2]):
-            rays[0, v, u], rays[1, v, u] = ray_of(camera, float(u), float(v), basis)
+            rays[0, v, u], rays[1, v, u] = undistort_pixel(camera, float(u), float(v), basis)
 
 
 @kernel()
-def _coordinates(rig, x, y, z, basis):
+def _project_depth(rig, x, y, z, basis):
     """Where the projector sees (x z, y z, z); NaN far outside its image."""
     X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
     X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
     X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
     if not X2 > 0.0:
         return np.nan, np.nan
-    u, v = image_of(rig.projector, X0 / X2, X1 / X2, basis)
+    u, v = distort_to_pixel(rig.projector, X0 / X2, X1 / X2, basis)
     width, height = rig.projector.size[0], rig.projector.size[1]
     if -MARGIN * width <= u <= (1.0 + MARGIN) * width and -MARGIN * height <= v <= (1.0 + MARGIN) * height:
         return u, v
@@ -121,12 +121,12 @@ def _coordinates(rig, x, y, z, basis):
 
 
 @kernel()
-def _reach(rig, x, y, near, far, basis):
+def _depth_interval(rig, x, y, near, far, basis):
     """The depths between ``near`` and ``far`` at which a ray is near the projector's image; NaN if there are none."""
     first = last = np.nan
     for k in range(33):
         z = near + (far - near) * k / 32.0
-        u, _ = _coordinates(rig, x, y, z, basis)
+        u, _ = _project_depth(rig, x, y, z, basis)
         if np.isfinite(u):
             if not np.isfinite(first):
                 first = z
@@ -141,7 +141,7 @@ def _reach(rig, x, y, near, far, basis):
         outside = inside + (limit - inside) / abs(limit - inside) * (far - near) / 32.0
         for _ in range(20):
             middle = 0.5 * (inside + outside)
-            if np.isfinite(_coordinates(rig, x, y, middle, basis)[0]):
+            if np.isfinite(_project_depth(rig, x, y, middle, basis)[0]):
                 inside = middle
             else:
                 outside = middle
@@ -153,11 +153,11 @@ def _reach(rig, x, y, near, far, basis):
 
 
 @kernel()
-def _through_three(rig, row, centre, x, y, near, far, basis):
+def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     """(c0, c1, c2, first depth, last depth) of one ray."""
     first, last = near, far
-    if np.isnan(_coordinates(rig, x, y, near, basis)[0]) or np.isnan(_coordinates(rig, x, y, far, basis)[0]):
-        first, last = _reach(rig, x, y, near, far, basis)
+    if np.isnan(_project_depth(rig, x, y, near, basis)[0]) or np.isnan(_project_depth(rig, x, y, far, basis)[0]):
+        first, last = _depth_interval(rig, x, y, near, far, basis)
         if not last - first > 1e-3 * (far - near):
             return np.nan, np.nan, np.nan, np.nan, np.nan
     # nodes of Chebyshev's polynomial in 1/z, in which the coordinate is nearly linear
@@ -165,7 +165,7 @@ def _through_three(rig, row, centre, x, y, near, far, basis):
     a, b = 1.0 / last, 1.0 / first
     for k in range(3):
         z = 1.0 / (0.5 * (a + b) + 0.433 * (b - a) * (k - 1))
-        found = _coordinates(rig, x, y, z, basis)
+        found = _project_depth(rig, x, y, z, basis)
         s = found[row] - centre
         if k == 0:
             z0, s0 = z, s
@@ -177,7 +177,7 @@ def _through_three(rig, row, centre, x, y, near, far, basis):
     m00, m01, r0 = s1 - s0, s0 * z0 - s1 * z1, z1 - z0
     m10, m11, r1 = s2 - s0, s0 * z0 - s2 * z2, z2 - z0
     determinant = m00 * m11 - m01 * m10
-    if not (abs(determinant) > 0.0 and abs(s2 - s0) > LEAST_MOVED * abs(z2 - z0)):
+    if not (abs(determinant) > 0.0 and abs(s2 - s0) > MIN_SLOPE * abs(z2 - z0)):
         return np.nan, np.nan, np.nan, np.nan, np.nan
     c1 = (r0 * m11 - m01 * r1) / determinant
     c2 = (m00 * r1 - r0 * m10) / determinant
@@ -185,17 +185,17 @@ def _through_three(rig, row, centre, x, y, near, far, basis):
 
 
 @kernel()
-def _rational(rig, row, centre, near, far, rays, rows, coefficients):
+def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
     basis = np.zeros((4, 4))
     for v in rows:
         for u in range(rays.shape[2]):
-            c0, c1, c2, _, _ = _through_three(rig, row, centre, rays[0, v, u], rays[1, v, u], near, far, basis)
+            c0, c1, c2, _, _ = _interpolate_rational(rig, row, centre, rays[0, v, u], rays[1, v, u], near, far, basis)
             coefficients[0, v, u], coefficients[1, v, u], coefficients[2, v, u] = c0, c1, c2
 
 
 @kernel()
-def _is_lit(lit, u, v, size):
-    """Whether the cell of a pixel was lit; none is outside the image."""
+def _is_cell_supported(lit, u, v, size):
+    """Whether the cell of a pixel was illuminated; none is outside the image."""
     if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
         return False
     column = min(int((u + 0.5) / size[0] * lit.shape[1]), lit.shape[1] - 1)
@@ -203,25 +203,25 @@ def _is_lit(lit, u, v, size):
 
 
 @kernel()
-def _corrections(rig, row, centre, near, far, step, camera_lit, projector_lit, rows, grid, known):
+def _tabulate(rig, row, centre, near, far, step, camera_lit, projector_lit, rows, grid, known):
     """What the exact depth has beyond the rational function's at the grid's nodes, and which of them poses support."""
     basis = np.zeros((4, 4))
     for j in rows:
         for i in range(grid.shape[1]):
             u, v = float(i * step), float(j * step)
-            x, y = ray_of(rig.camera, u, v, basis)
-            c0, c1, c2, first, last = _through_three(rig, row, centre, x, y, near, far, basis)
+            x, y = undistort_pixel(rig.camera, u, v, basis)
+            c0, c1, c2, first, last = _interpolate_rational(rig, row, centre, x, y, near, far, basis)
             if np.isnan(c0):
                 continue
             # the last nodes may lie past the image's edge, and stand for it
             edge_u, edge_v = min(u, rig.camera.size[0] - 1.0), min(v, rig.camera.size[1] - 1.0)
-            seen = _is_lit(camera_lit, edge_u, edge_v, rig.camera.size)
+            seen = _is_cell_supported(camera_lit, edge_u, edge_v, rig.camera.size)
             for k in range(grid.shape[2]):
                 target = near + (far - near) * k / (grid.shape[2] - 1.0)
                 z = min(max(target, first), last)
                 pu, pv, change = np.nan, np.nan, np.inf
                 for _ in range(12):
-                    pu, pv = _coordinates(rig, x, y, z, basis)
+                    pu, pv = _project_depth(rig, x, y, z, basis)
                     s = (pu if row == 0 else pv) - centre
                     change = target - (c0 + c1 * s) / (1.0 + c2 * s)
                     z = min(max(z + change, first), last)
@@ -230,6 +230,6 @@ def _corrections(rig, row, centre, near, far, step, camera_lit, projector_lit, r
                 s = (pu if row == 0 else pv) - centre
                 correction = z - (c0 + c1 * s) / (1.0 + c2 * s)
                 settled = abs(change) < 1e-3 or z in (first, last)
-                if settled and abs(correction) < MOST_CORRECTED * (last - first):
+                if settled and abs(correction) < MAX_CORRECTION * (last - first):
                     grid[j, i, k] = correction
-                    known[j, i, k] = seen and _is_lit(projector_lit, pu, pv, rig.projector.size)
+                    known[j, i, k] = seen and _is_cell_supported(projector_lit, pu, pv, rig.projector.size)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from slviewer.geometry.brown import brown, unbrown
+from slviewer.geometry.brown import distort_point, undistort_point
 from slviewer.geometry.jit import kernel
 
 CELLS_ACROSS = 26
@@ -108,7 +108,7 @@ def displacement(device, u, v, basis):
 
 
 @kernel()
-def undisplaced(device, u, v, basis):
+def remove_displacement(device, u, v, basis):
     """The pixel (u, v) less the displacement that brought it there: q with q + W(q) = (u, v)."""
     x, y = u, v
     for _ in range(20):
@@ -123,23 +123,23 @@ def undisplaced(device, u, v, basis):
 
 
 @kernel()
-def image_of(device, x, y, basis):
+def distort_to_pixel(device, x, y, basis):
     """The pixel of an undistorted normalised point, without derivatives; NaN past the fold of Brown's polynomial."""
     k = device.numbers
     if not x * x + y * y < k[9]:
         return np.nan, np.nan
-    xd, yd, _, _, _ = brown(x, y, k)
+    xd, yd, _, _, _ = distort_point(x, y, k)
     u, v = k[0] * xd + k[2], k[1] * yd + k[3]
     du, dv, _, _, _, _, _, _ = displacement(device, u, v, basis)
     return u + du, v + dv
 
 
 @kernel()
-def ray_of(device, u, v, basis):
+def undistort_pixel(device, u, v, basis):
     """The undistorted normalised point seen at a pixel, without derivatives; NaN where the inversion fails."""
     k = device.numbers
-    x, y = undisplaced(device, u, v, basis)
-    return unbrown((x - k[2]) / k[0], (y - k[3]) / k[1], k)
+    x, y = remove_displacement(device, u, v, basis)
+    return undistort_point((x - k[2]) / k[0], (y - k[3]) / k[1], k)
 
 
 @kernel()
@@ -148,4 +148,4 @@ def _undistort_all(device, pixels, rays):
     for n in range(pixels.shape[0]):
         rays[n, 0], rays[n, 1] = np.nan, np.nan
         if np.isfinite(pixels[n, 0]) and np.isfinite(pixels[n, 1]):
-            rays[n, 0], rays[n, 1] = ray_of(device, pixels[n, 0], pixels[n, 1], basis)
+            rays[n, 0], rays[n, 1] = undistort_pixel(device, pixels[n, 0], pixels[n, 1], basis)

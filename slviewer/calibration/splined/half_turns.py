@@ -9,27 +9,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from slviewer.calibration.splined.normal import Data, predicted
+from slviewer.calibration.splined.normal import PoseData, predict_observations
 from slviewer.calibration.splined.unknowns import State
 from slviewer.errors import InputError
 from slviewer.target.board import Board
 
-SURE = 5.0
+DECISION_SIGMAS = 5.0
 """Sigmas of pure chance by which a pose must agree with the others' reverse before it counts as turned."""
-SMOOTH = 4
+SMOOTH_DEGREE = 4
 """Degree of the polynomials that are no evidence."""
 _STEP_MM = 0.01
 
 
-def may_be_turned(notation: str) -> bool:
-    """Whether a board's numbering may start at either end: circles that are not seen to be marked."""
+def is_numbering_ambiguous(notation: str) -> bool:
+    """Whether a board's numbering may start at either end: circles without a detected mark."""
     try:
         return Board.parse(notation).kind in ("circles", "acircles")
     except InputError:  # a calibration made elsewhere
         return False
 
 
-def opposite(points: np.ndarray) -> np.ndarray | None:
+def opposite_features(points: np.ndarray) -> np.ndarray | None:
     """(f,) where each feature of (f, 3) mm lies after half a turn of the board; None where the board is not the same
     then."""
     middle = (points.min(0) + points.max(0)) / 2
@@ -39,17 +39,17 @@ def opposite(points: np.ndarray) -> np.ndarray | None:
     return partner if apart < 1e-3 and np.array_equal(partner[partner], np.arange(len(points))) else None
 
 
-def half_turned(state: State, data: Data, residuals: np.ndarray, certain: np.ndarray) -> np.ndarray:
+def detect_half_turns(state: State, data: PoseData, residuals: np.ndarray, certain: np.ndarray) -> np.ndarray:
     """(p,) bool: poses that are numbered from the other end than most, or than the ``certain`` (p,) bool ones, beyond
     doubt.
 
     ``residuals`` (n, 2) px: of the features.
     """
-    partner = opposite(data.points)
+    partner = opposite_features(data.points)
     count = state.layout.poses
     if partner is None or count < 3 or certain.all():
         return np.zeros(count, bool)
-    reversed_part = _reversed(_places(state, data, residuals), partner, data.points)
+    reversed_part = _odd_part(_measure_offsets(state, data, residuals), partner, data.points)
     length = np.linalg.norm(reversed_part, axis=1)
     unit = reversed_part / np.maximum(length, 1e-12)[:, None]
     alike = unit @ unit.T
@@ -62,13 +62,13 @@ def half_turned(state: State, data: Data, residuals: np.ndarray, certain: np.nda
     others = total - signs[:, None] * reversed_part
     agree = np.einsum("pn,pn->p", unit, others) / np.maximum(np.linalg.norm(others, axis=1), 1e-12)
     # of two features that are each other's opposite only one counts, and what is smooth does not
-    freedom = max(len(data.points) - (SMOOTH + 1) * (SMOOTH + 2) // 2, 1)
-    return np.asarray((agree * np.sqrt(freedom) < -SURE) & ~certain)
+    freedom = max(len(data.points) - (SMOOTH_DEGREE + 1) * (SMOOTH_DEGREE + 2) // 2, 1)
+    return np.asarray((agree * np.sqrt(freedom) < -DECISION_SIGMAS) & ~certain)
 
 
-def turned_over(state: State, data: Data, poses: np.ndarray) -> tuple[State, Data]:
+def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[State, PoseData]:
     """Both with these ``poses`` (p,) bool numbered from the other end."""
-    partner = opposite(data.points)
+    partner = opposite_features(data.points)
     if partner is None or not poses.any():
         return state, data
     middle = (data.points.min(0) + data.points.max(0)) / 2
@@ -81,14 +81,14 @@ def turned_over(state: State, data: Data, poses: np.ndarray) -> tuple[State, Dat
     return replace(state, R_board=R, t_board=t), data._replace(feature=feature)
 
 
-def _places(state: State, data: Data, residuals: np.ndarray) -> np.ndarray:
+def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.ndarray:
     """(p, f, 2) mm: how far off each pose sees each feature on the board; 0 where it does not see it, or badly."""
     by_place = []
-    here, _ = predicted(state, data)
+    here, _ = predict_observations(state, data)
     for k in range(2):
         step = np.zeros_like(state.offsets)
         step[:, k] = _STEP_MM
-        by_place.append((predicted(replace(state, offsets=state.offsets + step), data)[0] - here) / _STEP_MM)
+        by_place.append((predict_observations(replace(state, offsets=state.offsets + step), data)[0] - here) / _STEP_MM)
     J = np.stack(by_place, axis=2)  # of px by mm
     usable = np.isfinite(J).all((1, 2)) & np.isfinite(residuals).all(1)
     usable[usable] &= np.abs(np.linalg.det(J[usable])) > 1e-9
@@ -103,12 +103,12 @@ def _places(state: State, data: Data, residuals: np.ndarray) -> np.ndarray:
     return places
 
 
-def _reversed(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _odd_part(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(p, 2 f): of places (p, f, 2), what half a turn of the board changes the sign of, and is not smooth."""
     # the circle there moves the other way when the board is turned: what reverses is the mean of both
     odd = (places + places[:, partner]) / 2
     x, y = (2 * (points[:, :2] - points[:, :2].min(0)) / np.maximum(np.ptp(points[:, :2], axis=0), 1e-9) - 1).T
-    smooth = np.stack([x**i * y**j for i in range(SMOOTH + 1) for j in range(SMOOTH + 1 - i)], axis=1)
+    smooth = np.stack([x**i * y**j for i in range(SMOOTH_DEGREE + 1) for j in range(SMOOTH_DEGREE + 1 - i)], axis=1)
     basis, _ = np.linalg.qr(smooth)
     odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)
     return np.asarray(odd.reshape(len(places), -1))

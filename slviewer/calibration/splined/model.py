@@ -1,4 +1,4 @@
-"""The splined calibration as a model: points from phase, what supports them, and how sure they are."""
+"""The splined calibration as a model: points from phase, what supports them, and their uncertainty."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.observe import AXES, Observation
-from slviewer.calibration.splined.adjust import adjust
+from slviewer.calibration.splined.adjust import adjust_bundle
 from slviewer.calibration.splined.board_shape import board_frame, board_heights
 from slviewer.calibration.splined.bundle import Bundle
-from slviewer.calibration.splined.compiled import Compiled, compile_axis, pixel_rays
+from slviewer.calibration.splined.compiled import CompiledAxis, compile_axis, pixel_rays
 from slviewer.calibration.splined.fields import undistort
-from slviewer.calibration.splined.residual_noise import LEAST_SIGMA_PX
-from slviewer.calibration.splined.uncertainty import SigmaMap, sigma_map, volume_sigma
+from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX
+from slviewer.calibration.splined.uncertainty import SigmaMap, compute_sigma_map, summarise_volume_sigma
 from slviewer.calibration.splined.unknowns import Arrangement, lens_of
-from slviewer.calibration.splined.volume import is_lit
+from slviewer.calibration.splined.volume import is_supported
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
@@ -31,7 +31,7 @@ NEAR, FAR = 0.7, 1.4
 class SplinedModel:
     """The joint adjustment, compiled when first used (about a second an axis at full size).
 
-    Pixels that look through cells of camera or projector that no target pose lit are masked, unless asked for.
+    Pixels that look through cells of camera or projector that no target pose illuminated are masked, unless asked for.
     """
 
     bundle: Bundle
@@ -71,7 +71,7 @@ class SplinedModel:
         """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2); NaN
         where no target pose supports one of them."""
         rays = undistort(self.rig.camera, pixels), undistort(self.rig.projector, projector)
-        known = is_lit(self.rig.camera, pixels, self.bundle.camera_poses > 0) & is_lit(
+        known = is_supported(self.rig.camera, pixels, self.bundle.camera_poses > 0) & is_supported(
             self.rig.projector, projector, self.bundle.projector_poses > 0
         )
         return np.where(known[:, None], rays[0], np.nan), np.where(known[:, None], rays[1], np.nan)
@@ -86,14 +86,14 @@ class SplinedModel:
         return self.rays.astype(np.float32)
 
     @cached_property
-    def _compiled(self) -> dict[Axis, Compiled]:
+    def _compiled(self) -> dict[Axis, CompiledAxis]:
         return {}
 
     @cached_property
     def _sigma_maps(self) -> dict[Axis, SigmaMap]:
         return {}
 
-    def compiled(self, axis: Axis) -> Compiled:
+    def fast_axis(self, axis: Axis) -> CompiledAxis:
         """The fast form of one axis."""
         if axis not in self._compiled:
             lit = self.bundle.camera_poses > 0, self.bundle.projector_poses > 0
@@ -102,10 +102,10 @@ class SplinedModel:
 
     def points(self, phase: PhaseMap, supported: bool = True) -> np.ndarray:
         """(h, w, 3) float32 mm; NaN where the phase is invalid, beyond ``depths_mm`` or, if only ``supported`` points
-        are wanted, where no pose lit what the pixel looks through."""
+        are wanted, where no pose illuminated what the pixel looks through."""
         self._check(phase)
         px_per_rad = phase.period_px / (2 * np.pi)
-        return self.compiled(phase.axis).depth(phase.phase, px_per_rad, self._single_rays, supported)
+        return self.fast_axis(phase.axis).depth(phase.phase, px_per_rad, self._single_rays, supported)
 
     def support(self, phase: PhaseMap) -> np.ndarray:
         """(h, w) bool: measured pixels that target poses support, in the camera and in the projector."""
@@ -115,7 +115,7 @@ class SplinedModel:
         """(h, w) float32: |dz/dphi| mm/rad at the phases measured."""
         self._check(phase)
         px_per_rad = phase.period_px / (2 * np.pi)
-        return self.compiled(phase.axis).depth_per_px(phase.phase, px_per_rad) * np.float32(px_per_rad)
+        return self.fast_axis(phase.axis).depth_per_px(phase.phase, px_per_rad) * np.float32(px_per_rad)
 
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
         """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``; NaN where points are."""
@@ -126,24 +126,24 @@ class SplinedModel:
         """Projector px that phases of the target poses scatter by beyond their predicted noise (1 sigma): what disturbs
         the phase there disturbs it in every capture."""
         excess = float(self.bundle.noise.excess_px[AXES.index(axis)])
-        return excess if excess > 2 * LEAST_SIGMA_PX else 0.0  # the least that an estimate can be means none
+        return excess if excess > 2 * MIN_SIGMA_PX else 0.0  # the least that an estimate can be means none
 
     def sigma_map(self, axis: Axis) -> SigmaMap:
         """What the calibration leaves uncertain of depths through one axis, wherever points are measured."""
         if axis not in self._sigma_maps:
-            self._sigma_maps[axis] = sigma_map(self.bundle, axis, *self.depths_mm)
+            self._sigma_maps[axis] = compute_sigma_map(self.bundle, axis, *self.depths_mm)
         return self._sigma_maps[axis]
 
     def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
         """(h, w) float32 mm: standard deviation of depth that the calibration leaves, rigid motion apart; NaN where the
         organised points (h, w, 3) are. It is the same in every scan, and averages out in none. Where residuals exceed
         their noise it is larger by that ratio, for what they consist of then is not independent."""
-        return self.sigma_map(axis).at(points) * np.float32(self.residuals_over_noise(axis))
+        return self.sigma_map(axis).interpolate(points) * np.float32(self.residuals_over_noise(axis))
 
     @cached_property
     def sigma_volume(self) -> dict[str, Any]:
-        """Uncertainty of the working volume, as ``uncertainty.volume_sigma`` returns it."""
-        return volume_sigma(self.bundle)
+        """Uncertainty of the working volume, as ``uncertainty.summarise_volume_sigma`` returns it."""
+        return summarise_volume_sigma(self.bundle)
 
     def summary(self) -> dict[str, Any]:
         """The figures of ``text``, JSON-able."""
@@ -194,7 +194,7 @@ class SplinedModel:
                     [f"  board turned by 180 degrees in {', '.join(bundle.turned)}: numbered as in the others"]
                     * bool(bundle.turned)
                 ),
-                f"  lit by target poses: {100 * lit['camera']:.0f} % of the camera's cells, "
+                f"  illuminated by target poses: {100 * lit['camera']:.0f} % of the camera's cells, "
                 f"{100 * lit['projector']:.0f} % of the projector's",
                 f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma): median "
                 f"{sure['median']:.4f} mm and 95 % below {sure['p95']:.4f} mm over the {100 * sure['supported']:.0f} % "
@@ -211,9 +211,9 @@ class SplinedModel:
         return self.bundle.to_arrays()
 
     @classmethod
-    def restored(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "SplinedModel":
+    def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "SplinedModel":
         """The inverse of ``to_dict`` and ``to_arrays``."""
-        return cls(Bundle.restored(data, arrays))
+        return cls(Bundle.from_arrays(data, arrays))
 
     def _check(self, phase: PhaseMap) -> None:
         width, height = (int(n) for n in self.rig.camera.size)
@@ -231,4 +231,4 @@ def calibrate_splined(
 
     Raises InputError where poses lack an axis, and CalibrationRejected where they contradict each other.
     """
-    return SplinedModel(adjust(observations, stereo, progress))
+    return SplinedModel(adjust_bundle(observations, stereo, progress))

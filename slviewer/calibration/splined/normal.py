@@ -6,24 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slviewer.calibration.splined.board_shape import TERMS
-from slviewer.calibration.splined.residuals import (
-    CAMERA,
-    DENSE,
-    HEIGHT,
-    OFFSET,
-    PROJECTOR,
-    feature_row,
-    sample_row,
-)
+from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
+from slviewer.calibration.splined.residuals import CAMERA, DENSE, HEIGHT, OFFSET, PROJECTOR, feature_row, sample_row
 from slviewer.calibration.splined.unknowns import RIG, State
 from slviewer.geometry.jit import kernel
 
-MOST_LANES = 4
+MAX_LANES = 4
 """Matrices that threads fill side by side: each takes the memory of the whole."""
 
 
-class Data(NamedTuple):
+class PoseData(NamedTuple):
     """What was observed, all poses one after another.
 
     Of pose i, features ``feature_from[i] : feature_from[i + 1]``: ``feature`` (n,) which of the board's, seen at
@@ -41,7 +33,7 @@ class Data(NamedTuple):
     frame: np.ndarray
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Room for one thread."""
 
     camera_basis: np.ndarray
@@ -58,32 +50,32 @@ class Work(NamedTuple):
 
 
 @kernel()
-def _work():
-    return Work(
+def _allocate_workspace():
+    return Workspace(
         np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((2, 3)), np.zeros((2, 9)), np.zeros((2, 9)), np.zeros((2, 2)),
-        np.zeros((3, TERMS)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
+        np.zeros((3, HEIGHT_TERMS)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
     )  # fmt: skip
 
 
-def predicted(state: State, data: Data) -> tuple[np.ndarray, np.ndarray]:
+def predict_observations(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
     """Where features (n, 2) and samples' projector coordinates (m, 2) should be, px; NaN where nothing is seen."""
     features, samples = np.empty_like(data.feature_px), np.empty_like(data.sample_px)
     model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
-    shares = _shares(state.layout.poses)
+    shares = _split_poses(state.layout.poses)
     with ThreadPoolExecutor(len(shares)) as threads:
         list(threads.map(lambda poses: _predict(*model, data, poses, features, samples), shares))
     return features, samples
 
 
 def normal_equations(
-    state: State, data: Data, residuals: tuple[np.ndarray, np.ndarray], weights: tuple[np.ndarray, np.ndarray]
+    state: State, data: PoseData, residuals: tuple[np.ndarray, np.ndarray], weights: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N, N) of which the upper triangle is filled, and (N,): J'WJ and J'W r.
 
     ``residuals`` and ``weights``: of features (n, 2), and of samples (m, 2); what weighs 0 may be NaN.
     """
     layout = state.layout
-    shares = _shares(layout.poses)
+    shares = _split_poses(layout.poses)
     matrices = [np.zeros((layout.size, layout.size)) for _ in shares]
     right = np.zeros((len(shares), layout.size))
     at = np.array(
@@ -102,15 +94,15 @@ def normal_equations(
     return matrices[0], right.sum(0)
 
 
-def _shares(poses: int) -> list[np.ndarray]:
+def _split_poses(poses: int) -> list[np.ndarray]:
     """The poses of each thread: a kernel's parallel loops take no structures."""
-    lanes = max(1, min(MOST_LANES, cpu_count() or 1, poses))
+    lanes = max(1, min(MAX_LANES, cpu_count() or 1, poses))
     return [np.arange(lane, poses, lanes) for lane in range(lanes)]
 
 
 @kernel()
 def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
-    work = _work()
+    work = _allocate_workspace()
     row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
     for i in poses:
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
@@ -125,10 +117,10 @@ def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
 
 @kernel()
 def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_w, sample_w, at, poses, A, b):
-    work = _work()
+    work = _allocate_workspace()
     row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
     columns = np.empty(DENSE, np.int64)  # of a row's entries, in the order of the vector
-    for c in range(TERMS):
+    for c in range(HEIGHT_TERMS):
         columns[HEIGHT + c] = at[0] + c
     for c in range(RIG):
         columns[CAMERA + c] = at[2] + c

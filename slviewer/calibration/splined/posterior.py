@@ -1,15 +1,15 @@
-"""How a measured point answers to the rig's unknowns: what turns their covariance into the cloud's."""
+"""Derivatives of measured points by the rig's unknowns, which turn their covariance into the cloud's."""
 
 import numpy as np
 import scipy.sparse as sp
 
-from slviewer.calibration.splined.residuals import looking, seen_by
+from slviewer.calibration.splined.residuals import project_to_device, undistort_ray
 from slviewer.calibration.splined.unknowns import LENS, RIG, State
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 
-ENTRIES = RIG + 48
+MAX_ENTRIES = RIG + 48
 """A row's unknowns: lenses, rotation and translation; 16 knots of either component of the camera's field, 16 of one of
 the projector's."""
 
@@ -23,15 +23,15 @@ def point_rows(state: State, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> s
         raise InputError(f"the axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows)")
     at = state.layout
     starts = np.array([at.camera_field - at.rig, at.projector_field - at.rig], np.int64)
-    values, columns = np.zeros((len(z), 3, ENTRIES)), np.zeros((len(z), ENTRIES), np.int64)
-    _rows(state.rig, 0 if axis == "x" else 1, pixels, z, starts, values, columns)
+    values, columns = np.zeros((len(z), 3, MAX_ENTRIES)), np.zeros((len(z), MAX_ENTRIES), np.int64)
+    _fill_rows(state.rig, 0 if axis == "x" else 1, pixels, z, starts, values, columns)
     indices = np.repeat(columns, 3, axis=0).ravel()
-    pointers = np.arange(0, 3 * len(z) + 1) * ENTRIES
+    pointers = np.arange(0, 3 * len(z) + 1) * MAX_ENTRIES
     return sp.csr_matrix((values.ravel(), indices, pointers), (3 * len(z), at.size - at.rig))
 
 
 @kernel()
-def _rows(rig, row, pixels, depths, starts, values, columns):
+def _fill_rows(rig, row, pixels, depths, starts, values, columns):
     basis, other = np.zeros((4, 4)), np.zeros((4, 4))
     by_point, by_lens = np.zeros((2, 3)), np.zeros((2, 9))
     ray_by_lens, ray_by_field = np.zeros((2, 9)), np.zeros((2, 2))
@@ -40,11 +40,11 @@ def _rows(rig, row, pixels, depths, starts, values, columns):
     knots, others = stride * rig.camera.coefficients.shape[1], across * rig.projector.coefficients.shape[1]
     for n in range(depths.shape[0]):
         z = depths[n]
-        x, y, ci, cj = looking(rig.camera, pixels[n, 0], pixels[n, 1], basis, ray_by_lens, ray_by_field)
+        x, y, ci, cj = undistort_ray(rig.camera, pixels[n, 0], pixels[n, 1], basis, ray_by_lens, ray_by_field)
         for a in range(3):
             V[a] = z * (rig.R[a, 0] * x + rig.R[a, 1] * y + rig.R[a, 2])
             X[a] = V[a] + rig.t[a]
-        u, _, pi, pj = seen_by(rig.projector, X, other, by_point, by_lens)
+        u, _, pi, pj = project_to_device(rig.projector, X, other, by_point, by_lens)
         if not (np.isfinite(u) and np.isfinite(x)):
             values[n] = np.nan
             continue
@@ -59,12 +59,12 @@ def _rows(rig, row, pixels, depths, starts, values, columns):
             dx, dy = ray_by_lens[0, c], ray_by_lens[1, c]
             dz = per_z * z * (m[0] * dx + m[1] * dy)
             values[n, 0, c], values[n, 1, c], values[n, 2, c] = x * dz + z * dx, y * dz + z * dy, dz
-            _along(values[n], LENS + c, x, y, per_z * by_lens[row, c])
-        _along(values[n], 2 * LENS, x, y, per_z * (p[2] * V[1] - p[1] * V[2]))
-        _along(values[n], 2 * LENS + 1, x, y, per_z * (p[0] * V[2] - p[2] * V[0]))
-        _along(values[n], 2 * LENS + 2, x, y, per_z * (p[1] * V[0] - p[0] * V[1]))
+            _depth_direction(values[n], LENS + c, x, y, per_z * by_lens[row, c])
+        _depth_direction(values[n], 2 * LENS, x, y, per_z * (p[2] * V[1] - p[1] * V[2]))
+        _depth_direction(values[n], 2 * LENS + 1, x, y, per_z * (p[0] * V[2] - p[2] * V[0]))
+        _depth_direction(values[n], 2 * LENS + 2, x, y, per_z * (p[1] * V[0] - p[0] * V[1]))
         for a in range(3):
-            _along(values[n], 2 * LENS + 3 + a, x, y, per_z * p[a])
+            _depth_direction(values[n], 2 * LENS + 3 + a, x, y, per_z * p[a])
         for a in range(4):
             for b in range(4):
                 k, spline = 4 * a + b, basis[2, a] * basis[0, b]
@@ -75,10 +75,10 @@ def _rows(rig, row, pixels, depths, starts, values, columns):
                     columns[n, c] = starts[0] + component * knots + (cj + a) * stride + ci + b
                     values[n, 0, c], values[n, 1, c], values[n, 2, c] = x * dz + z * dx, y * dz + z * dy, dz
                 columns[n, RIG + 32 + k] = starts[1] + row * others + (pj + a) * across + pi + b
-                _along(values[n], RIG + 32 + k, x, y, per_z * other[2, a] * other[0, b])
+                _depth_direction(values[n], RIG + 32 + k, x, y, per_z * other[2, a] * other[0, b])
 
 
 @kernel()
-def _along(values, column, x, y, dz):
+def _depth_direction(values, column, x, y, dz):
     """A change of depth alone moves the point along its ray."""
     values[0, column], values[1, column], values[2, column] = x * dz, y * dz, dz

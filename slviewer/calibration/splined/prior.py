@@ -1,4 +1,4 @@
-"""What is known of the unknowns without looking."""
+"""Prior of the unknowns: normal distributions that regularise the adjustment."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ import numpy as np
 
 from slviewer.calibration.splined.board_shape import GAUGE_MM, HEIGHT_SIGMA_MM, OFFSET_SIGMA_MM, offset_gauge
 from slviewer.calibration.splined.fields import roughness
-from slviewer.calibration.splined.normal import Data
-from slviewer.calibration.splined.residual_noise import better_strength
+from slviewer.calibration.splined.normal import PoseData
+from slviewer.calibration.splined.residual_noise import update_strength
 from slviewer.calibration.splined.unknowns import State
 
 POSE_SIGMA = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
-"""rad and mm: holds a pose that was set aside as a whole."""
+"""rad and mm: holds a pose that was excluded as a whole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Prior:
     gauge: np.ndarray
 
     @classmethod
-    def of(cls, state: State, data: Data) -> "Prior":
+    def build(cls, state: State, data: PoseData) -> "Prior":
         forms = [roughness(d.coefficients) for d in (state.rig.camera, state.rig.projector)]
         return cls((forms[0], forms[1]), offset_gauge(data.points))
 
@@ -54,13 +54,13 @@ class Prior:
             total += strength * float(np.sum(field * (field @ form)))
         return 0.5 * float(total)
 
-    def better(
+    def update_strengths(
         self, strengths: Sequence[float], state: State, solve: Callable[[np.ndarray], np.ndarray]
     ) -> list[float]:
         """The fields' strengths after one update."""
         size = state.layout.size
         return [
-            better_strength(strength, form, field, first, solve, size)
+            update_strength(strength, form, field, first, solve, size)
             for first, field, form, strength in self._fields(state, strengths)
         ]
 

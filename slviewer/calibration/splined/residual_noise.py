@@ -1,4 +1,4 @@
-"""How much each observation and each prior counts: estimated from the residuals, never taken from constants."""
+"""Weights of observations and priors, estimated from the residuals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,19 +6,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from slviewer.calibration.splined.normal import Data
+from slviewer.calibration.splined.normal import PoseData
 
-TUKEY = 4.685
-"""Sigmas beyond which an observation says nothing: 95 % efficient on normal residuals."""
-LEAST_SIGMA_PX = 1e-4
-MOST_RATIO = 100.0
+TUKEY_SIGMAS = 4.685
+"""Sigmas beyond which an observation has no weight: 95 % efficient on normal residuals."""
+MIN_SIGMA_PX = 1e-4
+MAX_RATIO = 100.0
 """Of residuals over their predicted noise, that the difference of both can tell."""
-MOST_OWN = 2.5
+MAX_POSE_NOISE_RATIO = 2.5
 """How many times the features' common noise one pose may have of its own: a tilted or blurred board is read less well.
 What exceeds that contradicts the other poses."""
 PROBES = 24
 """Random vectors that estimate a trace: to a percent of it."""
-STRENGTHS = (1e-1, 1e6)
+STRENGTH_BOUNDS = (1e-1, 1e6)
 """Bounds of a prior's strength, 1/px^2: a field of px and no prior, or no field."""
 
 
@@ -35,7 +35,7 @@ class Noise:
     def ratio(self) -> tuple[float, float]:
         """How many times their own predicted noise the samples scatter by, x and y: 1 where noise explains them."""
         pairs = zip(self.sample_px, self.excess_px, strict=True)
-        predicted = [np.sqrt(max(s * s - e * e, (s / MOST_RATIO) ** 2, LEAST_SIGMA_PX**2)) for s, e in pairs]
+        predicted = [np.sqrt(max(s * s - e * e, (s / MAX_RATIO) ** 2, MIN_SIGMA_PX**2)) for s, e in pairs]
         x, y = (max(1.0, float(s / p)) for s, p in zip(self.sample_px, predicted, strict=True))
         return x, y
 
@@ -44,21 +44,21 @@ class Noise:
         return np.sqrt(sample_sigma**2 + np.square(self.excess_px))
 
 
-def measured_noise(features: np.ndarray, samples: np.ndarray, sample_sigma: np.ndarray) -> Noise:
+def estimate_noise(features: np.ndarray, samples: np.ndarray, sample_sigma: np.ndarray) -> Noise:
     """From residuals (n, 2) of features and (m, 2) of samples, robustly; what is NaN does not count."""
     camera = 1.4826 * float(np.nanmedian(np.abs(features)))
-    excess = [_excess(samples[:, k], sample_sigma[:, k]) for k in range(2)]
+    excess = [_excess_sigma(samples[:, k], sample_sigma[:, k]) for k in range(2)]
     total = 1.4826 * np.nanmedian(np.abs(samples), axis=0)
-    return Noise(max(camera, LEAST_SIGMA_PX), (excess[0], excess[1]), (float(total[0]), float(total[1])))
+    return Noise(max(camera, MIN_SIGMA_PX), (excess[0], excess[1]), (float(total[0]), float(total[1])))
 
 
-def _excess(residuals: np.ndarray, sigma: np.ndarray) -> float:
+def _excess_sigma(residuals: np.ndarray, sigma: np.ndarray) -> float:
     """What, added to the predicted noise, makes the residuals' robust standard deviation 1."""
     read = np.isfinite(residuals) & np.isfinite(sigma)
     if not read.any():
-        return LEAST_SIGMA_PX
+        return MIN_SIGMA_PX
     r, variance = np.abs(residuals[read]), sigma[read] ** 2
-    low, high = LEAST_SIGMA_PX, max(3.0 * float(np.median(r)), LEAST_SIGMA_PX)
+    low, high = MIN_SIGMA_PX, max(3.0 * float(np.median(r)), MIN_SIGMA_PX)
     for _ in range(40):
         middle = 0.5 * (low + high)
         too_wide = 1.4826 * np.median(r / np.sqrt(variance + middle**2)) > 1.0
@@ -66,14 +66,14 @@ def _excess(residuals: np.ndarray, sigma: np.ndarray) -> float:
     return high
 
 
-def own_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) -> np.ndarray:
+def pose_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) -> np.ndarray:
     """(n, 2) px: each feature's noise, that of its pose where it exceeds what all have in common."""
     sigma = np.full_like(features, noise.camera_px)
     for first, last in pairwise(feature_from):
         found = np.abs(features[first:last])
         if np.isfinite(found).any():
             own = 1.4826 * float(np.nanmedian(found))
-            sigma[first:last] = np.clip(own, noise.camera_px, MOST_OWN * noise.camera_px)
+            sigma[first:last] = np.clip(own, noise.camera_px, MAX_POSE_NOISE_RATIO * noise.camera_px)
     return sigma
 
 
@@ -86,13 +86,15 @@ def robust_weights(
     """
     weights = []
     for r, s in zip((features, samples), sigmas, strict=True):
-        scaled = np.minimum(np.abs(np.nan_to_num(r / s, nan=0.0)) / TUKEY, 1.0)
+        scaled = np.minimum(np.abs(np.nan_to_num(r / s, nan=0.0)) / TUKEY_SIGMAS, 1.0)
         trust = np.prod((1.0 - scaled**2) ** 2, axis=1, keepdims=True)
         weights.append(np.where(np.isfinite(r / s), trust / s**2, 0.0))
     return weights[0], weights[1]
 
 
-def pose_trust(weights: tuple[np.ndarray, np.ndarray], sigmas: tuple[np.ndarray, np.ndarray], data: Data) -> np.ndarray:
+def pose_trust(
+    weights: tuple[np.ndarray, np.ndarray], sigmas: tuple[np.ndarray, np.ndarray], data: PoseData
+) -> np.ndarray:
     """(poses, 2): the mean of Tukey's biweight over each pose's features, and over its samples."""
     trust = []
     for w, s, start in zip(weights, sigmas, (data.feature_from, data.sample_from), strict=True):
@@ -102,7 +104,7 @@ def pose_trust(weights: tuple[np.ndarray, np.ndarray], sigmas: tuple[np.ndarray,
     return np.stack(trust, axis=1)
 
 
-def better_strength(
+def update_strength(
     strength: float,
     form: np.ndarray,
     field: np.ndarray,
@@ -124,4 +126,4 @@ def better_strength(
     trace = float(np.sum(spread * pulled)) / PROBES
     determined = max(components * n - strength * trace, 1.0)
     energy = float(np.sum(field * (field @ form)))
-    return float(np.clip(determined / max(energy, 1e-12), *STRENGTHS))
+    return float(np.clip(determined / max(energy, 1e-12), *STRENGTH_BOUNDS))

@@ -8,8 +8,8 @@ Derivatives follow the vector of ``unknowns``, with a small dense row for pose (
 import numpy as np
 
 from slviewer.calibration.splined.board_shape import height_at
-from slviewer.calibration.splined.fields import displacement, undisplaced
-from slviewer.geometry.brown import brown, unbrown
+from slviewer.calibration.splined.fields import displacement, remove_displacement
+from slviewer.geometry.brown import distort_point, undistort_point
 from slviewer.geometry.jit import kernel
 
 POSE, HEIGHT, OFFSET, CAMERA, PROJECTOR, TURN, SHIFT, DENSE = 0, 6, 18, 20, 29, 38, 41, 44
@@ -17,7 +17,7 @@ POSE, HEIGHT, OFFSET, CAMERA, PROJECTOR, TURN, SHIFT, DENSE = 0, 6, 18, 20, 29, 
 
 
 @kernel()
-def seen_by(device, X, basis, by_point, by_lens):
+def project_to_device(device, X, basis, by_point, by_lens):
     """(u, v, first column, first row of the field's cell) of a point X (3,) in the device's frame.
 
     Fills ``by_point`` (2, 3) and ``by_lens`` (2, 9); the derivative by the field's coefficients is ``basis``'s product.
@@ -27,7 +27,7 @@ def seen_by(device, X, basis, by_point, by_lens):
     x, y = X[0] * inverse, X[1] * inverse
     if not (X[2] > 0.0 and x * x + y * y < k[9]):
         return np.nan, np.nan, 0, 0
-    xd, yd, dxx, dxy, dyy = brown(x, y, k)
+    xd, yd, dxx, dxy, dyy = distort_point(x, y, k)
     u, v = k[0] * xd + k[2], k[1] * yd + k[3]
     du, dv, duu, duv, dvu, dvv, i, j = displacement(device, u, v, basis)
     r2 = x * x + y * y
@@ -56,19 +56,19 @@ def seen_by(device, X, basis, by_point, by_lens):
 
 
 @kernel()
-def looking(device, u, v, basis, by_lens, by_field):
+def undistort_ray(device, u, v, basis, by_lens, by_field):
     """(x, y, first column, first row): the undistorted normalised point that a camera pixel sees.
 
     Fills ``by_lens`` (2, 9), and ``by_field`` (2, 2): by a displacement along u and v where the field is evaluated.
     """
     k = device.numbers
-    qu, qv = undisplaced(device, u, v, basis)
+    qu, qv = remove_displacement(device, u, v, basis)
     xd, yd = (qu - k[2]) / k[0], (qv - k[3]) / k[1]
-    x, y = unbrown(xd, yd, k)
+    x, y = undistort_point(xd, yd, k)
     if not np.isfinite(x):
         return np.nan, np.nan, 0, 0
     _, _, duu, duv, dvu, dvv, i, j = displacement(device, qu, qv, basis)
-    _, _, dxx, dxy, dyy = brown(x, y, k)
+    _, _, dxx, dxy, dyy = distort_point(x, y, k)
     determinant = dxx * dyy - dxy * dxy
     ixx, ixy, iyy = dyy / determinant, -dxy / determinant, dxx / determinant
     r2 = x * x + y * y
@@ -119,7 +119,7 @@ def feature_row(rig, R, t, heights, frame, point, offset, work, row):
     for a in range(3):
         L[a] = R[a, 0] * x + R[a, 1] * y + R[a, 2] * z
         X[a] = L[a] + t[a]
-    u, v, i, j = seen_by(rig.camera, X, work.camera_basis, work.by_point, work.by_lens)
+    u, v, i, j = project_to_device(rig.camera, X, work.camera_basis, work.by_point, work.by_lens)
     row[:] = 0.0
     if not np.isfinite(u):
         return u, v, i, j
@@ -148,7 +148,7 @@ def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
     Fills ``row`` (2, 44), ``by_field`` (2, 2) by the camera's displacement, and both bases of ``work``.
     """
     row[:] = 0.0
-    x, y, ci, cj = looking(rig.camera, u, v, work.camera_basis, work.ray_by_lens, work.ray_by_field)
+    x, y, ci, cj = undistort_ray(rig.camera, u, v, work.camera_basis, work.ray_by_lens, work.ray_by_field)
     facing = R[0, 2] * x + R[1, 2] * y + R[2, 2]
     if not (np.isfinite(x) and facing != 0.0):
         return np.nan, np.nan, ci, cj, 0, 0
@@ -172,7 +172,7 @@ def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
     for a in range(3):
         V[a] = s * (rig.R[a, 0] * x + rig.R[a, 1] * y + rig.R[a, 2])
         X[a] = V[a] + rig.t[a]
-    pu, pv, pi, pj = seen_by(rig.projector, X, work.projector_basis, work.by_point, work.by_lens)
+    pu, pv, pi, pj = project_to_device(rig.projector, X, work.projector_basis, work.by_point, work.by_lens)
     if not np.isfinite(pu):
         return np.nan, np.nan, ci, cj, pi, pj
     for k in range(2):

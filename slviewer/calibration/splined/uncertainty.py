@@ -1,11 +1,11 @@
-"""How sure the calibration is of every place: standard deviations that no longer exposure and no second scan lessens.
+"""Calibration uncertainty at every point: systematic, so that neither longer exposure nor repeated scans reduce it.
 
 All of them are of what a rigid motion leaves: where the whole space lies in the camera's frame is thirty times less
 certain than its shape, and nothing that is measured with it depends on that.
 
-Where no target pose looked, the fields are what their priors make of their edges. A prior takes second differences for
+Outside the calibrated region, the fields are extrapolated by their priors. A prior takes second differences for
 independent of each other; where a lens's are not, it errs by more than the prior says, and by how much more is seen in
-the fields' supported part: ``persistence``.
+the fields' supported part: ``persistence_ratio``.
 """
 
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.volume import (
     BestMotion,
     Volume,
-    better_axis,
-    is_lit,
-    looked,
+    depth_axis,
+    is_supported,
     motion_free,
     sigma_3d,
+    view_pixels,
     working_volume,
 )
 from slviewer.fringe.sequence import Axis
@@ -33,8 +33,8 @@ from slviewer.geometry.jit import kernel
 NODES = (21, 16, 11)
 """Of the map across, down, and in depth: then what lies between is right within a tenth or two, and a map takes about a
 second."""
-LEAST_FITTED = 3
-CARRIED = 3
+MIN_FITTED_POINTS = 3
+EXTRAPOLATED_CELLS = 3
 """Cells: about how far beyond the supported ones the working volume goes."""
 
 
@@ -47,7 +47,7 @@ class SigmaMap:
     near: float
     far: float
 
-    def at(self, points: np.ndarray) -> np.ndarray:
+    def interpolate(self, points: np.ndarray) -> np.ndarray:
         """(h, w) float32 mm at the organised points (h, w, 3) of the whole image; NaN where they are.
 
         Between nodes its logarithm is linear: it grows hundredfold where support ends.
@@ -57,16 +57,16 @@ class SigmaMap:
         return out
 
 
-def sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> SigmaMap:
+def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> SigmaMap:
     """What the calibration leaves uncertain of the depths measured through one axis: a second of work.
 
     The rigid motion is that of the working volume's supported places.
     """
     rig = bundle.state.rig
     reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
-    motion = BestMotion.of(reference.points, _fitted(bundle, reference))
+    motion = BestMotion.fit(reference.points, _select_fitted(bundle, reference))
     jacobian = bundle.point_jacobian(axis, reference.pixels, reference.z)
-    moved = bundle.whitened(jacobian) @ motion.weights.astype(np.float32)
+    moved = bundle.whiten(jacobian) @ motion.weights.astype(np.float32)
     width, height = (int(n) for n in rig.camera.size)
     across, down, deep = NODES
     v, u, z = np.meshgrid(
@@ -75,9 +75,9 @@ def sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> SigmaMap:
     pixels, nodes = np.column_stack([u.ravel(), v.ravel()]), z.ravel()
     jacobian = bundle.point_jacobian(axis, pixels, nodes)[2::3]
     jacobian.data[~np.isfinite(jacobian.data)] = 0.0
-    places = Volume(pixels, nodes, *looked(rig, pixels, nodes))
-    depths = bundle.whitened(jacobian) - moved @ motion.at(places.points)[2::3].astype(np.float32).T
-    sigma = np.sqrt(np.einsum("mn,mn->n", depths, depths)) * beyond(bundle, places)
+    places = Volume(pixels, nodes, *view_pixels(rig, pixels, nodes))
+    depths = bundle.whiten(jacobian) - moved @ motion.displace(places.points)[2::3].astype(np.float32).T
+    sigma = np.sqrt(np.einsum("mn,mn->n", depths, depths)) * extrapolation_factor(bundle, places)
     unknown = np.isnan(sigma) | (abs(jacobian).sum(axis=1).A1 == 0)
     sigma, unknown = sigma.reshape(u.shape), unknown.reshape(u.shape)
     # a pixel that is measured may have a node beyond the projector's view beside it
@@ -85,34 +85,35 @@ def sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> SigmaMap:
     return SigmaMap(np.ascontiguousarray(sigma[tuple(nearest)], np.float32), near, far)
 
 
-def sigma_of(bundle: Bundle, axis: Axis, volume: Volume) -> np.ndarray:
+def volume_sigmas(bundle: Bundle, axis: Axis, volume: Volume) -> np.ndarray:
     """(n,) mm: standard deviation in all directions together of a volume's places, measured through one axis, without
     the rigid motion of those that are supported."""
-    whitened = bundle.whitened(bundle.point_jacobian(axis, volume.pixels, volume.z))
-    sigma = sigma_3d(motion_free(whitened, volume.points, _fitted(bundle, volume)))
-    return np.asarray(sigma * beyond(bundle, volume))
+    whitened = bundle.whiten(bundle.point_jacobian(axis, volume.pixels, volume.z))
+    sigma = sigma_3d(motion_free(whitened, volume.points, _select_fitted(bundle, volume)))
+    return np.asarray(sigma * extrapolation_factor(bundle, volume))
 
 
-def beyond(bundle: Bundle, places: Volume) -> np.ndarray:
-    """(n,): by how much the priors' standard deviations are too small: 1 where target poses looked; elsewhere the
-    persistence of the field, or fields, that none of them lit there."""
+def extrapolation_factor(bundle: Bundle, places: Volume) -> np.ndarray:
+    """(n,): by how much the priors' standard deviations are too small: 1 inside the calibrated region; elsewhere the
+    persistence of the field, or fields, that none of them illuminated there."""
     factor = np.ones(len(places.z))
     rig = bundle.state.rig
     for device, pixels, poses in (
         (rig.camera, places.pixels, bundle.camera_poses),
         (rig.projector, places.projector, bundle.projector_poses),
     ):
-        factor = np.where(is_lit(device, pixels, poses > 0), factor, np.maximum(factor, persistence(device, poses > 0)))
+        supported = is_supported(device, pixels, poses > 0)
+        factor = np.where(supported, factor, np.maximum(factor, persistence_ratio(device, poses > 0)))
     return factor
 
 
-def persistence(device: Device, lit: np.ndarray) -> float:
+def persistence_ratio(device: Device, lit: np.ndarray) -> float:
     """How much farther a field's second differences carry over some cells than if they were independent: the ratio of
-    their sums' standard deviations, over the cells (rows, columns) bool that poses lit; 1 or more."""
+    their sums' standard deviations, over the cells (rows, columns) bool that poses illuminated; 1 or more."""
     c = device.coefficients
     corners = np.pad(lit, 1, mode="edge")
     known = corners[:-1, :-1] & corners[1:, :-1] & corners[:-1, 1:] & corners[1:, 1:]
-    whole = binary_erosion(known, np.ones((CARRIED, CARRIED), bool))
+    whole = binary_erosion(known, np.ones((EXTRAPOLATED_CELLS, EXTRAPOLATED_CELLS), bool))
     if not whole.any():
         return 1.0
     middle = 2 * c[:, 1:-1, 1:-1]
@@ -120,21 +121,21 @@ def persistence(device: Device, lit: np.ndarray) -> float:
     each, together = 0.0, 0.0
     for differences in (*across, *down):
         each += float(np.mean(differences[known] ** 2))
-        together += float(np.mean(uniform_filter(differences, CARRIED)[whole] ** 2)) * CARRIED**2
+        together += float(np.mean(uniform_filter(differences, EXTRAPOLATED_CELLS)[whole] ** 2)) * EXTRAPOLATED_CELLS**2
     return max(1.0, float(np.sqrt(together / max(each, 1e-300))))
 
 
-def volume_sigma(bundle: Bundle) -> dict[str, Any]:
-    """How sure points of the working volume are, in all directions together, before anything is scanned.
+def summarise_volume_sigma(bundle: Bundle) -> dict[str, Any]:
+    """Uncertainty of the working volume's points, in all directions together, before anything is scanned.
 
     ``median``, ``p95`` mm over the places that target poses support; ``worst`` mm of all, and ``worst_at`` (u, v, z);
     ``supported``: their share of what camera and projector both see; ``depths_mm``; the ``axis`` measured through.
     """
     rig = bundle.state.rig
     volume = working_volume(rig, bundle.depth_range_mm)
-    axis = better_axis(rig, volume)
-    fitted = _fitted(bundle, volume)
-    sigma = sigma_of(bundle, axis, volume)
+    axis = depth_axis(rig, volume)
+    fitted = _select_fitted(bundle, volume)
+    sigma = volume_sigmas(bundle, axis, volume)
     worst = int(np.argmax(sigma))
     return {
         "median": float(np.median(sigma[fitted])),
@@ -147,10 +148,10 @@ def volume_sigma(bundle: Bundle) -> dict[str, Any]:
     }
 
 
-def _fitted(bundle: Bundle, volume: Volume) -> np.ndarray:
+def _select_fitted(bundle: Bundle, volume: Volume) -> np.ndarray:
     """(n,) bool: the supported places; all, where these are too few to say how the space lies."""
     supported = volume.supported(bundle.state.rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
-    return supported if np.count_nonzero(supported) >= LEAST_FITTED else np.ones(len(supported), bool)
+    return supported if np.count_nonzero(supported) >= MIN_FITTED_POINTS else np.ones(len(supported), bool)
 
 
 @kernel(parallel=True)

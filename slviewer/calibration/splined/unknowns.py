@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from slviewer.calibration.splined.board_shape import TERMS
+from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
 from slviewer.calibration.splined.fields import Device, no_displacement
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.brown import fold_radius_squared
@@ -47,7 +47,7 @@ class UnknownLayout:
 
     @property
     def offsets(self) -> int:
-        return self.height + TERMS
+        return self.height + HEIGHT_TERMS
 
     @property
     def rig(self) -> int:
@@ -78,7 +78,7 @@ class State:
     offsets: np.ndarray
 
     @classmethod
-    def start(cls, stereo: StereoModel, poses: list[str], features: int) -> "State":
+    def from_stereo(cls, stereo: StereoModel, poses: list[str], features: int) -> "State":
         """Where a stereo calibration leaves off: no displacement, a flat board."""
         rig = stereo.rig
         devices = [
@@ -90,7 +90,7 @@ class State:
             Arrangement(devices[0], devices[1], rig.R.copy(), rig.t.copy()),
             np.ascontiguousarray(T[:, :3, :3]),
             np.ascontiguousarray(T[:, :3, 3]),
-            np.zeros(TERMS),
+            np.zeros(HEIGHT_TERMS),
             np.zeros((features, 2)),
         )
 
@@ -99,7 +99,7 @@ class State:
         knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
         return UnknownLayout(len(self.t_board), len(self.offsets), knots[0], knots[1])
 
-    def moved(self, step: np.ndarray) -> "State":
+    def step(self, step: np.ndarray) -> "State":
         """The state after a step in the vector's order; rotations turn from the left by small rotation vectors."""
         at = self.layout
         pose = step[: at.height].reshape(-1, 6)
@@ -108,12 +108,12 @@ class State:
         return replace(
             self,
             rig=Arrangement(
-                _moved(rig.camera, s[:LENS], fields[0]),
-                _moved(rig.projector, s[LENS : 2 * LENS], fields[1]),
-                turned(rig.R, s[2 * LENS : 2 * LENS + 3]),
+                _step_device(rig.camera, s[:LENS], fields[0]),
+                _step_device(rig.projector, s[LENS : 2 * LENS], fields[1]),
+                rotate_left(rig.R, s[2 * LENS : 2 * LENS + 3]),
                 rig.t + s[2 * LENS + 3 : RIG],
             ),
-            R_board=np.array([turned(R, w) for R, w in zip(self.R_board, pose[:, :3], strict=True)]),
+            R_board=np.array([rotate_left(R, w) for R, w in zip(self.R_board, pose[:, :3], strict=True)]),
             t_board=self.t_board + pose[:, 3:],
             heights=self.heights + step[at.height : at.offsets],
             offsets=self.offsets + step[at.offsets : at.rig].reshape(-1, 2),
@@ -127,13 +127,13 @@ def lens_of(device: Device) -> Lens:
     return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
 
 
-def turned(R: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def rotate_left(R: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """(3, 3): R turned from the left, and a rotation to rounding still."""
     u, _, v = np.linalg.svd(cv2.Rodrigues(np.ascontiguousarray(vector))[0] @ R)
     return np.asarray(u @ v)
 
 
-def _moved(device: Device, numbers: np.ndarray, coefficients: np.ndarray) -> Device:
+def _step_device(device: Device, numbers: np.ndarray, coefficients: np.ndarray) -> Device:
     k = device.numbers[:LENS] + numbers
     return Device(
         np.append(k, fold_radius_squared(k[4:])),

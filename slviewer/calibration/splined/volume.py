@@ -1,16 +1,16 @@
-"""The working volume: where the rig is asked how sure it is, and what of its errors means anything there."""
+"""The working volume: points at which uncertainty is evaluated, without the rigid motion that no measurement needs."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.calibration.splined.fields import Device, image_of, ray_of
+from slviewer.calibration.splined.fields import Device, distort_to_pixel, undistort_pixel
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 
-REACH = (0.87, 1.13)
+DEPTH_FACTORS = (0.87, 1.13)
 """Of the nearest and the farthest calibrated depth: in front of them (R1), inside (R2) and behind (R3), as the Letter
 measured."""
 
@@ -26,14 +26,16 @@ class Volume:
     projector: np.ndarray
 
     def supported(self, rig: Arrangement, camera_lit: np.ndarray, projector_lit: np.ndarray) -> np.ndarray:
-        """(n,) bool: those seen through cells (rows, columns) bool that target poses lit, in both devices."""
-        return is_lit(rig.camera, self.pixels, camera_lit) & is_lit(rig.projector, self.projector, projector_lit)
+        """(n,) bool: those seen through cells (rows, columns) bool that target poses illuminated, in both devices."""
+        return is_supported(rig.camera, self.pixels, camera_lit) & is_supported(
+            rig.projector, self.projector, projector_lit
+        )
 
 
 def working_volume(
     rig: Arrangement,
     calibrated_mm: tuple[float, float],
-    reach: tuple[float, float] = REACH,
+    reach: tuple[float, float] = DEPTH_FACTORS,
     columns: int = 9,
     rows: int = 7,
     depths: int = 5,
@@ -53,31 +55,31 @@ def working_volume(
         np.linspace(near, far, depths),
         indexing="ij",
     )
-    found = volume_at(rig, np.column_stack([u.ravel(), v.ravel()]), z.ravel())
+    found = select_visible(rig, np.column_stack([u.ravel(), v.ravel()]), z.ravel())
     if not len(found.z):
         raise InputError(f"camera and projector share nothing they both see at {near:.0f}-{far:.0f} mm")
     return found
 
 
-def volume_at(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volume:
+def select_visible(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volume:
     """Those of camera ``pixels`` (n, 2) at depths ``z`` (n,) mm that the projector's image holds."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
-    points, projector = looked(rig, pixels, z)
+    points, projector = view_pixels(rig, pixels, z)
     seen = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)  # False for NaN
     return Volume(pixels[seen], z[seen], points[seen], projector[seen])
 
 
-def looked(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def view_pixels(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) mm: what camera ``pixels`` (n, 2) float64 see at depths ``z`` (n,); (n, 2) px: where the projector has it,
     inside its image or not. NaN where a lens has no answer."""
     points, projector = np.empty((len(z), 3)), np.empty((len(z), 2))
-    _look(rig, pixels, z, points, projector)
+    _view_all(rig, pixels, z, points, projector)
     return points, projector
 
 
-def is_lit(device: Device, pixels: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    """(n,) bool: whether the cells of ``pixels`` (n, 2) are among those (rows, columns) bool that target poses lit;
-    beyond the image, those at its edge. False for NaN."""
+def is_supported(device: Device, pixels: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """(n,) bool: whether the cells of ``pixels`` (n, 2) are among those (rows, columns) bool that target poses
+    illuminated; beyond the image, those at its edge. False for NaN."""
     shape = np.array([lit.shape[1], lit.shape[0]])
     known = np.isfinite(pixels).all(axis=1)
     place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
@@ -85,9 +87,9 @@ def is_lit(device: Device, pixels: np.ndarray, lit: np.ndarray) -> np.ndarray:
     return np.asarray(lit[cells[:, 1], cells[:, 0]] & known)
 
 
-def better_axis(rig: Arrangement, volume: Volume) -> Axis:
+def depth_axis(rig: Arrangement, volume: Volume) -> Axis:
     """The projector coordinate that depth moves more, in the median over the volume."""
-    _, later = looked(rig, volume.pixels, 1.001 * volume.z)
+    _, later = view_pixels(rig, volume.pixels, 1.001 * volume.z)
     across, down = np.nanmedian(np.abs(later - volume.projector), axis=0)
     return "y" if down > across else "x"
 
@@ -102,7 +104,7 @@ class BestMotion:
     arm: float
 
     @classmethod
-    def of(cls, points: np.ndarray, fitted: np.ndarray | None = None) -> "BestMotion":
+    def fit(cls, points: np.ndarray, fitted: np.ndarray | None = None) -> "BestMotion":
         """For errors of ``points`` (n, 3), or of those that are ``fitted`` (n,) bool; the others weigh nothing.
 
         Raises InputError where these are fewer than three.
@@ -112,23 +114,23 @@ class BestMotion:
             raise InputError(f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three")
         centre = points[chosen].mean(axis=0)
         arm = max(float(np.sqrt(np.mean((points[chosen] - centre) ** 2))), 1e-12)
-        held = _motions(points, centre, arm) * np.repeat(chosen, 3)[:, None]
+        held = _motion_basis(points, centre, arm) * np.repeat(chosen, 3)[:, None]
         return cls(np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T, centre, arm)
 
-    def at(self, points: np.ndarray) -> np.ndarray:
+    def displace(self, points: np.ndarray) -> np.ndarray:
         """(3 n, 6): how points (n, 3) move; x, y, z of the first, then of the next."""
-        return _motions(points, self.centre, self.arm)
+        return _motion_basis(points, self.centre, self.arm)
 
 
 def motion_free(whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | None = None) -> np.ndarray:
     """(m, 3 n): ``whitened`` (m, 3 n; x, y, z of the first of ``points`` (n, 3), then of the next) without the rigid
-    motion of the points, which no measurement of a shape sees.
+    motion of the points, to which measurements of a shape are invariant.
 
     The motion is that which fits the points best, or those of them that are ``fitted`` (n,) bool; it is taken from all.
     A Jacobian by the unknowns is given transposed. Raises InputError where fewer than three points are fitted.
     """
-    motion = BestMotion.of(points, fitted)
-    weights, moved = motion.weights.astype(whitened.dtype), motion.at(points).astype(whitened.dtype)
+    motion = BestMotion.fit(points, fitted)
+    weights, moved = motion.weights.astype(whitened.dtype), motion.displace(points).astype(whitened.dtype)
     return np.asarray(whitened - (whitened @ weights) @ moved.T)
 
 
@@ -138,7 +140,7 @@ def sigma_3d(whitened: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(squares.reshape(-1, 3).sum(axis=1)))
 
 
-def _motions(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
+def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
     x, y, z = ((points - centre) / arm).T
     none, one = np.zeros(len(points)), np.ones(len(points))
     along = np.array(
@@ -152,10 +154,10 @@ def _motions(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
 
 
 @kernel()
-def _look(rig, pixels, depths, points, projector):
+def _view_all(rig, pixels, depths, points, projector):
     basis = np.zeros((4, 4))
     for n in range(depths.shape[0]):
-        x, y = ray_of(rig.camera, pixels[n, 0], pixels[n, 1], basis)
+        x, y = undistort_pixel(rig.camera, pixels[n, 0], pixels[n, 1], basis)
         z = depths[n]
         points[n, 0], points[n, 1], points[n, 2] = x * z, y * z, z
         X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
@@ -163,5 +165,5 @@ def _look(rig, pixels, depths, points, projector):
         X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
         u = v = np.nan
         if X2 > 0.0:  # False for NaN
-            u, v = image_of(rig.projector, X0 / X2, X1 / X2, basis)
+            u, v = distort_to_pixel(rig.projector, X0 / X2, X1 / X2, basis)
         projector[n, 0], projector[n, 1] = u, v

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from slviewer.calibration.next_pose import GOAL, Coverage
+from slviewer.calibration.next_pose import GOAL_POSES, Coverage
 from slviewer.gui.import_inputs import ImportInputs
 from slviewer.gui.inputs import Choice, Follows, change
 from slviewer.gui.panel import Stage
@@ -67,7 +67,7 @@ def _grid(counts: np.ndarray, width: int, height: int, marks: dict[tuple[int, in
 
 
 def _field(count: int, width: int, height: int, mark: str = "") -> str:
-    colour = "transparent" if count < 0 else _COLOURS[min(int(count), GOAL)]
+    colour = "transparent" if count < 0 else _COLOURS[min(int(count), GOAL_POSES)]
     style = (
         f"width:{width}px;height:{height}px;border-radius:2px;background:{colour};font-size:9px;line-height:{height}px"
     )

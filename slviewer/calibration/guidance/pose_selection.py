@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.guidance.coarse_rig import GuidanceBench
-from slviewer.calibration.guidance.information import Information, Sight
+from slviewer.calibration.guidance.information import Information, Sensitivity
 from slviewer.calibration.next_pose import depth_range
 
 DEPTHS = (0.0, 0.2, 0.45, 0.75, 1.1, 1.45)
@@ -16,7 +16,7 @@ DEPTHS = (0.0, 0.2, 0.45, 0.75, 1.1, 1.45)
 TILTS_DEG = ((0, 0), (16, 0), (-16, 0), (0, 16), (0, -16), (22, 22), (22, -22), (-22, 22), (-22, -22), (32, 0),
              (-32, 0), (0, 32), (0, -32))  # fmt: skip
 """About x and y."""
-TOWARDS = tuple((x, y) for x, y in product((-1.0, 0.0, 1.0), repeat=2))
+DIRECTIONS = tuple((x, y) for x, y in product((-1.0, 0.0, 1.0), repeat=2))
 """The image's corners, edges and middle: a board goes as far there as it stays in view."""
 _OFFSETS = 15  # places along each side that are tried
 TRIALS = 56
@@ -35,22 +35,22 @@ class Guidance:
 
 def predicted_sigma(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> float:
     """mm: the calibration's 3D sigma after ``poses`` T_camera_board (4, 4), root mean square over the volume."""
-    sight = Sight.of(bench, depth_range(bench.board, bench.stereo.camera))
-    return Information.of(bench, bench.rows(np.reshape(poses, (-1, 4, 4))), sight).sigma_mm
+    sight = Sensitivity.from_bench(bench, depth_range(bench.board, bench.stereo.camera))
+    return Information.from_rows(bench, bench.rows(np.reshape(poses, (-1, 4, 4))), sight).sigma_mm
 
 
-def guide(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> Guidance | None:
+def suggest_poses(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> Guidance | None:
     """What to capture after ``poses`` T_camera_board (4, 4); None where no pose is in view of both devices."""
     candidates = candidate_poses(bench)
     if not len(candidates):
         return None
-    sight = Sight.of(bench, depth_range(bench.board, bench.stereo.camera))
-    information = Information.of(bench, bench.rows(np.reshape(poses, (-1, 4, 4))), sight)
+    sight = Sensitivity.from_bench(bench, depth_range(bench.board, bench.stereo.camera))
+    information = Information.from_rows(bench, bench.rows(np.reshape(poses, (-1, 4, 4))), sight)
     rng = np.random.default_rng(len(poses))
     tried = rng.permutation(len(candidates))[:TRIALS]
     gains = dict(zip(tried.tolist(), map(information.gain, bench.rows(candidates[tried])), strict=True))
     best = max(gains, key=lambda i: gains[i])
-    nearest = np.argsort([_apart(candidates[best], T) for T in candidates])[: TRIALS // 5]
+    nearest = np.argsort([_pose_distance(candidates[best], T) for T in candidates])[: TRIALS // 5]
     more = [i for i in nearest.tolist() if i not in gains]
     gains |= dict(zip(more, map(information.gain, bench.rows(candidates[more])), strict=True))
     order = sorted(gains, key=lambda i: -gains[i])
@@ -80,18 +80,18 @@ def candidate_poses(bench: GuidanceBench) -> np.ndarray:
     found = []
     for each, seen in zip(T, bench.in_view(T.reshape(-1, 4, 4)).reshape(T.shape[:2]), strict=True):
         if seen.any():
-            found.append(each[seen][_spread(places[seen])])
+            found.append(each[seen][_select_spread(places[seen])])
     return np.concatenate(found) if found else np.zeros((0, 4, 4))
 
 
-def _spread(places: np.ndarray) -> list[int]:
-    """Which of the places (n, 2) lie farthest towards each of `TOWARDS`; the middle is theirs."""
+def _select_spread(places: np.ndarray) -> list[int]:
+    """Which of the places (n, 2) lie farthest towards each of `DIRECTIONS`; the middle is theirs."""
     inward = 0.01 * (places**2).sum(1)
     off = ((places - (places.min(0) + places.max(0)) / 2) ** 2).sum(1)
-    return sorted({int(np.argmax(places @ np.array(to) - inward) if any(to) else np.argmin(off)) for to in TOWARDS})
+    return sorted({int(np.argmax(places @ np.array(to) - inward) if any(to) else np.argmin(off)) for to in DIRECTIONS})
 
 
-def _apart(one: np.ndarray, other: np.ndarray) -> float:
+def _pose_distance(one: np.ndarray, other: np.ndarray) -> float:
     """How different two poses are: a tenth of the distance counts like 15 degrees."""
     shift = float(np.linalg.norm(one[:3, 3] - other[:3, 3])) / (0.1 * one[2, 3])
     turn = float(np.arccos(np.clip((np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2, -1, 1)))

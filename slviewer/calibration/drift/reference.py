@@ -1,8 +1,9 @@
-"""What a calibration's own poses say of how well one view can tell where the projector stands.
+"""Reference for the drift check: how precisely one view determines the projector's pose, from the calibration's own
+poses.
 
-The lenses do a little that Brown's model does not hold. What they do is learnt here from all poses together, as fields
-of displacement; then every pose is asked, with fields learnt from the others alone, how far the projector seems to have
-moved. It has not: what the poses answer is the floor under every later answer.
+Lens distortion beyond Brown's model is estimated from all poses together, as displacement fields. Then each pose, with
+the fields of the others alone, gives an apparent motion of the projector. Its true motion is zero: these apparent
+motions are the noise floor of every later check.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,29 +14,30 @@ import scipy.sparse as sp
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from slviewer.calibration.drift.view import KINDS, DriftView, Field, Linear, linear
+from slviewer.calibration.drift.view import KINDS, DisplacementField, DriftView, LinearView, linearise_view
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 
-LEAST_POSES = 8
-"""With fewer, one pose's fields from the others say little about a later view's."""
+MIN_POSES = 8
+"""With fewer, leave-one-out fields do not represent a later view's."""
 ROUGHNESS_PX = 0.1
 """Typical second difference of a field's coefficients, a cell apart."""
 HEIGHT_PX = 1.0
-"""Typical height of a field: holds what no view supports."""
+"""Typical height of a field: prior where no view supports it."""
 UNSUPPORTED_PX = 0.1
-"""Where a lens error is known no better than this, no view is asked."""
+"""Pixels whose lens error is less certain than this are not used."""
 RIG_SIGMAS = np.array([3e-3] * 3 + [3.0] * 3)
 """rad and mm: how far the calibration's own arrangement may be off."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseChange:
-    """How far the projector seems to have moved in one view: ``change`` (6,) rad and mm, as ``Linear`` orders it.
+    """How far the projector seems to have moved in one view: ``change`` (6,) rad and mm, as ``LinearView`` orders
+    it.
 
     ``spreads``: by kind (6, 6), its covariance for errors of 1 px in every observation; ``by_growth`` (6,): what it
-    would be if only the board grew, relative to that. ``scale`` is how much larger than it is the board seems,
+    would be if only the board grew, relative to that. ``scale`` is the board's apparent relative growth,
     ``across_px`` how far off its epipolar lines on average (NaN with one axis), ``misfit_px`` the RMS that no change
     explains.
     """
@@ -54,12 +56,12 @@ class PoseChange:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
-    """A calibration as the drift check sees it.
+class DriftReference:
+    """What the drift check needs of a calibration.
 
     ``shared`` are the coefficients of the arrangement's correction and the lens errors, with their ``covariance``;
     ``sigmas`` px by kind what one observation is worth, lens errors left over included; ``answers`` those of its own
-    poses, each left out in turn.
+    poses, each excluded in turn.
     """
 
     rig: StereoRig
@@ -68,12 +70,12 @@ class Reference:
     sigmas: Mapping[str, float]
     answers: tuple[PoseChange, ...]
 
-    def ask(self, view: DriftView) -> PoseChange:
-        """What a later view answers."""
-        equations = linear(self.rig, view)
-        known = _design(equations)
+    def estimate_change(self, view: DriftView) -> PoseChange:
+        """The projector's apparent change in a later view."""
+        equations = linearise_view(self.rig, view)
+        known = _shared_design(equations)
         variance = np.asarray(known.multiply(known @ self.covariance).sum(axis=1)).ravel()
-        return answer(equations, self.shared, self.sigmas, variance < UNSUPPORTED_PX**2)
+        return solve_change(equations, self.shared, self.sigmas, variance < UNSUPPORTED_PX**2)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Flat named arrays, for saving."""
@@ -90,7 +92,7 @@ class Reference:
         }
 
     @classmethod
-    def restored(cls, rig: StereoRig, arrays: Mapping[str, np.ndarray]) -> "Reference":
+    def from_arrays(cls, rig: StereoRig, arrays: Mapping[str, np.ndarray]) -> "DriftReference":
         """The inverse of ``to_arrays``, of a calibration with this rig."""
         each = zip(*(arrays[name] for name in ("names", "changes", "spreads", "by_growth", "figures")), strict=True)
         answers = tuple(
@@ -101,37 +103,37 @@ class Reference:
         return cls(rig, arrays["shared"], arrays["covariance"], sigmas, answers)
 
 
-def refer(rig: StereoRig, views: Sequence[DriftView]) -> Reference:
+def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReference:
     """Lens errors and floor from a calibration's own views. Raises InputError for fewer than LEAST_POSES."""
-    if len(views) < LEAST_POSES:
+    if len(views) < MIN_POSES:
         raise InputError(
-            f"the calibration has {len(views)} poses, and {LEAST_POSES} are needed to know how well one board tells "
-            "where the projector stands: calibrate with more"
+            f"the calibration has {len(views)} poses, and {MIN_POSES} are needed for a drift reference: "
+            "calibrate with more poses"
         )
-    equations = [linear(rig, view) for view in views]
+    equations = [linearise_view(rig, view) for view in views]
     prior = _prior(rig)
     sigmas = dict.fromkeys(KINDS, 0.05)
     weights = [_weights(e, e.usable, np.zeros(len(e.residuals)), sigmas, robust=False) for e in equations]
     for _ in range(3):
-        parts = [_reduced(e, w) for e, w in zip(equations, weights, strict=True)]
+        parts = [_reduce_normal_equations(e, w) for e, w in zip(equations, weights, strict=True)]
         factor = cho_factor(sum((N for N, _ in parts), prior))
         shared = cho_solve(factor, sum(b for _, b in parts))
-        left = [_left(e, w, shared) for e, w in zip(equations, weights, strict=True)]
-        sigmas = {k: _spread(equations, left, i, sigmas[k]) for i, k in enumerate(KINDS)}
+        left = [_remaining_residuals(e, w, shared) for e, w in zip(equations, weights, strict=True)]
+        sigmas = {k: _sigma_of(equations, left, i, sigmas[k]) for i, k in enumerate(KINDS)}
         weights = [_weights(e, e.usable, r, sigmas) for e, r in zip(equations, left, strict=True)]
     total, right = sum((N for N, _ in parts), prior), sum(b for _, b in parts)
     others = [cho_solve(cho_factor(total - N), right - b) for N, b in parts]
-    for _ in range(2):  # what an observation is worth decides how much each has to say, and the other way round
-        answers = tuple(answer(e, g, sigmas, e.usable) for e, g in zip(equations, others, strict=True))
-        sigmas = _worth(answers, sigmas)
+    for _ in range(2):  # the weights depend on the sigmas, and the sigmas on the changes
+        answers = tuple(solve_change(e, g, sigmas, e.usable) for e, g in zip(equations, others, strict=True))
+        sigmas = _fit_sigmas(answers, sigmas)
     covariance = cho_solve(factor, np.eye(len(shared)))
-    return Reference(rig, shared, covariance, sigmas, answers)
+    return DriftReference(rig, shared, covariance, sigmas, answers)
 
 
-def answer(e: Linear, shared: np.ndarray, sigmas: Mapping[str, float], supported: np.ndarray) -> PoseChange:
-    """What one view says, with lens errors from elsewhere."""
+def solve_change(e: LinearView, shared: np.ndarray, sigmas: Mapping[str, float], supported: np.ndarray) -> PoseChange:
+    """The projector's apparent change in one view, given lens errors ``shared``."""
     usable = e.usable & supported
-    left = np.where(usable, e.residuals, 0.0) - _design(e) @ shared
+    left = np.where(usable, e.residuals, 0.0) - _shared_design(e) @ shared
     both = np.hstack([e.pose, e.change])
     w = _weights(e, usable, left, sigmas, robust=False)
     for _ in range(5):
@@ -155,14 +157,14 @@ def answer(e: Linear, shared: np.ndarray, sigmas: Mapping[str, float], supported
     )
 
 
-def _design(e: Linear) -> sp.csr_array:
-    """What all views share: the arrangement's correction, then the lens errors."""
+def _shared_design(e: LinearView) -> sp.csr_array:
+    """Columns of the unknowns that all views share: the rig's correction, then the lens errors."""
     return sp.csr_array(sp.hstack([sp.csr_array(np.where(np.isfinite(e.change), e.change, 0.0)), e.shared]))
 
 
 def _prior(rig: StereoRig) -> np.ndarray:
     blocks = [sp.diags(RIG_SIGMAS**-2.0)]
-    for field in (Field(rig.camera.size), Field(rig.projector.size)):
+    for field in (DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)):
         one = field.roughness / ROUGHNESS_PX**2 + sp.eye(field.unknowns) / HEIGHT_PX**2
         blocks += [one, one]
     prior: np.ndarray = sp.block_diag(blocks).toarray()
@@ -170,7 +172,7 @@ def _prior(rig: StereoRig) -> np.ndarray:
 
 
 def _weights(
-    e: Linear, usable: np.ndarray, left: np.ndarray, sigmas: Mapping[str, float], robust: bool = True
+    e: LinearView, usable: np.ndarray, left: np.ndarray, sigmas: Mapping[str, float], robust: bool = True
 ) -> np.ndarray:
     w = np.zeros(len(left))
     for i, kind in enumerate(KINDS):
@@ -190,9 +192,9 @@ def _gain(J: np.ndarray, w: np.ndarray) -> np.ndarray:
     return gain
 
 
-def _reduced(e: Linear, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations of what is shared, the view's own pose eliminated."""
-    D, P = _design(e), np.nan_to_num(e.pose)
+def _reduce_normal_equations(e: LinearView, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of the shared unknowns, the view's own pose eliminated."""
+    D, P = _shared_design(e), np.nan_to_num(e.pose)
     r = np.where(w > 0, e.residuals, 0.0)
     weighted = sp.csr_array(sp.diags(w) @ D)
     cross = weighted.T @ P
@@ -201,20 +203,20 @@ def _reduced(e: Linear, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return N, weighted.T @ r - cross @ (inverse @ (P.T @ (w * r)))
 
 
-def _left(e: Linear, w: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    left = np.where(e.usable, e.residuals, 0.0) - _design(e) @ shared
+def _remaining_residuals(e: LinearView, w: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    left = np.where(e.usable, e.residuals, 0.0) - _shared_design(e) @ shared
     return left - np.nan_to_num(e.pose) @ (_gain(e.pose, w) @ left)
 
 
-def _spread(equations: Sequence[Linear], left: Sequence[np.ndarray], kind: int, otherwise: float) -> float:
+def _sigma_of(equations: Sequence[LinearView], left: Sequence[np.ndarray], kind: int, otherwise: float) -> float:
     values = np.concatenate([r[e.usable & (e.kinds == kind)] for e, r in zip(equations, left, strict=True)])
     return max(robust_sigma(values), 1e-3) if len(values) else otherwise
 
 
-def _worth(answers: Sequence[PoseChange], start: Mapping[str, float]) -> dict[str, float]:
-    """The sigma of each kind that makes the changes seen most likely, if none of them is one.
+def _fit_sigmas(answers: Sequence[PoseChange], start: Mapping[str, float]) -> dict[str, float]:
+    """The sigma of each kind that maximises the likelihood of the apparent changes if none is real.
 
-    Neighbouring samples err alike, so that one is worth less than its own scatter says.
+    Neighbouring samples have correlated errors: the effective sigma exceeds their own scatter.
     """
     spreads = np.array([[a.spreads[kind] for kind in KINDS] for a in answers])  # (views, kinds, 6, 6)
     changes = np.array([a.change for a in answers])[..., None]

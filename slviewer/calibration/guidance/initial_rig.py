@@ -1,4 +1,4 @@
-"""A rig from few poses: good enough to tell where a board would be seen and what it would tell, not to measure with."""
+"""An approximate rig from few poses: for predicting visibility and information, not for measuring."""
 
 from collections.abc import Sequence
 
@@ -8,17 +8,17 @@ import numpy as np
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 
-LEAST_POSES = 3
-MOST_FEATURES = 60
+MIN_POSES = 3
+MAX_FEATURES = 60
 """Of a pose."""
-FREE_DISTORTION = 6
+POSES_FOR_TWO_COEFFICIENTS = 6
 """Poses from which on two radial coefficients are told apart; fewer give one."""
-MOST_APART = 0.05, 0.1
+MAX_DISAGREEMENT = 0.05, 0.1
 """Medians over the poses: of how far their arrangements turn from the common one, rad, and are away, of its length."""
 _FOCALS = 0.4, 12.0  # of a lens, in widths of its image
 
 
-def rough_rig(
+def estimate_rig(
     points: Sequence[np.ndarray],
     camera: Sequence[np.ndarray],
     projector: Sequence[np.ndarray],
@@ -34,12 +34,12 @@ def rough_rig(
         known = np.nonzero(np.isfinite(c).all(1) & np.isfinite(q).all(1))[0]
         if len(known) < 12:
             return None
-        keep = known[np.unique(np.linspace(0, len(known) - 1, MOST_FEATURES).astype(int))]
+        keep = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
         chosen.append([np.ascontiguousarray(a[keep], np.float32) for a in (p, c, q)])
-    if len(chosen) < LEAST_POSES:
+    if len(chosen) < MIN_POSES:
         return None
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    if len(chosen) < FREE_DISTORTION:
+    if len(chosen) < POSES_FOR_TWO_COEFFICIENTS:
         flags |= cv2.CALIB_FIX_K2
     lenses, poses = [], []
     for k, size in enumerate(sizes):
@@ -51,19 +51,19 @@ def rough_rig(
         if not (np.isfinite(K).all() and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))):
             return None
         lenses.append(Lens(K, np.ravel(D)[:5], size))
-        poses.append([_matrix(r, t) for r, t in zip(turns, shifts, strict=True)])
+        poses.append([_camera_matrix(r, t) for r, t in zip(turns, shifts, strict=True)])
     T = [there @ np.linalg.inv(here) for here, there in zip(*poses, strict=True)]
     t = np.median([each[:3, 3] for each in T], axis=0)
     u, _, v = np.linalg.svd(np.median([each[:3, :3] for each in T], axis=0))
     R = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
     turned = np.median([np.linalg.norm(cv2.Rodrigues(each[:3, :3] @ R.T)[0]) for each in T])
     away = np.median([np.linalg.norm(each[:3, 3] - t) for each in T]) / max(float(np.linalg.norm(t)), 1e-9)
-    if turned > MOST_APART[0] or away > MOST_APART[1] or any(pose[2, 3] <= 0 for pose in poses[0]):
+    if turned > MAX_DISAGREEMENT[0] or away > MAX_DISAGREEMENT[1] or any(pose[2, 3] <= 0 for pose in poses[0]):
         return None
     return StereoRig(lenses[0], lenses[1], R, t), poses[0]
 
 
-def _matrix(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+def _camera_matrix(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
     return T

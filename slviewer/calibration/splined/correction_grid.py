@@ -1,14 +1,14 @@
-"""What a grid adds to the rational function's depths, a row of the image at a time; see `compiled`."""
+"""The grid of corrections to the rational function's depths, applied a row of the image at a time; see `compiled`."""
 
 import numpy as np
 from numba import njit, prange
 
 from slviewer.geometry.jit import fma, kernel
-from slviewer.geometry.rays import along_rays
+from slviewer.geometry.rays import fill_points
 
 
 @njit(inline="always")
-def located(rational, near, per_mm, deepest):
+def locate_layers(rational, near, per_mm, deepest):
     """Whether a depth of the rational function lies in the grid, and between which layers: the first (-1 where it does
     not), and how far on to the next."""
     depth = (rational - near) * per_mm
@@ -19,7 +19,7 @@ def located(rational, near, per_mm, deepest):
 
 
 @njit(inline="always")
-def _blended(above, below, down, i, k):
+def _blend_rows(above, below, down, i, k):
     """The grid at a column and a layer, between two of its rows."""
     column, layer = np.uint64(i), np.uint64(k)  # an index with a sign would be tested for counting from the end
     upper = above[column, layer]
@@ -27,8 +27,8 @@ def _blended(above, below, down, i, k):
 
 
 @njit(inline="always")
-def correct(z, cell, rest, grid, step, row):
-    """Add the grid to an image row's depths ``z`` (w,); ``cell`` int32 and ``rest`` (w,) as `located` has them.
+def add_corrections(z, cell, rest, grid, step, row):
+    """Add the grid to an image row's depths ``z`` (w,); ``cell`` int32 and ``rest`` (w,) as `locate_layers` has them.
 
     Where a surface is, the pixels of a grid cell lie between two or three layers, whose few numbers then serve all of
     them in the processor's wide registers; elsewhere each pixel looks up its own.
@@ -49,9 +49,9 @@ def correct(z, cell, rest, grid, step, row):
         if top < 0:
             continue
         if top <= k + 1:
-            a0, a1 = _blended(above, below, down, i, k), _blended(above, below, down, i, k + 1)
-            b0, b1 = _blended(above, below, down, i + 1, k), _blended(above, below, down, i + 1, k + 1)
-            a2, b2 = _blended(above, below, down, i, top + 1), _blended(above, below, down, i + 1, top + 1)
+            a0, a1 = _blend_rows(above, below, down, i, k), _blend_rows(above, below, down, i, k + 1)
+            b0, b1 = _blend_rows(above, below, down, i + 1, k), _blend_rows(above, below, down, i + 1, k + 1)
+            a2, b2 = _blend_rows(above, below, down, i, top + 1), _blend_rows(above, below, down, i + 1, top + 1)
             for q in range(len(here)):
                 first, deep = cells[q] == k, part[q]
                 a = fma(deep, a1 - a0, a0) if first else fma(deep, a2 - a1, a1)
@@ -61,9 +61,9 @@ def correct(z, cell, rest, grid, step, row):
             for q in range(len(here)):
                 n, deep = np.int64(cells[q]), part[q]
                 if n >= 0:
-                    a, b = _blended(above, below, down, i, n), _blended(above, below, down, i + 1, n)
-                    a = fma(deep, _blended(above, below, down, i, n + 1) - a, a)
-                    b = fma(deep, _blended(above, below, down, i + 1, n + 1) - b, b)
+                    a, b = _blend_rows(above, below, down, i, n), _blend_rows(above, below, down, i + 1, n)
+                    a = fma(deep, _blend_rows(above, below, down, i, n + 1) - a, a)
+                    b = fma(deep, _blend_rows(above, below, down, i + 1, n + 1) - b, b)
                     here[q] += fma(np.float32(q) * per_px, b - a, a)
 
 
@@ -80,7 +80,7 @@ def evaluate(phase, numbers, c, rays, grid, step, out):
         for u in range(width):
             s = fma(px_per_rad, phase[v, u], -centre)
             rational = np.divide(fma(c[1, v, u], s, c[0, v, u]), fma(c[2, v, u], s, one))
-            inside, cell[u], rest[u] = located(rational, near, per_mm, deepest)
+            inside, cell[u], rest[u] = locate_layers(rational, near, per_mm, deepest)
             z[u] = rational if inside else none
-        correct(z, cell, rest, grid, step, v)
-        along_rays(rays[0, v], rays[1, v], z, out[v])
+        add_corrections(z, cell, rest, grid, step, v)
+        fill_points(rays[0, v], rays[1, v], z, out[v])
