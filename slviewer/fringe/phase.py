@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.edge_blur import edge_error
 from slviewer.fringe.sequence import Axis
 
 GRAY_SIGMA_CELLS = 12**-0.5
@@ -108,6 +107,8 @@ class PhaseMap:
     def edge_error_px(self) -> np.ndarray:
         """(h, w) float32 px: by how much the camera's blur displaces the coordinate where the surface's brightness
         jumps (see `edge_blur`); 0 for Gray code alone, NaN where the phase is."""
+        from slviewer.fringe.edge_blur import edge_error  # loads numba, which reading a phase does not need
+
         if self.steps == 0:
             return self.phase * 0
         a, b = self.noise

@@ -223,7 +223,7 @@ def test_a_look_for_a_driver_loads_nothing_else():
         "real = importlib.util.find_spec\n"
         "importlib.util.find_spec = lambda name: name == 'numba_cuda' or real(name)\n"
         "from slviewer.geometry import cuda_device\n"
-        "found = cuda_device.device()\n"
+        "found = cuda_device.find_device()\n"
         "sys.exit(found is None and bool({'numba', 'numba_cuda'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
