@@ -25,7 +25,7 @@ MOSTLY = 0.5
 APART = 6
 """Pixels of the grid over which coordinates are compared: several cells of the code."""
 FEWEST_TURNS = 100
-MOST_CLIPPED = 0.05
+MAX_CLIPPED = 0.05
 """Mean share of saturated values at illuminated pixels, beyond which bits and fringes become unreadable in places."""
 UNSTEADY = 0.1
 """Relative rms of the mean brightness of phase steps, which incomplete fringes do not reach."""
@@ -50,19 +50,22 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
         under_equal_light = _find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
         is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
         # Frames out of their place spoil the estimate of the light: what explains them as they are is believed.
-        return contradictions if under_equal_light and is_explained else under_equal_light
+        if not under_equal_light or not is_explained:
+            contradictions = under_equal_light
     if any(contradiction.cause not in ("unreadable", "duplicate-frame") for contradiction in contradictions):
         return contradictions
+    if not contradictions:
+        return ()
     sample = sample_lines(sequence, stack)
     coded = coded_frames(sequence)
     illuminated = sample.swing(coded) > sample.least_swing
     clipped = np.array([float(np.mean(sample.frames[i][illuminated] >= sample.white)) for i in coded])
-    if np.mean(clipped) > MOST_CLIPPED:
-        return (_saturated(coded, clipped),)
+    saturated = _saturated(coded, clipped) if np.mean(clipped) > MAX_CLIPPED else None
     unsteady = _unsteadiness(sequence, sample, illuminated)
-    if light.unexplained and unsteady > UNSTEADY:
-        return (Contradiction(*describe_disturbance(light.unexplained), None, unsteady),)
-    return contradictions
+    terms = light.terms or light.unexplained
+    if unsteady > UNSTEADY and terms and not (saturated and saturated.cause == "room-light"):
+        return (Contradiction(*describe_disturbance(terms), None, unsteady),)
+    return (saturated,) if saturated else contradictions
 
 
 def _saturated(coded: list[int], clipped: np.ndarray) -> Contradiction:
