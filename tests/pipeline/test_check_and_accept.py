@@ -79,7 +79,7 @@ def test_accept_finds_a_scale_and_applies_it_on_request(measured, tmp_path):
     assert scale.ppm == pytest.approx(500, abs=scale.U_ppm) and scale.U_ppm < 200
     assert first.applied is None and "--apply-scale" in first.text()
     assert first.repeatability.sigma_mm == pytest.approx(first.repeatability.predicted_mm, rel=0.15)
-    assert first.budget.unknown == ("drift",) and first.budget.U_mm > 2e-6 * 500 * 100
+    assert first.budget.unknown == ("drift",) and first.budget.U_mm > 2e-6 * scale.ppm * 99
     applied = accept(measured, short, apply_scale_found=True)
     assert applied.applied == pytest.approx(1 / (1 + 1e-6 * scale.ppm), abs=1e-9)
     again = accept(measured, short)

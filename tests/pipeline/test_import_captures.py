@@ -139,7 +139,7 @@ def test_a_projector_size_that_is_not_stated_is_said(run: Run, tmp_path: Path) -
     assert status == 0 and "unknown size" in out
 
 
-@pytest.mark.parametrize(("gain", "word"), [(0.2, "exposure"), (1.9, "saturates"), (1.0, "")])
+@pytest.mark.parametrize(("gain", "word"), [(0.2, "exposure"), (1.9, "saturated"), (1.0, "")])
 def test_a_wrong_exposure_is_reported(tmp_path: Path, run: Run, gain: float, word: str) -> None:
     steps = phase_steps("x", 4, float(PROJECTOR[0]))
     sequence = PatternSequence(PROJECTOR, tuple(steps))
