@@ -118,8 +118,8 @@ def raised(
         noise_px = phase.sigma_px
         excess = cv2.resize(excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
         error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
-        known = cloud.sigma_calibration
-        return replace(cloud, sigma_calibration=error if known is None else np.hypot(known, error))
+        known = cloud.sigma_edges
+        return replace(cloud, sigma_edges=error if known is None else np.hypot(known, error))
     if factor == 1.0:
         return cloud
     left = None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor)

@@ -82,7 +82,7 @@ def scan_cloud(
     if store.has_result(kept) and is_fresh(store, kept):
         meta = store.load_result(kept, only=())[0]
         if model in (None, meta["model"]):
-            names = {"points", "sigma_z", "texture", "sigma_calibration"} & set(meta["arrays"])
+            names = {"points", "sigma_z", "texture", "sigma_calibration", "sigma_edges"} & set(meta["arrays"])
             arrays = store.load_result(kept, only=names)[1]
             return Cloud(axis=meta["axis"], model=meta["model"], **arrays)
     fitted = load_model(store, model or preferred(store))

@@ -48,6 +48,7 @@ def scaled(cloud: Cloud, factor: float) -> Cloud:
         points=cloud.points * np.float32(factor),
         sigma_z=cloud.sigma_z * np.float32(factor),
         sigma_calibration=None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor),
+        sigma_edges=None if cloud.sigma_edges is None else cloud.sigma_edges * np.float32(factor),
         texture=cloud.texture,
     )
 

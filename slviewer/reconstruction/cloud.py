@@ -14,8 +14,9 @@ class Cloud:
 
     ``points``: (h, w, 3) float32 mm in the camera's frame, NaN where invalid. ``axis``: the one that depth came from.
     ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm, predicted from the capture's noise.
-    ``sigma_calibration``: (h, w) float32 mm of z too, the same in every scan: what the calibration leaves uncertain,
-    rigid motion apart, and what blur at edges and light by other paths add; None where nothing of it is known.
+    ``sigma_calibration``: (h, w) float32 mm of z too, what the calibration leaves uncertain, rigid motion apart: the
+    same in every scan; None from a model that does not know. ``sigma_edges``: (h, w) float32 mm, what the camera's blur
+    at edges and light by other paths add, no less lasting; None where nothing does.
     ``texture``: (h, w) grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's
     range (10, 12, 14 or 16 bits, whichever holds its brightest pixel).
     """
@@ -26,6 +27,7 @@ class Cloud:
     sigma_z: np.ndarray
     texture: np.ndarray | None = None
     sigma_calibration: np.ndarray | None = None
+    sigma_edges: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points, dtype=np.float32)
@@ -37,11 +39,12 @@ class Cloud:
             )
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "sigma_z", sigma_z)
-        if self.sigma_calibration is not None:
-            left = np.asarray(self.sigma_calibration, dtype=np.float32)
-            if left.shape != sigma_z.shape:
-                raise InputError(f"sigma_calibration of shape {left.shape} does not belong to {sigma_z.shape} pixels.")
-            object.__setattr__(self, "sigma_calibration", left)
+        for name in ("sigma_calibration", "sigma_edges"):
+            if getattr(self, name) is not None:
+                lasting = np.asarray(getattr(self, name), dtype=np.float32)
+                if lasting.shape != sigma_z.shape:
+                    raise InputError(f"{name} of shape {lasting.shape} does not belong to {sigma_z.shape} pixels.")
+                object.__setattr__(self, name, lasting)
         if self.texture is not None:
             object.__setattr__(self, "texture", _eight_bits(self.texture, points.shape[:2]))
 
@@ -57,15 +60,21 @@ class Cloud:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(h, w) float32 mm: the standard deviation of z from noise and calibration together, NaN where invalid; from
-        noise alone where the calibration's part is not known. As a picture, the map of how sure the cloud is."""
-        if self.sigma_calibration is None:
-            return self.sigma_z
-        return np.asarray(np.hypot(self.sigma_z, self.sigma_calibration))
+        """(h, w) float32 mm: the standard deviation of z from noise, calibration and edges together, as far as they are
+        known; NaN where invalid."""
+        lasting = self.sigma_lasting
+        return self.sigma_z if lasting is None else np.asarray(np.hypot(self.sigma_z, lasting))
+
+    @property
+    def sigma_lasting(self) -> np.ndarray | None:
+        """(h, w) float32 mm: the part of `sigma` that averaging over exposures does not lessen; None if not known."""
+        if self.sigma_calibration is None or self.sigma_edges is None:
+            return self.sigma_edges if self.sigma_calibration is None else self.sigma_calibration
+        return np.asarray(np.hypot(self.sigma_calibration, self.sigma_edges))
 
     def sigmas(self, chosen: np.ndarray) -> dict[str, np.ndarray]:
         """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them: ``sigma_noise``, and
-        where the model knows it ``sigma_calibration`` and ``sigma``, both together; mm of z."""
+        where the model knows it ``sigma_calibration`` and ``sigma``, all together; mm of z."""
         scalars = {"sigma_noise": self.sigma_z[chosen]}
         if self.sigma_calibration is not None:
             scalars |= {"sigma_calibration": self.sigma_calibration[chosen], "sigma": self.sigma[chosen]}

@@ -85,9 +85,7 @@ def reconstruct(
         axis = _best_axis(measured)
         points, sigma_z, edges = measured[axis]
     left = model.sigma_calibration(axis, points) if isinstance(model, Sure) else None
-    if edges is not None and (left is not None or np.nanmax(edges / sigma_z, initial=0.0) > 1.0):
-        left = edges if left is None else np.hypot(left, edges)
-    return Cloud(points, axis, model.name, sigma_z, texture, left)
+    return Cloud(points, axis, model.name, sigma_z, texture, left, edges)
 
 
 def choose_axis(model: Model, phases: Mapping[Axis, PhaseMap]) -> Axis:

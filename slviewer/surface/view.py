@@ -69,7 +69,7 @@ def view_of(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
     points = np.where(kept[..., None], cloud.points[crop], np.float32(np.nan))
     cosine = sight(points, normals)
     noise = _known_noise(cloud.sigma_z[crop], points, cosine, kept)
-    lasting = np.zeros_like(noise) if cloud.sigma_calibration is None else cloud.sigma_calibration[crop]
+    lasting = np.zeros_like(noise) if cloud.sigma_lasting is None else cloud.sigma_lasting[crop]
     # depth's error along the normal: moved by dz, a point moves by dz along its ray (x/z, y/z, 1)
     along = cosine * np.linalg.norm(points, axis=-1) / points[..., 2]
     noise, lasting = noise * along, np.nan_to_num(lasting) * along

@@ -50,7 +50,7 @@ def _scanned(store: Session, name: str) -> MeasuredSurface:
     meta, arrays = store.load_result(f"clouds/{name}")
     left = arrays.get("sigma_calibration")
     points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
-    cloud = Cloud(points, meta["axis"], meta["model"], sigma, texture, left)
+    cloud = Cloud(points, meta["axis"], meta["model"], sigma, texture, left, arrays.get("sigma_edges"))
     return surface_of(store, name, cloud, load_model(store, meta["model"]))
 
 

@@ -108,6 +108,8 @@ def make_cloud(session: Session, name: str, model: str | None, report: Reporter,
         if cloud.sigma_calibration is not None:
             meta["sigma_calibration_mm"] = float(np.median(cloud.sigma_calibration[cloud.mask]))
             arrays["sigma_calibration"] = cloud.sigma_calibration
+        if cloud.sigma_edges is not None:
+            arrays["sigma_edges"] = cloud.sigma_edges
         report(0.95, "saving")
         session.guarded(report.saving).save_result(f"clouds/{name}", meta, arrays)
     report(1.0, "reconstructed")
