@@ -26,7 +26,8 @@ THUMBNAIL_PX = 240
 class ScanCloud:
     """A reconstructed capture on the camera's grid: `points` (h, w, 3) float32 mm and `sigma_z`, `phase` (rad),
     `modulation` (h, w) float32, NaN where invalid; `texture` (h, w) or (h, w, 3) uint8; `errors` as in `error_maps`.
-    `sigma_calibration` (h, w) float32 mm is what the calibration's own uncertainty adds; None where it is not known.
+    `sigma_calibration` (h, w) float32 mm is what the calibration's own uncertainty adds, `sigma_edges` what blur at edges
+    does; None where it is not known.
     """
 
     name: str
@@ -39,6 +40,7 @@ class ScanCloud:
     texture: np.ndarray
     errors: Mapping[str, np.ndarray]
     sigma_calibration: np.ndarray | None = None
+    sigma_edges: np.ndarray | None = None
 
     def thinned(self, limit: int) -> tuple[slice, slice]:
         """The part of the grid to draw: every so many rows and columns, at most about `limit` measured points."""

@@ -275,8 +275,10 @@ def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
 
 def uncertainty(cloud: ScanCloud) -> np.ndarray:
     """(h, w) mm: one standard deviation of z, of noise and calibration together as far as they are known."""
-    noise = np.where(np.isfinite(cloud.points[..., 2]), cloud.sigma_z, np.nan)
-    return noise if cloud.sigma_calibration is None else np.hypot(noise, cloud.sigma_calibration)
+    sigma = np.where(np.isfinite(cloud.points[..., 2]), cloud.sigma_z, np.nan)
+    for part in (cloud.sigma_calibration, cloud.sigma_edges):
+        sigma = sigma if part is None else np.hypot(sigma, part)
+    return np.asarray(sigma)
 
 
 def point_words(cloud: ScanCloud, u: int, v: int) -> Html:
