@@ -26,8 +26,8 @@ THUMBNAIL_PX = 240
 class ScanCloud:
     """A reconstructed capture on the camera's grid: `points` (h, w, 3) float32 mm and `sigma_z`, `phase` (rad),
     `modulation` (h, w) float32, NaN where invalid; `texture` (h, w) or (h, w, 3) uint8; `errors` as in `error_maps`.
-    `sigma_calibration` (h, w) float32 mm is what the calibration's own uncertainty adds, `sigma_edges` what blur at edges
-    does; None where it is not known.
+    `sigma_calibration` (h, w) float32 mm is what the calibration's own uncertainty adds, `sigma_edges` what blur at
+    edges does; None where it is not known.
     """
 
     name: str
