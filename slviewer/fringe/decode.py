@@ -3,15 +3,13 @@
 import numpy as np
 
 from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
-from slviewer.fringe.aliased_harmonics import correct_harmonics, estimate_aliased_harmonics
-from slviewer.fringe.frame_light import CLIPPED, equalized_axis, original_levels
+from slviewer.fringe.frame_light import CLIPPED, equalized_axis
 from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
 from slviewer.fringe.levels import cell_misfit, code_cell_px, found_levels, lowest_coordinate, unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.reference import code_bits, dark_sigmas, decode_reference, phase_shift
+from slviewer.fringe.reference import code_bits, complete_map, dark_sigmas, decode_reference, phase_shift
 from slviewer.fringe.reference_spikes import border_rad, cell_rad, is_plain, repeat_cells
-from slviewer.fringe.scatter import with_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
 
@@ -44,27 +42,9 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
         maps = _cells(found, stack, scale)
     else:
         maps = _levels(found, stack, scale)
-    phase, wrapped, modulation, background, reason = maps
-    phase = _settled(found, phase, reason)
-    harmonics = estimate_aliased_harmonics(found, stack, clipped, noise)
-    phase, wrapped = correct_harmonics(harmonics, found, phase, wrapped)
-    if factor != 1:
-        modulation, background, noise = original_levels(modulation, background, noise, factor)
-    unambiguous = unambiguous_px(found)
-    phase_map = PhaseMap(
-        axis,
-        found.period_px,
-        phase,
-        wrapped,
-        modulation,
-        background,
-        reason,
-        noise,
-        found.steps,
-        unambiguous,
-        harmonics.error_rad,
-    )
-    return with_scatter(phase_map)
+    phase, *others = maps
+    phase = _settled(found, phase, others[-1])
+    return complete_map(axis, found, stack, clipped, (phase, *others), noise, factor)
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:

@@ -56,6 +56,23 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
     phase, reason = settle(found, phase, reason)
+    return complete_map(axis, found, stack, white, (phase, wrapped, modulation, background, reason), noise, factor)
+
+
+def complete_map(
+    axis: Axis,
+    found: Layout,
+    stack: np.ndarray,
+    white: float,
+    maps: tuple[np.ndarray, ...],
+    noise: tuple[float, float],
+    factor: float,
+) -> PhaseMap:
+    """The phase map of decoded ``maps`` (phase, wrapped phase, modulation, background, reason), each (h, w): corrected
+    for gamma, in grey levels of the capture, which equalising multiplied by ``factor``, and with the scatter of its
+    phase. ``white`` and ``noise`` are those of the ``stack`` that was decoded.
+    """
+    phase, wrapped, modulation, background, reason = maps
     harmonics = estimate_aliased_harmonics(found, stack, white, noise)
     phase, wrapped = correct_harmonics(harmonics, found, phase, wrapped)
     if factor != 1:

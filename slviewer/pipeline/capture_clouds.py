@@ -54,7 +54,7 @@ def capture_cloud(
     for message in check.warnings:
         warn(message)
     cloud = scaled(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
-    return raised(cloud, check.sigma_factor, check.excess_px, phases)
+    return raise_uncertainty(cloud, check.sigma_factor, check.excess_px, phases)
 
 
 def absolute_phases(
@@ -105,7 +105,7 @@ def absolute_phases(
     return absolute
 
 
-def raised(
+def raise_uncertainty(
     cloud: Cloud,
     factor: float,
     excess_px: NDArray[np.float32] | None = None,

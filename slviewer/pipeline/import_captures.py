@@ -57,8 +57,7 @@ def import_captures(
     Captures that cannot be read or decoded are skipped, and ``warn`` hears why. Raises InputError where none is left,
     or, with ``strict``, for the first of them; nothing is saved then.
     """
-    known = None if projector else _known_projector(session)
-    found = _find_captures(source, layout, sequence, prefix, projector, channel, known, warn, options)
+    found = _find_captures(source, layout, sequence, prefix, projector, channel, session, warn, options)
     return _save(found, session, role, origin, force, strict, progress, warn)
 
 
@@ -90,11 +89,11 @@ def _find_captures(
     prefix: str | None,
     projector: Size | None,
     channel: Channel | None,
-    known: tuple[int, int] | None,
+    session: SessionLike | None,
     warn: Warn,
     options: dict[str, Any],
 ) -> Imports:
-    """The captures of a folder, not yet read; ``known``: the projector's size where nobody states it."""
+    """The captures of a folder, not yet read; ``session`` knows the projector's size where nobody states it."""
     source = Path(source).expanduser()
     if layout == "detect":
         layout = "frames" if sequence is not None else detect_layout(source)
@@ -106,7 +105,7 @@ def _find_captures(
         if toml is None:
             raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
         options["toml"] = Path(toml)
-    elif size is None and (size := known) is not None:
+    elif size is None and session is not None and (size := _known_projector(session)) is not None:
         warn(f"the projector is taken to have {size[0]}x{size[1]} px, as in the session: --projector for another size")
     found = LAYOUTS[layout].read(source, prefix=prefix, projector=size, **options)
     if channel is not None:

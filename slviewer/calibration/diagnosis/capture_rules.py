@@ -40,10 +40,10 @@ def find_frame_faults(e: Evidence) -> Iterator[Finding]:
     for cause in ORDERS:
         names = tuple(name for name, order in orders.items() if order == cause)
         if names:
-            mended = all(name in e.set_aside or was_refused(e, name) for name in names)
+            is_excluded = all(name in e.set_aside or was_refused(e, name) for name in names)
             yield Finding(
                 cause,
-                severity_of(e, names, mended),
+                severity_of(e, names, is_excluded),
                 f"{list_poses(e, names)} {ORDERS[cause]}",
                 _ORDER_REMEDY[cause],
                 names,
@@ -168,7 +168,9 @@ def find_wrong_description(e: Evidence) -> Iterator[Finding]:
             continue
         names = tuple(name for name, contradiction in first.items() if contradiction.cause == cause)
         sentence, _, remedy = first[names[0]].message.rpartition(": ")
-        yield Finding(cause, severity_of(e, names, mended=True), f"{list_poses(e, names)} {sentence}", remedy, names)
+        yield Finding(
+            cause, severity_of(e, names, is_excluded=True), f"{list_poses(e, names)} {sentence}", remedy, names
+        )
 
 
 def find_wrong_board_size(e: Evidence) -> Iterator[Finding]:

@@ -91,7 +91,7 @@ def find_faulty_poses(e: Evidence) -> Iterator[Finding]:
         if poses:
             names = tuple(poses)
             sentence = "; ".join(list(poses.values())[:3]) + (f"; and {len(poses) - 3} more" if len(poses) > 3 else "")
-            how = severity_of(e, names, mended=e.solution is not None)
+            how = severity_of(e, names, is_excluded=e.solution is not None)
             yield Finding(cause, how, f"{sentence}; excluded", _REMEDIES[cause], names)
 
 
@@ -102,12 +102,12 @@ _REMEDIES: dict[Cause, str] = {
 }
 
 
-def severity_of(e: Evidence, names: tuple[str, ...], mended: bool) -> Severity:
-    """How bad it is that these poses are faulty; ``repaired``: they do not count."""
+def severity_of(e: Evidence, names: tuple[str, ...], is_excluded: bool) -> Severity:
+    """How bad it is that these poses are faulty; ``is_excluded``: the fit does without them."""
     if len(names) >= COMMON_SHARE * len(e.poses):
         return "rejected"
     left = len(e.solution.used) if e.solution else 0
-    return "note" if mended and left >= FEW_POSES and len(names) <= 0.25 * len(e.poses) else "doubtful"
+    return "note" if is_excluded and left >= FEW_POSES and len(names) <= 0.25 * len(e.poses) else "doubtful"
 
 
 def was_refused(e: Evidence, name: str) -> bool:
