@@ -33,11 +33,13 @@ def union(commands: dict[str, Callable[..., Any]]) -> Any:
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
 
 
-def write_json(path: Path | None, data: dict[str, Any]) -> None:
-    """Write a result to a file, where one is asked for."""
+def write_json(path: Path | None, result: object) -> None:
+    """Write a result, plain values or dataclasses, to the file that ``--json`` names; nothing without one."""
     if path is not None:
+        from slviewer.records import to_plain  # lazily: it brings NumPy
+
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(data, indent=2) + "\n")
+        path.write_text(json.dumps(result, indent=2, default=to_plain) + "\n")
 
 
 def ui() -> dict[str, Any]:

@@ -1,12 +1,13 @@
 """Where the uncertainty of a measured length comes from, in the manner of the GUM."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from slviewer.evaluation.render import render
+from slviewer.records import to_plain
 
 COVERAGE = 2.0
 
@@ -62,9 +63,9 @@ class ErrorBudget:
             ]
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self) | {"U_mm": self.U_mm, "k": COVERAGE, "unknown": list(self.unknown)}
+    def to_json(self) -> dict[str, Any]:
+        """The fields, U and what it lacks."""
+        return to_plain(self) | {"U_mm": self.U_mm, "k": COVERAGE, "unknown": self.unknown}
 
 
 def budget(length_mm: float, contributions: Sequence[Contribution]) -> ErrorBudget:

@@ -97,7 +97,7 @@ class Comparison:
             where = f"region: {where}, {100 * self.share:.0f} % of the measured pixels; coverage is of this region"
         return "\n".join([*(line for line in (shares, where) if line), render(table)])
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """For JSON: the figures without the maps; what is not known is None."""
         models = {
             model: {

@@ -19,6 +19,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.shapes import fit_plane
 from slviewer.reconstruction.reconstruct import Model
+from slviewer.records import to_plain
 
 FOLDS = 5
 LEAST_POSES = 5
@@ -95,21 +96,10 @@ class CrossValidation:
         return "\n".join([*lines, *(f"{model} is not judged: {why}" for model, why in self.failed.items())])
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """The fields, the recommended model and each model's figures over all poses."""
         figures = ("plane_mm", "board_mm", "scale_ppm", "camera_px", "projector_px")
-        return {
-            "recommended": self.recommended,
-            "models": {model: {figure: self.rms(model, figure) for figure in figures} for model in self.models},
-            "poses": {m: {name: dict(vars(pose)) for name, pose in poses.items()} for m, poses in self.poses.items()},
-            "folds": [list(fold) for fold in self.folds],
-            "failed": dict(self.failed),
-        }
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> "CrossValidation":
-        """The inverse of ``to_json``."""
-        poses = {m: {name: HeldOut(**pose) for name, pose in found.items()} for m, found in data["poses"].items()}
-        return cls(poses, tuple(tuple(fold) for fold in data["folds"]), data["failed"])
+        models = {model: {figure: self.rms(model, figure) for figure in figures} for model in self.models}
+        return {"recommended": self.recommended, "models": models, **to_plain(self)}
 
 
 def split(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tuple[str, ...], ...]:

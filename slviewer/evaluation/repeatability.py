@@ -1,7 +1,7 @@
 """How well a measurement repeats itself, which says nothing of how true it is."""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,9 +39,9 @@ class Repeatability:
             "It says nothing of accuracy."
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able, without the map."""
-        return {name: value for name, value in asdict(self).items() if name != "sigma_map"}
+    def to_json(self) -> dict[str, Any]:
+        """The fields without the map."""
+        return {name: value for name, value in vars(self).items() if name != "sigma_map"}
 
 
 def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> Repeatability:

@@ -8,6 +8,7 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measurements import quantities_of
+from slviewer.records import from_plain
 from slviewer.session.measurements import Measurement
 
 _UNITS = {"deg": "°", "%": " %", "": ""}
@@ -50,7 +51,7 @@ def drawn(
         a, b = (np.array(end) for end in measured.data["ends"])
         return _dimension(a, b)
     if measured.kind == "section":
-        plane = CutPlane.from_dict(measured.data["plane"])
+        plane = from_plain(measured.data["plane"], CutPlane)
         off = _OFF * float(np.ptp(np.concatenate(lines)[:, 0])) if lines else 0.0
         cut = [lifted(plane, line + np.array([0.0, off])) for line in lines]
         place = cut[0][np.argmax(cut[0] @ plane.up)] if cut else plane.origin
@@ -70,7 +71,7 @@ def drawn(
 def feature_of(measured: Measurement) -> Feature | None:
     """The point, plane, sphere or cylinder that a measurement is."""
     found = measured.data.get("feature") or measured.data.get("fit", {}).get("feature")
-    return None if found is None else Feature.from_dict(found)
+    return None if found is None else from_plain(found, Feature)
 
 
 def lifted(plane: CutPlane, points: np.ndarray) -> np.ndarray:

@@ -78,14 +78,14 @@ class Deviation:
         edges = np.linspace(-limit, limit, bins + 1)
         return edges, np.histogram(values, edges)[0]
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able: everything but what is told point by point."""
+    def to_json(self) -> dict[str, Any]:
+        """The figures of the whole scan, without those of each point."""
         return {
             "statistics_mm": self.statistics(),
             "reach_mm": self.reach_mm,
             "coverage": self.coverage,
             "alignment_mm": self.alignment_mm,
-            "T_nominal_scan": self.T_nominal_scan.tolist(),
+            "T_nominal_scan": self.T_nominal_scan,
         }
 
 

@@ -1,8 +1,7 @@
 """What is picked or fitted on a measured surface: a point, a plane, a sphere, a cylinder."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -75,17 +74,6 @@ class Feature:
     def parameters(self) -> int:
         """How many parameters it has."""
         return {"point": 3, "plane": 3, "sphere": 4, "cylinder": 5}[self.kind]
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        direction = None if self.direction is None else self.direction.tolist()
-        return {"kind": self.kind, "place": self.place.tolist(), "direction": direction, "radius": self.radius}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Feature":
-        """The inverse of ``to_dict``."""
-        direction = None if data["direction"] is None else np.array(data["direction"])
-        return cls(data["kind"], np.array(data["place"]), direction, data["radius"])
 
     @property
     def _direction(self) -> np.ndarray:

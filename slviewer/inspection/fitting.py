@@ -1,6 +1,5 @@
 """Planes, spheres and cylinders fitted to a selected region: what they are, how sure, and whether they are any."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +13,7 @@ from slviewer.inspection.features import Feature, Kind
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.starts import as_plane, as_sphere, start
 from slviewer.inspection.uncertainty import Shared, Spread, propagated, scatter
+from slviewer.records import to_plain
 
 LEAST_POINTS = 50
 MOST_FITTED = 20_000
@@ -61,35 +61,20 @@ class FeatureFit:
         found.append(Quantity("farthest off", self.maximum, "mm"))
         return found
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able, without the spread's shared part."""
+    def to_json(self) -> dict[str, Any]:
+        """The record of a measurement, without the part of the uncertainty that fits of one calibration share."""
         return {
-            "feature": self.feature.to_dict(),
-            "scatter": self.spread.scatter.tolist(),
+            "feature": to_plain(self.feature),
+            "scatter": self.spread.scatter,
             "calibration": self.spread.calibration,
-            "sigmas": self.spread.sigmas.tolist(),
+            "sigmas": self.spread.sigmas,
             "rms_mm": self.rms,
             "max_mm": self.maximum,
             "form_mm": self.form,
             "used": self.used,
             "left_out": self.left_out,
-            "warnings": list(self.warnings),
+            "warnings": self.warnings,
         }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any], shared: np.ndarray | None) -> "FeatureFit":
-        """The inverse of ``to_dict``."""
-        spread = Spread(np.array(data["scatter"]), shared, data["calibration"])
-        return cls(
-            Feature.from_dict(data["feature"]),
-            spread,
-            data["rms_mm"],
-            data["max_mm"],
-            data["form_mm"],
-            data["used"],
-            data["left_out"],
-            tuple(data["warnings"]),
-        )
 
 
 def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, calibration: str = "") -> FeatureFit:

@@ -1,8 +1,7 @@
 """One number that was measured, with its unit and how sure it is."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 Unit = Literal["mm", "deg", "mm²", "%", ""]
 COVERAGE = 2.0
@@ -31,12 +30,3 @@ class Quantity:
         if self.U is None:
             return f"{self.name} {self.value:.{digits}f}{unit}"
         return f"{self.name} {self.value:.{digits}f} ± {self.U:.{digits}f}{unit} (k = 2)"
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Quantity":
-        """The inverse of ``to_dict``."""
-        return cls(**data)

@@ -1,8 +1,6 @@
 """A surface cut by a plane: ordered lines to read heights, widths and radii off."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -41,15 +39,6 @@ class CutPlane:
     def drawn(self, points: np.ndarray) -> np.ndarray:
         """(n, 2) mm: points (n, 3) in the drawing, along and up."""
         return np.asarray((points - self.origin) @ np.stack([self.along, self.up]).T)
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {name: getattr(self, name).tolist() for name in ("origin", "along", "up")}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "CutPlane":
-        """The inverse of ``to_dict``."""
-        return cls(*(np.array(data[name]) for name in ("origin", "along", "up")))
 
 
 def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np.ndarray]:

@@ -1,8 +1,6 @@
 """Whether deviations stay within a tolerance, as far as their uncertainty lets one say."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,16 +35,6 @@ class ToleranceVerdict:
     inside: float
     outside: float
     close: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "ToleranceVerdict":
-        """The inverse of ``to_dict``."""
-        low, high = tuple(data["lowest"]), tuple(data["highest"])
-        return cls(**{**data, "lowest": low, "highest": high})
 
 
 def judged(found: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> ToleranceVerdict:

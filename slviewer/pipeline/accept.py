@@ -41,11 +41,11 @@ class Accepted:
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``accept --json``."""
-        return self.acceptance.to_dict() | {
+        return self.acceptance.to_json() | {
             "scale_factor": self.factor,
             "scale_applied": self.applied,
-            "budget": None if self.budget is None else self.budget.to_dict(),
-            "repeatability": None if self.repeatability is None else self.repeatability.to_dict(),
+            "budget": None if self.budget is None else self.budget.to_json(),
+            "repeatability": None if self.repeatability is None else self.repeatability.to_json(),
         }
 
     def text(self) -> str:

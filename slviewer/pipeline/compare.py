@@ -16,6 +16,7 @@ from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.measured_surface import MeasuredSurface, surface
 from slviewer.pipeline.measurements import triangles_of
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.records import to_plain
 from slviewer.session.measurements import Measurement, save_measurement
 from slviewer.session.nominal import Nominal, Units, check_size, read_nominal
 from slviewer.session.ply import write_ply
@@ -57,8 +58,8 @@ class Compared:
                 "notes": list(self.nominal.notes),
             },
             "noise_mm": self.noise_mm,
-            **self.found.to_dict(),
-            "tolerance": None if self.verdict is None else self.verdict.to_dict() | {"rule": RULE},
+            **self.found.to_json(),
+            "tolerance": None if self.verdict is None else to_plain(self.verdict) | {"rule": RULE},
         }
 
     def text(self) -> str:
@@ -248,12 +249,12 @@ def _kept(
     kept = np.flatnonzero(found.counted)
     some = kept[:: -(-len(kept) // MOST_KEPT)]
     data = {
-        "quantities": [each.to_dict() for each in quantities],
+        "quantities": quantities,
         "scale": on.scale,
         "nominal": {"name": nominal.name, "hash": nominal.hash, "units": nominal.units or "mm"},
         "noise_mm": noise,
-        "verdict": None if verdict is None else verdict.to_dict(),
-        **found.to_dict(),
+        "verdict": verdict,
+        **found.to_json(),
     }
     arrays = {
         "points": points[some].astype(np.float32),

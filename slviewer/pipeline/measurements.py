@@ -13,7 +13,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
-from slviewer.inspection.fitting import FeatureFit, fit_feature
+from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.regions import Region
 from slviewer.inspection.relations import distance, relation
@@ -24,6 +24,7 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.mesh import grid_triangles
 from slviewer.reconstruction.reconstruct import JUMP
+from slviewer.records import from_plain
 from slviewer.session.atomic import replace_file
 from slviewer.session.measurements import (
     Measurement,
@@ -47,7 +48,7 @@ def add_point(session: SessionLike, on: MeasuredSurface, at: Place, name: str = 
     """A picked point, for relations with what is fitted."""
     feature, spread = on.picked(at)
     x, y, z = (Quantity(axis, float(value), "mm") for axis, value in zip("xyz", feature.place, strict=True))
-    data = {"at": at, "feature": feature.to_dict(), "scatter": spread.scatter.tolist(), "calibration": on.calibration}
+    data = {"at": at, "feature": feature, "scatter": spread.scatter, "calibration": on.calibration}
     arrays = {} if spread.shared is None else {"shared": spread.shared.astype(np.float32)}
     with opened(session, write=True) as store:
         return _saved(store, on, "point", [x, y, z], data, arrays, name)
@@ -73,7 +74,7 @@ def add_fit(session: SessionLike, on: MeasuredSurface, shape: Shape, region: Reg
         found = replace(found, warnings=(*found.warnings, told))
     arrays = {} if found.spread.shared is None else {"shared": found.spread.shared.astype(np.float32)}
     where = f"{region.text()}: {found.used:,} used, {found.left_out:,} left out"
-    data = {"region": region.to_dict(), "where": where, "fit": found.to_dict()}
+    data = {"region": region.to_json(), "where": where, "fit": found.to_json()}
     with opened(session, write=True) as store:
         return _saved(store, on, shape, found.quantities(), data, arrays, name)
 
@@ -99,7 +100,7 @@ def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measur
             source=source,
             model=model,
             inputs={},
-            data=_data(found, {"between": [first.name, second.name]}),
+            data={"quantities": found, "between": [first.name, second.name]},
             arrays={},
             of=(a, b),
             name=name or f"{first.name} – {second.name}",
@@ -119,7 +120,7 @@ def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, n
         Quantity("length along", float(np.ptp(heights[:, 0])), "mm"),
         Quantity("height range", float(np.ptp(heights[:, 1])), "mm"),
     ]
-    data = {"at": [a, b], "plane": plane.to_dict()}
+    data = {"at": [a, b], "plane": plane}
     arrays = {
         "lines": np.concatenate(lines).astype(np.float32),
         "lengths": np.array([len(line) for line in lines], np.int32),
@@ -136,7 +137,7 @@ def section_lines(session: SessionLike, identity: str) -> tuple[CutPlane, list[n
             raise InputError(f"{measured.name} is a {measured.kind}, not a section: choose a section")
         arrays = measurement_arrays(store, identity)
     lines = np.split(arrays["lines"].astype(np.float64), np.cumsum(arrays["lengths"])[:-1])
-    return CutPlane.from_dict(measured.data["plane"]), lines
+    return from_plain(measured.data["plane"], CutPlane), lines
 
 
 def measurements(session: SessionLike) -> list[Measurement]:
@@ -165,7 +166,7 @@ def rename(session: SessionLike, identity: str, name: str) -> Measurement:
 
 def quantities_of(measured: Measurement) -> list[Quantity]:
     """What a measurement read, with units and uncertainties."""
-    return [Quantity.from_dict(each) for each in measured.data["quantities"]]
+    return from_plain(measured.data["quantities"], list[Quantity])
 
 
 def in_words(measured: Measurement) -> str:
@@ -219,11 +220,8 @@ def feature_of(store: Session, measured: Measurement) -> tuple[Feature, Spread]:
         raise InputError(f"{measured.name} is a {measured.kind}: choose a point, plane, sphere or cylinder")
     shared = measurement_arrays(store, measured.id).get("shared")
     shared = None if shared is None else shared.astype(np.float64)
-    if measured.kind == "point":
-        spread = Spread(np.array(measured.data["scatter"]), shared, measured.data["calibration"])
-        return Feature.from_dict(measured.data["feature"]), spread
-    fit = FeatureFit.from_dict(measured.data["fit"], shared)
-    return fit.feature, fit.spread
+    record = measured.data if measured.kind == "point" else measured.data["fit"]
+    return from_plain(record["feature"], Feature), Spread(np.array(record["scatter"]), shared, record["calibration"])
 
 
 def _saved(
@@ -241,14 +239,10 @@ def _saved(
         source=on.source,
         model=on.model,
         inputs=on.inputs,
-        data=_data(found, data) | {"scale": on.scale},
+        data={"quantities": found, **data, "scale": on.scale},
         arrays=arrays,
         name=name,
     )
-
-
-def _data(found: list[Quantity], data: dict[str, Any]) -> dict[str, Any]:
-    return {"quantities": [quantity.to_dict() for quantity in found], **data}
 
 
 def _stale(store: Session, measured: Measurement) -> bool:

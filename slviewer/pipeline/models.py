@@ -15,6 +15,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.records import from_plain
 from slviewer.session.store import Session
 
 Model = StereoModel | PixelwiseModel | SplinedModel
@@ -173,7 +174,7 @@ def validation(store: Session) -> CrossValidation | None:
     them as they are now."""
     if store.state_of(VALIDATION) != "fresh":
         return None
-    return CrossValidation.from_json(store.load_result(VALIDATION, only=())[0]["validation"])
+    return from_plain(store.load_result(VALIDATION, only=())[0]["validation"], CrossValidation)
 
 
 def rejection(store: Session) -> str:

@@ -52,7 +52,7 @@ class Verification:
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``verify --json``, and for spheres the distances between their centres."""
-        data: dict[str, Any] = {"captures": {name: comparison.to_dict() for name, comparison in self.captures.items()}}
+        data: dict[str, Any] = {"captures": {name: comparison.to_json() for name, comparison in self.captures.items()}}
         if distances := self.centre_distances_mm():
             data["centre_distances_mm"] = {f"{a} - {b}": found for (a, b), found in distances.items()}
         return data

@@ -16,9 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from slviewer.errors import SessionError
+from slviewer.records import to_plain
 
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|new)-\d+-[0-9a-f]+")
 _SPARE_BYTES = 1 << 20  # metadata, folders, the file system's own rounding
@@ -43,21 +42,13 @@ def write_bytes(path: Path, *parts: Any) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write a new JSON file and sync it. NumPy numbers and arrays become numbers and lists."""
+    """Write a new JSON file and sync it. Takes what `records.to_plain` takes."""
     write_bytes(path, to_json(data))
 
 
 def to_json(data: Any) -> bytes:
     """UTF-8 JSON for people and programs; NaN stays NaN, as Python's own reader understands it."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.generic | np.ndarray):
-            return value.tolist()
-        if isinstance(value, os.PathLike):
-            return os.fspath(value)
-        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
-
-    return (json.dumps(data, indent=2, ensure_ascii=False, default=plain) + "\n").encode()
+    return (json.dumps(data, indent=2, ensure_ascii=False, default=to_plain) + "\n").encode()
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -135,7 +135,7 @@ def measure(
         found = measured.captures[name]
         models = available(session)
         meta = {
-            **found.to_dict(),
+            **found.to_json(),
             "centres_mm": {m: r.sphere.centre for m, r in found.results.items() if isinstance(r, SphereResult)},
             "masked": dict(measured.masked[name]),
             "scales": {model: scale_factor(session, model) for model in models},

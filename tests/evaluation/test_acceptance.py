@@ -101,7 +101,7 @@ def test_a_scale_error_of_200_ppm_is_found(bars, true_test):
     wrong = outcome(Artefact.from_dict(GIVEN), bars, true_model(200e-6))
     assert wrong.scale.ppm == pytest.approx(200, abs=wrong.scale.U_ppm)
     assert wrong.scale.ppm - true_test.scale.ppm == pytest.approx(200, abs=3)
-    low, high = wrong.scale.to_dict()["within_95_ppm"]
+    low, high = wrong.scale.to_json()["within_95_ppm"]
     assert low < 200 < high and wrong.scale.U_ppm < 150
 
 

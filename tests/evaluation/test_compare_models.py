@@ -72,7 +72,7 @@ def test_a_given_region_is_taken_as_it_is() -> None:
 
 def test_what_is_not_known_is_none_in_json() -> None:
     points, _ = board_before_a_wall()
-    figures = json.loads(json.dumps(compare("plane", {"stereo": seen(points, "stereo")}).to_dict()))
+    figures = json.loads(json.dumps(compare("plane", {"stereo": seen(points, "stereo")}).to_json()))
     assert figures["incidence"] is None
     assert figures["models"]["stereo"]["coverage"] is None
     assert figures["models"]["stereo"]["radius_mm"] is None
@@ -97,7 +97,7 @@ def test_models_without_common_pixels_are_refused() -> None:
 def test_a_sphere_reports_its_radius() -> None:
     points = cloud(sphere_depth((0.0, 0.0, 650.0), 98.0), 0.04)
     result = compare("sphere", {"stereo": seen(points, "stereo", 0.04)}, radius=98.0)
-    assert result.to_dict()["models"]["stereo"]["radius_mm"] == pytest.approx(98.0, abs=0.01)
+    assert result.to_json()["models"]["stereo"]["radius_mm"] == pytest.approx(98.0, abs=0.01)
     assert "98.0" in result.text()
 
 
@@ -196,7 +196,7 @@ def test_a_plane_that_is_a_minor_part_of_the_scene_is_told_with_its_place() -> N
     rough = plane_depth(900.0) + 40.0 * np.sin(u / 6.0)
     points = cloud(np.where(board, plane_depth(), rough), 0.05)
     result = compare("plane", {"stereo": seen(points, "stereo")}, np.ones(board.shape, bool))
-    assert 0.0 < result.share < 0.5 and result.to_dict()["share"] == result.share
+    assert 0.0 < result.share < 0.5 and result.to_json()["share"] == result.share
     (warning,) = [w for w in result.warnings if "measured pixels" in w]
     assert f"{100 * result.share:.0f} %" in warning and result.region_text() in warning
     assert "columns" in result.region_text() and "coverage is of this region" in result.text()

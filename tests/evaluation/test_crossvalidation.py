@@ -14,6 +14,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.geometry.rig import StereoRig
+from slviewer.records import from_plain
 from slviewer.target.board import Board
 
 SIZE, PERIOD = (200, 150), 18.0
@@ -134,6 +135,6 @@ def test_it_survives_saving_and_says_what_failed() -> None:
     found = gathered(("stereo", "pixelwise"), [fold], (("p0",), ("p1",)), {"pixelwise": "3 usable poses"})
     assert found.rms("stereo", "board_mm") == pytest.approx(np.sqrt(0.1))
     assert "recommended: stereo" in found.text() and "pixelwise is not judged: 3 usable poses" in found.text()
-    assert CrossValidation.from_json(json.loads(json.dumps(found.to_json()))) == found
+    assert from_plain(json.loads(json.dumps(found.to_json())), CrossValidation) == found
     with pytest.raises(InputError, match="no model"):
         gathered(("stereo",), [], (), {"stereo": "why"})

@@ -14,6 +14,7 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.records import to_plain
 from slviewer.session.measurements import Measurement
 from slviewer.wizard.surfaces import place_at
 
@@ -23,16 +24,16 @@ TOP = CENTRE - np.array([0.0, 0.0, 30.0])
 
 def made(kind: str, quantities: list[Quantity], of: tuple[str, ...] = (), stale: bool = False, **data) -> Measurement:
     name = f"<b>{kind}</b>"
-    data["quantities"] = [quantity.to_dict() for quantity in quantities]
+    data["quantities"] = to_plain(quantities)
     return Measurement(f"m_{kind}", name, kind, "scan_01", "stereo", "", data, of, stale)
 
 
 SPHERE = made(
     "sphere",
     [Quantity("radius", 25.0, "mm", 0.01, whole=False)],
-    fit={"feature": Feature("sphere", CENTRE, None, 25.0).to_dict(), "warnings": ["it is rough"]},
+    fit={"feature": to_plain(Feature("sphere", CENTRE, None, 25.0)), "warnings": ["it is rough"]},
 )
-POINT = made("point", [Quantity("x", -0.00001, "mm")], feature=Feature("point", TOP).to_dict())
+POINT = made("point", [Quantity("x", -0.00001, "mm")], feature=to_plain(Feature("point", TOP)))
 
 
 def text(html: str) -> str:
@@ -71,10 +72,10 @@ def test_what_is_drawn_lies_where_it_was_measured() -> None:
     segments, _ = drawn(related, {"m_point": POINT, "m_sphere": SPHERE})  # type: ignore[misc]
     assert np.allclose(segments[0, 0], TOP) and np.allclose(segments[2, 1], CENTRE)
     tube = Feature("cylinder", CENTRE, np.array([0.0, 1.0, 0.0]), 8.0)
-    cylinder = made("cylinder", [], fit={"feature": tube.to_dict()}, region={"kind": "ball", "size": [12.0]})
+    cylinder = made("cylinder", [], fit={"feature": to_plain(tube)}, region={"kind": "ball", "size": [12.0]})
     segments, _ = drawn(cylinder, {})  # type: ignore[misc]
     assert np.allclose(np.abs(segments[:-1, :, 1] - CENTRE[1]), 12) and np.ptp(segments[..., 0]) == pytest.approx(16.16)
-    plane = made("plane", [], fit={"feature": Feature("plane", CENTRE, np.array([0.0, 0.0, -1.0])).to_dict()})
+    plane = made("plane", [], fit={"feature": to_plain(Feature("plane", CENTRE, np.array([0.0, 0.0, -1.0])))})
     segments, _ = drawn(plane, {})  # type: ignore[misc]
     assert np.allclose(segments[:-1, :, 2], CENTRE[2] - 0.15)
 
@@ -92,7 +93,7 @@ def test_a_section_is_read_off_at_its_cursors() -> None:
     assert "drawn alike" in section_figure("s", [arc], cursors).caption
     flat = arc * [1, 0.01]
     assert "larger than lengths" in section_figure("s", [flat], placed([flat], (10.0, 90.0, 50.0))).caption
-    cut = made("section", [], plane=plane.to_dict())
+    cut = made("section", [], plane=to_plain(plane))
     segments, place = drawn(cut, {}, [arc])  # type: ignore[misc]
     assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(449)  # the highest point, a little off
 

@@ -10,6 +10,7 @@ from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colour
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.tolerance import ToleranceVerdict, judged
+from slviewer.records import from_plain, to_plain
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import rotation
@@ -119,7 +120,7 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     assert verdict.decision == "fail" and verdict.highest[1] == "fail" and verdict.lowest[1] == "pass"
     assert verdict.inside > 90 and 0.05 < verdict.outside < 5
     assert verdict.inside + verdict.outside + verdict.close == pytest.approx(100)
-    assert ToleranceVerdict.from_dict(verdict.to_dict()) == verdict
+    assert from_plain(to_plain(verdict), ToleranceVerdict) == verdict
     assert judged(found, np.full(len(points), 0.01), 0.3).decision == "pass"
     assert judged(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
 

@@ -8,8 +8,11 @@ from shapes_of_points import MIDDLE, cylinder, plane, sphere, strewn
 
 from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
-from slviewer.inspection.fitting import FeatureFit, fit_feature, least_squares
+from slviewer.inspection.fitting import fit_feature, least_squares
+from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.uncertainty import scatter
+from slviewer.records import from_plain
+from slviewer.session.atomic import to_json
 
 
 def test_a_sphere_with_strays_has_its_radius_within_its_uncertainty() -> None:
@@ -109,8 +112,11 @@ def test_a_features_parameters_move_it_as_its_jacobian_says(kind) -> None:
         assert np.allclose(numeric, J[:, k], atol=1e-5)
 
 
-def test_a_fit_is_the_same_after_it_was_kept() -> None:
-    found = fit_feature("sphere", sphere(2000, 50.0, 0.8, 0.02))
-    again = FeatureFit.from_dict(json.loads(json.dumps(found.to_dict())), None)
-    assert [q.text() for q in again.quantities()] == [q.text() for q in found.quantities()]
-    assert "radius 50.0" in again.quantities()[0].text() and "± 0.0" in again.quantities()[0].text()
+def test_a_saved_fit_gives_the_same_feature_and_quantities() -> None:
+    fit = fit_feature("sphere", sphere(2000, 50.0, 0.8, 0.02))
+    record = json.loads(to_json(fit.to_json()))
+    feature = from_plain(record["feature"], Feature)
+    assert feature.radius == fit.feature.radius and np.array_equal(feature.place, fit.feature.place)
+    quantities = from_plain(json.loads(to_json(fit.quantities())), list[Quantity])
+    assert quantities == fit.quantities()
+    assert "radius 50.0" in quantities[0].text() and "± 0.0" in quantities[0].text()

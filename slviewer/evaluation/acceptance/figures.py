@@ -7,8 +7,8 @@ probability, by the test's own uncertainty.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -61,10 +61,6 @@ class AcceptanceFigure:
             (error_mm - outer, error_mm + outer),
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Judgement:
@@ -74,10 +70,6 @@ class Judgement:
     worst: AcceptanceFigure
     limit_mm: float | None
     decision: Decision | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
 
 
 def judge(name: str, figures: Sequence[AcceptanceFigure], limit_mm: float | None) -> Judgement:

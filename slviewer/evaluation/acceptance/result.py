@@ -1,7 +1,7 @@
 """An acceptance test as a whole: what was found at each position, the scale, and the verdicts."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from slviewer.evaluation.acceptance.artefact import Artefact
 from slviewer.evaluation.acceptance.figures import K_95, K_997, RULE, Decision, Judgement, judge
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, Position
 from slviewer.evaluation.render import Row, render
+from slviewer.records import to_plain
 
 POSITIONS = {"ball-bar": 7, "sphere": 7, "plane": 6}
 CLAIM = "follows the ideas of VDI/VDE 2634 part 2 and ISO 10360-13, and claims conformity with neither"
@@ -41,9 +42,9 @@ class ScaleEstimate:
         """The interval of k standard uncertainties, ppm."""
         return self.ppm - k * self.u_ppm, self.ppm + k * self.u_ppm
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self) | {"within_95_ppm": self.within(K_95), "within_997_ppm": self.within(K_997)}
+    def to_json(self) -> dict[str, Any]:
+        """The fields and both intervals."""
+        return to_plain(self) | {"within_95_ppm": self.within(K_95), "within_997_ppm": self.within(K_997)}
 
 
 @dataclass(frozen=True)
@@ -129,16 +130,12 @@ class Acceptance:
             lines.append(f"{self.decision.upper()}: {RULE}")
         return "\n".join([*lines, f"This test {CLAIM}."])
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """The contract of ``accept --json``."""
-        return {
-            "artefact": asdict(self.artefact),
-            "model": self.model,
-            "positions": [asdict(position) for position in self.positions],
-            "judgements": [judgement.to_dict() for judgement in self.judgements],
-            "scale": None if self.scale is None else self.scale.to_dict(),
+        return to_plain(self) | {
+            "scale": None if self.scale is None else self.scale.to_json(),
             "decision": self.decision,
-            "lacks": list(self.lacks),
+            "lacks": self.lacks,
             "rule": RULE,
             "claim": CLAIM,
         }

@@ -1,0 +1,65 @@
+"""Dataclasses to and from plain values: the one codec for what is written as JSON or TOML.
+
+`to_plain(record)` is nested dicts, lists, tuples, numbers, strings and None, keyed by the names of the fields; arrays
+become nested lists, paths strings. `from_plain(data, Kind)` is the inverse: it checks every field's type, ignores keys
+that the dataclass does not have, gives absent fields their defaults, and leaves checks of values to `__post_init__`::
+
+    @dataclass(frozen=True, eq=False)
+    class CutPlane:
+        origin: NDArray[np.float64]
+        up: NDArray[np.float64] | None = None
+
+    data = to_plain(plane)                 # {"origin": [0.0, 0.0, 580.0], "up": None}
+    plane = from_plain(data, CutPlane)     # arrays of the annotated dtype; InputError names what does not fit
+
+Records nest: a field may be another dataclass, a tuple, a mapping or an optional of these. Name fields after their keys
+on disk, and no method is needed. Where a published record holds computed figures too, add them to the plain fields:
+`to_plain(self) | {"decision": self.decision}`. `session.atomic.write_json` and the commands' `--json` take dataclasses
+as they are. Properties are not written.
+"""
+
+import os
+from collections.abc import Mapping
+from typing import Any, TypeVar, get_args
+
+import msgspec
+import numpy as np
+
+from slviewer.errors import InputError
+
+T = TypeVar("T")
+
+
+def to_plain(value: Any) -> Any:
+    """A dataclass, or anything that holds some, as plain values for JSON; TypeError for what has no plain form."""
+    return msgspec.to_builtins(value, enc_hook=plain_leaf)
+
+
+def from_plain(data: Any, kind: type[T]) -> T:
+    """The value of type `kind` that `to_plain` made `data` from. Raises InputError that names the field amiss."""
+    try:
+        return msgspec.convert(data, kind, dec_hook=_array)
+    except msgspec.ValidationError as error:
+        raise InputError(f"This is no valid {kind.__name__}: {error}.") from error
+
+
+def plain_leaf(value: Any) -> Any:
+    """NumPy values, paths and mappings that are no dicts, one step plainer; the hook of every JSON writer."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f"{type(value).__name__} has no plain form")
+
+
+def _array(kind: Any, value: Any) -> Any:
+    """An array of the dtype that a field is annotated with, of the values' own where it names none."""
+    if kind is not np.ndarray and getattr(kind, "__origin__", None) is not np.ndarray:
+        raise NotImplementedError(f"{kind} is no type of records")
+    dtype = next(iter(get_args(get_args(kind)[1])), None) if get_args(kind) else None
+    array = np.asarray(value, None if dtype is Any else dtype)
+    if array.dtype.kind not in "biuf":
+        raise ValueError("Expected numbers")
+    return array
