@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from fringe_scene import capture, slope
 
-from slviewer.fringe import decode as decoding
+from slviewer.fringe import reference
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.decode import decode, decode_reference
 from slviewer.fringe.layout import layout
@@ -23,7 +23,7 @@ TRUTH = slope(240, 320)
 
 def decode_uncorrected(monkeypatch, sequence, stack, axis="x"):
     with monkeypatch.context() as patch:
-        patch.setattr(decoding, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
+        patch.setattr(reference, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
         return decode(sequence, stack, axis)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slviewer.errors import InputError
-from slviewer.fringe import decode as decoding
+from slviewer.fringe import reference
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.decode import decode
 from slviewer.fringe.patterns import profile, render
@@ -60,7 +60,7 @@ def ripple_rad(phase, coordinate):
 
 @pytest.mark.parametrize(("steps", "before_rad", "times"), [(3, 0.15, 20), (4, 0.005, 3)])  # noise leaves 1.3 mrad
 def test_phase_errors_of_gamma_shrink_with_the_table_on_a_plane(monkeypatch, steps, before_rad, times):
-    monkeypatch.setattr(decoding, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
+    monkeypatch.setattr(reference, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
     rig = letter(0.25, local_distortion_px=0, gamma=2.2)
     renderer = Renderer(rig, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0]))))
     plain = complementary(rig.projector.size, steps, 36.0)
