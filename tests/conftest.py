@@ -1,6 +1,7 @@
 """What all tests may use."""
 
 import os
+import sys
 
 # Workers share the cores: libraries that each take all of them wait for one another.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -18,19 +19,22 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 from playwright.sync_api import Browser, sync_playwright
 
-TESTS = Path(__file__).parent
-FIRST = ("commands/", "server/", "devices/", "gui/", "wizard/", "pipeline/", "preflight/", "validation/")
-"""One worker compiles the kernels in the first of these, while the other runs what needs few of them."""
+sys.dont_write_bytecode = False  # what tests start as processes need not compile the sources again
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes long first, so that both workers end at about the same time; each compiles what the other does not."""
-
-    def turn(item: pytest.Item) -> int:
-        path = item.path.relative_to(TESTS).as_posix()
-        return next((i for i, start in enumerate(FIRST) if path.startswith(start)), len(FIRST))
-
-    items.sort(key=turn)
+    """Mark what the shared fixtures make heavy, and put long files first: both workers end at about the same time."""
+    weight: dict[Path, int] = {}
+    for item in items:
+        fixtures = getattr(item, "fixturenames", ())
+        if "browser" in fixtures:
+            item.add_marker(pytest.mark.browser)
+        if "recorded" in fixtures:
+            item.add_marker(pytest.mark.slow)
+        heavy = sum(item.get_closest_marker(name) is not None for name in ("browser", "slow"))
+        weight[item.path] = max(weight.get(item.path, 0), heavy)
+    items.sort(key=lambda item: -weight[item.path])
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -88,6 +92,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     8 poses, planes, spheres and objects at quarter resolution, made once for all workers: only to be read or copied.
     """
+    from slviewer.calibration.splined import fields
     from slviewer.cli import main
 
     base = tmp_path_factory.getbasetemp()
@@ -95,8 +100,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     session, found = folder / "session", folder / "calibration.json"
     with FileLock(f"{folder}.lock"):
         if not folder.exists():
-            assert main(["simulate", str(session), "--scale", "0.25", "--poses", "8"]) == 0
-            assert main(["calibrate", str(session), "--target", "circles:21x16:9", "--json", str(found)]) == 0
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(fields, "CELLS_ACROSS", 12)  # a hundredth of the time to solve, and as good for this rig
+                assert main(["simulate", str(session), "--scale", "0.25", "--poses", "8"]) == 0
+                assert main(["calibrate", str(session), "--target", "circles:21x16:9", "--json", str(found)]) == 0
     assert json.loads(found.read_text())["poses_used"], "the worker that made it failed"
     return folder
 

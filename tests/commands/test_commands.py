@@ -12,6 +12,8 @@ import trimesh
 from slviewer.session.exporters import write_calibration
 from slviewer.session.store import Session
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 
 
@@ -122,6 +124,7 @@ def test_reproduce_remakes_the_letters_tables_and_figures(
     session: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("slviewer.validation.reproduce.QUICK_SCALE", 0.25)
+    monkeypatch.setattr("slviewer.calibration.splined.fields.CELLS_ACROSS", 12)
     out = session.parent  # whose session is what reproduce would simulate, but for fewer poses
     status, text, _ = run("reproduce", "--quick", "--out", out, "--json", tmp_path / "figures.json")
     assert status == 0

@@ -15,6 +15,8 @@ from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.live_scan import LiveCloud
 from slviewer.wizard.operator import Operator
 
+pytestmark = pytest.mark.slow
+
 SCALE = 0.15
 COMPILED_MS = 240_000
 """Until the first live cloud, where no kernel was compiled before."""

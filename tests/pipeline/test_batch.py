@@ -29,6 +29,8 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.truth import rig_record
 from slviewer.target.board import Board
 
+pytestmark = pytest.mark.slow
+
 SPHERES, PLANES = ("sphere_1", "sphere_3"), ("plane_03", "plane_04", "plane_05")
 
 

@@ -18,6 +18,8 @@ from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.validation.faulty_captures import BOARD, FaultBench
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 POSES = 7
 

@@ -25,6 +25,8 @@ from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import rig_record
 from slviewer.target.board import Board
 
+pytestmark = pytest.mark.slow
+
 BOARD = Board.parse("circles:21x16:9")
 ARTEFACT = """
 kind = "ball-bar"

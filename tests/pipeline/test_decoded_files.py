@@ -19,6 +19,8 @@ from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 
 

@@ -14,6 +14,8 @@ from slviewer.pipeline.frame_residuals import capture_warnings, described, keep_
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.slow
+
 
 def taken(sequence_of=p18, gamma=1.0, thing="board", seed=0, **wrong):
     world = SimulatedWorld(letter(0.2, seed, gamma=gamma))

@@ -19,6 +19,8 @@ from slviewer.preflight.check_rig import check_capture
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.slow
+
 Change = Callable[[np.ndarray], np.ndarray]
 
 

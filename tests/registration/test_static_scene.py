@@ -16,6 +16,8 @@ from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.scenes import Surface
 from slviewer.simulation.turning import AXIS, AXIS_POINT, turning
 
+pytestmark = pytest.mark.slow
+
 NOISE = 0.04
 SIZE = (220, 165)
 WALL_MM = 780.0

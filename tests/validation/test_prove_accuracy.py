@@ -21,6 +21,8 @@ from slviewer.validation import prove_rigs
 from slviewer.validation.prove_accuracy import AccuracyProof, prove_accuracy
 from slviewer.validation.prove_rigs import FLOOR, PlaneFigures, RigFigures, cases
 
+pytestmark = pytest.mark.slow
+
 SHAPES = ("plane_03", "sphere_3", "sphere_4")
 """Inside the calibrated depths, where a few poses already suffice."""
 

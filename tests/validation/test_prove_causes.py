@@ -7,6 +7,8 @@ import pytest
 from slviewer.validation.faulty_captures import FAULTS
 from slviewer.validation.prove_causes import CauseProof, prove_causes
 
+pytestmark = pytest.mark.slow
+
 SINGLE = (
     "board transposed in one pose",
     "board shifted by a row in one pose",

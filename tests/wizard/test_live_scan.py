@@ -27,6 +27,8 @@ from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.live_scan import LiveCloud, Measuring
 from slviewer.wizard.operator import Operator
 
+pytestmark = pytest.mark.slow
+
 SCALE = 0.15
 RIG = {"driver": "simulated", "scale": SCALE, "settle_ms": 4}  # what waits beside it needs the cores too
 SETTINGS = CameraSettings(1.0, 1.0)

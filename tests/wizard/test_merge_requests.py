@@ -23,6 +23,8 @@ from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import MergeView, Snapshot
 from slviewer.wizard.stored_views import merge_view
 
+pytestmark = pytest.mark.slow
+
 STEP_DEG = 12.0
 MIDDLE = np.array([0.0, 0.0, 520.0])
 NAMES = ("first", "second", "third")

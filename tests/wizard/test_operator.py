@@ -17,6 +17,8 @@ from slviewer.wizard import acquisition, preview_watcher
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Snapshot
 
+pytestmark = pytest.mark.slow
+
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
 TARGET = "circles:21x16:9"
 ROOT = Path(__file__).parents[3]
