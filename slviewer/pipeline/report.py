@@ -13,8 +13,6 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.lens import Lens
-from slviewer.inspection.quantities import Quantity
 from slviewer.pipeline.calibration_verdict import last_verdict
 from slviewer.pipeline.check import history
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
@@ -37,7 +35,6 @@ from slviewer.report.data import (
     CalibrationFigures,
     CaptureRow,
     DeviationView,
-    DeviceParameters,
     DriftRow,
     ErrorMaps,
     MeasurementRow,
@@ -45,7 +42,6 @@ from slviewer.report.data import (
     PixelCurve,
     PixelFitView,
     PoseResiduals,
-    Reading,
     SectionView,
     SessionData,
     SpacingRow,
@@ -230,23 +226,7 @@ def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str,
         if name in observations:
             o = observations[name]
             residuals[name] = PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
-    rig = stereo.rig
-    return CalibrationFigures(
-        camera=_parameters(rig.camera, stereo.focal_sigma_px.get("camera", np.nan)),
-        projector=_parameters(rig.projector, stereo.focal_sigma_px.get("projector", np.nan)),
-        R=rig.R,
-        t=rig.t,
-        target=stereo.board,
-        depth_range_mm=stereo.depth_range_mm or (np.nan, np.nan),
-        reprojection_rms_px=stereo.reprojection_rms_px,
-        pose_rms_px=stereo.pose_rms_px,
-        residuals=residuals,
-        features_set_aside=stereo.features_set_aside,
-    )
-
-
-def _parameters(lens: Lens, sigma: float) -> DeviceParameters:
-    return DeviceParameters(lens.K, lens.D, lens.size, sigma)
+    return CalibrationFigures(stereo, residuals)
 
 
 def curve_at(
@@ -266,7 +246,6 @@ def curve_at(
     return PixelCurve(pixel, axis, phase, z, x, y, fit.coefficients[:, v, u], fit.rms_mm[:, v, u])
 
 
-UNITS = {"deg": "°"}
 MOST_DRAWN = 6
 """Sections, and comparisons with nominal models, that are drawn, the last ones; the CSV holds all."""
 
@@ -289,12 +268,8 @@ def _row(measured: Measurement) -> MeasurementRow:
     if "between" in data:
         where = " and ".join(data["between"])
     notes = tuple(data["fit"]["warnings"]) if "fit" in data else ()
-    readings = [_reading(quantity) for quantity in quantities_of(measured)]
-    return MeasurementRow(measured.name, measured.kind, measured.source, readings, where, notes, measured.stale)
-
-
-def _reading(quantity: Quantity) -> Reading:
-    return Reading(quantity.name, quantity.value, UNITS.get(quantity.unit, quantity.unit), quantity.U, quantity.whole)
+    quantities = quantities_of(measured)
+    return MeasurementRow(measured.name, measured.kind, measured.source, quantities, where, notes, measured.stale)
 
 
 def _deviation(store: Session, measured: Measurement) -> DeviationView:

@@ -12,7 +12,9 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.drift.check import Drift
+from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation
+from slviewer.inspection.quantities import Quantity
 
 ByModel = Mapping[str, float]
 """One value a model, such as ``{"stereo": 0.198, "pixelwise": 0.076}``."""
@@ -159,16 +161,6 @@ class CaptureRow:
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceParameters:
-    """A lens as calibrated: K (3, 3) px, D (5,) k1 k2 p1 p2 k3, size (width, height), and sigma of the focal length."""
-
-    K: np.ndarray
-    D: np.ndarray
-    size: tuple[int, int]
-    focal_sigma_px: float = float("nan")
-
-
-@dataclass(frozen=True, eq=False)
 class PoseResiduals:
     """Features of one board pose: camera ``pixels`` (n, 2) and ``camera``, ``projector`` residuals (n, 2) px.
 
@@ -183,21 +175,10 @@ class PoseResiduals:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFigures:
-    """A stereo calibration: lenses, ``R`` (3, 3) and ``t`` (3,) mm camera to projector, and how well the poses agree.
+    """A stereo calibration and the residuals of its poses' features, which may be empty where none were saved."""
 
-    ``pose_rms_px`` holds (camera, projector) by pose; ``residuals`` may be empty where none were kept.
-    """
-
-    camera: DeviceParameters
-    projector: DeviceParameters
-    R: np.ndarray
-    t: np.ndarray
-    target: str
-    depth_range_mm: tuple[float, float]
-    reprojection_rms_px: Mapping[str, float]
-    pose_rms_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    stereo: StereoModel
     residuals: Mapping[str, PoseResiduals] = field(default_factory=dict)
-    features_set_aside: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,18 +240,6 @@ class DriftRow:
 
 
 @dataclass(frozen=True)
-class Reading:
-    """One number that was measured: ``unit`` as it is printed; ``U`` its expanded uncertainty (k = 2), None where it
-    has none; ``whole``: whether U holds the calibration's part."""
-
-    name: str
-    value: float
-    unit: str
-    U: float | None = None
-    whole: bool = True
-
-
-@dataclass(frozen=True)
 class MeasurementRow:
     """A distance, a fit, an angle, … on the scan ``source``; ``where``: the region or what it lies between; ``notes``
     are sentences."""
@@ -278,7 +247,7 @@ class MeasurementRow:
     name: str
     kind: str
     source: str
-    readings: Sequence[Reading]
+    quantities: Sequence[Quantity]
     where: str = ""
     notes: Sequence[str] = ()
     stale: bool = False
@@ -324,9 +293,6 @@ class SessionData:
     pixel_fits: Sequence[PixelFitView] = ()
     verifications: Sequence[VerificationView] = ()
     spacings: Sequence[SpacingRow] = ()
-    clouds: Sequence[CloudView] = ()
-    merged: CloudView | None = None
-    pairs: Sequence[MergePair] = ()
     warnings: Sequence[str] = ()
     verdict: Verdict | None = None
     verdict_of_calibration: bool = True

@@ -42,16 +42,18 @@ def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[Sect
     items += [PageNotice(f"{row.name}: {note}.") for row in rows for note in row.notes]
     body: list[list[str | Cell]] = []
     for row in rows:
-        for i, reading in enumerate(row.readings):
-            digits = 1 if reading.unit == "%" else 4
-            U: str | Cell = UNKNOWN if reading.U is None else f"{reading.U:.{digits}f}"
-            if reading.U is not None and not reading.whole:
-                U = f"{U} *"
-            named: list[str | Cell] = [row.name, row.kind, row.source] if not i else ["", "", ""]
-            if not i and row.stale:
-                named[0] = Cell(f"{row.name} (stale)", "worse")
-            where = row.where if not i else ""
-            body.append([*named, reading.name, number(reading.value, digits), reading.unit, U, where])
+        named: list[str | Cell] = [
+            Cell(f"{row.name} (stale)", "worse") if row.stale else row.name,
+            row.kind,
+            row.source,
+        ]
+        where = row.where
+        for q in row.quantities:
+            digits = 1 if q.unit == "%" else 4
+            U = UNKNOWN if q.U is None else f"{q.U:.{digits}f}{'' if q.whole else ' *'}"
+            unit = "°" if q.unit == "deg" else q.unit
+            body.append([*named, q.name, number(q.value, digits), unit, U, where])
+            named, where = ["", "", ""], ""
     columns = [Column("measurement", align="left"), Column("kind", align="left"), Column("scan", align="left")]
     columns += [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns += [Column("U, k = 2"), Column("of", align="left")]
@@ -59,7 +61,7 @@ def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[Sect
         "U is the expanded uncertainty: the scatter of the points, and what the calibration leaves uncertain. –: a "
         "residual or a plain reading, which has none."
     ]
-    if any(reading.U is not None and not reading.whole for row in rows for reading in row.readings):
+    if any(q.U is not None and not q.whole for row in rows for q in row.quantities):
         notes.append("* without the calibration's part, which this calibration does not know.")
     if body:
         items.append(Table(columns, body, "Measured on the scans", notes))

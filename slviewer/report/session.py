@@ -1,10 +1,13 @@
 """Any session as the sections of a page: what was captured, how it was calibrated, and what that measures."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from slviewer.calibration.stereo import StereoModel
+from slviewer.geometry.lens import Lens
 from slviewer.report.canvas import percentile
-from slviewer.report.clouds import clouds, merged_cloud
-from slviewer.report.data import CalibrationFigures, DeviceParameters, SessionData, VerificationView
+from slviewer.report.data import CalibrationFigures, SessionData, VerificationView
 from slviewer.report.maps import error_maps, rms_maps
 from slviewer.report.measurements import deviations_section, measurements_section
 from slviewer.report.page import Cell, Column, Headline, Item, Mark, PageNotice, Section, Table
@@ -21,7 +24,6 @@ from slviewer.report.tables import (
     better_worse,
     incidence_text,
     mean_of,
-    merge_table,
     models_of,
     number,
     spacing_table,
@@ -51,9 +53,9 @@ def session_headlines(data: SessionData) -> list[Headline]:
     if calibration is not None:
         used = sum(row.state == "used" for row in data.captures)
         wanted = sum(row.role == "calibration" for row in data.captures)
-        near, far = calibration.depth_range_mm
-        headlines.append(Headline(f"{used} of {wanted}", "target poses used", f"boards at {near:.0f} to {far:.0f} mm"))
-        rms = calibration.reprojection_rms_px
+        note = f"boards at {_depths(calibration.stereo)}"
+        headlines.append(Headline(f"{used} of {wanted}", "target poses used", note))
+        rms = calibration.stereo.reprojection_rms_px
         if rms:
             headlines.append(
                 Headline(
@@ -93,7 +95,7 @@ def session_sections(data: SessionData) -> list[Section]:
     if data.verdict is not None:
         sections.append(verdict_section(data.verdict, data.verdict_of_calibration))
     if data.calibration is not None:
-        sections += [_reprojection(data.calibration), _parameters(data.calibration)]
+        sections += [_reprojection(data.calibration), _parameters(data.calibration.stereo)]
     if data.models is not None:
         sections.append(models_section(data.models))
     if data.pixel_fits:
@@ -104,8 +106,6 @@ def session_sections(data: SessionData) -> list[Section]:
         sections.append(acceptance_section(data.acceptances))
     if data.drifts:
         sections.append(drift_section(data.drifts))
-    if data.clouds or data.merged is not None:
-        sections.append(_clouds(data))
     if data.measurements or data.sections:
         sections.append(measurements_section(data.measurements, data.sections))
     if data.deviations:
@@ -150,85 +150,97 @@ def _captures(data: SessionData) -> Section:
 
 
 def _reprojection(calibration: CalibrationFigures) -> Section:
-    rms = calibration.reprojection_rms_px
+    stereo, residuals = calibration.stereo, calibration.residuals
+    rms, cameras, projectors = stereo.reprojection_rms_px, stereo.rig.camera.size, stereo.rig.projector.size
     items: list[Item] = []
-    if calibration.pose_rms_px:
-        items.append(pose_bars(calibration.pose_rms_px, calibration.reprojection_rms_px))
-    residuals = calibration.residuals
+    if stereo.pose_rms_px:
+        items.append(pose_bars(stereo.pose_rms_px, rms))
     if residuals:
-        worst = max(residuals, key=lambda name: max(calibration.pose_rms_px.get(name, (0.0, 0.0))))
+        worst = max(residuals, key=lambda name: max(stereo.pose_rms_px.get(name, (0.0, 0.0))))
         shown = residuals[worst]
         items += [
-            residual_arrows(f"camera, {worst} (the worst pose)", shown.pixels, shown.camera, calibration.camera.size),
-            residual_arrows(f"projector, {worst}", shown.projector_pixels, shown.projector, calibration.projector.size),
-            coverage("camera", calibration.camera.size, [r.pixels for r in residuals.values()]),
-            coverage("projector", calibration.projector.size, [r.projector_pixels for r in residuals.values()]),
+            residual_arrows(f"camera, {worst} (the worst pose)", shown.pixels, shown.camera, cameras),
+            residual_arrows(f"projector, {worst}", shown.projector_pixels, shown.projector, projectors),
+            coverage("camera", cameras, [r.pixels for r in residuals.values()]),
+            coverage("projector", projectors, [r.projector_pixels for r in residuals.values()]),
         ]
-    if calibration.pose_rms_px:
-        items.append(_pose_table(calibration))
-    aside = calibration.features_set_aside
+    if stereo.pose_rms_px:
+        items.append(_pose_table(stereo.pose_rms_px))
+    aside = stereo.features_set_aside
     text = [
         "How far the target's features lie from where the calibration predicts them, in px: "
         + ", ".join(f"{device} {value:.3f}" for device, value in rms.items())
-        + f". Target: {calibration.target}."
+        + f". Target: {stereo.board}."
         if rms
-        else "This calibration was made elsewhere, and says nothing of its reprojection error."
+        else "This calibration was made elsewhere, without a reprojection error."
     ]
     if aside:
-        text.append(f"{_counted(aside, 'feature')} beyond 6 robust sigma {'were' if aside > 1 else 'was'} set aside.")
+        text.append(f"{_counted(aside, 'feature')} beyond 6 robust sigma {'were' if aside > 1 else 'was'} excluded.")
     return Section("Reprojection", text, items)
 
 
-def _pose_table(calibration: CalibrationFigures) -> Table:
-    typical = np.sqrt(np.nanmean(np.square(list(calibration.pose_rms_px.values())), axis=0))
-    columns = [
-        Column("pose", align="left"),
-        Column("camera", "px"),
-        Column("projector", "px"),
-        Column("", align="left"),
-    ]
+def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
+    typical = np.sqrt(np.nanmean(np.square(list(pose_rms_px.values())), axis=0))
+    columns = [Column("pose", align="left"), Column("camera", "px"), Column("projector", "px")]
     rows: list[list[str | Cell]] = []
-    for name, values in calibration.pose_rms_px.items():
+    for name, values in pose_rms_px.items():
         high = [value > WORST * usual for value, usual in zip(values, typical, strict=True)]
         shown = [Cell(f"{v:.3f}", "worse") if h else number(v) for v, h in zip(values, high, strict=True)]
         rows.append([name, *shown, Cell("look at this pose", "worse") if any(high) else ""])
-    if not any(row[3] for row in rows):
-        columns, rows = columns[:3], [row[:3] for row in rows]
-    return Table(columns, rows, "Reprojection RMS of each pose")
+    if any(row[3] for row in rows):
+        columns.append(Column("", align="left"))
+    return Table(columns, [row[: len(columns)] for row in rows], "Reprojection RMS of each pose")
 
 
-def _parameters(calibration: CalibrationFigures) -> Section:
-    def lens(device: DeviceParameters) -> list[str]:
-        K, D, sigma = device.K, device.D, device.focal_sigma_px
+def lens_rows(stereo: StereoModel) -> list[tuple[str, str, str, str]]:
+    """Both lenses' parameters in words: (name, unit, camera's, projector's)."""
+
+    def values(lens: Lens, sigma: float) -> list[str]:
         spread = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
         return [
-            f"{device.size[0]} x {device.size[1]}",
-            *(f"{K[i, i]:.2f}{spread}" for i in (0, 1)),
-            *(f"{K[i, 2]:.2f}" for i in (0, 1)),
-            *(f"{value:.5f}".replace("-", "−") for value in D[:5]),
+            f"{lens.size[0]} x {lens.size[1]}",
+            *(f"{lens.K[i, i]:.2f}{spread}" for i in (0, 1)),
+            *(f"{lens.K[i, 2]:.2f}" for i in (0, 1)),
+            *(f"{value:.5f}".replace("-", "−") for value in lens.D[:5]),
         ]
 
     names = ["size", "focal length fx", "focal length fy", "principal point cx", "principal point cy"]
     names += ["radial k1", "radial k2", "tangential p1", "tangential p2", "radial k3"]
-    units = ["px"] * 5 + [""] * 5
-    rows = list(zip(names, units, lens(calibration.camera), lens(calibration.projector), strict=True))
-    columns = [Column("parameter", align="left"), Column("unit", align="centre"), Column("camera"), Column("projector")]
-    t = np.asarray(calibration.t, float).ravel()
-    angle = np.degrees(np.arccos(np.clip((np.trace(calibration.R) - 1) / 2, -1, 1)))
-    axes = np.degrees(np.arccos(np.clip(calibration.R[2, 2], -1, 1)))
-    rig = [
-        ["baseline (distance of the two devices)", f"{np.linalg.norm(t):.2f} mm"],
-        ["t, camera to projector (x, y, z)", " / ".join(f"{v:.2f}" for v in t).replace("-", "−") + " mm"],
-        ["angle between the optical axes", f"{axes:.2f}°"],
-        ["rotation, camera to projector", f"{angle:.2f}°"],
-        ["depths of the boards", "{:.0f} to {:.0f} mm".format(*calibration.depth_range_mm)],
+    sigmas = stereo.focal_sigma_px
+    camera = values(stereo.rig.camera, sigmas.get("camera", np.nan))
+    projector = values(stereo.rig.projector, sigmas.get("projector", np.nan))
+    return list(zip(names, ["px"] * 5 + [""] * 5, camera, projector, strict=True))
+
+
+def rig_rows(stereo: StereoModel) -> list[tuple[str, str]]:
+    """Where the projector stands in the camera's frame, in words: (quantity, value with its unit)."""
+    R, t = stereo.rig.R, np.asarray(stereo.rig.t, float).ravel()
+    angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    axes = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))
+    return [
+        ("baseline (distance of the two devices)", f"{np.linalg.norm(t):.2f} mm"),
+        ("t, camera to projector (x, y, z)", " / ".join(f"{v:.2f}" for v in t).replace("-", "−") + " mm"),
+        ("angle between the optical axes", f"{axes:.2f}°"),
+        ("rotation, camera to projector", f"{angle:.2f}°"),
+        ("depths of the boards", _depths(stereo)),
     ]
+
+
+def _depths(stereo: StereoModel) -> str:
+    if stereo.depth_range_mm is None:
+        return "unknown"
+    return "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm)
+
+
+def _parameters(stereo: StereoModel) -> Section:
+    columns = [Column("parameter", align="left"), Column("unit", align="centre"), Column("camera"), Column("projector")]
+    note = "± is one standard deviation, from the lens's own calibration."
     return Section(
         "Parameters",
         "Pinhole and Brown distortion of both devices, and where the projector stands in the camera's frame.",
         [
-            Table(columns, rows, "Lenses", ["± is one standard deviation, from the lens's own calibration."]),
-            Table([Column("quantity", align="left"), Column("value")], rig, "Rig"),
+            Table(columns, lens_rows(stereo), "Lenses", [note]),
+            Table([Column("quantity", align="left"), Column("value")], rig_rows(stereo), "Rig"),
         ],
     )
 
@@ -320,17 +332,6 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
     if masked:
         notes.append("Masked: pixels that look through parts of camera or projector that no target pose lit.")
     return Table(columns, rows, caption, notes)
-
-
-def _clouds(data: SessionData) -> Section:
-    items: list[Item] = []
-    if data.pairs:
-        items.append(merge_table(data.pairs, "Alignment of the scans by point-to-plane ICP"))
-    if data.clouds:
-        items.append(clouds(data.clouds))
-    if data.merged is not None:
-        items.append(merged_cloud(data.merged))
-    return Section("Scans", "", items)
 
 
 def _counted(count: int, word: str) -> str:

@@ -1,6 +1,7 @@
 """Numbers as tables: every value with its unit and its rival, and who wins in colour and in words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -51,122 +52,71 @@ def models_of(rows: Sequence[Mapping[str, float]]) -> list[str]:
 
 def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
     """Incidence, RMS and floor by model, who wins, and, where rows have them, the Letter's own figures."""
-    models = models_of([row.rms_mm for row in rows])
-    letters = models_of([row.letter_rms_mm for row in rows])
-    columns = [Column("plane", align="left"), Column("R1 / R2 / R3", "%", align="centre")]
-    for model in models:
-        columns += [Column("RMS", "mm", model), Column("floor", "mm", model)]
-    columns += [Column("against " + models[0], "", model, "left") for model in models[1:]]
-    group = "the Letter's rig"
-    if letters:
-        columns.append(Column("R1 / R2 / R3", "%", group, "centre"))
-        columns += [Column(model, "mm", group) for model in letters]
-        columns += [Column("against " + letters[0], "", group, "left") for _ in letters[1:]]
-
-    def cells(
-        name: str, incidence: str | Cell, rms: ByModel, floor: ByModel, letter_incidence: str | Cell, letter: ByModel
-    ) -> list[str | Cell]:
-        row: list[str | Cell] = [name, incidence]
-        for model in models:
-            row += [_won(model, rms, models), _muted(floor.get(model, np.nan))]
-        row += [verdict(rms.get(model, np.nan), rms.get(models[0], np.nan)) for model in models[1:]]
-        if letters:
-            row.append(letter_incidence)
-            row += [number(letter.get(model, np.nan)) for model in letters]
-            row += [_plain(verdict(letter.get(m, np.nan), letter.get(letters[0], np.nan))) for m in letters[1:]]
-        return row
-
-    body = [
-        cells(
-            row.name,
-            incidence_text(row.incidence),
-            row.rms_mm,
-            row.noise_floor_mm,
-            incidence_text(row.letter_incidence),
-            row.letter_rms_mm,
-        )
-        for row in rows
+    rms, floor = _by_model(rows, "rms_mm"), _by_model(rows, "noise_floor_mm")
+    letter = _by_model(rows, "letter_rms_mm")
+    columns: list[_Filled] = [
+        (Column("plane", align="left"), [*(row.name for row in rows), "mean"]),
+        (Column("R1 / R2 / R3", "%", align="centre"), [*(incidence_text(row.incidence) for row in rows), ""]),
     ]
-    footer = cells(
-        "mean",
-        "",
-        {m: mean_of([row.rms_mm.get(m, np.nan) for row in rows]) for m in models},
-        {m: mean_of([row.noise_floor_mm.get(m, np.nan) for row in rows]) for m in models},
-        "",
-        {m: mean_of([row.letter_rms_mm.get(m, np.nan) for row in rows]) for m in letters},
-    )
-    notes = ["RMS over the pixels that every model measures; floor: what the capture's noise alone would give."]
-    return Table(columns, body, caption, notes, [footer] if len(rows) > 1 else [])
+    for model in rms:
+        columns.append((Column("RMS", "mm", model), _won(model, rms)))
+        columns.append((Column("floor", "mm", model), _muted(floor.get(model, []), len(rows))))
+    columns += _against(rms, "against")
+    if letter:
+        group = "the Letter's rig"
+        shares = [*(incidence_text(row.letter_incidence) for row in rows), ""]
+        columns.append((Column("R1 / R2 / R3", "%", group, "centre"), shares))
+        columns += [(Column(model, "mm", group), [number(v) for v in values]) for model, values in letter.items()]
+        columns += [
+            (replace(column, group=group), [_plain(cell) for cell in cells])
+            for column, cells in _against(letter, "against")
+        ]
+    note = "RMS over the pixels that every model measures; floor: what the capture's noise alone would give."
+    return _filled_table(columns, caption, [note])
 
 
 def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
     """RMS, floor and fitted radius by model, who wins in the radius, and the Letter's own figures where known."""
-    models = models_of([row.rms_mm for row in rows])
-    letters = models_of([row.letter_rms_mm for row in rows])
-    columns = [Column("sphere", align="left"), Column("range", align="centre")]
-    for model in models:
-        columns += [Column("RMS", "mm", model), Column("floor", "mm", model)]
-        columns += [Column("radius", "mm", model), Column("error", "mm", model)]
-    columns += [Column("radius against " + models[0], "", model, "left") for model in models[1:]]
-    for model in letters:
-        columns += [
-            Column("RMS", "mm", f"the Letter's rig, {model}"),
-            Column("radius", "mm", f"the Letter's rig, {model}"),
-        ]
-    body: list[list[str | Cell]] = []
-    for row in rows:
-        errors = {m: row.radius_mm.get(m, np.nan) - row.true_radius_mm for m in models}
-        line: list[str | Cell] = [row.name, row.region]
-        for m in models:
-            line += [_won(m, row.rms_mm, models), _muted(row.noise_floor_mm.get(m, np.nan))]
-            line += [number(row.radius_mm.get(m, np.nan)), _won(m, errors, models, signed=True)]
-        line += [verdict(errors[m], errors[models[0]]) for m in models[1:]]
-        for m in letters:
-            line += [number(row.letter_rms_mm.get(m, np.nan)), number(row.letter_radius_mm.get(m, np.nan), 2)]
-        body.append(line)
-    sizes = {m: mean_of([abs(row.radius_mm.get(m, np.nan) - row.true_radius_mm) for row in rows]) for m in models}
-    footer: list[str | Cell] = ["mean", ""]
-    for m in models:
-        footer += [number(mean_of([row.rms_mm.get(m, np.nan) for row in rows]))]
-        footer += [_muted(mean_of([row.noise_floor_mm.get(m, np.nan) for row in rows]))]
-        footer += [number(mean_of([row.radius_mm.get(m, np.nan) for row in rows])), number(sizes[m])]
-    footer += [verdict(sizes[m], sizes[models[0]]) for m in models[1:]]
-    for m in letters:
-        footer += [number(mean_of([row.letter_rms_mm.get(m, np.nan) for row in rows]))]
-        footer += [number(mean_of([row.letter_radius_mm.get(m, np.nan) for row in rows]), 3)]
-    true = sorted({row.true_radius_mm for row in rows if np.isfinite(row.true_radius_mm)})
-    notes = [
-        f"True radius {' or '.join(f'{r:g} mm' for r in true)}; the mean of the errors is that of their sizes."
-        if true
-        else "The true radius is not known."
+    rms, floor = _by_model(rows, "rms_mm"), _by_model(rows, "noise_floor_mm")
+    radius, letter = _by_model(rows, "radius_mm"), _by_model(rows, "letter_rms_mm")
+    errors = _errors(rms, radius, [row.true_radius_mm for row in rows])
+    columns: list[_Filled] = [
+        (Column("sphere", align="left"), [*(row.name for row in rows), "mean"]),
+        (Column("range", align="centre"), [*(row.region for row in rows), ""]),
     ]
-    return Table(columns, body, caption, notes, [footer] if len(rows) > 1 else [])
+    for model in rms:
+        columns.append((Column("RMS", "mm", model), _won(model, rms)))
+        columns.append((Column("floor", "mm", model), _muted(floor.get(model, []), len(rows))))
+        columns.append(
+            (Column("radius", "mm", model), [number(r) for r in radius.get(model, [np.nan] * (len(rows) + 1))])
+        )
+        columns.append((Column("error", "mm", model), _won(model, errors, signed=True)))
+    columns += _against(errors, "radius against")
+    for model, values in letter.items():
+        *radii, mean = _by_model(rows, "letter_radius_mm")[model]
+        group = f"the Letter's rig, {model}"
+        columns.append((Column("RMS", "mm", group), [number(v) for v in values]))
+        columns.append((Column("radius", "mm", group), [*(number(r, 2) for r in radii), number(mean)]))
+    true = sorted({row.true_radius_mm for row in rows if np.isfinite(row.true_radius_mm)})
+    known = f"True radius {' or '.join(f'{r:g} mm' for r in true)}; the mean of the errors is that of their sizes."
+    return _filled_table(columns, caption, [known if true else "The true radius is not known."])
 
 
 def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
     """Distances between spheres, known (where they are) and measured; flatness is blind to scale and shear, these are
     not."""
-    models = models_of([row.measured_mm for row in rows])
+    measured = _by_model(rows, "measured_mm")
+    names: _Filled = (Column("spheres", align="left"), [*(row.name for row in rows), "mean size of the error"])
     if not any(np.isfinite(row.known_mm) for row in rows):
-        plain = [[row.name, *(number(row.measured_mm.get(m, np.nan)) for m in models)] for row in rows]
-        return Table([Column("spheres", align="left"), *(Column(m, "mm") for m in models)], plain, caption)
-    columns = [Column("spheres", align="left"), Column("known", "mm")]
-    for model in models:
-        columns += [Column("measured", "mm", model), Column("error", "mm", model)]
-    columns += [Column("against " + models[0], "", model, "left") for model in models[1:]]
-    body: list[list[str | Cell]] = []
-    for row in rows:
-        errors = {m: row.measured_mm.get(m, np.nan) - row.known_mm for m in models}
-        line: list[str | Cell] = [row.name, number(row.known_mm)]
-        for m in models:
-            line += [number(row.measured_mm.get(m, np.nan)), _won(m, errors, models, signed=True)]
-        body.append(line + [verdict(errors[m], errors[models[0]]) for m in models[1:]])
-    sizes = {m: spacing_error(rows, m) for m in models}
-    footer: list[str | Cell] = ["mean size of the error", ""]
-    for m in models:
-        footer += ["", number(sizes[m])]
-    footer += [verdict(sizes[m], sizes[models[0]]) for m in models[1:]]
-    return Table(columns, body, caption, (), [footer] if len(rows) > 1 else [])
+        plain = [(Column(model, "mm"), [number(v) for v in values]) for model, values in measured.items()]
+        table = _filled_table([names, *plain], caption)
+        return replace(table, footer=())
+    errors = _errors(measured, measured, [row.known_mm for row in rows])
+    columns: list[_Filled] = [names, (Column("known", "mm"), [*(number(row.known_mm) for row in rows), ""])]
+    for model, values in measured.items():
+        columns.append((Column("measured", "mm", model), [*(number(v) for v in values[:-1]), ""]))
+        columns.append((Column("error", "mm", model), _won(model, errors, signed=True)))
+    return _filled_table(columns + _against(errors, "against"), caption)
 
 
 def spacing_error(rows: Sequence[SpacingRow], model: str) -> float:
@@ -194,22 +144,59 @@ def incidence_text(incidence: Mapping[str, float]) -> str | Cell:
     return " / ".join(f"{abs(incidence.get(region, 0.0)):.1f}".removesuffix(".0") for region in ("R1", "R2", "R3"))
 
 
-def _won(model: str, errors: ByModel, models: Sequence[str], signed: bool = False) -> str | Cell:
-    """A model's error; marked better where it beats every other, worse where the first model beats it."""
-    mine = errors.get(model, np.nan)
-    text = number(mine, signed=signed)
-    if isinstance(text, Cell):
-        return text
-    others = [errors.get(other, np.nan) for other in models if other != model]
-    if others and all(better_worse(mine, other) == "better" for other in others):
-        return Cell(text, "better")
-    lost = model != models[0] and better_worse(mine, errors.get(models[0], np.nan)) == "worse"
-    return Cell(text, "worse") if lost else text
+_Filled = tuple[Column, list[str | Cell]]
+"""A column with its cells, the last of which is that of the means."""
 
 
-def _muted(value: float) -> Cell:
-    text = number(value)
-    return text if isinstance(text, Cell) else Cell(text, "muted")
+def _filled_table(columns: Sequence[_Filled], caption: str, notes: Sequence[str] = ()) -> Table:
+    """The columns side by side; the means are a footer where there is more than one row."""
+    *rows, means = zip(*(cells for _, cells in columns), strict=True)
+    return Table([column for column, _ in columns], rows, caption, notes, [means] if len(rows) > 1 else [])
+
+
+def _by_model(rows: Sequence[object], figure: str) -> dict[str, list[float]]:
+    """{model: its figure in every row (NaN where unknown), then their mean}."""
+    figures: list[ByModel] = [getattr(row, figure) for row in rows]
+    values = {model: [each.get(model, np.nan) for each in figures] for model in models_of(figures)}
+    return {model: [*of_rows, mean_of(of_rows)] for model, of_rows in values.items()}
+
+
+def _errors(
+    models: Iterable[str], measured: Mapping[str, Sequence[float]], true: Sequence[float]
+) -> dict[str, list[float]]:
+    """{model: measured less true value in every row, then the mean of their sizes}."""
+    unknown = [np.nan] * (len(true) + 1)
+    errors = {m: [v - t for v, t in zip(measured.get(m, unknown)[:-1], true, strict=True)] for m in models}
+    return {model: [*each, mean_of([abs(error) for error in each])] for model, each in errors.items()}
+
+
+def _against(errors: Mapping[str, Sequence[float]], words: str) -> list[_Filled]:
+    """Each further model's errors against the first model's, in words."""
+    first, *others = errors
+    return [
+        (Column(f"{words} {first}", "", model, "left"), list(map(verdict, errors[model], errors[first])))
+        for model in others
+    ]
+
+
+def _won(model: str, errors: Mapping[str, Sequence[float]], signed: bool = False) -> list[str | Cell]:
+    """A model's errors; marked better where one beats every other model's, worse where the first model beats it. The
+    last, a mean, is ``signed`` in no case."""
+    cells: list[str | Cell] = []
+    first, others = next(iter(errors)), [each for name, each in errors.items() if name != model]
+    for i, mine in enumerate(errors[model]):
+        text = number(mine, signed=signed and i < len(errors[model]) - 1)
+        if isinstance(text, str) and others and all(better_worse(mine, each[i]) == "better" for each in others):
+            text = Cell(text, "better")
+        elif isinstance(text, str) and model != first and better_worse(mine, errors[first][i]) == "worse":
+            text = Cell(text, "worse")
+        cells.append(text)
+    return cells
+
+
+def _muted(values: Sequence[float], rows: int) -> list[str | Cell]:
+    texts = [number(value) for value in values or [np.nan] * (rows + 1)]
+    return [text if isinstance(text, Cell) else Cell(text, "muted") for text in texts]
 
 
 def _plain(cell: str | Cell) -> str | Cell:

@@ -2,11 +2,13 @@
 
 import numpy as np
 
+from slviewer.calibration.stereo import StereoModel
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
 from slviewer.report.data import (
     CalibrationFigures,
     CaptureRow,
     CloudView,
-    DeviceParameters,
     ErrorMaps,
     MergePair,
     PixelCurve,
@@ -246,23 +248,26 @@ def session_data(width: int = 1600) -> SessionData:
         )
         for i, row in enumerate(plane_rows()[:3:2])
     ]
+    rig = StereoRig(
+        Lens(K, D, (width, height)), Lens(K * [[0.4], [0.8], [1]], -D, (912, 1140)), R, np.array([-178.2, 0.4, 21.3])
+    )
+    stereo = StereoModel(
+        rig,
+        "circles:21x16:9",
+        ("x",),
+        {"camera": 0.041, "projector": 0.062, "stereo": 0.053},
+        {},
+        rms,
+        {},
+        (498.0, 703.0),
+        {"camera": 1.2, "projector": 2.1},
+        3,
+    )
     return SessionData(
         name="Vase <script>alert(1)</script>",
         captures=captures,
-        calibration=CalibrationFigures(
-            DeviceParameters(K, D, (width, height), 1.2),
-            DeviceParameters(K * [[0.4], [0.8], [1]], -D, (912, 1140), 2.1),
-            R,
-            np.array([-178.2, 0.4, 21.3]),
-            "circles:21x16:9",
-            (498.0, 703.0),
-            {"camera": 0.041, "projector": 0.062, "stereo": 0.053},
-            rms,
-            residuals,
-            3,
-        ),
+        calibration=CalibrationFigures(stereo, residuals),
         pixel_fits=[PixelFitView("x", rms_maps(width), np.full((height, width), 17, np.uint16))],
         verifications=planes,
-        clouds=[CloudView("vase <b>blue</b>", cloud(width, 590))],
         warnings=["the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"],
     )

@@ -10,8 +10,9 @@ from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.drift.check import Drift
+from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation, HeldOut
-from slviewer.report.data import AcceptanceView, DriftRow, ModelsView, PlaneRow, SpacingRow
+from slviewer.report.data import AcceptanceView, CalibrationFigures, DriftRow, ModelsView, PlaneRow, SpacingRow
 from slviewer.report.page import Cell, Figure, PageNotice, Section, Table, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
@@ -154,7 +155,7 @@ def test_a_sessions_report(tmp_path: Path) -> None:
     sections = session_sections(data)
     titles = [section.title for section in sections]
     assert titles == [
-        "To notice", "Reprojection", "Parameters", "Pixel-wise model", "Verification", "Scans", "Captures"
+        "To notice", "Reprojection", "Parameters", "Pixel-wise model", "Verification", "Captures"
     ]  # fmt: skip
     words = "\n".join(texts(section) for section in sections)
     for word in (
@@ -175,7 +176,7 @@ def test_a_sessions_report(tmp_path: Path) -> None:
 
 def test_a_session_with_nothing_in_it() -> None:
     data = dataclasses.replace(
-        session_data(WIDTH), captures=[], calibration=None, pixel_fits=(), verifications=(), clouds=(), warnings=()
+        session_data(WIDTH), captures=[], calibration=None, pixel_fits=(), verifications=(), warnings=()
     )
     (section,) = session_sections(data)
     assert "no captures yet" in texts(section) and session_headlines(data) == []
@@ -184,8 +185,8 @@ def test_a_session_with_nothing_in_it() -> None:
 def test_a_calibration_made_elsewhere() -> None:
     data = session_data(WIDTH)
     assert data.calibration is not None
-    bare = dataclasses.replace(data.calibration, reprojection_rms_px={}, pose_rms_px={}, residuals={})
-    sections = session_sections(dataclasses.replace(data, calibration=bare, verifications=(), pixel_fits=(), clouds=()))
+    bare = CalibrationFigures(StereoModel.from_rig(data.calibration.stereo.rig))
+    sections = session_sections(dataclasses.replace(data, calibration=bare, verifications=(), pixel_fits=()))
     assert "made elsewhere" in texts(sections[1])
 
 

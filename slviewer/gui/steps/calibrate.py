@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from slviewer.calibration.stereo import StereoModel
 from slviewer.gui.calibration_words import (
     choice_words,
     comparison_table,
@@ -21,10 +22,10 @@ from slviewer.gui.widgets import Html, Words, block, cell, colours, table, toned
 from slviewer.pipeline.report import calibration_view
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationFigures as Details
-from slviewer.report.data import DeviceParameters
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
+from slviewer.report.session import lens_rows, rig_rows
 from slviewer.target.board import Board
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import CalibrationView, PreviewView, SessionView, Snapshot
@@ -206,7 +207,7 @@ class Panel:
                 )
             self._draw_pose(session, calibration)
             self._draw_boards(session, calibration)
-            self._painter.ask("parameters", made, lambda: _parameters(self._detailed(made)), self._parameters.set)
+            self._painter.ask("parameters", made, lambda: _parameters(self._detailed(made).stereo), self._parameters.set)
             axis: Any = self._axis.value
             if axis not in calibration.fit_rms_mm:
                 return
@@ -257,8 +258,8 @@ class Panel:
             if found is None:
                 return None
             if device == "camera":
-                return residual_arrows(title, found.pixels, found.camera, details.camera.size)
-            return residual_arrows(title, found.projector_pixels, found.projector, details.projector.size)
+                return residual_arrows(title, found.pixels, found.camera, details.stereo.rig.camera.size)
+            return residual_arrows(title, found.projector_pixels, found.projector, details.stereo.rig.projector.size)
 
         self._painter.ask("arrows", (made, name, device), arrows, self._arrows.set)
 
@@ -404,28 +405,8 @@ def _fits(calibration: CalibrationView) -> Html:
     return table(("Median RMS of the fits", "z", "x", "y"), rows)
 
 
-def _parameters(details: Details) -> Html:
-    def lens(device: DeviceParameters) -> list[str]:
-        K, D, sigma = device.K, device.D, device.focal_sigma_px
-        doubt = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
-        return [
-            f"{device.size[0]} x {device.size[1]} px",
-            *(f"{K[i, i]:.1f}{doubt} px" for i in (0, 1)),
-            *(f"{K[i, 2]:.1f} px" for i in (0, 1)),
-            *(f"{value:.5f}".replace("-", "−") for value in D[:5]),
-        ]
-
-    names = ["size", "focal length fx", "focal length fy", "centre cx", "centre cy", "k1", "k2", "p1", "p2", "k3"]
-    lenses = list(zip(names, lens(details.camera), lens(details.projector), strict=True))
-    t = np.asarray(details.t, float).ravel()
-    turned = np.degrees(np.arccos(np.clip((np.trace(details.R) - 1) / 2, -1, 1)))
-    axes = np.degrees(np.arccos(np.clip(details.R[2, 2], -1, 1)))
-    rig = [
-        ("baseline", f"{np.linalg.norm(t):.2f} mm"),
-        ("t, camera to projector", " / ".join(f"{value:.2f}" for value in t).replace("-", "−") + " mm"),
-        ("rotation", f"{turned:.2f}°"),
-        ("angle between the axes", f"{axes:.2f}°"),
-        ("target", details.target or "made elsewhere"),
-    ]
+def _parameters(stereo: StereoModel) -> Html:
+    lenses = [(f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)]
+    rig = [*rig_rows(stereo), ("target", stereo.board or "made elsewhere")]
     note = block(toned("± is one standard deviation.", "dim"))
     return Html(table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig) + cell(note))
