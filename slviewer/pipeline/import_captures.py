@@ -18,10 +18,11 @@ from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.frame_residuals import keep_residuals
 from slviewer.pipeline.models import available
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
+from slviewer.session.capture import NewCapture
 from slviewer.session.importers import guessed_description
 from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
-from slviewer.session.importers.imported import ImportableRecording, ImportedCapture, Imports, Skipped, none_usable
+from slviewer.session.importers.imported import ImportableRecording, Imports, Skipped, none_usable
 from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
 from slviewer.session.store import Session, is_session
 
@@ -70,7 +71,7 @@ def read_captures(
     channel: Channel | None = None,
     warn: Warn = unwarned,
     **options: Any,
-) -> list[ImportedCapture]:
+) -> list[NewCapture]:
     """Read a folder of captures of any known layout into memory, as ``import_captures`` does; nothing is saved.
 
     Of several exposures each pixel comes from the longest that did not clip it. Raises InputError where an image cannot
@@ -168,7 +169,7 @@ def _save(
             stated.add(message)
             warn(message)
 
-    def read() -> Iterator[ImportedCapture]:
+    def read() -> Iterator[NewCapture]:
         for i, recording in enumerate(found.recordings):
             progress(i / len(found), f"reading {recording.name}")
             try:
@@ -209,7 +210,7 @@ def _known_projector(session: SessionLike) -> tuple[int, int] | None:
     return sizes.pop() if len(sizes) == 1 else None
 
 
-def _assumptions(recording: ImportableRecording, capture: ImportedCapture) -> Iterator[str]:
+def _assumptions(recording: ImportableRecording, capture: NewCapture) -> Iterator[str]:
     """What was assumed of a capture because nothing stated it."""
     used = capture.settings.get("channel")
     if used and recording.channel is None:
@@ -222,7 +223,7 @@ def _assumptions(recording: ImportableRecording, capture: ImportedCapture) -> It
         )
 
 
-def checked(capture: ImportedCapture, warn: Warn) -> ImportedCapture:
+def checked(capture: NewCapture, warn: Warn) -> NewCapture:
     """The capture, with its Gray origin estimated if it was not given; InputError where its frames contradict its
     description.
     """

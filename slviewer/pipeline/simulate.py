@@ -13,7 +13,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
-from slviewer.session.importers.imported import ImportedCapture
+from slviewer.session.capture import NewCapture
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import printed_board
@@ -62,7 +62,7 @@ def simulate(
     only_x = one_axis(both, "x")
     truth: dict[str, Any] = {"preset": preset, "scale": scale, "seed": seed, "target": TARGET, "rig": rig_record(rig)}
 
-    def rendered(scenes: dict[str, Scene], sequence: PatternSequence) -> Iterator[ImportedCapture]:
+    def rendered(scenes: dict[str, Scene], sequence: PatternSequence) -> Iterator[NewCapture]:
         """One capture after another; the next one is rendered while one is saved."""
         source = f"simulated: {preset}, scale {scale:g}, seed {seed}"
         numbers = {name: i for i, name in enumerate(plan)}
@@ -74,7 +74,7 @@ def simulate(
                     work = Renderer(rig, following[1]).capture
                     waiting.append(renderer.submit(work, sequence, numbers[following[0]]))
                 progress(numbers[name] / len(plan), f"rendering {name}")
-                yield ImportedCapture(name, sequence, waiting.popleft().result(), None, source)
+                yield NewCapture(name, sequence, waiting.popleft().result(), None, source)
 
     with Session.create(session) as store:
         groups = {kind: {n: s for n, s in plan.items() if n.startswith(f"{kind}_")} for kind in KINDS}

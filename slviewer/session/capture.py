@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from slviewer.errors import InputError, SessionError
-from slviewer.fringe.hdr import choose_exposure, chosen, peaks, pick
+from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.atomic import read_json, to_json, write_bytes, write_json
 from slviewer.session.stack import check_frames, describe_stack, read_stack, write_stack
@@ -89,68 +89,57 @@ class Capture:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-class NewCapture(Protocol):
-    """What `Session.save_captures` takes: `importers.imported.ImportedCapture`, or anything like it."""
+@dataclass(frozen=True)
+class NewCapture:
+    """A capture in memory, to be saved: ``frames`` (n, h, w) uint8 or uint16 in the order of ``sequence``, or
+    (k n, h, w) of the k ``exposures_ms``, one exposure after the other; ``texture`` (h, w, 3) RGB where the scene is
+    known in colour; ``source``: where it comes from."""
+
+    name: str
+    sequence: PatternSequence
+    frames: np.ndarray
+    texture: np.ndarray | None
+    source: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    exposures_ms: Sequence[float] = ()
 
     @property
-    def name(self) -> str: ...
-    @property
-    def sequence(self) -> PatternSequence: ...
-    @property
-    def frames(self) -> np.ndarray: ...
-    @property
-    def texture(self) -> np.ndarray | None: ...
-    @property
-    def source(self) -> str: ...
-    @property
-    def settings(self) -> Mapping[str, Any]: ...
-    @property
-    def exposures_ms(self) -> Sequence[float]: ...
+    def nbytes(self) -> int:
+        """Bytes of frames and texture."""
+        return self.frames.nbytes + (0 if self.texture is None else self.texture.nbytes)
+
+    def merged_frames(self) -> np.ndarray:
+        """(n, h, w): of several exposures, each pixel from the longest that did not clip it."""
+        if not self.exposures_ms:
+            return self.frames
+        return merge_exposures(np.split(self.frames, len(self.exposures_ms)), self.exposures_ms)[0]
+
+    def check(self) -> None:
+        """Raise InputError unless frames, exposures and texture fit the sequence and one another."""
+        exposures, texture, shape = self.exposures_ms, self.texture, self.frames.shape
+        check_frames(self.frames)
+        if len(exposures) == 1 or len(set(exposures)) < len(exposures) or min(exposures, default=1) <= 0:
+            raise InputError(f"exposures of {list(exposures)} ms: give two or more, each once, or none")
+        if len(self.frames) != len(self.sequence.frames) * max(1, len(exposures)):
+            times = f" in {len(exposures)} exposures" if exposures else ""
+            raise InputError(
+                f"{shape[0]} frames for a sequence of {len(self.sequence.frames)}{times}: give one image a pattern"
+            )
+        if texture is not None and (texture.shape != (*shape[1:], 3) or texture.dtype not in (np.uint8, np.uint16)):
+            raise InputError(
+                f"a colour texture of shape {(*shape[1:], 3)}, uint8 or uint16, is needed, "
+                f"got {texture.shape} {texture.dtype}"
+            )
 
 
-def check_capture(
-    role: str,
-    sequence: PatternSequence,
-    frames: np.ndarray,
-    texture: np.ndarray | None,
-    exposures_ms: Sequence[float] = (),
-) -> None:
-    """Raise InputError unless frames (n, h, w), or (k n, h, w) of k exposures, and a texture (h, w, 3) fit."""
-    if role not in get_args(Role):
-        raise InputError(f"role {role!r} is unknown: use 'calibration' or 'scan'")
-    check_frames(frames)
-    if len(exposures_ms) == 1 or len(set(exposures_ms)) < len(exposures_ms) or min(exposures_ms, default=1) <= 0:
-        raise InputError(f"exposures of {list(exposures_ms)} ms: give two or more, each once, or none")
-    if len(frames) != len(sequence.frames) * max(1, len(exposures_ms)):
-        times = f" in {len(exposures_ms)} exposures" if exposures_ms else ""
-        raise InputError(
-            f"{len(frames)} frames for a sequence of {len(sequence.frames)}{times}: give one image a pattern"
-        )
-    if texture is not None and (texture.shape != (*frames.shape[1:], 3) or texture.dtype not in (np.uint8, np.uint16)):
-        raise InputError(
-            f"a colour texture of shape {(*frames.shape[1:], 3)}, uint8 or uint16, is needed, "
-            f"got {texture.shape} {texture.dtype}"
-        )
-
-
-def write_capture(
-    folder: Path,
-    role: Role,
-    sequence: PatternSequence,
-    frames: np.ndarray,
-    *,
-    texture: np.ndarray | None,
-    source: str,
-    settings: Mapping[str, Any],
-    board: str | None,
-    exposures_ms: Sequence[float] = (),
-) -> None:
-    """Write a checked capture into an empty folder, every file synced; one exposure's frames after the other's."""
+def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | None) -> None:
+    """Write a checked capture into an empty folder, every file synced."""
+    frames, texture, exposures_ms = capture.frames, capture.texture, list(capture.exposures_ms)
     frames_hash = write_stack(folder / "frames.zarr", frames)
-    described = sequence.to_dict()
+    described = capture.sequence.to_dict()
     whole = hashlib.blake2b(frames_hash.encode() + to_json(described), digest_size=20)
     if exposures_ms:
-        whole.update(to_json(list(exposures_ms)))
+        whole.update(to_json(exposures_ms))
     if texture is not None:
         whole.update(np.ascontiguousarray(texture).data)
         write_bytes(folder / "texture.png", _png(texture))
@@ -159,14 +148,14 @@ def write_capture(
         {
             "role": role,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "source": source,
+            "source": capture.source,
             "board": board,
             "camera": {"size": [frames.shape[2], frames.shape[1]], "dtype": str(frames.dtype)},
             "frames": len(frames),
-            **({"exposures_ms": list(exposures_ms)} if exposures_ms else {}),
+            **({"exposures_ms": exposures_ms} if exposures_ms else {}),
             "hash": whole.hexdigest(),
             "texture": texture is not None,
-            "settings": dict(settings),
+            "settings": capture.settings,
             "sequence": described,
         },
     )

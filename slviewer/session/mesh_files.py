@@ -13,7 +13,6 @@ Large ones are written piece by piece, and appear whole or not at all.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -37,56 +36,9 @@ IN_WORDS = {
 FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 DECIMALS = 6
 """Of lengths in text: a nanometre, below what a float32 of some hundred mm resolves."""
+LENGTHS = " ".join([f"%.{DECIMALS}f"] * 3)
 _NUMBER, _SMALL, _GREY = 11, 9, 4
 """Characters that a coordinate, a sigma or a part of a normal, and a grey level take in text, with the blank."""
-
-
-Field = bytes | tuple[np.ndarray, int]
-"""What stands in every line: the same characters, or numbers (n,) with so many decimals."""
-_LARGEST = 1e12
-_GAP = 0  # a character that is dropped in the end
-
-
-def lines(fields: Sequence[Field]) -> bytes:
-    """A line of ASCII text for each record; ``fields`` from left to right, with at least one of numbers."""
-    count = next(len(field[0]) for field in fields if isinstance(field, tuple))
-    columns = [
-        np.broadcast_to(np.frombuffer(field, np.uint8), (count, len(field)))
-        if isinstance(field, bytes)
-        else _characters(*field)
-        for field in (*fields, b"\n")
-    ]
-    text = np.concatenate(columns, axis=1).ravel()
-    return text[text != _GAP].tobytes()
-
-
-def _characters(values: np.ndarray, decimals: int) -> np.ndarray:
-    """(n, width) uint8: the digits of each number, to the right."""
-    size = np.abs(values.astype(np.float64 if values.dtype.kind == "f" else np.int64))
-    most = size.max(initial=0)
-    if not most < _LARGEST:
-        raise InputError(f"a value of {most:g} cannot be written as text: is it a measurement?")
-    left = np.rint(size * 10**decimals).astype(np.int64)
-    negative = (values < 0) & (left > 0)
-    whole = len(str(int(most) + 1))
-    width = 1 + whole + (decimals + 1 if decimals else 0)
-    out = np.full((len(values), width), _GAP, np.uint8)
-    column = width - 1
-    for _ in range(decimals):
-        left, digit = np.divmod(left, 10)
-        out[:, column] = digit + ord("0")
-        column -= 1
-    if decimals:
-        out[:, column] = ord(".")
-        column -= 1
-    first = True
-    while column > 0:
-        shown = (left > 0) | first
-        left, digit = np.divmod(left, 10)
-        out[:, column] = np.where(shown, digit + ord("0"), _GAP)
-        column, first = column - 1, False
-    out[negative, 0] = ord("-")  # what lies between it and the digits is dropped
-    return out
 
 
 def write_shape(
@@ -156,12 +108,8 @@ def _comments(notes: Sequence[str]) -> str:
 def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> None:
     with arriving_file(path, estimated_bytes("xyz", len(points), colours=colours is not None)) as file:
         for part in pieces(len(points)):
-            fields: list[Field] = []
-            for values in points[part].T:
-                fields += [(values, DECIMALS), b" "]
-            for values in () if colours is None else colours[part].T:
-                fields += [(values, 0), b" "]
-            file.write(lines(fields[:-1]))
+            columns = [points[part]] if colours is None else [points[part], colours[part]]
+            file.write(_lines(LENGTHS if colours is None else f"{LENGTHS} %d %d %d", *columns))
 
 
 def _write_stl(path: Path, points: np.ndarray, faces: np.ndarray) -> None:
@@ -191,26 +139,24 @@ def _write_obj(
     size = estimated_bytes("obj", len(points), len(faces), colours=colours is not None, normals=normals is not None)
     with arriving_file(path, size) as file:
         file.write(_comments(notes).encode("ascii"))
-        _write_vertices(file, points, colours)
+        for part in pieces(len(points)):
+            if colours is None:
+                file.write(_lines(f"v {LENGTHS}", points[part]))
+            else:
+                file.write(_lines(f"v {LENGTHS} %.4f %.4f %.4f", points[part], colours[part] / 255))
         for part in pieces(0 if normals is None else len(points)):
             assert normals is not None
-            file.write(lines([b"vn", *_numbers(without_nan("nx", normals[part]), DECIMALS)]))
+            file.write(_lines(f"vn {LENGTHS}", without_nan("nx", normals[part])))
         for part in pieces(len(faces)):
-            corners = _numbers(faces[part] + 1, 0)
-            if normals is not None:  # each vertex has its own
-                blank, vertex = corners[::2], corners[1::2]
-                corners = [each for pair in zip(blank, vertex, strict=True) for each in (*pair, b"//", pair[1])]
-            file.write(lines([b"f", *corners]))
+            corners = faces[part] + 1
+            if normals is None:
+                file.write(_lines("f %d %d %d", corners))
+            else:  # each vertex has its own
+                file.write(_lines("f %d//%d %d//%d %d//%d", np.repeat(corners, 2, axis=1)))
 
 
-def _write_vertices(file: BinaryIO, points: np.ndarray, colours: np.ndarray | None) -> None:
-    for part in pieces(len(points)):
-        fields = _numbers(points[part], DECIMALS)
-        if colours is not None:
-            fields += _numbers(colours[part].astype(np.float32) / 255, 4)
-        file.write(lines([b"v", *fields]))
-
-
-def _numbers(rows: np.ndarray, decimals: int) -> list[Field]:
-    """The columns of (n, k) numbers, a blank before each."""
-    return [field for column in rows.T for field in (b" ", (column, decimals))]
+def _lines(pattern: str, *columns: np.ndarray) -> bytes:
+    """A line of ASCII text for each row of the columns (n, k) side by side; `pattern` has a conversion for each."""
+    rows = np.concatenate([np.asarray(each, np.float64) for each in columns], axis=1)
+    rows = np.round(rows, DECIMALS) + 0.0  # no "-0.000000"
+    return ((pattern + "\n") * len(rows) % tuple(rows.ravel().tolist())).encode("ascii")

@@ -5,14 +5,14 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from slviewer.errors import InputError, SessionError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session import atomic
-from slviewer.session.capture import Capture, NewCapture, Role, check_capture, read_capture, write_capture
+from slviewer.session.capture import Capture, NewCapture, Role, read_capture, write_capture
 from slviewer.session.layout import furnish, inner_folders, is_session, new_folder, session_folder
 from slviewer.session.lock import WriterLock
 from slviewer.session.names import natural_key, safe_name, safe_path
@@ -135,9 +135,8 @@ class Session:
         Complete on disk when this returns; absent if it raises: InputError for a name that is taken (unless `force`,
         which moves the old capture to the trash) or frames that do not fit, SessionError where the disk refuses.
         """
-        staged = self._stage(name, role, sequence, frames, texture, source, settings or {}, board, force, exposures_ms)
-        self._commit_capture(staged, name)
-        return self.load_capture(name)
+        capture = NewCapture(name, sequence, frames, texture, source, settings or {}, exposures_ms)
+        return self.save_captures([capture], role, board=board, force=force)[0]
 
     def save_captures(
         self, captures: Iterable[NewCapture], role: Role, *, board: object | None = None, force: bool = False
@@ -151,17 +150,14 @@ class Session:
             for new in captures:
                 if new.name in staged:
                     raise InputError(f"two captures are named {new.name!r}: rename one of their folders")
-                staged[new.name] = self._stage(
-                    new.name, role, new.sequence, new.frames, new.texture, new.source, new.settings, board, force,
-                    new.exposures_ms,
-                )  # fmt: skip
+                staged[new.name] = self._stage(new, role, None if board is None else str(board), force)
                 del new  # before the next one is made
         except BaseException:
             for folder in staged.values():
                 atomic.discard(folder)
             raise
         for name, folder in staged.items():
-            self._commit_capture(folder, name)
+            atomic.commit(folder, self._capture_folder(name), self._trash_place(name))
         return [self.load_capture(name) for name in staged]
 
     def trash_capture(self, name: str) -> Path:
@@ -339,41 +335,20 @@ class Session:
         if self._allow is not None:
             self._allow()
 
-    def _stage(
-        self,
-        name: str,
-        role: Role,
-        sequence: PatternSequence,
-        frames: np.ndarray,
-        texture: np.ndarray | None,
-        source: str,
-        settings: Mapping[str, Any],
-        board: object | None,
-        force: bool,
-        exposures_ms: Sequence[float] = (),
-    ) -> Path:
+    def _stage(self, capture: NewCapture, role: Role, board: str | None, force: bool) -> Path:
+        """Write a capture beside its place, and return the folder, which `atomic.commit` renames."""
         self._require_writer()
-        target = self._capture_folder(name)
+        target = self._capture_folder(capture.name)
         if target.exists() and not force:
-            raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")
-        check_capture(role, sequence, frames, texture, exposures_ms)
-        size = frames.nbytes + (0 if texture is None else texture.nbytes)
-        with atomic.staged_folder(target, size) as staged:
-            write_capture(
-                staged,
-                role,
-                sequence,
-                frames,
-                texture=texture,
-                source=source,
-                settings=settings,
-                board=None if board is None else str(board),
-                exposures_ms=exposures_ms,
+            raise InputError(
+                f"there is a capture {capture.name!r} already: choose another name, or replace it with --force"
             )
+        if role not in get_args(Role):
+            raise InputError(f"role {role!r} is unknown: use 'calibration' or 'scan'")
+        capture.check()
+        with atomic.staged_folder(target, capture.nbytes) as staged:
+            write_capture(staged, capture, role, board)
         return staged
-
-    def _commit_capture(self, staged: Path, name: str) -> None:
-        atomic.commit(staged, self._capture_folder(name), self._trash_place(name))
 
     def _capture_folder(self, name: str) -> Path:
         return self.folder / "captures" / safe_name(name)

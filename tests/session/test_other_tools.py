@@ -8,8 +8,8 @@ import pytest
 
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
+from slviewer.session.capture import NewCapture
 from slviewer.session.importers import layouts, opencv_graycode, slstudio, sltk
-from slviewer.session.importers.imported import ImportedCapture
 
 COLUMNS, ROWS = 640, 120
 SIZE = (COLUMNS, ROWS)
@@ -34,7 +34,7 @@ def bit_of(at: np.ndarray, place: int) -> np.ndarray:
     return ((at ^ (at >> 1)) >> place) & 1
 
 
-def decoded_error(capture: ImportedCapture, axis: str) -> np.ndarray:
+def decoded_error(capture: NewCapture, axis: str) -> np.ndarray:
     """px, where decoded; most of the frame must be."""
     phase = decode(capture.sequence, capture.merged_frames(), axis)
     assert phase.mask.mean() > 0.9

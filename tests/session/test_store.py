@@ -14,7 +14,7 @@ import zarr
 
 from slviewer.errors import Cancelled, InputError, SessionError
 from slviewer.fringe.sequence import Frame
-from slviewer.session.importers.imported import ImportedCapture
+from slviewer.session.capture import NewCapture
 from slviewer.session.store import Session
 
 
@@ -113,9 +113,9 @@ def test_the_hash_follows_everything_that_is_decoded(session, sequence, frames):
 
 
 def test_captures_are_saved_all_or_none(session, sequence, frames, noise):
-    def source(fails: bool) -> Iterator[ImportedCapture]:
+    def source(fails: bool) -> Iterator[NewCapture]:
         for i in range(3):
-            yield ImportedCapture(f"pose_{i}", sequence, noise(i), None, "elsewhere", {"i": i})
+            yield NewCapture(f"pose_{i}", sequence, noise(i), None, "elsewhere", {"i": i})
         if fails:
             raise InputError("pose_3 is unreadable")
 
@@ -127,9 +127,9 @@ def test_captures_are_saved_all_or_none(session, sequence, frames, noise):
     np.testing.assert_array_equal(saved[2].frames, noise(2))
     assert saved[2].meta["settings"] == {"i": 2} and saved[2].meta["board"] == "circles:21x16:9"
     with pytest.raises(InputError, match="already"):
-        session.save_captures([ImportedCapture("new", sequence, frames, None, ""), *source(False)], "calibration")
+        session.save_captures([NewCapture("new", sequence, frames, None, ""), *source(False)], "calibration")
     with pytest.raises(InputError, match="two captures"):
-        session.save_captures([ImportedCapture("new", sequence, frames, None, "")] * 2, "calibration")
+        session.save_captures([NewCapture("new", sequence, frames, None, "")] * 2, "calibration")
     assert session.capture_names() == ["pose_0", "pose_1", "pose_2"]
 
 

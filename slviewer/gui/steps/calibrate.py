@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import viser
 
-from slviewer.calibration.stereo import StereoModel
 from slviewer.gui.calibration_words import (
     choice_words,
     comparison_table,
@@ -207,7 +206,7 @@ class Panel:
                 )
             self._draw_pose(session, calibration)
             self._draw_boards(session, calibration)
-            self._painter.ask("parameters", made, lambda: _parameters(self._detailed(made).stereo), self._parameters.set)
+            self._painter.ask("parameters", made, lambda: _parameters(self._detailed(made)), self._parameters.set)
             axis: Any = self._axis.value
             if axis not in calibration.fit_rms_mm:
                 return
@@ -405,7 +404,8 @@ def _fits(calibration: CalibrationView) -> Html:
     return table(("Median RMS of the fits", "z", "x", "y"), rows)
 
 
-def _parameters(stereo: StereoModel) -> Html:
+def _parameters(details: Details) -> Html:
+    stereo = details.stereo
     lenses = [(f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)]
     rig = [*rig_rows(stereo), ("target", stereo.board or "made elsewhere")]
     note = block(toned("± is one standard deviation.", "dim"))

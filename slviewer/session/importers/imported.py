@@ -7,34 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from slviewer.errors import InputError
-from slviewer.fringe.hdr import merge_exposures
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.session.capture import NewCapture
 from slviewer.session.importers.images import DEFAULT_CHANNEL, IMAGE_SUFFIXES, Channel, read_frames
 from slviewer.session.names import natural_key, safe_name
 
 _MOST_REASONS = 3
-
-
-@dataclass(frozen=True)
-class ImportedCapture:
-    """One capture as another tool recorded it, in memory."""
-
-    name: str
-    sequence: PatternSequence
-    frames: np.ndarray  # (n, h, w) uint8 or uint16, in the sequence's order; (k n, h, w) of k exposures
-    texture: np.ndarray | None  # (h, w, 3) RGB where the source is in colour
-    source: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    exposures_ms: tuple[float, ...] = ()  # empty where there was but one
-
-    def merged_frames(self) -> np.ndarray:
-        """(n, h, w): of several exposures, each pixel from the longest that did not clip it."""
-        if not self.exposures_ms:
-            return self.frames
-        return merge_exposures(np.split(self.frames, len(self.exposures_ms)), self.exposures_ms)[0]
 
 
 @dataclass(frozen=True)
@@ -49,14 +28,14 @@ class ImportableRecording:
     channel: Channel | None = None  # of colour frames; None: the default
     exposures_ms: tuple[float, ...] = ()
 
-    def read(self) -> ImportedCapture:
+    def read(self) -> NewCapture:
         """The capture with its frames; InputError where an image cannot be used. `settings["channel"]` states which
         channel of colour frames was taken."""
         channel = self.channel or DEFAULT_CHANNEL
         shown, middle = _colour_frame(self.sequence), len(self.exposures_ms) // 2 * len(self.sequence.frames)
         images = read_frames(self.files, None if shown is None else shown + middle, channel)
         settings = {**self.settings, "channel": channel} if images.in_colour else self.settings
-        return ImportedCapture(
+        return NewCapture(
             self.name, self.sequence, images.stack, images.texture, str(self.source), settings, self.exposures_ms
         )
 
@@ -83,7 +62,7 @@ class Imports:
     def __len__(self) -> int:
         return len(self.recordings)
 
-    def __iter__(self) -> Iterator[ImportedCapture]:
+    def __iter__(self) -> Iterator[NewCapture]:
         return (recording.read() for recording in self.recordings)
 
 
