@@ -17,6 +17,7 @@ from slviewer.evaluation.render import Row, render
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.geometry.shapes import fit_plane
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.records import to_plain
@@ -204,12 +205,9 @@ def _at(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def _laid_over(board: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, float]:
     """((n, 3) the board's points where they come nearest to the measured ones without stretching, and how much longer
     the measured ones are)."""
-    p, q = board - board.mean(0), measured - measured.mean(0)
-    U, singular, Vt = np.linalg.svd(p.T @ q)
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = U @ turn @ Vt
-    scale = float(np.sum(singular * np.diag(turn)) / np.sum(p**2))
-    return p @ R + measured.mean(0), scale
+    laid, middle = move_points(fit_rigid(board, measured), board), measured.mean(0)
+    scale = float(np.sum((laid - middle) * (measured - middle)) / np.sum((laid - middle) ** 2))
+    return laid, scale
 
 
 def _rms(differences: np.ndarray) -> float:

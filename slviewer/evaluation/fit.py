@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -50,21 +50,41 @@ class ShapeResult:
         )
 
 
-def settle(fit: Callable[[np.ndarray], Fitted], points: np.ndarray, start: Fitted) -> tuple[Fitted, np.ndarray]:
-    """Least squares over ``points`` (n, 3), those beyond 5 robust sigma set aside, repeated until the set is stable.
+class Shape(Protocol):
+    """A surface with distances from it."""
 
-    Sigma is 1.4826 times the median absolute deviation of *all* points, so that it does not shrink from round to round
-    until only the best are left. Returns the shape and which points counted, (n,) bool.
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distances (n,) mm of points (n, 3)."""
+
+
+AnyShape = TypeVar("AnyShape", bound=Shape)
+
+
+def fit_settled(
+    fit: Callable[[np.ndarray, AnyShape], AnyShape], points: np.ndarray, start: AnyShape
+) -> tuple[AnyShape, np.ndarray]:
+    """Fit a shape to points (n, 3) mm, those beyond 5 robust sigma excluded, repeated until the set is stable.
+
+    ``fit(points, shape)`` is a least-squares fit that may start from a shape. Returns the shape and which points were
+    used, (n,) bool.
     """
     shape, kept = start, np.zeros(len(points), dtype=bool)
     for _ in range(30):
-        residuals = shape.distance(points)
-        reach = max(SET_ASIDE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
-        before, kept = kept, np.abs(residuals - np.median(residuals)) <= reach
+        before, kept = kept, within_sigmas(shape.distance(points), points)
         if np.count_nonzero(kept ^ before) <= 1e-5 * len(points):
             break
-        shape = fit(points[kept])
+        shape = fit(points[kept], shape)
     return shape, kept
+
+
+def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n,) bool: the residuals (n,) mm within 5 robust sigma of their median.
+
+    Sigma is that of *all* residuals, so that it does not shrink from round to round until only the best are left; of
+    exact points it is nothing but rounding, which excludes none of them.
+    """
+    reach = max(SET_ASIDE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
+    return np.asarray(np.abs(residuals - np.median(residuals)) <= reach)
 
 
 def measure(
@@ -79,7 +99,7 @@ def measure(
     chosen = points[looked_at].astype(np.float64)
     if len(chosen) < LEAST_POINTS:
         raise InputError(f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed.")
-    shape, kept = settle(fit, chosen, start)
+    shape, kept = fit_settled(lambda some, _: fit(some), chosen, start)
     residuals = shape.distance(chosen)
 
     error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)

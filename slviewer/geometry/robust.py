@@ -8,9 +8,11 @@ import numpy as np
 Solution = TypeVar("Solution")
 
 
-def robust_sigma(residuals: np.ndarray) -> float:
-    """1.4826 times the median absolute deviation: the standard deviation of normal residuals, robust to outliers."""
-    return float(1.4826 * np.median(np.abs(residuals - np.median(residuals))))
+def robust_sigma(residuals: np.ndarray, about: float | None = None) -> float:
+    """1.4826 times the median absolute deviation from the median, or from ``about``: the standard deviation of normal
+    residuals, robust to outliers."""
+    centre = np.median(residuals) if about is None else about
+    return float(1.4826 * np.median(np.abs(residuals - centre)))
 
 
 def tukey_weights(residuals: np.ndarray, sigma: float) -> np.ndarray:

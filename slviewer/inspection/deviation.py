@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.placing import found_start
 from slviewer.inspection.uncertainty import scatter
@@ -129,7 +130,7 @@ def deviation(
             f"No point of the scan lies within {reach_mm:.3g} mm of the nominal model: does it show that part?"
         )
     say(0.95)
-    feet = _moved(points[kept], T) - signed[kept, None] * towards[kept]
+    feet = move_points(T, points[kept]) - signed[kept, None] * towards[kept]
     measured, uncovered = _coverage(feet, surface)
     back = np.linalg.inv(T)
     say(1.0)
@@ -139,21 +140,17 @@ def deviation(
         T,
         reach_mm,
         measured,
-        (uncovered @ back[:3, :3].T + back[:3, 3]).astype(np.float32),
+        move_points(back, uncovered).astype(np.float32),
         alignment,
         start,
     )
-
-
-def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def _signed(
     points: np.ndarray, normals: np.ndarray | None, surface: NominalSurface, T: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances (n,) and the nominal's normals (n, 3), NaN where a point does not belong to it."""
-    away, towards = surface.signed(_moved(points, T))
+    away, towards = surface.signed(move_points(T, points))
     belongs = np.abs(away) <= reach
     if normals is not None:
         cosine = np.sum((normals @ T[:3, :3].T) * towards, axis=1)
@@ -186,26 +183,16 @@ def _best_fit(
                 f"Only {np.count_nonzero(kept)} points of the scan lie within {reach:.3g} mm of the nominal model: "
                 "does it show that part?"
             )
-        moved = _moved(points[kept], T)
+        moved = move_points(T, points[kept])
         middle = moved.mean(axis=0)
         J = np.hstack([np.cross(moved - middle, towards[kept]), towards[kept]])
         information = J.T @ J
         change = -np.linalg.lstsq(information, J.T @ away[kept], rcond=1e-10)[0]
-        T = _turned(change, middle) @ T
+        T = turn_about(change[:3], middle, change[3:]) @ T
         if np.abs(J @ change).max() < 1e-5:
             break
     covariance = scatter(moved, J, away[kept])
     return T, float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean()))
-
-
-def _turned(change: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """(4, 4): turned by the vector change[:3] about ``middle``, then shifted by change[3:]."""
-    from scipy.spatial.transform import Rotation
-
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix()
-    T[:3, 3] = middle - T[:3, :3] @ middle + change[3:]
-    return T
 
 
 def _coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndarray]:

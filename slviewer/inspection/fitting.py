@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.figures import narrowest
-from slviewer.evaluation.fit import SET_ASIDE_SIGMA, SET_ASIDE_WARNING
+from slviewer.evaluation.fit import SET_ASIDE_SIGMA, SET_ASIDE_WARNING, fit_settled, within_sigmas
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.inspection.features import Feature, Kind
 from slviewer.inspection.quantities import Quantity
@@ -97,7 +97,7 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
     except InputError as error:
         raise _why_not(kind, looked_at, error) from error
     residuals = feature.distance(points)
-    counted = np.abs(residuals - np.median(residuals)) <= _reach(residuals, points)
+    counted = within_sigmas(residuals, points)
     used = int(np.count_nonzero(counted))
     aside = 1 - used / len(points)
     rms = float(np.sqrt(np.mean(residuals[counted] ** 2)))
@@ -132,20 +132,11 @@ def least_squares(kind: Kind, points: np.ndarray, begin: Feature | None) -> Feat
 
 def _settled(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
     """The feature, and which of the points it was fitted to: repeated until the set is stable."""
-    feature = start(kind, points, lambda some, begin: least_squares(kind, some, begin))
-    kept = np.zeros(len(points), bool)
-    for _ in range(30):
-        residuals = feature.distance(points)
-        before, kept = kept, np.abs(residuals - np.median(residuals)) <= _reach(residuals, points)
-        if np.count_nonzero(kept ^ before) <= 1e-5 * len(points):
-            break
-        feature = least_squares(kind, points[kept], feature)
-    return feature, kept
 
+    def fit(some: np.ndarray, begin: Feature | None) -> Feature:
+        return least_squares(kind, some, begin)
 
-def _reach(residuals: np.ndarray, points: np.ndarray) -> float:
-    # exact points have no spread: rounding must not set any of them aside
-    return max(SET_ASIDE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
+    return fit_settled(fit, points, start(kind, points, fit))
 
 
 def _refined(feature: Feature, points: np.ndarray) -> Feature:

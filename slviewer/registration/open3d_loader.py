@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 from slviewer.errors import SlviewerError
 
 
@@ -77,3 +79,16 @@ def _supply_libusb() -> None:
                 ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
         except (ImportError, OSError):
             return  # the import of Open3D says what is missing, in its own words
+
+
+def align_icp(
+    scan: Any, reference: Any, T: np.ndarray, gate: float, loss: Any, settled: float, iterations: int
+) -> np.ndarray:
+    """(4, 4): Open3D's point-to-plane ICP of two of its clouds from the pose ``T``, with pairs up to ``gate`` mm apart.
+
+    Ends after ``iterations``, or where fitness and RMSE change by less than the share ``settled``.
+    """
+    pipeline = open3d().pipelines.registration
+    criteria = pipeline.ICPConvergenceCriteria(settled, settled, iterations)
+    method = pipeline.TransformationEstimationPointToPlane(loss)
+    return np.array(pipeline.registration_icp(scan, reference, gate, T, method, criteria).transformation)

@@ -8,13 +8,12 @@ refused, with the reason.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.registration.freedom import WORDS, Freedom, freedom
-from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.prepared import Prepared, prepared, scale_of
 from slviewer.registration.refine import Uncertainty, refined
 from slviewer.registration.refusal import Refused
@@ -138,7 +137,8 @@ def _judged(scan: Prepared, reference: Prepared, start: Candidate, size: float) 
     T = start.T
     for voxel, gate in LEVELS_MM:
         widest = max(gate * scale, 2.0 * max(scan.spacing, reference.spacing), 3.0 * _noise(scan, reference))
-        T = _icp(scan.thinned(voxel * scale), reference.thinned(voxel * scale), T, widest)
+        loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
+        T = align_icp(scan.thinned(voxel * scale), reference.thinned(voxel * scale), T, widest, loss, 1e-6, 40)
     narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * _noise(scan, reference))
     end = refined(scan, reference, T, widest, narrowest)
     result, held = _figures(scan, reference, end.T, end.gate_mm, end.uncertainty, start.start)
@@ -149,13 +149,6 @@ def _judged(scan: Prepared, reference: Prepared, start: Candidate, size: float) 
 def _noise(scan: Prepared, reference: Prepared) -> float:
     """Of the distance of two points that lie on each other, mm, as far as it is known."""
     return float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
-
-
-def _icp(scan: Any, reference: Any, T: np.ndarray, gate: float) -> np.ndarray:
-    pipeline = open3d().pipelines.registration
-    method = pipeline.TransformationEstimationPointToPlane(pipeline.TukeyLoss(0.5 * gate))
-    criteria = pipeline.ICPConvergenceCriteria(1e-6, 1e-6, 40)
-    return np.array(pipeline.registration_icp(scan, reference, gate, T, method, criteria).transformation)
 
 
 def _figures(

@@ -3,8 +3,9 @@
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.registration.refusal import Refused
-from slviewer.registration.start import Candidate, rigid
+from slviewer.registration.start import Candidate
 
 LEAST_PICKS = 3
 _THIN = 0.1
@@ -35,10 +36,8 @@ def picked_start(scan_points: np.ndarray, reference_points: np.ndarray) -> tuple
                 f"The points picked on the {name} lie on one line, which leaves the turn about it open: "
                 "pick one more beside it.",
             )
-    R, t = rigid(p[None], q[None])
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R[0], t[0]
-    residual = np.linalg.norm(p @ R[0].T + t[0] - q, axis=1)
+    T = fit_rigid(p, q)
+    residual = np.linalg.norm(move_points(T, p) - q, axis=1)
     extent = float(np.linalg.norm(np.ptp(q, axis=0)))
     if residual.max() > _WORST * extent:
         raise Refused(

@@ -9,14 +9,14 @@ neighbours that are wrong together do not pass for independent measurements.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from slviewer.geometry.rigid import move_points, turn_about
+from slviewer.geometry.robust import robust_sigma, tukey_weights
 from slviewer.registration.prepared import Prepared
 
 _STEPS = 12
 _SETTLED_MM, _NEAR_MM = 2e-3, 5e-3
 _FIRST_POINTS, _MOST_POINTS = 8_000, 40_000
-_TUKEY = 4.685  # times the residuals' standard deviation
 _ALIKE = 0.8  # cosine between the normals of a pair
 _PATCHES = (16.0, 9.0, 5.0)
 """Sides of the patches, as shares of the overlap's diameter: the coarsest that leaves enough patches sees the most of
@@ -73,10 +73,10 @@ def refined(scan: Prepared, reference: Prepared, T: np.ndarray, widest: float, n
             return Refined(T, gate, None)
         arm, normal, residual = pairs
         centre = arm.mean(axis=0)
-        sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
-        J, weight = _jacobian(arm - centre, normal), _weights(residual, sigma)
+        sigma = max(robust_sigma(residual, about=0.0), 1e-6)
+        J, weight = _jacobian(arm - centre, normal), tukey_weights(residual, sigma)
         step = -np.linalg.lstsq((J * weight[:, None]).T @ J, J.T @ (weight * residual), rcond=1e-10)[0]
-        T = _moved(step, centre) @ T
+        T = turn_about(step[:3], centre, step[3:]) @ T
         closed = min(gate, max(3.0 * sigma, narrowest))
         moved = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.linalg.norm(np.ptp(arm, axis=0))
         if closed > 0.99 * gate and moved < (_SETTLED_MM if stride == least else _NEAR_MM):
@@ -92,7 +92,7 @@ def _pairs(
     scan: Prepared, reference: Prepared, T: np.ndarray, gate: float, lateral: float, stride: int = 1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Scan points in the reference's frame (n, 3), the pairs' mean normals (n, 3) and residuals (n,) in mm."""
-    points = scan.fine_points[::stride] @ T[:3, :3].T + T[:3, 3]
+    points = move_points(T, scan.fine_points[::stride])
     distance, nearest = reference.fine_tree.query(
         points, distance_upper_bound=float(np.hypot(gate, lateral)), workers=-1
     )
@@ -109,27 +109,15 @@ def _pairs(
     return (points[kept], normal[kept], residual[kept]) if np.count_nonzero(kept) >= 60 else None
 
 
-def _weights(residual: np.ndarray, sigma: float) -> np.ndarray:
-    return np.square(np.clip(1.0 - np.square(residual / (_TUKEY * sigma)), 0.0, None))
-
-
 def _jacobian(arm: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.hstack([np.cross(arm, normal), normal])
-
-
-def _moved(step: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """(4, 4): the turn by ``step[:3]`` about ``centre``, then the shift by ``step[3:]``."""
-    M = np.eye(4)
-    M[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
-    M[:3, 3] = centre + step[3:] - M[:3, :3] @ centre
-    return M
 
 
 def _uncertainty(points: np.ndarray, normal: np.ndarray, residual: np.ndarray) -> Uncertainty | None:
     centre = points.mean(axis=0)
     arm = points - centre
-    sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
-    J, weight = _jacobian(arm, normal), _weights(residual, sigma)
+    sigma = max(robust_sigma(residual, about=0.0), 1e-6)
+    J, weight = _jacobian(arm, normal), tukey_weights(residual, sigma)
     H = (J * weight[:, None]).T @ J
     gradient = J * (weight * residual)[:, None]
     diameter = 2.0 * float(np.sqrt(np.mean(np.sum(arm**2, axis=1))))

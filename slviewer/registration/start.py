@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slviewer.registration.open3d_loader import open3d
+from slviewer.geometry.rigid import fit_rigid, rigid_transform
+from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.prepared import Prepared
 
 Start = Literal["features", "centroids", "initial", "picked", "turntable"]
@@ -38,9 +39,8 @@ def candidates(scan: Prepared, reference: Prepared, voxel: float) -> Iterator[Ca
     """The poses worth trying, features first, from the clouds thinned to ``voxel`` mm."""
     for T in _feature_poses(scan, reference, voxel):
         yield Candidate(T, "features")
-    T = np.eye(4)
-    T[:3, 3] = np.median(reference.fine_points, axis=0) - np.median(scan.fine_points, axis=0)
-    yield Candidate(T, "centroids")
+    shift = np.median(reference.fine_points, axis=0) - np.median(scan.fine_points, axis=0)
+    yield Candidate(rigid_transform(np.eye(3), shift), "centroids")
 
 
 def ranked_starts(
@@ -57,7 +57,7 @@ def ranked_starts(
     for candidate in tried:
         T = candidate.T
         for gate in (6.0 * voxel, 3.0 * voxel, 1.5 * voxel):
-            T = _icp(scan, reference, T, gate)
+            T = align_icp(scan, reference, T, gate, open3d().pipelines.registration.L2Loss(), 1e-5, 20)
         if all(apart(np.asarray(scan.points), T, other.T) > 0.5 * voxel for other in found):
             found.append(Candidate(T, candidate.start, _score(scan, reference, tree, T, voxel)))
     return sorted(found, key=lambda candidate: -candidate.score)
@@ -67,13 +67,6 @@ def apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
     """How far, in mm, two poses put some 20 of the points from each other at most."""
     probe = points[:: max(1, len(points) // 20)]
     return float(np.abs(probe @ (T - other)[:3, :3].T + (T - other)[:3, 3]).max())
-
-
-def _icp(scan: Any, reference: Any, T: np.ndarray, gate: float) -> np.ndarray:
-    pipeline = open3d().pipelines.registration
-    criteria = pipeline.ICPConvergenceCriteria(1e-5, 1e-5, 20)
-    method = pipeline.TransformationEstimationPointToPlane()
-    return np.array(pipeline.registration_icp(scan, reference, gate, T, method, criteria).transformation)
 
 
 def _score(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
@@ -107,22 +100,21 @@ def _feature_poses(scanned: Prepared, referred: Prepared, voxel: float) -> list[
     triplets = triplets[_same_triangle(p[triplets], q[triplets], 0.1 * span, voxel)][:2000]
     if len(triplets) == 0:
         return []
-    R, t = rigid(p[triplets], q[triplets])
-    votes = np.empty(len(R), dtype=np.int64)
-    for chunk in np.array_split(np.arange(len(R)), max(1, len(R) * len(p) // 1_000_000)):
-        moved = np.einsum("kij,nj->kni", R[chunk], p) + t[chunk, None]
+    motions = fit_rigid(p[triplets], q[triplets])
+    votes = np.empty(len(motions), dtype=np.int64)
+    for chunk in np.array_split(np.arange(len(motions)), max(1, len(motions) * len(p) // 1_000_000)):
+        R, t = motions[chunk, :3, :3], motions[chunk, :3, 3]
+        moved = np.einsum("kij,nj->kni", R, p) + t[:, None]
         close = np.sum((moved - q) ** 2, axis=2) < (1.5 * voxel) ** 2
-        alike = np.einsum("kij,nj,ni->kn", R[chunk], n, m, optimize=True) > 0.8
+        alike = np.einsum("kij,nj,ni->kn", R, n, m, optimize=True) > 0.8
         votes[chunk] = np.count_nonzero(close & alike, axis=1)
 
     poses: list[np.ndarray] = []
     for k in np.argsort(-votes, kind="stable"):
         if len(poses) == _CANDIDATES or votes[k] < max(4.0, _LEAST_VOTES * votes.max()):
             break
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R[k], t[k]
-        if all(apart(p, T, other) > 5.0 * voxel for other in poses):
-            poses.append(T)
+        if all(apart(p, motions[k], other) > 5.0 * voxel for other in poses):
+            poses.append(motions[k])
     return poses
 
 
@@ -130,14 +122,3 @@ def _same_triangle(p: np.ndarray, q: np.ndarray, shortest: float, slack: float) 
     """Which pairs of triangles ``(k, 3, 3)`` have sides longer than ``shortest`` that agree within ``slack`` mm."""
     a, b = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))
     return np.all((a > shortest) & (np.abs(a - b) < slack), axis=1)
-
-
-def rigid(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations ``(k, 3, 3)`` and translations ``(k, 3)`` that map the points ``p`` ``(k, n, 3)`` best onto ``q``."""
-    p0, q0 = p.mean(axis=1), q.mean(axis=1)
-    H = np.einsum("kni,knj->kij", p - p0[:, None], q - q0[:, None])
-    U, _, Vt = np.linalg.svd(H)
-    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    Vt[:, 2] *= sign[:, None]
-    R = np.einsum("kji,klj->kil", Vt, U)
-    return R, q0 - np.einsum("kij,kj->ki", R, p0)

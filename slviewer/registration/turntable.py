@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import turn_about
 
 _OFF_DEG = 3.0
 """A step that was found and one that was told differ by less."""
@@ -23,10 +24,7 @@ class Axis:
     def turned(self, deg: float) -> np.ndarray:
         """(4, 4): where the table, turned by so much, has brought what it carries."""
         unit = np.asarray(self.direction, dtype=np.float64) / np.linalg.norm(self.direction)
-        M = np.eye(4)
-        M[:3, :3] = Rotation.from_rotvec(np.radians(deg) * unit).as_matrix()
-        M[:3, 3] = self.point - M[:3, :3] @ self.point
-        return M
+        return turn_about(np.radians(deg) * unit, self.point)
 
 
 def axis_of(steps: Sequence[np.ndarray], step_deg: float) -> Axis:

@@ -18,6 +18,7 @@ import numpy as np
 
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.evaluation.render import render
+from slviewer.geometry.rigid import fit_rigid
 from slviewer.pipeline.feedback import Progress, unheard
 from slviewer.simulation.hostile import FAULTS, SEVERITIES, Direction, Fault, Severity
 from slviewer.simulation.rig import letter
@@ -292,10 +293,8 @@ def fit_gauge(measured: Sequence[MeasuredScan]) -> tuple[np.ndarray, np.ndarray]
     for _ in range(3):
         if np.count_nonzero(keep) < 10:
             break
-        a, b = points[keep].mean(0), truth[keep].mean(0)
-        U, _, Vt = np.linalg.svd((points[keep] - a).T @ (truth[keep] - b))
-        R = Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
-        t = b - R @ a
+        T = fit_rigid(points[keep], truth[keep])
+        R, t = T[:3, :3], T[:3, 3]
         off = np.linalg.norm(points @ R.T + t - truth, axis=1)
         keep = off <= np.quantile(off, 0.9)
     return R, t

@@ -22,6 +22,7 @@ from slviewer.evaluation.render import Row, render
 from slviewer.fringe.decode import texture
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
+from slviewer.geometry.rigid import fit_rigid
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, part, unheard
 from slviewer.pipeline.simulate import TARGET, turn_plan
@@ -30,7 +31,6 @@ from slviewer.reconstruction.reconstruct import Model, reconstruct
 from slviewer.registration.multiway import Alignment, Starts, register_all
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.refusal import Refused
-from slviewer.registration.start import rigid
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import rotation
@@ -245,10 +245,7 @@ def _scanned(renderer: Renderer, model: Model, name: str, number: int) -> Cloud:
 def _frame(true: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """(4, 4): from the true camera's frame to the calibrated one's. A calibration is free to choose it: turned by a
     part of a milliradian, with the optical axis where no lens says it is, it measures every distance the same."""
-    R, t = rigid(true[None], measured[None])
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R[0], t[0]
-    return T
+    return fit_rigid(true, measured)
 
 
 def _registered(

@@ -1,0 +1,38 @@
+"""Rigid motions as matrices (4, 4): ``T_b_a`` maps points of frame a into frame b."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Floats = NDArray[np.float64]
+
+
+def rigid_transform(R: Floats, t: Floats) -> Floats:
+    """(..., 4, 4): the motion X -> R X + t of rotations ``R`` (..., 3, 3) and shifts ``t`` (..., 3) mm."""
+    T = np.zeros((*np.shape(R)[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def turn_about(rotation: Floats, centre: Floats, shift: Floats | float = 0.0) -> Floats:
+    """(4, 4): the turn by a rotation vector (3,) rad about ``centre`` (3,) mm, then the shift (3,) mm."""
+    R = Rotation.from_rotvec(rotation).as_matrix()
+    return rigid_transform(R, centre - R @ centre + shift)
+
+
+def move_points(T: Floats, points: np.ndarray) -> Floats:
+    """(n, 3): points (n, 3) mm moved by ``T`` (4, 4); NaN stays NaN."""
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def fit_rigid(points: Floats, targets: Floats) -> Floats:
+    """(..., 4, 4): the motion of least squares that brings points (..., n, 3) onto ``targets`` (..., n, 3), in order.
+
+    Kabsch's algorithm; the points must be finite, three or more and not on one line.
+    """
+    p0, q0 = points.mean(axis=-2), targets.mean(axis=-2)
+    H = np.swapaxes(points - p0[..., None, :], -1, -2) @ (targets - q0[..., None, :])
+    U, _, Vt = np.linalg.svd(H)
+    Vt[..., 2, :] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[..., None]
+    R = np.swapaxes(U @ Vt, -1, -2)
+    return rigid_transform(R, q0 - (R @ p0[..., None])[..., 0])
