@@ -62,6 +62,3 @@ EXPERIMENT_3_POINTS = {"R1": 1_642_179, "R2": 1_476_327, "R3": 1_034_094}
 EXPERIMENT_3_ICP_RMS_MM = {"R1": 0.26, "R2": 0.25}  # with R3 as the reference
 
 REPROJECTION_RMS_PX = {"camera": 0.253, "projector": 0.141}
-PIXEL_FIT_RMS_MM = 0.15  # "below"
-
-IN_RANGE_POSES = (3, 4, 9, 10)  # at least 87 % in R2

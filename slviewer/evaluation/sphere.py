@@ -1,11 +1,9 @@
-"""How round, how large and how far apart a cloud measures spheres."""
+"""How round and how large a cloud measures spheres."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.errors import InputError
 from slviewer.evaluation.fit import ShapeResult, measure
 from slviewer.evaluation.region import find_sphere, find_spheres, start_sphere
 from slviewer.geometry.shapes import Sphere, fit_sphere
@@ -49,33 +47,3 @@ def evaluate_spheres(
     """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise as above."""
     found = find_spheres(points, count, sigma_z, radius)
     return [evaluate_sphere(points, region, sigma_z, radius, start) for start, region in found]
-
-
-@dataclass(frozen=True)
-class Spacing:
-    """Distance between two spheres' centres, measured and known, and the error in mm and in parts of the known."""
-
-    pair: tuple[str, str]
-    distance_mm: float
-    known_mm: float
-
-    @property
-    def error_mm(self) -> float:
-        return self.distance_mm - self.known_mm
-
-    @property
-    def error_ppm(self) -> float:
-        return 1e6 * self.error_mm / self.known_mm
-
-
-def spacings(centres: Mapping[str, np.ndarray], known_mm: Mapping[tuple[str, str], float]) -> list[Spacing]:
-    """The spacing of every pair of spheres whose distance is known; ``centres`` are (3,) mm by name."""
-    found = []
-    for (a, b), known in known_mm.items():
-        missing = [name for name in (a, b) if name not in centres]
-        if missing:
-            raise InputError(f"No sphere called {missing[0]!r} was measured: there are {', '.join(centres) or 'none'}.")
-        if not known > 0:
-            raise InputError(f"The known distance between {a} and {b} is {known:g} mm: give a positive one.")
-        found.append(Spacing((a, b), float(np.linalg.norm(np.subtract(centres[a], centres[b]))), known))
-    return found

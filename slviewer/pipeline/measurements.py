@@ -74,7 +74,7 @@ def add_fit(session: SessionLike, on: MeasuredSurface, shape: Shape, region: Reg
         found = replace(found, warnings=(*found.warnings, told))
     arrays = {} if found.spread.shared is None else {"shared": found.spread.shared.astype(np.float32)}
     where = f"{region.text()}: {found.used:,} used, {found.left_out:,} left out"
-    data = {"region": region.to_json(), "where": where, "fit": found.to_json()}
+    data = {"region": region, "where": where, "fit": found.to_json()}
     with opened(session, write=True) as store:
         return _saved(store, on, shape, found.quantities(), data, arrays, name)
 

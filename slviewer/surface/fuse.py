@@ -47,13 +47,6 @@ class Fused:
         """The share of the points that more than one scan measured."""
         return float((self.seen_by > 1).mean())
 
-    @property
-    def disagreement_mm(self) -> float:
-        """Root mean square of the distances along the normal between scans where they overlap; NaN if none do."""
-        counts = np.array([pair.places for pair in self.pairs.values()], float)
-        squares = np.array([pair.rms_mm**2 for pair in self.pairs.values()])
-        return float(np.sqrt((counts * squares).sum() / counts.sum())) if counts.sum() else float("nan")
-
 
 def fuse(
     scans: Mapping[str, Cloud], T_reference_scan: Mapping[str, np.ndarray], progress: Progress | None = None

@@ -12,7 +12,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
 from slviewer.evaluation.render import render
-from slviewer.evaluation.tables import rows
+from slviewer.evaluation.tables import letter_rows
 from slviewer.pipeline.merge import Merge
 
 MODELS = ("stereo", "pixelwise", "splined")
@@ -78,11 +78,11 @@ class Reproduction:
                 f"(the Letter: {theirs['camera']:.3f}, {theirs['projector']:.3f}).",
                 "",
                 "Flat board (Table 1)",
-                render(_shown(rows(self.planes, letter=True))),
+                render(_shown(letter_rows(self.planes))),
                 f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
                 "",
                 f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
-                render(_shown(rows(self.spheres, letter=True))),
+                render(_shown(letter_rows(self.spheres))),
                 "Distances between the sphere centres, RMS error: "
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from artefact_places import bar_places, plane_places, sphere_places
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact, Limits
 from slviewer.evaluation.acceptance.figures import AcceptanceFigure, decide, narrowest
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure
-from slviewer.evaluation.acceptance.places import bar_places, plane_places, sphere_places
 from slviewer.evaluation.acceptance.result import conclude
 from slviewer.evaluation.budget import Contribution, budget
 from slviewer.evaluation.repeatability import repeatability

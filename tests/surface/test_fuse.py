@@ -46,7 +46,7 @@ def test_a_place_is_kept_once_with_its_normal_outwards(fused: Fused) -> None:
     assert normals is not None
     outwards = (normals * points).sum(axis=1) / np.linalg.norm(points, axis=1)
     assert np.percentile(outwards, 1) > 0.97
-    assert fused.shared > 0.9 and 0.02 < fused.disagreement_mm < 0.1
+    assert fused.shared > 0.9 and all(0.02 < pair.rms_mm < 0.1 for pair in fused.pairs.values())
 
 
 def test_a_bad_scan_weighs_little() -> None:
@@ -114,7 +114,7 @@ def test_a_single_scan_is_cleaned_and_stays_where_it_is() -> None:
     found = fuse({"one": scan}, {"one": np.eye(4)})
     kept = {tuple(p) for p in scan.measured.tolist()}
     assert all(tuple(p) in kept for p in found.surface.points.tolist())
-    assert np.isnan(found.disagreement_mm) and found.shared == 0
+    assert not found.pairs and found.shared == 0
 
 
 def test_refusals() -> None:
