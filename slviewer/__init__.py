@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from slviewer.session.ply import write_ply
     from slviewer.session.store import Session
     from slviewer.surface.fuse import fuse as fuse_clouds
-    from slviewer.surface.meshing import mesh_of as mesh_cloud
+    from slviewer.surface.meshing import build_mesh as mesh_cloud
     from slviewer.target.board import Board
     from slviewer.target.detect import detect as detect_board
 
@@ -91,7 +91,7 @@ _EXPORTS = {
     "measure": "pipeline.measure",
     "merge": "pipeline.merge",
     "mesh": "pipeline.mesh",
-    "mesh_cloud": "surface.meshing:mesh_of",
+    "mesh_cloud": "surface.meshing:build_mesh",
     "multifrequency": "fringe.presets",
     "p18": "fringe.presets",
     "read_captures": "pipeline.import_captures",

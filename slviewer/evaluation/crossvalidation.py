@@ -31,7 +31,7 @@ BETTER = 0.98
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutPose:
     """What one model makes of one pose that it was not made from.
 
     ``plane_mm``: RMS distance of the board's pixels from their plane. ``board_mm``: RMS distance of the features from
@@ -53,7 +53,7 @@ class CrossValidation:
     """``poses``: {model: {pose: what it made of it}}, every model over the same pixels. ``folds``: poses left out
     together. ``failed``: {model: why it could not be fitted to some fold}."""
 
-    poses: Mapping[str, Mapping[str, HeldOut]]
+    poses: Mapping[str, Mapping[str, HeldOutPose]]
     folds: tuple[tuple[str, ...], ...]
     failed: Mapping[str, str]
 
@@ -103,7 +103,7 @@ class CrossValidation:
         return {"recommended": self.recommended, "models": models, **to_plain(self)}
 
 
-def split(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tuple[str, ...], ...]:
+def split_folds(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tuple[str, ...], ...]:
     """Poses dealt into folds in the order of their depths, so that each fold holds near and far ones.
 
     Raises InputError for fewer than ``LEAST_POSES`` poses.
@@ -138,7 +138,7 @@ def smoothed_phases(observation: Observation) -> dict[Axis, PhaseMap]:
 
 def measure_held_out(
     models: Mapping[str, Model], observation: Observation, axis: Axis, rig: StereoRig
-) -> dict[str, HeldOut]:
+) -> dict[str, HeldOutPose]:
     """What each model makes of a pose, all from the same axis and over the pixels and features that all of them
     measure; empty where these are too few. ``rig`` turns millimetres into pixels.
     """
@@ -156,7 +156,7 @@ def measure_held_out(
     for name, points in clouds.items():
         seen, X = points[common].astype(float), features[name][read]
         placed, scale = _laid_over(board, X)
-        found[name] = HeldOut(
+        found[name] = HeldOutPose(
             plane_mm=float(np.sqrt(np.mean(fit_plane(seen).distance(seen) ** 2))),
             board_mm=_rms(X - placed),
             scale_ppm=1e6 * (scale - 1),
@@ -168,9 +168,9 @@ def measure_held_out(
     return found
 
 
-def gathered(
+def gather_results(
     names: Sequence[str],
-    measured: Sequence[Mapping[str, Mapping[str, HeldOut]]],
+    measured: Sequence[Mapping[str, Mapping[str, HeldOutPose]]],
     folds: tuple[tuple[str, ...], ...],
     failed: Mapping[str, str],
 ) -> CrossValidation:
@@ -178,7 +178,7 @@ def gathered(
 
     Raises InputError where no model could be judged.
     """
-    poses: dict[str, dict[str, HeldOut]] = {}
+    poses: dict[str, dict[str, HeldOutPose]] = {}
     for model in (name for name in names if name not in failed):
         by_pose = {pose: found[model] for fold in measured for pose, found in fold.items() if model in found}
         if by_pose:

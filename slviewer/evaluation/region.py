@@ -78,7 +78,7 @@ def find_spheres(
 def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None) -> Plane:
     """The plane that most points under ``mask`` agree with."""
     measured = measured_pixels(points, mask)
-    return ransac_plane(sample(points, measured), max(RANSAC_TOLERANCE_MM, 2.0 * _typical(sigma_z, measured)))[0]
+    return ransac_plane(sample_points(points, measured), max(RANSAC_TOLERANCE_MM, 2.0 * _typical(sigma_z, measured)))[0]
 
 
 def start_sphere(
@@ -87,7 +87,7 @@ def start_sphere(
     """The sphere that most points under ``mask`` agree with."""
     measured = measured_pixels(points, mask)
     tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical(sigma_z, measured))
-    return ransac_sphere(sample(points, measured), tolerance, radius)[0]
+    return ransac_sphere(sample_points(points, measured), tolerance, radius)[0]
 
 
 def _typical(sigma_z: np.ndarray | None, measured: np.ndarray) -> float:
@@ -116,7 +116,7 @@ def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     return measured
 
 
-def sample(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
+def sample_points(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Some 40,000 of the measured points, (n, 3) float64."""
     chosen = points[measured]
     return chosen[:: -(-len(chosen) // _SAMPLE)].astype(np.float64)
@@ -145,7 +145,7 @@ def _grow(
             )
         if np.count_nonzero(patch ^ before) <= 1e-4 * np.count_nonzero(patch):
             break
-        shape = fit(sample(points, patch & agreeing))
+        shape = fit(sample_points(points, patch & agreeing))
     return shape, region
 
 

@@ -10,8 +10,8 @@ from slviewer.gui.inputs import change
 from slviewer.gui.panel import Stage
 from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.widgets import Html, Words, table
-from slviewer.inspection.section import between, nearest_on, radius_through
-from slviewer.report.canvas import finish, new_figure, tidy
+from slviewer.inspection.section import measure_cursors, nearest_on_section, radius_through
+from slviewer.report.canvas import finish_figure, new_figure, style_axes
 from slviewer.report.page import Figure
 
 CURSORS = ("A", "B", "C")
@@ -81,14 +81,14 @@ def _range(along: np.ndarray) -> tuple[float, float, float]:
 
 def placed(lines: list[np.ndarray], at: tuple[float, ...]) -> np.ndarray:
     """(3, 2) mm: where the cursors meet the section."""
-    return np.array([nearest_on(lines, x) for x in at])
+    return np.array([nearest_on_section(lines, x) for x in at])
 
 
 def cursor_words(cursors: np.ndarray) -> Html:
     """What the cursors (3, 2) read."""
     a, b, c = cursors
     rows: list[tuple[object, object]] = [
-        (f"{q.name} A – B", f"{q.value:.3f} {q.unit}".replace("-", "−")) for q in between(a, b)
+        (f"{q.name} A – B", f"{q.value:.3f} {q.unit}".replace("-", "−")) for q in measure_cursors(a, b)
     ]
     try:
         rows.append(("radius through A, C, B", f"{radius_through(a, c, b).value:.3f} mm"))
@@ -103,7 +103,7 @@ def section_figure(name: str, lines: list[np.ndarray], cursors: np.ndarray) -> F
     width, height = np.maximum(np.ptp(every, axis=0), 1e-6)
     drawing = new_figure(PLOT_PX, int(np.clip(1.6 * PLOT_PX * height / width + 90, _LEAST_HIGH, _MOST_HIGH)))
     axes = drawing.subplots()
-    tidy(axes, "", "along, mm", "height, mm")
+    style_axes(axes, "", "along, mm", "height, mm")
     for line in lines:
         axes.plot(*line[:: max(1, len(line) // _MOST_DRAWN)].T, color=_LINE, linewidth=1.3)
     for cursor, text, colour in zip(cursors, CURSORS, _COLOURS, strict=True):
@@ -114,4 +114,4 @@ def section_figure(name: str, lines: list[np.ndarray], cursors: np.ndarray) -> F
     axes.set_aspect("auto" if raised else "equal", adjustable="datalim")
     axes.margins(y=0.15)
     told = "heights are drawn larger than lengths" if raised else "lengths and heights are drawn alike"
-    return finish(drawing, f"Cut through both points and the camera; up is towards the camera; {told}.", name)
+    return finish_figure(drawing, f"Cut through both points and the camera; up is towards the camera; {told}.", name)

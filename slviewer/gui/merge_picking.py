@@ -18,7 +18,7 @@ from slviewer.gui.pictures import Painter, opened
 from slviewer.gui.viewpoints import ASIDE
 from slviewer.gui.widgets import Html, Words, block, boxed, cell, table, toned
 from slviewer.registration.multiway import Pair
-from slviewer.registration.picked import LEAST_PICKS, picked_start
+from slviewer.registration.picked import LEAST_PICKS, fit_picked_start
 from slviewer.wizard.result_views import ScanCloud, nearest, scan_cloud
 
 LAYER = "merge picks"
@@ -287,7 +287,7 @@ def _pairs_words(picks: _Picks) -> Html:
     if n < LEAST_PICKS:
         return block(toned(f"{n} of {LEAST_PICKS} pairs picked", "dim"))
     try:
-        _, apart = picked_start(*picks.points)
+        _, apart = fit_picked_start(*picks.points)
     except SlviewerError as error:
         return boxed(str(error), "warning")
     rows = [(f"Pair {k}", f"{mm:.2f} mm") for k, mm in enumerate(apart, 1)]

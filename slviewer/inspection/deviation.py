@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.inspection.placing import found_start
-from slviewer.inspection.uncertainty import scatter
+from slviewer.inspection.placing import search_start
+from slviewer.inspection.uncertainty import scatter_covariance
 from slviewer.registration.pairwise import Registration
 from slviewer.surface.shapes import Mesh
 
@@ -119,7 +119,7 @@ def deviation(
     say(0.0)
     start = None
     if initial is None:
-        start = found_start(points, normals, surface, sigma_mm, lambda share: say(0.6 * share))
+        start = search_start(points, normals, surface, sigma_mm, lambda share: say(0.6 * share))
         initial = start.T_reference_scan
     T, alignment = _best_fit(points, normals, surface, initial, reach_mm, lambda share: say(0.6 + 0.2 * share))
     say(0.8)
@@ -191,7 +191,7 @@ def _best_fit(
         T = turn_about(change[:3], middle, change[3:]) @ T
         if np.abs(J @ change).max() < 1e-5:
             break
-    covariance = scatter(moved, J, away[kept])
+    covariance = scatter_covariance(moved, J, away[kept])
     return T, float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean()))
 
 

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.figures import narrowest
+from slviewer.evaluation.acceptance.figures import narrowest_range
 from slviewer.evaluation.fit import SET_ASIDE_SIGMA, SET_ASIDE_WARNING, fit_settled, within_sigmas
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.inspection.features import Feature, Kind
 from slviewer.inspection.quantities import Quantity
-from slviewer.inspection.starts import as_plane, as_sphere, start
-from slviewer.inspection.uncertainty import Shared, Spread, propagated, scatter
+from slviewer.inspection.starts import as_plane, as_sphere, estimate_start
+from slviewer.inspection.uncertainty import Shared, Spread, propagate_covariance, scatter_covariance
 from slviewer.records import to_plain
 
 LEAST_POINTS = 50
@@ -53,7 +53,7 @@ class FeatureFit:
         known = self.spread.shared is not None
         found: list[Quantity] = []
         if f.radius is not None:
-            sigma = propagated(lambda step: float(f.moved(step).radius or 0.0), covariance)
+            sigma = propagate_covariance(lambda step: float(f.moved(step).radius or 0.0), covariance)
             found.append(Quantity("radius", f.radius, "mm", sigma, known))
             found.append(Quantity("diameter", 2 * f.radius, "mm", 2 * sigma, known))
         found.append(Quantity("form (95 %)", self.form, "mm"))
@@ -116,7 +116,7 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
             "aside: see that it shows nothing else"
         )
     farthest = float(residuals[counted][np.argmax(np.abs(residuals[counted]))])
-    form = narrowest(residuals[counted], 0.95)
+    form = narrowest_range(residuals[counted], 0.95)
     return FeatureFit(feature, spread, rms, farthest, form, used, len(points) - used, tuple(warnings))
 
 
@@ -136,7 +136,7 @@ def _settled(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
     def fit(some: np.ndarray, begin: Feature | None) -> Feature:
         return least_squares(kind, some, begin)
 
-    return fit_settled(fit, points, start(kind, points, fit))
+    return fit_settled(fit, points, estimate_start(kind, points, fit))
 
 
 def _refined(feature: Feature, points: np.ndarray) -> Feature:
@@ -172,7 +172,7 @@ def _refined(feature: Feature, points: np.ndarray) -> Feature:
 
 def _spread(feature: Feature, points: np.ndarray, shared: Shared | None, calibration: str) -> Spread:
     J = feature.jacobian(points)
-    own = scatter(points, J, feature.distance(points))
+    own = scatter_covariance(points, J, feature.distance(points))
     if shared is None:
         return Spread(own)
     some = points[:: -(-len(points) // MOST_SHARED)]

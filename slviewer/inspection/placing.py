@@ -8,8 +8,8 @@ import numpy as np
 
 from slviewer.errors import SlviewerError
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.registration.pairwise import MOST_ATTEMPTS, Registration, register_prepared, searched
-from slviewer.registration.prepared import Prepared, prepared
+from slviewer.registration.pairwise import MOST_ATTEMPTS, Registration, register_prepared, search_starts
+from slviewer.registration.prepared import PreparedScan, prepare_scan
 from slviewer.registration.refusal import Refused
 
 SAMPLES = 60_000
@@ -30,7 +30,7 @@ AWAY = 3.0
 """Diagonals: from so far."""
 
 
-def found_start(
+def search_start(
     points: np.ndarray,
     normals: np.ndarray | None,
     surface: NominalSurface,
@@ -44,7 +44,7 @@ def found_start(
     """
     places, facing = surface.sampled(SAMPLES)
     step = -(-len(points) // MOST_POINTS)
-    scan = prepared("scan", points[::step], None if normals is None else normals[::step], sigma_mm)
+    scan = prepare_scan("scan", points[::step], None if normals is None else normals[::step], sigma_mm)
     good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
     refusal: SlviewerError | None = None
     best: Registration | None = None
@@ -55,7 +55,7 @@ def found_start(
             continue
         camera = surface.middle + AWAY * surface.diagonal * view
         try:
-            found = _registered(scan, prepared("nominal model", places[seen] - camera, facing[seen]))
+            found = _registered(scan, prepare_scan("nominal model", places[seen] - camera, facing[seen]))
         except SlviewerError as error:
             refusal = refusal or error
             continue
@@ -76,11 +76,11 @@ def found_start(
     return best
 
 
-def _registered(scan: Prepared, reference: Prepared) -> Registration:
+def _registered(scan: PreparedScan, reference: PreparedScan) -> Registration:
     """As ``register_prepared``; of a part that looks alike from several sides the pose that leaves least: which of them
     it is makes no difference to how far the scan lies off."""
     size = min(scan.size, reference.size)
-    starts = searched(scan, reference, size)
+    starts = search_starts(scan, reference, size)
     try:
         return register_prepared(scan, reference, size=size, starts=starts)
     except Refused as error:

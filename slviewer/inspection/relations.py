@@ -8,7 +8,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.inspection.features import KINDS, Feature
 from slviewer.inspection.quantities import Quantity, Unit
-from slviewer.inspection.uncertainty import Spread, joint, propagated
+from slviewer.inspection.uncertainty import Spread, joint_covariance, propagate_covariance
 
 PARALLEL_DEG = 5.0
 """Axes nearer to parallel than this are as far apart as they are in the measured region: where they would meet, if they
@@ -118,7 +118,7 @@ def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list
     """
     if KINDS.index(a.kind) > KINDS.index(b.kind):
         a, a_spread, b, b_spread = b, b_spread, a, a_spread
-    covariance = joint(a_spread, b_spread)
+    covariance = joint_covariance(a_spread, b_spread)
     whole = a_spread.shared is not None and b_spread.shared is not None
     p = a.parameters
 
@@ -126,7 +126,7 @@ def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list
         def moved(step: np.ndarray) -> float:
             return meaning.of(a.moved(step[:p]), b.moved(step[p:]))
 
-        return Quantity(meaning.name, meaning.of(a, b), meaning.unit, propagated(moved, covariance), whole)
+        return Quantity(meaning.name, meaning.of(a, b), meaning.unit, propagate_covariance(moved, covariance), whole)
 
     return [quantity(meaning) for meaning in MEANINGS[a.kind, b.kind]]
 

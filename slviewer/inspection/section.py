@@ -97,7 +97,7 @@ def _chains(segments: np.ndarray, count: int) -> list[list[int]]:
     return chains
 
 
-def between(a: np.ndarray, b: np.ndarray) -> list[Quantity]:
+def measure_cursors(a: np.ndarray, b: np.ndarray) -> list[Quantity]:
     """What two cursors (2,) mm on a section read."""
     width, height = (float(value) for value in np.subtract(b, a))
     return [
@@ -117,7 +117,7 @@ def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Quantity:
     return Quantity("radius", sides[0] * sides[1] * sides[2] / (2 * area), "mm")
 
 
-def nearest_on(lines: list[np.ndarray], x: float, y: float | None = None) -> np.ndarray:
+def nearest_on_section(lines: list[np.ndarray], x: float, y: float | None = None) -> np.ndarray:
     """(2,) mm: where a cursor at ``x`` meets the section, at the line nearest to ``y`` or else the highest one; the
     nearest point drawn where no line passes x."""
     met = []

@@ -17,7 +17,7 @@ NEAR = 2.5
 """Robust standard deviations: what lies nearer belongs to a hypothesis."""
 
 
-def start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Feature | None], Feature]) -> Feature:
+def estimate_start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Feature | None], Feature]) -> Feature:
     """The shape that at least half of the points (n, 3) lie closest to; the same points give the same answer.
 
     ``fit``: least squares over points, from a start. Raises InputError, the last one's, where no sample holds a shape.

@@ -37,7 +37,7 @@ class ToleranceVerdict:
     close: float
 
 
-def judged(found: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> ToleranceVerdict:
+def judge_deviation(found: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> ToleranceVerdict:
     """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the surface's normal."""
     if not tolerance_mm > 0:
         raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")

@@ -39,7 +39,7 @@ class Spread:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def joint(a: Spread, b: Spread) -> np.ndarray:
+def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
     """(p + q, p + q): the covariance of two features' parameters; errors of a calibration that both have, are one."""
     p = len(a.scatter)
     whole = np.zeros((p + len(b.scatter),) * 2)
@@ -50,7 +50,7 @@ def joint(a: Spread, b: Spread) -> np.ndarray:
     return whole
 
 
-def propagated(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:
+def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:
     """Standard deviation of f(step) at step 0, for steps (p,) of a covariance.
 
     Along each principal direction f is asked one standard deviation to both sides, which also holds where f has a kink
@@ -65,7 +65,7 @@ def propagated(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> floa
     return float(np.sqrt(variance))
 
 
-def scatter(points: np.ndarray, jacobian: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+def scatter_covariance(points: np.ndarray, jacobian: np.ndarray, residuals: np.ndarray) -> np.ndarray:
     """(p, p): covariance of parameters fitted to points (n, 3) by least squares, from what the fit leaves over.
 
     The residuals (n,) of one patch count together: form and smooth errors do not average out over neighbours as noise

@@ -13,7 +13,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
 from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, measure
-from slviewer.evaluation.acceptance.result import Acceptance, conclude
+from slviewer.evaluation.acceptance.result import Acceptance, conclude_test
 from slviewer.evaluation.budget import Contribution, ErrorBudget, budget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
@@ -101,7 +101,7 @@ def accept(
                 found.append(measure(thing, cloud, captures[shot.name], shot.name, depth_range, plate))
             except InputError as error:
                 raise InputError(f"{shot.name}: {error}") from error
-        test = conclude(thing, name, found)
+        test = conclude_test(thing, name, found)
         steady = None
         if still:
             watching = part(progress, 0.5, 0.95)

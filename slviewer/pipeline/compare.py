@@ -11,7 +11,7 @@ from slviewer.evaluation.render import Row, render
 from slviewer.inspection.colours import colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.quantities import Quantity
-from slviewer.inspection.tolerance import DECIDED, RULE, ToleranceVerdict, judged
+from slviewer.inspection.tolerance import DECIDED, RULE, ToleranceVerdict, judge_deviation
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.measured_surface import MeasuredSurface, surface
 from slviewer.pipeline.measurements import triangles_of
@@ -173,7 +173,7 @@ def compare_surface(
     along = on.sigma_along(towards)
     kept = found.counted
     noise = float(np.sqrt(np.nanmean(along[kept] ** 2))) if np.isfinite(along[kept]).any() else float("nan")
-    verdict = None if tolerance is None else judged(found, on.sigma_along(towards, whole=True), tolerance)
+    verdict = None if tolerance is None else judge_deviation(found, on.sigma_along(towards, whole=True), tolerance)
     progress(0.9, "writing")
     ply = None
     if out is not None:

@@ -18,7 +18,7 @@ from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.names import natural_key
 from slviewer.session.ply import Ply, read_ply
 from slviewer.session.store import Session
-from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
+from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 
 
@@ -65,7 +65,7 @@ def scan_shape(
     frame = f"frame: {frame_of(store, cloud.model)}, x right, y down, z away"
     notes = (f"scan {name}, {frame}", *_of_model(store, cloud.model))
     if plan is not None:
-        return _meshed(name, mesh_of(cloud, plan, part(progress, 0.5, 1)), notes)
+        return _meshed(name, build_mesh(cloud, plan, part(progress, 0.5, 1)), notes)
     progress(0.7, "normals")
     normals, colours = grid_normals(cloud.points)[mask], cloud.colours()
     if colours is not None and colours.ndim == 1:
@@ -121,7 +121,7 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
         said = "sigma: expected error along the normal, mm"
         points = PointSet(merged.points, merged.normals, _rgb(merged))
         return Described(points, f"merge {name}", merged.scalars, (*notes, said))
-    return _meshed(f"merge {name}", mesh_of(_with_normals(merged), plan, part(progress, 0.1, 1)), notes)
+    return _meshed(f"merge {name}", build_mesh(_with_normals(merged), plan, part(progress, 0.1, 1)), notes)
 
 
 def merged_points(store: Session, name: str, warn: Warn) -> PointSet:
@@ -152,7 +152,7 @@ def _with_normals(merged: Ply) -> PointSet:
     )
 
 
-def _meshed(whose: str, made: Meshed, notes: tuple[str, ...]) -> Described:
+def _meshed(whose: str, made: BuiltMesh, notes: tuple[str, ...]) -> Described:
     done = tuple(made.text().splitlines())
     return Described(made.mesh, whose, {}, (*notes, "sigma: expected error along the normal, mm", *done), done)
 

@@ -19,9 +19,9 @@ from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Alignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
-from slviewer.registration.picked import picked_start
+from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.static_scene import ObjectAlignment, SceneContradiction, register_object
-from slviewer.registration.turntable import Axis
+from slviewer.registration.turntable import TurntableAxis
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
@@ -150,7 +150,7 @@ def merge(
     model: str | None = None,
     start: StartKind = "features",
     angle: float | None = None,
-    axis: Axis | None = None,
+    axis: TurntableAxis | None = None,
     poses: Mapping[str, np.ndarray] | None = None,
     picked: Picked | None = None,
     keep_background: bool = False,
@@ -275,7 +275,7 @@ def _starts(
     names: Sequence[str],
     start: StartKind,
     angle: float | None,
-    axis: Axis | None,
+    axis: TurntableAxis | None,
     poses: Mapping[str, np.ndarray] | None,
     picked: Picked | None,
     warn: Warn,
@@ -288,7 +288,7 @@ def _starts(
     for (scan, onto), (there, here) in (picked or {}).items():
         if not {scan, onto} <= set(names):
             raise UsageError(f"points were picked on {scan} and {onto}, which are not both among the scans to merge")
-        picks[scan, onto], apart = picked_start(there, here)
+        picks[scan, onto], apart = fit_picked_start(there, here)
         warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
     for base in {onto for _, onto in picks} if poses is None and angle is None else ():
         if all((name, base) in picks for name in names if name != base):  # pairs that nobody picked start there too

@@ -14,7 +14,7 @@ from slviewer.pipeline.models import check_accepted, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape
-from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
+from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh
 from slviewer.surface.shapes import PointSet
 
 MERGE = "merge/"
@@ -25,7 +25,7 @@ MERGE = "merge/"
 class MeshResult:
     """A mesh, what it was made of, and the file it went to. ``merged`` says how the scans were merged for it."""
 
-    meshed: Meshed
+    meshed: BuiltMesh
     sources: tuple[str, ...]
     out: Path
     merged: Merge | None = None
@@ -87,7 +87,7 @@ def mesh(
         else:
             warn_if_stale(store, warn)
             shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected)
-    meshed = mesh_of(shape, plan, part(progress, 0.5, 0.95))
+    meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95))
     progress(0.95, f"writing {path.name}")
     write_shape(path, meshed.mesh, notes=(f"of {', '.join(sources)}", *meshed.text().splitlines()))
     progress(1.0, "meshed")

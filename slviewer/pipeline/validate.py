@@ -11,7 +11,14 @@ from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
 from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected, InputError, UsageError
-from slviewer.evaluation.crossvalidation import FOLDS, CrossValidation, HeldOut, gathered, measure_held_out, split
+from slviewer.evaluation.crossvalidation import (
+    FOLDS,
+    CrossValidation,
+    HeldOutPose,
+    gather_results,
+    measure_held_out,
+    split_folds,
+)
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.models import (
     MODELS,
@@ -83,10 +90,10 @@ def cross_validate(
 ) -> CrossValidation:
     """The same for poses that are at hand, with circles at their centres, and the calibration made from all of them."""
     depths = {o.name: float(np.median(_depths(o, stereo))) for o in observations}
-    parts = split(depths, folds)
+    parts = split_folds(depths, folds)
     axis = best_axis(observations, stereo)
     failed: dict[str, str] = {}
-    measured: list[Mapping[str, Mapping[str, HeldOut]]] = []
+    measured: list[Mapping[str, Mapping[str, HeldOutPose]]] = []
     for k, fold in enumerate(parts):
         report = part(progress, k / len(parts), (k + 1) / len(parts))
         training = [o for o in observations if o.name not in fold]
@@ -108,7 +115,7 @@ def cross_validate(
                 failed[name] = str(error)
         report(len(models) / (len(models) + 1), f"measuring fold {k + 1} of {len(parts)}")
         measured.append({o.name: measure_held_out(fitted, o, axis, stereo.rig) for o in observations if o.name in fold})
-    return gathered(models, measured, parts, failed)
+    return gather_results(models, measured, parts, failed)
 
 
 def _told(progress: Progress, doing: str, share: float) -> None:

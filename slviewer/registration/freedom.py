@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slviewer.registration.prepared import Prepared
+from slviewer.registration.prepared import PreparedScan
 
 Shape = Literal["plane", "sphere", "cylinder", "slides", "turns"]
 
@@ -54,7 +54,9 @@ WORDS: dict[Shape, str] = {
 }
 
 
-def freedom(scan: Prepared, reference: Prepared, T: np.ndarray, points: np.ndarray, rms: float) -> Freedom:
+def estimate_freedom(
+    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, points: np.ndarray, rms: float
+) -> Freedom:
     """What the overlap's ``points`` (n, 3) mm, in the reference's frame, leave free; ``rms`` in mm is the noise."""
     if len(points) < 6:
         return Freedom(np.full(6, np.inf), np.eye(6))

@@ -35,7 +35,7 @@ class Edge:
 
 
 @dataclass(frozen=True)
-class Gap:
+class LoopGap:
     """What is left where a loop should close: mm at the middle of the overlap, degrees, and expected mm."""
 
     shift_mm: float
@@ -43,7 +43,9 @@ class Gap:
     expected_mm: float
 
 
-def tree(nodes: int, edges: Sequence[Edge], root: int, costs: np.ndarray | None = None) -> tuple[np.ndarray, list[int]]:
+def spanning_poses(
+    nodes: int, edges: Sequence[Edge], root: int, costs: np.ndarray | None = None
+) -> tuple[np.ndarray, list[int]]:
     """Each node's pose (nodes, 4, 4) in the root's frame along the surest edges, NaN where none leads; and for each
     node the index of the edge that leads to it, -1 for none. ``costs`` replace the edges' variances."""
     costs = np.array([edge.variance for edge in edges]) if costs is None else costs
@@ -71,10 +73,10 @@ def tree(nodes: int, edges: Sequence[Edge], root: int, costs: np.ndarray | None 
     return poses, by
 
 
-def gap(edge: Edge, poses: np.ndarray, expected_mm: float = float("nan")) -> Gap:
+def loop_gap(edge: Edge, poses: np.ndarray, expected_mm: float = float("nan")) -> LoopGap:
     """How far an edge is from where the poses put its scan."""
     residual = residuals([edge], poses)[0]
-    return Gap(float(np.linalg.norm(residual[3:])), float(np.degrees(np.linalg.norm(residual[:3]))), expected_mm)
+    return LoopGap(float(np.linalg.norm(residual[3:])), float(np.degrees(np.linalg.norm(residual[:3]))), expected_mm)
 
 
 def loop_of(edge: Edge, edges: Sequence[Edge], by: Sequence[int]) -> list[int]:
@@ -105,13 +107,13 @@ _LEVER_MM = 100.0
 """Unknown turns are counted in mm at so many mm, so that all unknowns are alike."""
 
 
-def optimised(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray:
+def optimise_poses(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray:
     """The poses (n, 4, 4) in the root's frame that all edges together make most likely, from poses near by."""
     moved, cost, _ = _problem(poses, edges, root)
     return moved(least_squares(cost, np.zeros(6 * (len(poses) - 1)), x_scale="jac").x)
 
 
-def uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> list[Uncertainty]:
+def pose_uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> list[Uncertainty]:
     """How sure each pose (n, 4, 4) in the root's frame is by all edges together, at the middle of what they share: the
     farther from the root, the less. The root's own is 0."""
     _, cost, middle = _problem(poses, edges, root)

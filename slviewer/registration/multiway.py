@@ -18,15 +18,15 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration import graph
-from slviewer.registration.agreeing import agreeing
-from slviewer.registration.graph import Edge, Gap
-from slviewer.registration.pairwise import Progress, Registration, register_prepared, searched
-from slviewer.registration.prepared import LEAST_POINTS, Prepared, prepared
+from slviewer.registration.consistency import select_consistent_edges
+from slviewer.registration.graph import Edge, LoopGap
+from slviewer.registration.pairwise import Progress, Registration, register_prepared, search_starts
+from slviewer.registration.prepared import LEAST_POINTS, PreparedScan, prepare_scan
 from slviewer.registration.refine import Uncertainty
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import Scan
 from slviewer.registration.start import Candidate, Start
-from slviewer.registration.turntable import Axis, axis_of
+from slviewer.registration.turntable import TurntableAxis, fit_turntable_axis
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
@@ -49,7 +49,7 @@ class Starts:
 
     poses: Mapping[str, np.ndarray] | None = None
     step_deg: float | None = None
-    axis: Axis | None = None
+    axis: TurntableAxis | None = None
     picked: Mapping[Pair, Candidate] | None = None
 
 
@@ -59,8 +59,8 @@ class Loop:
     adjustment and ``after``."""
 
     names: tuple[str, ...]
-    before: Gap
-    after: Gap
+    before: LoopGap
+    after: LoopGap
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ class _Work:
         axis = self.starts.axis or self._axis(step)
         return {name: (axis.turned(-step * k), "turntable") for k, name in enumerate(self.names)}
 
-    def _axis(self, step_deg: float) -> Axis:
+    def _axis(self, step_deg: float) -> TurntableAxis:
         """Found from pairs in a row that register without knowing it."""
         steps = []
         for before, name in pairwise(self.names):
@@ -182,7 +182,7 @@ class _Work:
         if not steps:
             raise Refused("overlap", "No two scans in a row register, so that the turntable's axis cannot be found: "
                           "give the axis, or scan at smaller steps.")  # fmt: skip
-        return axis_of(steps, step_deg)
+        return fit_turntable_axis(steps, step_deg)
 
     def _start(self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str) -> Candidate | None:
         if scan not in known or onto not in known:
@@ -198,7 +198,7 @@ class _Work:
                 for b in there:
                     pair = self.names[a], self.names[b]
                     if not {pair, pair[::-1]} & {*self.found, *self.refused}:
-                        begun = searched(self.scans[a], self.scans[b], self.size)
+                        begun = search_starts(self.scans[a], self.scans[b], self.size)
                         waiting.append((begun[0].score if begun else 0.0, pair, begun))
             for _, pair, begun in sorted(waiting, key=lambda one: -one[0]):
                 if self._try(*pair, None, begun):
@@ -231,13 +231,13 @@ class _Work:
 
     # registering
 
-    def _ready(self, given: tuple[str, Scan | Cloud]) -> Prepared:
+    def _ready(self, given: tuple[str, Scan | Cloud]) -> PreparedScan:
         name, scan = given
         scan = scan if isinstance(scan, Scan) else Scan.from_cloud(scan)
         chosen = slice(None) if scan.trusted is None else scan.trusted
         _check_trusted(name, scan)
         normals = None if scan.normals is None else scan.normals[chosen]
-        made = prepared(name, scan.points[chosen], normals, scan.sigma_mm)
+        made = prepare_scan(name, scan.points[chosen], normals, scan.sigma_mm)
         self.say(self._share + 0.2 / len(self.names))
         return made
 
@@ -298,32 +298,32 @@ class _Work:
         ]  # fmt: skip
 
     def _tree(self) -> tuple[np.ndarray, list[int]]:
-        return graph.tree(len(self.names), self._edges(), self.root)
+        return graph.spanning_poses(len(self.names), self._edges(), self.root)
 
     def _adjusted(self) -> Alignment:
         self.say(0.92)
         pairs, edges = list(self.found), self._edges()
         gates = [self.found[pair].gate_mm for pair in pairs]
-        kept, dropped = agreeing(len(self.names), edges, self.root, gates, self._fits)
+        kept, dropped = select_consistent_edges(len(self.names), edges, self.root, gates, self._fits)
         told = {
             pairs[k]: f"{pairs[k][0]} -> {pairs[k][1]} contradicts the other pairs by {shift:.1f} mm "
             f"and {turn:.1f} degrees, and is left out"
             for k, (shift, turn) in dropped.items()
         }
         edges, pairs = [edges[k] for k in kept], [pairs[k] for k in kept]
-        start, by = graph.tree(len(self.names), edges, self.root)
-        poses = graph.optimised(start, edges, self.root) if len(edges) >= len(self.names) else start
+        start, by = graph.spanning_poses(len(self.names), edges, self.root)
+        poses = graph.optimise_poses(start, edges, self.root) if len(edges) >= len(self.names) else start
         loops = []
         for k, edge in enumerate(edges):
             if k not in by:
                 expected = graph.expected_mm(edge, edges, by)
                 names = tuple(self.names[node] for node in graph.loop_of(edge, edges, by))
-                loops.append(Loop(names, graph.gap(edge, start, expected), graph.gap(edge, poses)))
+                loops.append(Loop(names, graph.loop_gap(edge, start, expected), graph.loop_gap(edge, poses)))
         self.say(1.0)
         return Alignment(
             self.reference,
             dict(zip(self.names, poses, strict=True)),
-            dict(zip(self.names, graph.uncertainties(poses, edges, self.root), strict=True)),
+            dict(zip(self.names, graph.pose_uncertainties(poses, edges, self.root), strict=True)),
             {pair: self.found[pair] for pair in pairs},
             tuple(sorted(loops, key=lambda loop: -loop.before.shift_mm)),
             told,
@@ -349,7 +349,7 @@ def _side_by_side(do: Callable[[Given], Made], each: Sequence[Given]) -> list[Ma
         return list(pool.map(do, each))
 
 
-def _overlap(scan: Prepared, reference: Prepared, T: np.ndarray) -> float:
+def _overlap(scan: PreparedScan, reference: PreparedScan, T: np.ndarray) -> float:
     """Share of the scan that lies on the reference where ``T`` puts it, as far as thinned clouds tell."""
     voxel = reference.size / 80.0
     points = np.asarray(scan.thinned(voxel).points)

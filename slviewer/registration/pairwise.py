@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.registration.freedom import WORDS, Freedom, freedom
+from slviewer.registration.freedom import WORDS, Freedom, estimate_freedom
 from slviewer.registration.open3d_loader import align_icp, open3d
-from slviewer.registration.prepared import Prepared, prepared, scale_of
-from slviewer.registration.refine import Uncertainty, refined
+from slviewer.registration.prepared import PreparedScan, prepare_scan, scale_of
+from slviewer.registration.refine import Uncertainty, refine_pose
 from slviewer.registration.refusal import Refused
-from slviewer.registration.start import SEARCHED, Candidate, Start, apart, ranked_starts
+from slviewer.registration.start import SEARCHED, Candidate, Start, pose_distance, rank_starts
 
 Progress = Callable[[float], None]
 
@@ -81,15 +81,15 @@ def register(
     """
     say = progress or (lambda share: None)
     say(0.0)
-    scan = prepared("scan", scan_points, scan_normals, sigma_mm)
-    reference = prepared("reference", reference_points, reference_normals, sigma_mm)
+    scan = prepare_scan("scan", scan_points, scan_normals, sigma_mm)
+    reference = prepare_scan("reference", reference_points, reference_normals, sigma_mm)
     say(0.3)
     return register_prepared(scan, reference, initial=initial, progress=lambda share: say(0.3 + 0.7 * share))
 
 
 def register_prepared(
-    scan: Prepared,
-    reference: Prepared,
+    scan: PreparedScan,
+    reference: PreparedScan,
     *,
     size: float | None = None,
     initial: np.ndarray | Candidate | None = None,
@@ -101,7 +101,7 @@ def register_prepared(
     say = progress or (lambda share: None)
     size = min(scan.size, reference.size) if size is None else size
     if starts is None:
-        starts = searched(scan, reference, size, initial)
+        starts = search_starts(scan, reference, size, initial)
     refusal: Refused | None = None
     for attempt, start in enumerate(starts[:MOST_ATTEMPTS]):
         say(0.4 + 0.15 * attempt)
@@ -119,8 +119,8 @@ def register_prepared(
     raise refusal or Refused("overlap", "The scan and the reference share nothing to start from: pick point pairs.")
 
 
-def searched(
-    scan: Prepared, reference: Prepared, size: float, initial: np.ndarray | Candidate | None = None
+def search_starts(
+    scan: PreparedScan, reference: PreparedScan, size: float, initial: np.ndarray | Candidate | None = None
 ) -> list[Candidate]:
     """The poses to start from, the best first; ``initial`` alone, brought near, where it is given."""
     if initial is not None and not isinstance(initial, Candidate):
@@ -128,10 +128,10 @@ def searched(
             raise InputError(f"The initial pose has shape {np.shape(initial)}: give a (4, 4) matrix.")
         initial = Candidate(np.asarray(initial, dtype=np.float64), "initial")
     coarse = max(size / 40.0, 2.0 * reference.spacing, 2.0 * scan.spacing)
-    return ranked_starts(scan, reference, float(f"{coarse:.3g}"), initial)
+    return rank_starts(scan, reference, float(f"{coarse:.3g}"), initial)
 
 
-def _judged(scan: Prepared, reference: Prepared, start: Candidate, size: float) -> Registration:
+def _judged(scan: PreparedScan, reference: PreparedScan, start: Candidate, size: float) -> Registration:
     """ICP from a start to the end, and its figures; raises ``Refused`` where they do not convince."""
     scale = scale_of(size)
     T = start.T
@@ -140,19 +140,24 @@ def _judged(scan: Prepared, reference: Prepared, start: Candidate, size: float) 
         loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
         T = align_icp(scan.thinned(voxel * scale), reference.thinned(voxel * scale), T, widest, loss, 1e-6, 40)
     narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * _noise(scan, reference))
-    end = refined(scan, reference, T, widest, narrowest)
+    end = refine_pose(scan, reference, T, widest, narrowest)
     result, held = _figures(scan, reference, end.T, end.gate_mm, end.uncertainty, start.start)
     _refuse_if_doubtful(result, held, size)
     return result
 
 
-def _noise(scan: Prepared, reference: Prepared) -> float:
+def _noise(scan: PreparedScan, reference: PreparedScan) -> float:
     """Of the distance of two points that lie on each other, mm, as far as it is known."""
     return float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
 
 
 def _figures(
-    scan: Prepared, reference: Prepared, T: np.ndarray, gate: float, uncertainty: Uncertainty | None, start: Start
+    scan: PreparedScan,
+    reference: PreparedScan,
+    T: np.ndarray,
+    gate: float,
+    uncertainty: Uncertainty | None,
+    start: Start,
 ) -> tuple[Registration, Freedom]:
     """The figures of a pose, from up to 50,000 scan points against every reference point."""
     spacing = reference.spacing
@@ -168,7 +173,7 @@ def _figures(
     aside = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
     facing = aside < spacing + 0.25 * height  # a point beyond the reference's rim faces nothing
     rms = _rms(height[overlapping])
-    held = freedom(scan, reference, T, counterpart[overlapping], rms)
+    held = estimate_freedom(scan, reference, T, counterpart[overlapping], rms)
     nowhere = Uncertainty(np.full((6, 6), np.inf), np.full(3, np.nan))
     figures = Registration(
         T_reference_scan=T,
@@ -213,7 +218,12 @@ def _refuse_if_doubtful(result: Registration, held: Freedom, size: float) -> Non
 
 
 def _refuse_rivals(
-    scan: Prepared, reference: Prepared, result: Registration, start: Candidate, others: list[Candidate], size: float
+    scan: PreparedScan,
+    reference: PreparedScan,
+    result: Registration,
+    start: Candidate,
+    others: list[Candidate],
+    size: float,
 ) -> None:
     """Raise where another pose fits alike."""
     for other in others:
@@ -223,7 +233,7 @@ def _refuse_rivals(
             rival = _judged(scan, reference, other, size)
         except Refused:
             continue
-        gap = apart(scan.fine_points, result.T_reference_scan, rival.T_reference_scan)
+        gap = pose_distance(scan.fine_points, result.T_reference_scan, rival.T_reference_scan)
         distinct = gap > max(5.0 * result.gate_mm, 10.0 * result.uncertainty.shift_mm)
         alike = rival.overlap >= RIVAL_OVERLAP * result.overlap and rival.rms_mm <= RIVAL_RMS * result.rms_mm
         if distinct and alike:

@@ -14,7 +14,7 @@ _WORST = 0.15
 """Of the picks' extent: what is worse was not the same points, and ICP would not find back."""
 
 
-def picked_start(scan_points: np.ndarray, reference_points: np.ndarray) -> tuple[Candidate, np.ndarray]:
+def fit_picked_start(scan_points: np.ndarray, reference_points: np.ndarray) -> tuple[Candidate, np.ndarray]:
     """The pose that brings three or more picked points (n, 3) mm of the scan onto those of the reference, in order,
     and how far each pair (n,) stays apart in mm.
 

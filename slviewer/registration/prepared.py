@@ -17,7 +17,7 @@ _GRAZING = np.cos(np.radians(75.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class PreparedScan:
     """``points`` (n, 3) float64 mm in the frame of the scan's camera; ``fine``: Open3D's cloud of them, thinned to
     ``voxel`` mm, with unit normals towards the camera, without what is seen at grazing angles; ``spacing``: median
     distance in mm of a point to the next; ``size``: longest side in mm; ``sigma_mm``: expected error of a point."""
@@ -89,9 +89,9 @@ class Prepared:
         return self._thinned[key]
 
 
-def prepared(
+def prepare_scan(
     name: str, points: np.ndarray, normals: np.ndarray | None = None, sigma_mm: float | None = None
-) -> Prepared:
+) -> PreparedScan:
     """Make ready the points ``(n, 3)`` mm of one scan, in the frame of its camera.
 
     ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for errors. Raises
@@ -111,7 +111,7 @@ def prepared(
         )
     thinning = len(points) / len(fine.points)
     spacing = _spacing(cKDTree(np.asarray(fine.points)), np.asarray(fine.points)) / np.sqrt(thinning)
-    return Prepared(points, fine, voxel, float(spacing), size, sigma_mm)
+    return PreparedScan(points, fine, voxel, float(spacing), size, sigma_mm)
 
 
 def scale_of(size: float) -> float:

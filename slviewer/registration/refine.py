@@ -12,7 +12,7 @@ import numpy as np
 
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.registration.prepared import Prepared
+from slviewer.registration.prepared import PreparedScan
 
 _STEPS = 12
 _SETTLED_MM, _NEAR_MM = 2e-3, 5e-3
@@ -50,7 +50,7 @@ class Uncertainty:
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class RefinedPose:
     """``T`` (4, 4) maps the scan into the reference's frame; ``gate_mm``: how far apart along their normals a pair's
     points may lie."""
 
@@ -59,7 +59,9 @@ class Refined:
     uncertainty: Uncertainty | None
 
 
-def refined(scan: Prepared, reference: Prepared, T: np.ndarray, widest: float, narrowest: float) -> Refined:
+def refine_pose(
+    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, widest: float, narrowest: float
+) -> RefinedPose:
     """Symmetric point-to-plane ICP on the thinned clouds, from a pose that is right within ``widest`` mm.
 
     The gate closes from ``widest`` to three times the residuals' noise, but not below ``narrowest``. Without enough
@@ -70,7 +72,7 @@ def refined(scan: Prepared, reference: Prepared, T: np.ndarray, widest: float, n
     for _ in range(_STEPS):
         pairs = _pairs(scan, reference, T, gate, lateral, stride)
         if pairs is None:
-            return Refined(T, gate, None)
+            return RefinedPose(T, gate, None)
         arm, normal, residual = pairs
         centre = arm.mean(axis=0)
         sigma = max(robust_sigma(residual, about=0.0), 1e-6)
@@ -85,11 +87,11 @@ def refined(scan: Prepared, reference: Prepared, T: np.ndarray, widest: float, n
             stride = least  # the last steps are of many more points
         gate = closed
     pairs = _pairs(scan, reference, T, gate, lateral, stride)
-    return Refined(T, gate, None if pairs is None else _uncertainty(*pairs))
+    return RefinedPose(T, gate, None if pairs is None else _uncertainty(*pairs))
 
 
 def _pairs(
-    scan: Prepared, reference: Prepared, T: np.ndarray, gate: float, lateral: float, stride: int = 1
+    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, gate: float, lateral: float, stride: int = 1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Scan points in the reference's frame (n, 3), the pairs' mean normals (n, 3) and residuals (n,) in mm."""
     points = move_points(T, scan.fine_points[::stride])

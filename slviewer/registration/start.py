@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.geometry.rigid import fit_rigid, rigid_transform
 from slviewer.registration.open3d_loader import align_icp, open3d
-from slviewer.registration.prepared import Prepared
+from slviewer.registration.prepared import PreparedScan
 
 Start = Literal["features", "centroids", "initial", "picked", "turntable"]
 """How a start was found: searched for (the first two); the last pose, picked points, the turntable's angle."""
@@ -35,7 +35,7 @@ class Candidate:
     score: float = float("nan")
 
 
-def candidates(scan: Prepared, reference: Prepared, voxel: float) -> Iterator[Candidate]:
+def candidates(scan: PreparedScan, reference: PreparedScan, voxel: float) -> Iterator[Candidate]:
     """The poses worth trying, features first, from the clouds thinned to ``voxel`` mm."""
     for T in _feature_poses(scan, reference, voxel):
         yield Candidate(T, "features")
@@ -43,8 +43,8 @@ def candidates(scan: Prepared, reference: Prepared, voxel: float) -> Iterator[Ca
     yield Candidate(rigid_transform(np.eye(3), shift), "centroids")
 
 
-def ranked_starts(
-    scanned: Prepared, referred: Prepared, voxel: float, initial: Candidate | None = None
+def rank_starts(
+    scanned: PreparedScan, referred: PreparedScan, voxel: float, initial: Candidate | None = None
 ) -> list[Candidate]:
     """The candidates after a coarse ICP, each pose once, that with the largest part of the scan on the reference first.
 
@@ -58,12 +58,12 @@ def ranked_starts(
         T = candidate.T
         for gate in (6.0 * voxel, 3.0 * voxel, 1.5 * voxel):
             T = align_icp(scan, reference, T, gate, open3d().pipelines.registration.L2Loss(), 1e-5, 20)
-        if all(apart(np.asarray(scan.points), T, other.T) > 0.5 * voxel for other in found):
+        if all(pose_distance(np.asarray(scan.points), T, other.T) > 0.5 * voxel for other in found):
             found.append(Candidate(T, candidate.start, _score(scan, reference, tree, T, voxel)))
     return sorted(found, key=lambda candidate: -candidate.score)
 
 
-def apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
+def pose_distance(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
     """How far, in mm, two poses put some 20 of the points from each other at most."""
     probe = points[:: max(1, len(points) // 20)]
     return float(np.abs(probe @ (T - other)[:3, :3].T + (T - other)[:3, 3]).max())
@@ -84,7 +84,7 @@ def _score(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float
     return float(on.sum() / len(points) * on.sum() / near.sum())
 
 
-def _feature_poses(scanned: Prepared, referred: Prepared, voxel: float) -> list[np.ndarray]:
+def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) -> list[np.ndarray]:
     """Up to six different poses, those on which most feature matches agree; none where there is nothing to match."""
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
     features = [one.features(voxel) for one in (scanned, referred)]
@@ -113,7 +113,7 @@ def _feature_poses(scanned: Prepared, referred: Prepared, voxel: float) -> list[
     for k in np.argsort(-votes, kind="stable"):
         if len(poses) == _CANDIDATES or votes[k] < max(4.0, _LEAST_VOTES * votes.max()):
             break
-        if all(apart(p, motions[k], other) > 5.0 * voxel for other in poses):
+        if all(pose_distance(p, motions[k], other) > 5.0 * voxel for other in poses):
             poses.append(motions[k])
     return poses
 

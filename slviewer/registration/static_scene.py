@@ -44,7 +44,7 @@ _NEIGHBOURS = 15
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
+class SurfaceSamples:
     """A scan thinned: ``points`` (n, 3) mm, unit ``normals`` (n, 3) towards the camera, a ``tree`` of its
     rays (x/z, y/z), the distance ``apart`` (n,) to the fourth nearest of them, the ``own`` tree of the points, and the
     ``neighbours`` (n, 8) of each."""
@@ -93,19 +93,19 @@ def register_object(
     ``progress`` receives the share of the work done, 0 to 1, and may raise to cancel.
     """
     say = progress or (lambda share: None)
-    views = {name: sampled(cloud.measured) for name, cloud in clouds.items()}
+    views = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
     alignment, static = None, _unmoved(clouds, views)
     if any(mask.any() for mask in static.values()):
         alignment, static = _moving(clouds, views, static, reference, starts, lambda done: say(0.5 * done))
     if alignment is None:
         alignment = register_all(clouds, reference, starts, lambda done: say(0.5 + 0.2 * done))
-        static = static_points(clouds, views, alignment)
+        static = detect_static_points(clouds, views, alignment)
     begun = {pair: found.start for pair, found in alignment.pairs.items()}
     whole, every = clouds, views
     for _ in range(ROUNDS):
         if not any(mask.any() for mask in static.values()):
             break
-        moving = without(whole, static)
+        moving = remove_points(whole, static)
         again = _registered(moving, reference, Starts(poses=alignment.T_reference_scan), lambda done: say(0.9))
         if again is None:  # too little is left of a scan: what moved with it may be needed to hold it
             static = {name: np.zeros_like(mask) for name, mask in static.items()}
@@ -113,8 +113,8 @@ def register_object(
             break
         pairs = {pair: replace(found, start=begun.get(pair, found.start)) for pair, found in again.pairs.items()}
         alignment, clouds = replace(again, pairs=pairs), moving
-        views = {name: sampled(cloud.measured) for name, cloud in clouds.items()}
-        before, static = static, static_points(whole, every, alignment)
+        views = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
+        before, static = static, detect_static_points(whole, every, alignment)
         if all(np.count_nonzero(static[n] ^ before[n]) < SETTLED * before[n].size for n in static):
             static = before
             break
@@ -127,7 +127,7 @@ def register_object(
     return ObjectAlignment(alignment, clouds, static, contradictions)
 
 
-def without(clouds: Mapping[str, Cloud], static: Mapping[str, np.ndarray]) -> dict[str, Cloud]:
+def remove_points(clouds: Mapping[str, Cloud], static: Mapping[str, np.ndarray]) -> dict[str, Cloud]:
     """The clouds less the points at ``static`` (h, w) bool."""
     return {
         name: replace(cloud, points=np.where(static[name][..., None], np.float32(np.nan), cloud.points))
@@ -146,21 +146,21 @@ def _registered(
 
 def _moving(
     clouds: Mapping[str, Cloud],
-    views: Mapping[str, Sampled],
+    views: Mapping[str, SurfaceSamples],
     unmoved: Mapping[str, np.ndarray],
     reference: str,
     starts: Starts | None,
     progress: Progress,
 ) -> tuple[Alignment | None, dict[str, np.ndarray]]:
     """The motion of what does not agree ``unmoved``, and what stands still beside it; None where there is none."""
-    alignment = _registered(without(clouds, unmoved), reference, starts, progress)
+    alignment = _registered(remove_points(clouds, unmoved), reference, starts, progress)
     if alignment is None:
         return None, {}
-    static = static_points(clouds, views, alignment)
+    static = detect_static_points(clouds, views, alignment)
     return (alignment, static) if any(mask.any() for mask in static.values()) else (None, {})
 
 
-def _unmoved(clouds: Mapping[str, Cloud], views: Mapping[str, Sampled]) -> dict[str, np.ndarray]:
+def _unmoved(clouds: Mapping[str, Cloud], views: Mapping[str, SurfaceSamples]) -> dict[str, np.ndarray]:
     """By scan, (h, w) bool: the points that agree with the next scan's where neither is moved; all False where these
     are nearly none of a scan, or too little is left."""
     votes = {name: np.zeros(len(view.points)) for name, view in views.items()}
@@ -168,7 +168,7 @@ def _unmoved(clouds: Mapping[str, Cloud], views: Mapping[str, Sampled]) -> dict[
     for one, other in pairwise(clouds):
         gate = SIGMAS * float(np.hypot(np.nan_to_num(sigma[one]), np.nan_to_num(sigma[other])))
         for scan, onto in ((one, other), (other, one)):
-            height = np.abs(heights(views[scan], views[onto], np.eye(4)))
+            height = np.abs(heights_above(views[scan], views[onto], np.eye(4)))
             with np.errstate(invalid="ignore"):
                 votes[scan] += (height <= gate).astype(float) - (height > gate)
     static = {name: _static_pixels(clouds[name], views[name], votes[name]) for name in clouds}
@@ -179,7 +179,7 @@ def _unmoved(clouds: Mapping[str, Cloud], views: Mapping[str, Sampled]) -> dict[
     return static
 
 
-def sampled(points: np.ndarray) -> Sampled:
+def sample_surface(points: np.ndarray) -> SurfaceSamples:
     """The measured points (n, 3) mm of a scan, in its camera's frame, as the comparisons below take them."""
     o3d = open3d()
     points = np.asarray(points, np.float64)
@@ -194,10 +194,10 @@ def sampled(points: np.ndarray) -> Sampled:
     tree, own = cKDTree(thin[:, :2] / thin[:, 2:]), cKDTree(thin)
     apart = tree.query(tree.data, k=min(5, len(thin)))[0][:, -1]
     neighbours = own.query(thin, k=min(8, len(thin)))[1]
-    return Sampled(thin, normals, tree, apart, own, neighbours)
+    return SurfaceSamples(thin, normals, tree, apart, own, neighbours)
 
 
-def heights(scan: Sampled, onto: Sampled, T: np.ndarray) -> np.ndarray:
+def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> np.ndarray:
     """(n,) mm: how far a scan's samples, carried over by ``T`` (4, 4), lie in front of another scan's surface
     (negative: behind, hidden by it), along that surface's normal; NaN where the other saw nothing.
 
@@ -214,16 +214,16 @@ def heights(scan: Sampled, onto: Sampled, T: np.ndarray) -> np.ndarray:
     return out
 
 
-def contradiction(scan: Sampled, onto: Sampled, T: np.ndarray, widest_mm: float) -> SceneContradiction:
+def contradiction(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray, widest_mm: float) -> SceneContradiction:
     """How much of two scans contradicts where ``T`` (4, 4) puts the first on the second, seen from either; points of
     one surface lie within ``widest_mm``."""
-    height = np.concatenate([heights(scan, onto, T), heights(onto, scan, np.linalg.inv(T))])
-    gate = gate_of(height, widest_mm)
+    height = np.concatenate([heights_above(scan, onto, T), heights_above(onto, scan, np.linalg.inv(T))])
+    gate = estimate_gate(height, widest_mm)
     known = height[np.isfinite(height)]
     return SceneContradiction(len(known), float(np.mean(known > gate)) if len(known) else 0.0, gate)
 
 
-def gate_of(height: np.ndarray, widest_mm: float) -> float:
+def estimate_gate(height: np.ndarray, widest_mm: float) -> float:
     """mm: ``SIGMAS`` times the scatter of heights that lie on each other, by the least quarter of those within
     ``widest_mm``: up to half of these may belong to another motion."""
     near = np.abs(height[np.abs(height) < widest_mm])
@@ -231,8 +231,8 @@ def gate_of(height: np.ndarray, widest_mm: float) -> float:
     return min(SIGMAS * scatter, widest_mm)
 
 
-def static_points(
-    clouds: Mapping[str, Cloud], views: Mapping[str, Sampled], alignment: Alignment
+def detect_static_points(
+    clouds: Mapping[str, Cloud], views: Mapping[str, SurfaceSamples], alignment: Alignment
 ) -> dict[str, np.ndarray]:
     """By scan, (h, w) bool: the points that stand still in the camera's frame while the rest moves as ``alignment``
     says.
@@ -246,8 +246,11 @@ def static_points(
     for (one, other), found in alignment.pairs.items():
         for scan, onto in ((one, other), (other, one)):
             T = np.linalg.inv(poses[onto]) @ poses[scan]
-            moved, unmoved = heights(views[scan], views[onto], T), heights(views[scan], views[onto], np.eye(4))
-            gate = gate_of(moved, found.gate_mm)
+            moved, unmoved = (
+                heights_above(views[scan], views[onto], T),
+                heights_above(views[scan], views[onto], np.eye(4)),
+            )
+            gate = estimate_gate(moved, found.gate_mm)
             with np.errstate(invalid="ignore"):
                 static = (np.abs(unmoved) <= gate) & (np.abs(moved) > gate)
                 moving = (np.abs(moved) <= gate) & (np.abs(unmoved) > gate)
@@ -255,7 +258,7 @@ def static_points(
     return {name: _static_pixels(clouds[name], views[name], votes[name]) for name in clouds}
 
 
-def _static_pixels(cloud: Cloud, view: Sampled, votes: np.ndarray) -> np.ndarray:
+def _static_pixels(cloud: Cloud, view: SurfaceSamples, votes: np.ndarray) -> np.ndarray:
     """(h, w) bool at the cloud's own resolution: what stands still, by the votes (n,) of the samples."""
     mask = cloud.mask
     out = np.zeros(mask.shape, bool)

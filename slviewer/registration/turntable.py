@@ -14,7 +14,7 @@ _OFF_DEG = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Axis:
+class TurntableAxis:
     """The table's axis in the camera's frame: a ``point`` (3,) mm on it, and its ``direction`` (3,), about which the
     table turns the right-handed way."""
 
@@ -27,7 +27,7 @@ class Axis:
         return turn_about(np.radians(deg) * unit, self.point)
 
 
-def axis_of(steps: Sequence[np.ndarray], step_deg: float) -> Axis:
+def fit_turntable_axis(steps: Sequence[np.ndarray], step_deg: float) -> TurntableAxis:
     """The axis, from how scans lie on the ones before them (``T`` (4, 4) each), one step of ``step_deg`` apart.
 
     It points so that the table turns by ``step_deg`` from each scan to the next. Raises ``InputError`` where a step
@@ -51,4 +51,4 @@ def axis_of(steps: Sequence[np.ndarray], step_deg: float) -> Axis:
     left = np.vstack([np.eye(3) - T[:3, :3] for T in steps])
     right = np.concatenate([T[:3, 3] for T in steps])
     # nothing fixes the place along the axis: the one nearest the camera is as good as any
-    return Axis(np.linalg.lstsq(left, right, rcond=1e-3)[0], direction / np.linalg.norm(direction))
+    return TurntableAxis(np.linalg.lstsq(left, right, rcond=1e-3)[0], direction / np.linalg.norm(direction))

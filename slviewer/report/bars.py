@@ -5,7 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.report.canvas import FULL, INK, REGIONS, SMALL_PT, finish, legend, model_colour, new_figure, tidy
+from slviewer.report.canvas import (
+    FULL,
+    INK,
+    REGIONS,
+    SMALL_PT,
+    finish_figure,
+    legend,
+    model_colour,
+    new_figure,
+    style_axes,
+)
 from slviewer.report.data import PlaneRow
 from slviewer.report.page import Figure
 
@@ -20,7 +30,7 @@ def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
     upper, lower = drawing.subplots(2, 1, height_ratios=(4.4, 1), sharex=True)
     at = np.arange(len(rows), dtype=float)
     width = 0.8 / len(models)
-    tidy(upper, "", "", "plane RMS, mm")
+    style_axes(upper, "", "", "plane RMS, mm")
     upper.grid(False, axis="x")
     for i, model in enumerate(models):
         x = at + (i - (len(models) - 1) / 2) * width
@@ -67,7 +77,7 @@ def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
     )
     upper.tick_params(labelbottom=False)
 
-    tidy(lower, "", "", "share", grid=False)
+    style_axes(lower, "", "", "share", grid=False)
     bottom = np.zeros(len(rows))
     for region in ("R1", "R2", "R3"):
         share = np.array([row.incidence.get(region, 0.0) for row in rows]) / 100
@@ -79,7 +89,7 @@ def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
     lower.set_xlim(-0.6, len(rows) - 0.4)
     lower.set_xticks(at, [row.name for row in rows], fontsize=SMALL_PT, rotation=45 if len(rows) > 14 else 0)
     legend(lower, loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True, handlelength=1.0)
-    return finish(
+    return finish_figure(
         drawing,
         "RMS distance of the flat board from its own plane, by model. Black ticks: what the capture's noise alone "
         "would give. Rings: the Letter's own figures, from its rig. Below: the share of each board in R1, R2 and R3.",

@@ -43,7 +43,7 @@ def new_figure(width: int, height: int) -> Any:
     return Drawing(figsize=(width / 100, height / 100), dpi=100 * DENSITY, facecolor="white", layout="constrained")
 
 
-def finish(drawing: Any, caption: str, alt: str, *, shaded: bool = False) -> Figure:
+def finish_figure(drawing: Any, caption: str, alt: str, *, shaded: bool = False) -> Figure:
     """Draw, and make it a report's figure: a PNG of 256 colours, less than half the size of full colour.
 
     ``shaded`` pictures, which would show bands in 256 colours, keep 64 levels a channel.
@@ -97,7 +97,7 @@ def _unpacked(colours: np.ndarray) -> np.ndarray:
     return np.stack([colours >> 16, colours >> 8 & 255, colours & 255], axis=-1).astype(np.uint8)
 
 
-def tidy(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK) -> None:
+def style_axes(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK) -> None:
     """Quiet axes: a light grid, two spines, labels in the page's sizes; ``x`` and ``y`` name quantity and unit."""
     axes.set_title(title, fontsize=TITLE_PT, color=colour, loc="left", fontweight="bold", pad=7)
     axes.set_xlabel(x, fontsize=TEXT_PT, color=SOFT)
@@ -112,9 +112,9 @@ def tidy(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = T
         axes.set_axisbelow(True)
 
 
-def bare(axes: Any, title: str = "", colour: str = INK) -> None:
+def style_image_axes(axes: Any, title: str = "", colour: str = INK) -> None:
     """Axes of an image: a title and nothing else."""
-    tidy(axes, title, grid=False, colour=colour)
+    style_axes(axes, title, grid=False, colour=colour)
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
@@ -135,7 +135,7 @@ def colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) 
     bar.outline.set_visible(False)
 
 
-def shrink(image: np.ndarray, width: int) -> np.ndarray:
+def shrink_map(image: np.ndarray, width: int) -> np.ndarray:
     """(h, w) float averaged over squares of whole pixels until it is at most ``width`` wide.
 
     A square is NaN where fewer than half of its pixels are finite.
@@ -156,7 +156,7 @@ def shrink(image: np.ndarray, width: int) -> np.ndarray:
     return out
 
 
-def rounded_up(value: float) -> float:
+def round_up(value: float) -> float:
     """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten; 1 for nothing finite above zero."""
     if not (np.isfinite(value) and value > 0):
         return 1.0

@@ -4,10 +4,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slviewer.report.canvas import DENSITY, FULL, HALF, INK, TEXT_PT, bare, colour_bar, finish, legend, new_figure
+from slviewer.report.canvas import (
+    DENSITY,
+    FULL,
+    HALF,
+    INK,
+    TEXT_PT,
+    colour_bar,
+    finish_figure,
+    legend,
+    new_figure,
+    style_image_axes,
+)
 from slviewer.report.data import CloudView
 from slviewer.report.page import Figure
-from slviewer.report.shaded import render, view_rotation
+from slviewer.report.shaded import render_points, view_rotation
 
 YAW_DEG, PITCH_DEG = 24.0, 18.0
 SCANS = ("#5b8fd0", "#e0a13c", "#63b28a", "#c8718f", "#8f83c9")
@@ -20,7 +31,7 @@ SQUARES, FINER = 14, 8
 """Squares across a chequered view, and how much finer it is told which scans measured there."""
 
 
-def clouds(views: Sequence[CloudView]) -> Figure:
+def draw_clouds(views: Sequence[CloudView]) -> Figure:
     """The scans side by side, each coloured by its own depth."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -39,14 +50,14 @@ def clouds(views: Sequence[CloudView]) -> Figure:
         z = points[:, 2]
         near, far = (np.percentile(z, [1, 99]) if len(z) else (0.0, 1.0)) + np.array([-1e-3, 1e-3])
         shades = palette(np.clip((z - near) / (far - near), 0, 1))[:, :3]
-        picture = render(points, normals, shades, size, view_rotation(YAW_DEG, PITCH_DEG))
-        bare(ax, view.name)
+        picture = render_points(points, normals, shades, size, view_rotation(YAW_DEG, PITCH_DEG))
+        style_image_axes(ax, view.name)
         ax.imshow(picture)
         ax.set_xlabel(_counted(view), fontsize=TEXT_PT, color=INK, loc="left")
         colour_bar(drawing, ScalarMappable(Normalize(near, far), palette), ax, "z, mm", shrink=0.7, aspect=20)
     for ax in axes[len(views) :]:
         ax.set_axis_off()
-    return finish(
+    return finish_figure(
         drawing,
         "Each scan as measured, seen from above and aside, lit by its own surface normals and coloured by depth.",
         "Shaded views of " + ", ".join(f"{view.name} ({_counted(view)})" for view in views),
@@ -54,25 +65,25 @@ def clouds(views: Sequence[CloudView]) -> Figure:
     )
 
 
-def merged_cloud(view: CloudView) -> Figure:
+def draw_merged_cloud(view: CloudView) -> Figure:
     """The merged cloud: lit as one surface, and coloured by the scan that each point comes from."""
     points, normals, source = _sampled(view)
     size = (2 * HALF - 40, 2 * HALF - 240)
     rotation = view_rotation(YAW_DEG, PITCH_DEG)
     drawing = new_figure(FULL, HALF - 40)
     left, right = drawing.subplots(1, 2)
-    bare(left, "as one surface")
-    left.imshow(render(points, normals, np.broadcast_to(CLAY, points.shape), size, rotation))
+    style_image_axes(left, "as one surface")
+    left.imshow(render_points(points, normals, np.broadcast_to(CLAY, points.shape), size, rotation))
     left.set_xlabel(_counted(view), fontsize=TEXT_PT, color=INK, loc="left")
-    bare(right, "by scan, in turns")
+    style_image_axes(right, "by scan, in turns")
     palette = np.array([_rgb(colour) for colour in SCANS])
     shown = _mosaic(points, source) if len(points) else np.arange(0)
     points, normals, source = points[shown], normals[shown], source[shown]
-    right.imshow(render(points, normals, palette[source % len(SCANS)], size, rotation))
+    right.imshow(render_points(points, normals, palette[source % len(SCANS)], size, rotation))
     for i, name in enumerate(view.names):
         right.plot([], [], "s", color=SCANS[i % len(SCANS)], markersize=8, label=name)
     legend(right, loc="upper left", bbox_to_anchor=(0, 0), ncols=max(len(view.names), 1), handletextpad=0.2)
-    return finish(
+    return finish_figure(
         drawing,
         "The merged cloud in the reference scan's frame. Right: each square shows the points of one scan alone, so "
         "that a step where squares meet would be a misalignment.",

@@ -3,7 +3,7 @@
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.report.canvas import FULL, HALF, INK, MODELS, SOFT, finish, legend, new_figure, tidy
+from slviewer.report.canvas import FULL, HALF, INK, MODELS, SOFT, finish_figure, legend, new_figure, style_axes
 from slviewer.report.data import PixelCurve
 from slviewer.report.page import Figure
 
@@ -42,8 +42,10 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
     for i, ((title, along, name, at, value, fitted), rms) in enumerate(zip(panels, curve.rms_mm, strict=True)):
         upper = drawing.add_subplot(grid[i, 0] if narrow else grid[0, i])
         lower = drawing.add_subplot(grid[i, 1] if narrow else grid[1, i], sharex=upper)
-        tidy(upper, f"{title}: RMS {1e3 * rms:.0f} µm" if narrow else title, along if narrow else "", f"{name}, mm")
-        tidy(lower, "", along, f"{name} - fit, µm")
+        style_axes(
+            upper, f"{title}: RMS {1e3 * rms:.0f} µm" if narrow else title, along if narrow else "", f"{name}, mm"
+        )
+        style_axes(lower, "", along, f"{name} - fit, µm")
         upper.tick_params(labelbottom=narrow)
         if at.size:
             margin = 0.06 * (np.ptp(at) or 1.0)
@@ -63,7 +65,7 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
         lower.axhline(0, color=SOFT, linewidth=0.8)
     u, v = curve.pixel
     said = ", ".join(f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True))
-    return finish(
+    return finish_figure(
         drawing,
         f"What camera pixel ({u}, {v}) learnt from {at.size} target poses: z as a rational function of the absolute "
         f"phase of axis {curve.axis}, x and y as lines through the camera's centre. "

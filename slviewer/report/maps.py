@@ -14,16 +14,16 @@ from slviewer.report.canvas import (
     INK,
     SOFT,
     TITLE_PT,
-    bare,
     colour_bar,
-    finish,
+    finish_figure,
     legend,
     model_colour,
     new_figure,
     percentile,
-    rounded_up,
-    shrink,
-    tidy,
+    round_up,
+    shrink_map,
+    style_axes,
+    style_image_axes,
 )
 from slviewer.report.page import Figure
 
@@ -51,8 +51,8 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
         places = list(drawing.subplots(1, 3))
     medians = [percentile(rms, 50) for rms in rms_mm]
     for axes, name, rms, median in zip(places, "zxy", rms_mm, medians, strict=True):
-        top = rounded_up(percentile(rms, 99))
-        bare(axes, f"{name}: {_median(median)}")
+        top = round_up(percentile(rms, 99))
+        style_image_axes(axes, f"{name}: {_median(median)}")
         image = axes.imshow(
             _shown(rms, width if narrow else width // 3),
             cmap=_map("viridis", 100),
@@ -63,7 +63,7 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
         )
         colour_bar(drawing, image, axes, "" if narrow and name != "z" else "RMS of the fit, mm", extend="max")
     named = f" along axis {axis}" if axis else ""
-    return finish(
+    return finish_figure(
         drawing,
         f"RMS of each camera pixel's fit over the target poses{named}, in z, x and y. Each colour scale ends at the "
         "99th percentile; grey pixels saw the board too rarely to be fitted.",
@@ -97,7 +97,9 @@ def error_maps(
     drawing.suptitle(title, x=0.004, ha="left", fontsize=TITLE_PT + 1.5, color=INK, fontweight="bold")
     image = None
     for ax, (model, errors) in zip(axes, cropped.items(), strict=True):
-        bare(ax, f"{model}: {'RMS ' if map_width > WIDE_PX else ''}{rms_mm[model]:.3f} mm", model_colour(model))
+        style_image_axes(
+            ax, f"{model}: {'RMS ' if map_width > WIDE_PX else ''}{rms_mm[model]:.3f} mm", model_colour(model)
+        )
         image = ax.imshow(
             _shown(errors, map_width),
             cmap=_map("RdBu_r", 101),
@@ -109,7 +111,7 @@ def error_maps(
     colour_bar(drawing, image, axes, "error, mm", extend="both")
     _histogram(histogram, cropped, rms_mm, floor_mm, limit)
     said = ", ".join(f"{model} {rms_mm[model]:.3f} mm" for model in maps)
-    return finish(
+    return finish_figure(
         drawing,
         f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus the RMS"
         f"{_floor_words(floor_mm)}.",
@@ -120,7 +122,7 @@ def error_maps(
 def error_limit(maps: list[np.ndarray]) -> float:
     """Where a symmetric colour scale for all of ``maps`` ends, mm: 99 % of the errors lie within."""
     samples = [m.ravel()[:: max(1, m.size // 300_000)] for m in maps]
-    return rounded_up(percentile(np.abs(np.concatenate(samples)), 99))
+    return round_up(percentile(np.abs(np.concatenate(samples)), 99))
 
 
 def _layout(width: int, count: int, aspect: float) -> tuple[Any, Any, Any, int]:
@@ -156,7 +158,7 @@ def _histogram(
     reach = 1.25 * limit
     edges = np.linspace(-reach, reach, BINS)
     centres = (edges[1:] + edges[:-1]) / 2
-    tidy(axes, "", "error, mm", "share of points")
+    style_axes(axes, "", "error, mm", "share of points")
     for model, errors in maps.items():
         finite = errors[np.isfinite(errors)]
         counts, _ = np.histogram(finite, BINS - 1, (-reach, reach))
@@ -190,7 +192,7 @@ def _box(maps: list[np.ndarray]) -> tuple[slice, slice]:
 
 def _shown(image: np.ndarray, width: int) -> np.ma.MaskedArray:
     """As fine as it will be drawn, invalid pixels masked."""
-    return np.ma.masked_invalid(shrink(image, DENSITY * width))
+    return np.ma.masked_invalid(shrink_map(image, DENSITY * width))
 
 
 def _map(name: str, levels: int) -> Any:

@@ -12,18 +12,18 @@ from slviewer.report.canvas import (
     FULL,
     SOFT,
     TEXT_PT,
-    bare,
     colour_bar,
-    finish,
+    finish_figure,
     legend,
     new_figure,
-    rounded_up,
-    tidy,
+    round_up,
+    style_axes,
+    style_image_axes,
 )
 from slviewer.report.data import DeviationView, MeasurementRow, SectionView
 from slviewer.report.page import Cell, Column, Figure, Item, Mark, PageNotice, Section, Table
-from slviewer.report.shaded import render, view_rotation
-from slviewer.report.tables import UNKNOWN, number
+from slviewer.report.shaded import render_points, view_rotation
+from slviewer.report.tables import UNKNOWN, format_number
 
 YAW_DEG, PITCH_DEG = 12.0, 10.0
 PICTURE = (560, 420)
@@ -52,7 +52,7 @@ def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[Sect
             digits = 1 if q.unit == "%" else 4
             U = UNKNOWN if q.U is None else f"{q.U:.{digits}f}{'' if q.whole else ' *'}"
             unit = "°" if q.unit == "deg" else q.unit
-            body.append([*named, q.name, number(q.value, digits), unit, U, where])
+            body.append([*named, q.name, format_number(q.value, digits), unit, U, where])
             named, where = ["", "", ""], ""
     columns = [Column("measurement", align="left"), Column("kind", align="left"), Column("scan", align="left")]
     columns += [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
@@ -76,14 +76,14 @@ def section_plot(view: SectionView) -> Figure:
     high = int(np.clip(FULL * height / width + 90, LEAST_HIGH, MOST_HIGH))
     drawing = new_figure(FULL, high)
     axes = drawing.subplots()
-    tidy(axes, view.name, "along, mm", "height, mm")
+    style_axes(axes, view.name, "along, mm", "height, mm")
     for line in view.lines:
         axes.plot(*_thinned(line).T, color=LINE, linewidth=1.3)
     # flat sections are raised, and it is said: to scale nothing would be seen of them
     raised = FULL / high * height / width < 0.15
     axes.set_aspect("auto" if raised else "equal", adjustable="datalim")
     told = "heights are drawn larger than lengths" if raised else "lengths and heights are drawn alike"
-    return finish(
+    return finish_figure(
         drawing,
         f"{view.name}: the surface where a plane cuts it; {told}.",
         f"Section {view.name}, {width:.1f} mm long and {height:.2f} mm high",
@@ -132,23 +132,33 @@ def _table(view: DeviationView) -> Table:
         return "" if verdict is None else _decided(verdict[key][1])
 
     rows: list[list[str | Cell]] = [
-        ["mean", number(numbers["mean"], 4, signed=True), "mm", ""],
-        ["RMS", number(numbers["rms"], 4), "mm", ""],
-        ["RMS of the scan's noise alone", number(found["noise_mm"], 4), "mm", ""],
-        ["95 % of the points are off by less than", number(numbers["within_95"], 4), "mm", ""],
-        ["range of 99.7 % of the points, lower end", number(numbers["p_low"], 4, signed=True), "mm", end("lowest")],
-        ["range of 99.7 % of the points, upper end", number(numbers["p_high"], 4, signed=True), "mm", end("highest")],
+        ["mean", format_number(numbers["mean"], 4, signed=True), "mm", ""],
+        ["RMS", format_number(numbers["rms"], 4), "mm", ""],
+        ["RMS of the scan's noise alone", format_number(found["noise_mm"], 4), "mm", ""],
+        ["95 % of the points are off by less than", format_number(numbers["within_95"], 4), "mm", ""],
+        [
+            "range of 99.7 % of the points, lower end",
+            format_number(numbers["p_low"], 4, signed=True),
+            "mm",
+            end("lowest"),
+        ],
+        [
+            "range of 99.7 % of the points, upper end",
+            format_number(numbers["p_high"], 4, signed=True),
+            "mm",
+            end("highest"),
+        ],
         ["lowest, highest point", f"{numbers['lowest']:+.3f}, {numbers['highest']:+.3f}".replace("-", "−"), "mm", ""],
     ]
     if verdict is not None:
         rows += [
-            ["expanded uncertainty U of a point, k = 2", number(verdict["U_mm"], 4), "mm", ""],
-            [f"within ± {verdict['tolerance_mm']:g} mm", number(verdict["within"], 2), "%", ""],
-            ["inside by more than U", number(verdict["inside"], 2), "%", ""],
-            ["outside by more than U", number(verdict["outside"], 2), "%", ""],
-            ["too close to tell", number(verdict["close"], 2), "%", ""],
+            ["expanded uncertainty U of a point, k = 2", format_number(verdict["U_mm"], 4), "mm", ""],
+            [f"within ± {verdict['tolerance_mm']:g} mm", format_number(verdict["within"], 2), "%", ""],
+            ["inside by more than U", format_number(verdict["inside"], 2), "%", ""],
+            ["outside by more than U", format_number(verdict["outside"], 2), "%", ""],
+            ["too close to tell", format_number(verdict["close"], 2), "%", ""],
         ]
-    rows.append(["area of the nominal that was measured", number(100 * found["coverage"], 1), "%", ""])
+    rows.append(["area of the nominal that was measured", format_number(100 * found["coverage"], 1), "%", ""])
     share = 100 * numbers["left_out"] / max(numbers["points"] + numbers["left_out"], 1)
     notes = [
         f"{numbers['points']:,} points. {numbers['left_out']:,} ({share:.1f} %) lie farther than "
@@ -189,7 +199,7 @@ def deviation_picture(view: DeviationView) -> Figure:
     verdict = view.found["verdict"]
     tolerance = None if verdict is None else float(verdict["tolerance_mm"])
     limit = colour_limit(view.signed, tolerance)
-    limit = rounded_up(limit) if tolerance is None else limit
+    limit = round_up(limit) if tolerance is None else limit
     palette = ListedColormap(deviation_colours(np.linspace(-1, 1, 255), 1.0) / 255)
     drawing = new_figure(FULL, 480)
     left, right = drawing.subplots(1, 2, width_ratios=(1.35, 1))
@@ -198,20 +208,20 @@ def deviation_picture(view: DeviationView) -> Figure:
     normals = np.concatenate([view.normals, np.full(view.uncovered.shape, np.nan)])
     grey = np.broadcast_to(np.array(LEFT_OUT, np.uint8), view.uncovered.shape)
     colours = np.concatenate([deviation_colours(view.signed, limit), grey]) / 255.0
-    bare(left, f"{view.source} against {view.nominal}")
+    style_image_axes(left, f"{view.source} against {view.nominal}")
     left.imshow(
-        render(points, normals, colours, (DENSITY * width, DENSITY * height), view_rotation(YAW_DEG, PITCH_DEG))
+        render_points(points, normals, colours, (DENSITY * width, DENSITY * height), view_rotation(YAW_DEG, PITCH_DEG))
     )
     mapped = ScalarMappable(Normalize(-limit, limit), palette)
     colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
     numbers = view.found["statistics_mm"]
-    tidy(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
+    style_axes(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
     edges = view.edges
     draw_deviations(right, edges, view.counts, limit, tolerance)
     far = max(edges[-1], 0.0 if tolerance is None else 1.15 * tolerance)
     right.set_xlim(-far, far)
     left.set_xlabel("grey: parts of the nominal that were not measured", fontsize=TEXT_PT, color=SOFT, loc="left")
-    return finish(
+    return finish_figure(
         drawing,
         f"{view.name}: red lies outside the nominal surface, blue inside it. Right: how many of the points lie how far "
         "off.",

@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
-from slviewer.report.canvas import DENSITY, FULL, INK, SMALL_PT, bare, colour_bar, finish, new_figure
+from slviewer.report.canvas import DENSITY, FULL, INK, SMALL_PT, colour_bar, finish_figure, new_figure, style_image_axes
 from slviewer.report.page import Figure
 
 REASON_LABELS = {
@@ -46,7 +46,7 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL
     step = max(1, -(-w // (DENSITY * map_px)))
     for axes, (axis, phase) in zip(np.atleast_1d(drawing.subplots(1, len(phases))), phases.items(), strict=True):
         shares = reason_shares(phase)
-        bare(axes, f"axis {axis}: {100 * shares[Reason.VALID]:.1f} % of the pixels valid")
+        style_image_axes(axes, f"axis {axis}: {100 * shares[Reason.VALID]:.1f} % of the pixels valid")
         coordinate, reason = phase.coordinate[::step, ::step], phase.reason[::step, ::step]
         image = axes.imshow(_masked(coordinate), cmap="viridis", aspect="equal", interpolation="nearest")
         cover = np.zeros((*reason.shape, 4), np.float32)
@@ -67,7 +67,7 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL
             handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=2, fontsize=SMALL_PT, frameon=False
         )
     said = ", ".join(f"axis {axis} {100 * float(phase.mask.mean()):.1f} % valid" for axis, phase in phases.items())
-    return finish(
+    return finish_figure(
         drawing,
         f"{title}: the projector coordinate that each camera pixel sees, in px; masked pixels in the colour of their "
         "reason.",

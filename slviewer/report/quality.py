@@ -6,7 +6,7 @@ from typing import Any
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.report.data import AcceptanceView, DriftRow, ModelsView
 from slviewer.report.page import Cell, Column, Headline, Item, Mark, PageNotice, Section, Table
-from slviewer.report.tables import UNKNOWN, number
+from slviewer.report.tables import UNKNOWN, format_number
 
 _LEVELS: dict[str, tuple[str, str]] = {
     "good": ("Good: nothing that was seen speaks against this calibration.", "good"),
@@ -141,9 +141,9 @@ def _acceptance(view: AcceptanceView) -> list[Item]:
         rows.append(
             [
                 each["property"],
-                number(worst["error_mm"], 4, signed=True),
+                format_number(worst["error_mm"], 4, signed=True),
                 worst["position"],
-                number(worst["U_mm"], 4),
+                format_number(worst["U_mm"], 4),
                 " ... ".join(f"{v:+.4f}".replace("-", "−") for v in worst["within_95_mm"]),
                 UNKNOWN if limit is None else f"{limit:g}",
                 Cell(*_DECISIONS[each["decision"]]),

@@ -6,16 +6,16 @@ import numpy as np
 
 from slviewer.report.bars import rms_bars
 from slviewer.report.canvas import HALF
-from slviewer.report.clouds import clouds, merged_cloud
+from slviewer.report.clouds import draw_clouds, draw_merged_cloud
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import PlaneRow, ReproductionData
 from slviewer.report.maps import error_limit, error_maps, rms_maps
 from slviewer.report.page import Cell, Column, Headline, Item, PageNotice, Section, Table
 from slviewer.report.space import planes_in_space
 from slviewer.report.tables import (
-    mean_of,
+    format_number,
+    known_mean,
     merge_table,
-    number,
     plane_table,
     spacing_error,
     spacing_table,
@@ -44,13 +44,13 @@ def reproduction_title(data: ReproductionData) -> tuple[str, str]:
 
 def reproduction_headlines(data: ReproductionData) -> list[Headline]:
     """Flatness, flatness inside R2, a sphere's radius and the spacing of spheres: stereo against pixelwise."""
-    mean = {m: mean_of([row.rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
-    letter = {m: mean_of([row.letter_rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
-    floor = mean_of([row.noise_floor_mm.get(OURS, np.nan) for row in data.planes])
+    mean = {m: known_mean([row.rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
+    letter = {m: known_mean([row.letter_rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
+    floor = known_mean([row.noise_floor_mm.get(OURS, np.nan) for row in data.planes])
     ratio, count = inside_ratio(data.planes)
     wins = sum(row.rms_mm.get(OURS, np.inf) < row.rms_mm.get(BASE, -np.inf) for row in data.planes)
     radius = {
-        m: mean_of([abs(row.radius_mm.get(m, np.nan) - row.true_radius_mm) for row in data.spheres])
+        m: known_mean([abs(row.radius_mm.get(m, np.nan) - row.true_radius_mm) for row in data.spheres])
         for m in (BASE, OURS)
     }
     spacing = {m: spacing_error(data.spacings, m) for m in (BASE, OURS)}
@@ -85,7 +85,7 @@ def reproduction_sections(data: ReproductionData) -> list[Section]:
 def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
     """Mean stereo RMS over mean pixelwise RMS of the planes inside R2, and how many these are."""
     inside = [row for row in rows if row.incidence.get("R2", 0.0) >= INSIDE_PERCENT]
-    base, ours = (mean_of([row.rms_mm.get(m, np.nan) for row in inside]) for m in (BASE, OURS))
+    base, ours = (known_mean([row.rms_mm.get(m, np.nan) for row in inside]) for m in (BASE, OURS))
     return (base / ours if ours > 0 else float("nan")), len(inside)
 
 
@@ -96,13 +96,18 @@ def _calibration(data: ReproductionData) -> Section:
         [
             f"reprojection, {device}",
             "px",
-            number(data.reprojection_rms_px.get(device, np.nan)),
-            number(data.letter_reprojection_rms_px.get(device, np.nan)),
+            format_number(data.reprojection_rms_px.get(device, np.nan)),
+            format_number(data.letter_reprojection_rms_px.get(device, np.nan)),
         ]
         for device in ("camera", "projector")
     ]
     rows += [
-        [f"pixel-wise fit in {axis}, median over the pixels", "mm", number(data.fit_rms_mm.get(axis, np.nan)), bound]
+        [
+            f"pixel-wise fit in {axis}, median over the pixels",
+            "mm",
+            format_number(data.fit_rms_mm.get(axis, np.nan)),
+            bound,
+        ]
         for axis, bound in zip("zxy", ("below 0.15",) * 3, strict=True)
     ]
     columns = [
@@ -182,9 +187,9 @@ def _merged(data: ReproductionData) -> Section:
     if data.pairs:
         items.append(merge_table(data.pairs, "Alignment of the scans by point-to-plane ICP"))
     if data.clouds:
-        items.append(clouds(data.clouds))
+        items.append(draw_clouds(data.clouds))
     if data.merged is not None:
-        items.append(merged_cloud(data.merged))
+        items.append(draw_merged_cloud(data.merged))
     letter = ""
     if data.letter_points:
         counts = ", ".join(f"{count:,} ({name})" for name, count in data.letter_points.items())
@@ -204,7 +209,7 @@ def _duel(label: str, values: dict[str, float], note: str) -> Headline:
 
 
 def _arrow(values: dict[str, float]) -> str:
-    base, ours = (number(values[model]) for model in (BASE, OURS))
+    base, ours = (format_number(values[model]) for model in (BASE, OURS))
     return f"{base if isinstance(base, str) else base.text} → {ours if isinstance(ours, str) else ours.text} mm"
 
 

@@ -6,7 +6,18 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.report.canvas import FULL, HALF, INK, SMALL_PT, colour_bar, finish, legend, new_figure, rounded_up, tidy
+from slviewer.report.canvas import (
+    FULL,
+    HALF,
+    INK,
+    SMALL_PT,
+    colour_bar,
+    finish_figure,
+    legend,
+    new_figure,
+    round_up,
+    style_axes,
+)
 from slviewer.report.page import Figure
 
 CAMERA, PROJECTOR = "#3c6e9e", "#c98a1b"
@@ -23,7 +34,7 @@ def pose_bars(
     narrow = width <= HALF
     drawing = new_figure(width, 260 if narrow else 300)
     axes = drawing.subplots()
-    tidy(axes, "", "", "reprojection RMS, px")
+    style_axes(axes, "", "", "reprojection RMS, px")
     axes.grid(False, axis="x")
     at = np.arange(len(names))
     for i, (device, colour) in enumerate((("camera", CAMERA), ("projector", PROJECTOR))):
@@ -37,7 +48,7 @@ def pose_bars(
     axes.set_xlim(-0.7, len(names) - 0.3)
     legend(axes, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, columnspacing=1.2)
     worst = names[int(np.argmax(np.nan_to_num(values).max(axis=1)))]
-    return finish(
+    return finish_figure(
         drawing,
         f"Reprojection error of each target pose. Dashed: the RMS over all poses. The worst pose is {worst}.",
         f"Bars of the reprojection error of {len(names)} poses, camera and projector; worst {worst}",
@@ -52,16 +63,16 @@ def residual_arrows(title: str, pixels: np.ndarray, residuals: np.ndarray, size:
     at, away = pixels[known], residuals[known]
     lengths = np.hypot(away[:, 0], away[:, 1])
     rms = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else float("nan")
-    scale = rounded_up(0.05 * size[0] / max(float(np.percentile(lengths, 95)), 1e-3)) if len(lengths) else 1.0
+    scale = round_up(0.05 * size[0] / max(float(np.percentile(lengths, 95)), 1e-3)) if len(lengths) else 1.0
     drawing, axes = _image_axes(size, f"{title}: RMS {rms:.3f} px")
     if len(at):
         arrows = axes.quiver(
             *at.T, *(scale * away.T), lengths, angles="xy", scale_units="xy", scale=1, cmap="plasma", width=0.0035
         )
-        arrows.set_clim(0, rounded_up(float(np.percentile(lengths, 98))))
+        arrows.set_clim(0, round_up(float(np.percentile(lengths, 98))))
         arrows.set_clip_on(False)
         arrows.set_in_layout(False)
-        key = rounded_up(rms)
+        key = round_up(rms)
         axes.quiverkey(
             arrows,
             *(0.86, 0.035),
@@ -73,7 +84,7 @@ def residual_arrows(title: str, pixels: np.ndarray, residuals: np.ndarray, size:
             labelcolor=INK,
             fontproperties={"size": SMALL_PT},
         )
-    return finish(
+    return finish_figure(
         drawing,
         f"{title}: measured minus predicted features, arrows drawn {scale:g} times as long as they are. Arrows "
         "without a pattern are noise; a swirl or a common direction means a lens, board or pose that the model lacks.",
@@ -111,7 +122,7 @@ def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> 
         zorder=0,
     )
     colour_bar(drawing, image, axes, "poses", shrink=0.7)
-    return finish(
+    return finish_figure(
         drawing,
         f"{title}: how many of the {len(poses)} poses cover each part of the image. "
         "A lens is known only where a target was.",
@@ -123,7 +134,7 @@ def _image_axes(size: tuple[int, int], title: str) -> tuple[Any, Any]:
     """A figure and its axes, framed as an image of ``size``."""
     drawing = new_figure(HALF, 420)
     axes = drawing.subplots()
-    tidy(axes, title, "column, px", "row, px", grid=False)
+    style_axes(axes, title, "column, px", "row, px", grid=False)
     for spine in axes.spines.values():
         spine.set_visible(True)
         spine.set_color("#b9c2cb")

@@ -22,12 +22,12 @@ from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
 from slviewer.report.tables import (
     UNKNOWN,
     better_worse,
+    compare_errors,
+    format_number,
     incidence_text,
-    mean_of,
+    known_mean,
     models_of,
-    number,
     spacing_table,
-    verdict,
 )
 
 WORST = 2.0
@@ -77,12 +77,12 @@ def session_headlines(data: SessionData) -> list[Headline]:
 def _proof(data: SessionData) -> list[Headline]:
     """The flattest model's mean plane RMS, beside its noise floor and the other models'."""
     planes = [v for v in data.verifications if v.shape == "plane"]
-    means = {m: mean_of([v.rms_mm.get(m, np.nan) for v in planes]) for m in models_of([v.rms_mm for v in planes])}
+    means = {m: known_mean([v.rms_mm.get(m, np.nan) for v in planes]) for m in models_of([v.rms_mm for v in planes])}
     means = {m: mean for m, mean in means.items() if np.isfinite(mean)}
     if not means:
         return []
     model = min(means, key=lambda m: means[m])
-    floor = mean_of([v.noise_floor_mm.get(model, np.nan) for v in planes])
+    floor = known_mean([v.noise_floor_mm.get(model, np.nan) for v in planes])
     notes = [f"noise floor {floor:.3f} mm"] if np.isfinite(floor) else []
     notes += [f"{other} {mean:.3f} mm" for other, mean in means.items() if other != model]
     mark: Mark = "better" if len(means) > 1 else ""
@@ -185,7 +185,7 @@ def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
     rows: list[list[str | Cell]] = []
     for name, values in pose_rms_px.items():
         high = [value > WORST * usual for value, usual in zip(values, typical, strict=True)]
-        shown = [Cell(f"{v:.3f}", "worse") if h else number(v) for v, h in zip(values, high, strict=True)]
+        shown = [Cell(f"{v:.3f}", "worse") if h else format_number(v) for v, h in zip(values, high, strict=True)]
         rows.append([name, *shown, Cell("look at this pose", "worse") if any(high) else ""])
     if any(row[3] for row in rows):
         columns.append(Column("", align="left"))
@@ -253,7 +253,14 @@ def _pixel_fits(data: SessionData) -> Section:
         fitted = np.isfinite(fit.rms_mm[0])
         medians = [float(np.median(rms[fitted])) if fitted.any() else np.nan for rms in fit.rms_mm]
         poses = float(np.median(fit.poses[fitted])) if fitted.any() else np.nan
-        rows.append([fit.axis, number(100 * fitted.mean(), 1), number(poses, 0), *(number(m) for m in medians)])
+        rows.append(
+            [
+                fit.axis,
+                format_number(100 * fitted.mean(), 1),
+                format_number(poses, 0),
+                *(format_number(m) for m in medians),
+            ]
+        )
     table = Table(columns, rows, "Fits by captured axis (median over the pixels)")
     return Section(
         "Pixel-wise model",
@@ -309,21 +316,24 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
         for i, model in enumerate(m for m in models if m in v.rms_mm):
             rms, rival = v.rms_mm[model], v.rms_mm.get(models[0], np.nan)
             mark = better_worse(rms, rival) if model != models[0] else ""
-            text = number(rms)
+            text = format_number(rms)
             row: list[str | Cell] = [v.name if not i else "", model]
-            row += [Cell(text, mark) if isinstance(text, str) else text, number(v.noise_floor_mm.get(model, np.nan))]
+            row += [
+                Cell(text, mark) if isinstance(text, str) else text,
+                format_number(v.noise_floor_mm.get(model, np.nan)),
+            ]
             if len(models) > 1:
-                row.append(verdict(rms, rival) if model != models[0] else "")
+                row.append(compare_errors(rms, rival) if model != models[0] else "")
             if sphere:
                 radius = v.radius_mm.get(model, np.nan)
-                row += [number(radius), number(radius - v.true_radius_mm, signed=True)]
+                row += [format_number(radius), format_number(radius - v.true_radius_mm, signed=True)]
             aside = 100 * v.set_aside.get(model, 0) / max(v.points, 1)
             share = f"{aside:.1f}"
             row += [incidence_text(v.incidence) if not i else "", f"{v.points:,}" if not i else ""]
             row.append(Cell(share, "worse") if aside > SET_ASIDE_PERCENT else share)
-            row.append(number(100 * v.coverage[model], 1) if model in v.coverage else UNKNOWN)
+            row.append(format_number(100 * v.coverage[model], 1) if model in v.coverage else UNKNOWN)
             if masked:
-                row.append(number(100 * v.masked[model], 1) if model in v.masked else UNKNOWN)
+                row.append(format_number(100 * v.masked[model], 1) if model in v.masked else UNKNOWN)
             rows.append(row)
     notes = [
         "Set aside: points beyond 5 robust sigma, above 2 % the RMS does not speak for the shape. Coverage: measured "

@@ -26,7 +26,7 @@ def view_rotation(yaw_deg: float, pitch_deg: float) -> np.ndarray:
     return tilt @ turn
 
 
-def render(
+def render_points(
     points: np.ndarray,
     normals: np.ndarray,
     colours: np.ndarray,

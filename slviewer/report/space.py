@@ -14,11 +14,11 @@ from slviewer.report.canvas import (
     SMALL_PT,
     SOFT,
     TITLE_PT,
-    bare,
-    finish,
+    finish_figure,
     legend,
     new_figure,
-    tidy,
+    style_axes,
+    style_image_axes,
 )
 from slviewer.report.page import Figure
 
@@ -43,12 +43,12 @@ def planes_in_space(outlines: Mapping[str, np.ndarray], depth_range_mm: tuple[fl
     _space(space, hulls, short, depth_range_mm, low, high)
     for row, (axis, title) in enumerate(((1, "from the side"), (0, "from above"))):
         axes = drawing.add_subplot(grid[row, 1])
-        tidy(axes, "", "z, mm" if row else "", f"{'xy'[axis]}, mm")
+        style_axes(axes, "", "z, mm" if row else "", f"{'xy'[axis]}, mm")
         axes.set_title(title, fontsize=TITLE_PT, color=INK, loc="left", fontweight="bold", pad=18)
         _profile(axes, axis, hulls, short, depth_range_mm, low, high)
         if not row:
             legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.08), borderaxespad=0.2)
-    return finish(
+    return finish_figure(
         drawing,
         f"Positions of the {len(hulls)} planes in the camera's frame. Shaded: R2, the calibrated depths of "
         f"{near:.0f} to {far:.0f} mm. Purple planes lie in front of it (R1), crimson ones "
@@ -119,7 +119,7 @@ def _space(
     """The perspective view: depth runs away to the right, the image's up is up."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    bare(axes)
+    style_image_axes(axes)
     for i, (name, hull) in enumerate(hulls.items()):
         colour = REGIONS[_region(hull, depth_range_mm)]
         shown = np.stack([hull[:, 2], hull[:, 0], -hull[:, 1]], axis=1)

@@ -13,7 +13,7 @@ EQUAL = 0.02
 UNKNOWN = Cell("–", "muted")
 
 
-def number(value: float, digits: int = 3, signed: bool = False) -> str | Cell:
+def format_number(value: float, digits: int = 3, signed: bool = False) -> str | Cell:
     """A value with so many decimals, halves rounded up as people do; a dash where it is unknown."""
     if not np.isfinite(value):
         return UNKNOWN
@@ -28,7 +28,7 @@ def better_worse(error: float, rival: float) -> Mark:
     return "better" if error < rival else "worse"
 
 
-def verdict(error: float, rival: float) -> str | Cell:
+def compare_errors(error: float, rival: float) -> str | Cell:
     """``2.6 times better``, in words and in colour."""
     error, rival = abs(error), abs(rival)
     if not (np.isfinite(error) and np.isfinite(rival) and error > 0 and rival > 0):
@@ -39,7 +39,7 @@ def verdict(error: float, rival: float) -> str | Cell:
     return Cell(f"{max(rival / error, error / rival):.2f} × {mark}", mark)
 
 
-def mean_of(values: Sequence[float]) -> float:
+def known_mean(values: Sequence[float]) -> float:
     """The mean of the known values; NaN where there is none."""
     known = [v for v in values if np.isfinite(v)]
     return float(np.mean(known)) if known else float("nan")
@@ -66,7 +66,9 @@ def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
         group = "the Letter's rig"
         shares = [*(incidence_text(row.letter_incidence) for row in rows), ""]
         columns.append((Column("R1 / R2 / R3", "%", group, "centre"), shares))
-        columns += [(Column(model, "mm", group), [number(v) for v in values]) for model, values in letter.items()]
+        columns += [
+            (Column(model, "mm", group), [format_number(v) for v in values]) for model, values in letter.items()
+        ]
         columns += [
             (replace(column, group=group), [_plain(cell) for cell in cells])
             for column, cells in _against(letter, "against")
@@ -88,15 +90,15 @@ def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
         columns.append((Column("RMS", "mm", model), _won(model, rms)))
         columns.append((Column("floor", "mm", model), _muted(floor.get(model, []), len(rows))))
         columns.append(
-            (Column("radius", "mm", model), [number(r) for r in radius.get(model, [np.nan] * (len(rows) + 1))])
+            (Column("radius", "mm", model), [format_number(r) for r in radius.get(model, [np.nan] * (len(rows) + 1))])
         )
         columns.append((Column("error", "mm", model), _won(model, errors, signed=True)))
     columns += _against(errors, "radius against")
     for model, values in letter.items():
         *radii, mean = _by_model(rows, "letter_radius_mm")[model]
         group = f"the Letter's rig, {model}"
-        columns.append((Column("RMS", "mm", group), [number(v) for v in values]))
-        columns.append((Column("radius", "mm", group), [*(number(r, 2) for r in radii), number(mean)]))
+        columns.append((Column("RMS", "mm", group), [format_number(v) for v in values]))
+        columns.append((Column("radius", "mm", group), [*(format_number(r, 2) for r in radii), format_number(mean)]))
     true = sorted({row.true_radius_mm for row in rows if np.isfinite(row.true_radius_mm)})
     known = f"True radius {' or '.join(f'{r:g} mm' for r in true)}; the mean of the errors is that of their sizes."
     return _filled_table(columns, caption, [known if true else "The true radius is not known."])
@@ -108,20 +110,20 @@ def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
     measured = _by_model(rows, "measured_mm")
     names: _Filled = (Column("spheres", align="left"), [*(row.name for row in rows), "mean size of the error"])
     if not any(np.isfinite(row.known_mm) for row in rows):
-        plain = [(Column(model, "mm"), [number(v) for v in values]) for model, values in measured.items()]
+        plain = [(Column(model, "mm"), [format_number(v) for v in values]) for model, values in measured.items()]
         table = _filled_table([names, *plain], caption)
         return replace(table, footer=())
     errors = _errors(measured, measured, [row.known_mm for row in rows])
-    columns: list[_Filled] = [names, (Column("known", "mm"), [*(number(row.known_mm) for row in rows), ""])]
+    columns: list[_Filled] = [names, (Column("known", "mm"), [*(format_number(row.known_mm) for row in rows), ""])]
     for model, values in measured.items():
-        columns.append((Column("measured", "mm", model), [*(number(v) for v in values[:-1]), ""]))
+        columns.append((Column("measured", "mm", model), [*(format_number(v) for v in values[:-1]), ""]))
         columns.append((Column("error", "mm", model), _won(model, errors, signed=True)))
     return _filled_table(columns + _against(errors, "against"), caption)
 
 
 def spacing_error(rows: Sequence[SpacingRow], model: str) -> float:
     """The mean size of a model's spacing errors, mm."""
-    return mean_of([abs(row.measured_mm.get(model, np.nan) - row.known_mm) for row in rows])
+    return known_mean([abs(row.measured_mm.get(model, np.nan) - row.known_mm) for row in rows])
 
 
 def merge_table(pairs: Sequence[MergePair], caption: str) -> Table:
@@ -130,8 +132,8 @@ def merge_table(pairs: Sequence[MergePair], caption: str) -> Table:
     columns = [Column("scan", align="left"), Column("reference", align="left"), Column("ICP RMS", "mm")]
     columns += [Column("overlap", "%")] + ([Column("the Letter's ICP RMS", "mm")] if letter else [])
     rows = [
-        [pair.name, pair.reference, number(pair.rms_mm), number(100 * pair.overlap, 0)]
-        + ([number(pair.letter_rms_mm, 2)] if letter else [])
+        [pair.name, pair.reference, format_number(pair.rms_mm), format_number(100 * pair.overlap, 0)]
+        + ([format_number(pair.letter_rms_mm, 2)] if letter else [])
         for pair in pairs
     ]
     return Table(columns, rows, caption)
@@ -158,7 +160,7 @@ def _by_model(rows: Sequence[object], figure: str) -> dict[str, list[float]]:
     """{model: its figure in every row (NaN where unknown), then their mean}."""
     figures: list[ByModel] = [getattr(row, figure) for row in rows]
     values = {model: [each.get(model, np.nan) for each in figures] for model in models_of(figures)}
-    return {model: [*of_rows, mean_of(of_rows)] for model, of_rows in values.items()}
+    return {model: [*of_rows, known_mean(of_rows)] for model, of_rows in values.items()}
 
 
 def _errors(
@@ -167,14 +169,14 @@ def _errors(
     """{model: measured less true value in every row, then the mean of their sizes}."""
     unknown = [np.nan] * (len(true) + 1)
     errors = {m: [v - t for v, t in zip(measured.get(m, unknown)[:-1], true, strict=True)] for m in models}
-    return {model: [*each, mean_of([abs(error) for error in each])] for model, each in errors.items()}
+    return {model: [*each, known_mean([abs(error) for error in each])] for model, each in errors.items()}
 
 
 def _against(errors: Mapping[str, Sequence[float]], words: str) -> list[_Filled]:
     """Each further model's errors against the first model's, in words."""
     first, *others = errors
     return [
-        (Column(f"{words} {first}", "", model, "left"), list(map(verdict, errors[model], errors[first])))
+        (Column(f"{words} {first}", "", model, "left"), list(map(compare_errors, errors[model], errors[first])))
         for model in others
     ]
 
@@ -185,7 +187,7 @@ def _won(model: str, errors: Mapping[str, Sequence[float]], signed: bool = False
     cells: list[str | Cell] = []
     first, others = next(iter(errors)), [each for name, each in errors.items() if name != model]
     for i, mine in enumerate(errors[model]):
-        text = number(mine, signed=signed and i < len(errors[model]) - 1)
+        text = format_number(mine, signed=signed and i < len(errors[model]) - 1)
         if isinstance(text, str) and others and all(better_worse(mine, each[i]) == "better" for each in others):
             text = Cell(text, "better")
         elif isinstance(text, str) and model != first and better_worse(mine, errors[first][i]) == "worse":
@@ -195,7 +197,7 @@ def _won(model: str, errors: Mapping[str, Sequence[float]], signed: bool = False
 
 
 def _muted(values: Sequence[float], rows: int) -> list[str | Cell]:
-    texts = [number(value) for value in values or [np.nan] * (rows + 1)]
+    texts = [format_number(value) for value in values or [np.nan] * (rows + 1)]
     return [text if isinstance(text, Cell) else Cell(text, "muted") for text in texts]
 
 

@@ -50,7 +50,7 @@ def new_folder(path: str | Path) -> Path:
     return folder
 
 
-def furnish(folder: Path) -> None:
+def create_layout(folder: Path) -> None:
     """Make a session of a folder from `new_folder`; it becomes one with its last file."""
     for inner in ("captures", "results"):
         (folder / inner).mkdir(exist_ok=True)

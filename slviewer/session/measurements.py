@@ -73,10 +73,10 @@ def load_measurement(store: Session, identity: str) -> Measurement:
     """One measurement. Raises InputError where there is none of that id."""
     result = _result(store, identity)
     meta = store.load_result(result, only=())[0]
-    return as_saved(identity, meta, store.decision(NAMES) or {}, store.state_of(result) == "stale")
+    return measurement_from_meta(identity, meta, store.decision(NAMES) or {}, store.state_of(result) == "stale")
 
 
-def as_saved(identity: str, meta: Mapping[str, Any], names: Mapping[str, str], stale: bool) -> Measurement:
+def measurement_from_meta(identity: str, meta: Mapping[str, Any], names: Mapping[str, str], stale: bool) -> Measurement:
     """The measurement of that id from its result's ``meta`` and the ``names`` that were given since."""
     kind = meta["kind"]
     return Measurement(

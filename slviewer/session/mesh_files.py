@@ -20,7 +20,7 @@ from slviewer import __version__
 from slviewer.errors import InputError
 from slviewer.session.atomic import arriving_file
 from slviewer.session.glb import write_glb
-from slviewer.session.ply import FACE, check_faces, pieces, plain, without_nan, write_ply
+from slviewer.session.ply import FACE, check_faces, pieces, replace_nan, to_ascii, write_ply
 from slviewer.surface.shapes import Mesh, PointSet
 
 POINT_FORMATS = ("ply", "xyz", "glb")
@@ -102,7 +102,7 @@ def estimated_bytes(
 
 
 def _comments(notes: Sequence[str]) -> str:
-    return "".join(f"# {plain(line)}\n" for line in (f"slviewer {__version__}: units mm", *notes))
+    return "".join(f"# {to_ascii(line)}\n" for line in (f"slviewer {__version__}: units mm", *notes))
 
 
 def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> None:
@@ -146,7 +146,7 @@ def _write_obj(
                 file.write(_lines(f"v {LENGTHS} %.4f %.4f %.4f", points[part], colours[part] / 255))
         for part in pieces(0 if normals is None else len(points)):
             assert normals is not None
-            file.write(_lines(f"vn {LENGTHS}", without_nan("nx", normals[part])))
+            file.write(_lines(f"vn {LENGTHS}", replace_nan("nx", normals[part])))
         for part in pieces(len(faces)):
             corners = faces[part] + 1
             if normals is None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from slviewer.errors import InputError, SessionError
 from slviewer.registration.open3d_loader import open3d
-from slviewer.session.nominal_file import Format, looked_at
+from slviewer.session.nominal_file import Format, check_nominal_file
 from slviewer.surface.shapes import Mesh
 
 Units = Literal["mm", "cm", "m", "inch"]
@@ -56,7 +56,7 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     before it is loaded, and never trusted.
     """
     path = Path(path).expanduser()
-    form = looked_at(path)
+    form = check_nominal_file(path)
     try:
         data = path.read_bytes()
         vertices, faces = _loaded(path.name, data, form)

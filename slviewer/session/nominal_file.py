@@ -20,7 +20,7 @@ _SIZES = {
 }  # fmt: skip
 
 
-def looked_at(path: Path) -> Format:
+def check_nominal_file(path: Path) -> Format:
     """The file's format, if it may be loaded.
 
     Raises SessionError for a file that is absent, too large, truncated, of another format, or without triangles.

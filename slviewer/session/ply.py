@@ -53,7 +53,7 @@ def write_ply(
     vertex = np.dtype([(name, code) for name, code, _ in fields])
     names = {np.dtype(code): name for name, code in TYPES.items()}
     header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm"]
-    header += [f"comment {plain(note)}" for note in (f"written by slviewer {__version__}", *notes)]
+    header += [f"comment {to_ascii(note)}" for note in (f"written by slviewer {__version__}", *notes)]
     header.append(f"element vertex {len(points)}")
     header += [f"property {names[vertex[name]]} {name}" for name in vertex.names or ()]
     size = len(points) * vertex.itemsize
@@ -68,7 +68,7 @@ def write_ply(
         for part in pieces(len(points)):
             records = np.empty(part.stop - part.start, vertex)
             for name, _, values in fields:
-                records[name] = without_nan(name, values[part])
+                records[name] = replace_nan(name, values[part])
             file.write(records.data)
         for part in pieces(0 if faces is None else len(faces)):
             assert faces is not None
@@ -118,12 +118,12 @@ def pieces(count: int) -> Iterator[slice]:
     return (slice(start, min(start + PIECE, count)) for start in range(0, count, PIECE))
 
 
-def plain(note: str) -> str:
+def to_ascii(note: str) -> str:
     """A sentence as one line of printable ASCII, for the comments of a file."""
     return " ".join(note.encode("ascii", "replace").decode().split())
 
 
-def without_nan(name: str, values: np.ndarray) -> np.ndarray:
+def replace_nan(name: str, values: np.ndarray) -> np.ndarray:
     """Values of a vertex property with what stands for those that are not known: see ``write_ply``."""
     if values.dtype.kind != "f" or name in ("x", "y", "z"):
         return values

@@ -13,7 +13,7 @@ from slviewer.errors import InputError, SessionError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session import atomic
 from slviewer.session.capture import Capture, NewCapture, Role, read_capture, write_capture
-from slviewer.session.layout import furnish, inner_folders, is_session, new_folder, session_folder
+from slviewer.session.layout import create_layout, inner_folders, is_session, new_folder, session_folder
 from slviewer.session.lock import WriterLock
 from slviewer.session.names import natural_key, safe_name, safe_path
 from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
@@ -43,7 +43,7 @@ class Session:
         lock = WriterLock(folder)
         lock.acquire()
         try:
-            furnish(folder)
+            create_layout(folder)
         except BaseException:
             lock.release()
             raise

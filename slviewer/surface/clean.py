@@ -22,7 +22,7 @@ LEAST_GROUP = 2e-4
 
 
 @dataclass(frozen=True)
-class Cleaned:
+class ExcludedPixels:
     """What of a scan is left out, in pixels: at its rim and at depth jumps, seen grazing or without a normal, in small
     groups, far from everything else."""
 
@@ -37,38 +37,38 @@ class Cleaned:
         return self.edges + self.grazing + self.groups + self.far
 
 
-def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, Cleaned]:
+def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels]:
     """(h, w) bool: the pixels of a cloud that lie on a surface, and what was left out.
 
     ``normals``: (h, w, 3), towards the camera.
     """
     mask = cloud.mask
-    kept = mask & ~at_jumps(cloud.points, cloud.sigma_z)
+    kept = mask & ~detect_jumps(cloud.points, cloud.sigma_z)
     # a pixel at the rim sees the surface with a part of its area only, in half a shadow, or with what lies behind
-    kept &= cv2.erode(without_pinholes(kept), np.ones((3, 3), np.uint8), borderValue=1).astype(bool)
+    kept &= cv2.erode(close_pinholes(kept), np.ones((3, 3), np.uint8), borderValue=1).astype(bool)
     edges = int(mask.sum() - kept.sum())
-    seen = kept & (np.abs(sight(cloud.points, normals)) > FLATTEST_SIGHT)  # False where the normal is NaN
+    seen = kept & (np.abs(sight_cosines(cloud.points, normals)) > FLATTEST_SIGHT)  # False where the normal is NaN
     grazing = int(kept.sum() - seen.sum())
     large = _large_groups(seen)
-    near = large & ~far_clusters(cloud.points, large)
+    near = large & ~detect_far_clusters(cloud.points, large)
     groups, far = int(seen.sum() - large.sum()), int(large.sum() - near.sum())
-    return near, Cleaned(edges, grazing, groups, far)
+    return near, ExcludedPixels(edges, grazing, groups, far)
 
 
-def sight(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def sight_cosines(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(h, w) cosine between the normals (h, w, 3) and the lines of sight to points (h, w, 3) in the camera's frame."""
     away = np.linalg.norm(points, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(-np.einsum("ijk,ijk->ij", points, normals) / away)
 
 
-def without_pinholes(mask: np.ndarray) -> np.ndarray:
+def close_pinholes(mask: np.ndarray) -> np.ndarray:
     """(h, w) uint8, 0 or 1: the mask with gaps of up to four pixels closed."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     return np.asarray(cv2.morphologyEx(np.pad(mask, 2).astype(np.uint8), cv2.MORPH_CLOSE, disc)[2:-2, 2:-2])
 
 
-def at_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
+def detect_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
     """(h, w) bool: the pixels (h, w, 3) mm whose depth leaps to a neighbour's: there one pixel sees two surfaces.
 
     A leap is larger than ``STEEPEST`` times the distance of the neighbours across the line of sight and six times their
@@ -90,7 +90,7 @@ def at_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
     return jumps
 
 
-def far_clusters(points: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def detect_far_clusters(points: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """(h, w) bool: of the points (h, w, 3) mm ``kept`` (h, w), those in small clusters far from everything else."""
     far = np.zeros(kept.shape, bool)
     places = points[kept].astype(np.float64)

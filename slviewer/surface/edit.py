@@ -6,15 +6,15 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.surface.shapes import Mesh
-from slviewer.surface.tools import carried, compact, legacy, moved
-from slviewer.surface.topology import areas, extent_across, face_groups, rims
+from slviewer.surface.tools import select_faces, surface_shift, to_open3d_mesh, transfer_attributes
+from slviewer.surface.topology import extent_across, face_areas, face_groups, opening_loops
 
 LEAST_SHARE = 0.01
 _THINNED_AT = 1000.0
 
 
 @dataclass(frozen=True)
-class Dropped:
+class DroppedParts:
     """Parts that were dropped, and the largest of them in mm2."""
 
     parts: int
@@ -22,7 +22,7 @@ class Dropped:
 
 
 @dataclass(frozen=True)
-class Filled:
+class FilledHoles:
     """Holes that were filled, the largest in mm across, and how many openings are left."""
 
     holes: int
@@ -31,7 +31,7 @@ class Filled:
 
 
 @dataclass(frozen=True)
-class Moved:
+class SurfaceShift:
     """How far a change moved the surface (of the vertices before, to the surface after), and its triangles."""
 
     rms_mm: float
@@ -40,23 +40,23 @@ class Moved:
     after: int
 
 
-def without_small_parts(mesh: Mesh, most_mm2: float) -> tuple[Mesh, Dropped]:
+def drop_small_parts(mesh: Mesh, most_mm2: float) -> tuple[Mesh, DroppedParts]:
     """The mesh without the parts of up to so many mm2 that have less than 1 % of the largest part's area."""
     if not len(mesh.faces):
-        return mesh, Dropped(0, 0.0)
+        return mesh, DroppedParts(0, 0.0)
     groups = face_groups(mesh.faces, len(mesh.vertices))
-    sizes = np.bincount(groups, weights=areas(mesh))
+    sizes = np.bincount(groups, weights=face_areas(mesh))
     small = (sizes < LEAST_SHARE * sizes.max()) & (sizes <= most_mm2)
     largest = float(sizes[small].max()) if small.any() else 0.0
-    return compact(mesh, ~small[groups]), Dropped(int(small.sum()), largest)
+    return select_faces(mesh, ~small[groups]), DroppedParts(int(small.sum()), largest)
 
 
-def fill_holes(mesh: Mesh, size_mm: float) -> tuple[Mesh, Filled]:
+def fill_holes(mesh: Mesh, size_mm: float) -> tuple[Mesh, FilledHoles]:
     """The mesh with the openings that are up to ``size_mm`` across closed, each by a fan around its middle."""
     if not size_mm >= 0:
         raise InputError(f"Holes of up to {size_mm} mm cannot be filled: give 0 or more.")
     vertices, faces, sizes, left = [mesh.vertices], [mesh.faces], [], 0
-    for loop in rims(mesh.faces):
+    for loop in opening_loops(mesh.faces):
         corners = mesh.vertices[loop]
         across = extent_across(corners)
         if across > size_mm:
@@ -70,29 +70,31 @@ def fill_holes(mesh: Mesh, size_mm: float) -> tuple[Mesh, Filled]:
         vertices.append(corners.mean(axis=0, keepdims=True))
         faces.append(np.stack([np.roll(loop, -1), loop, np.full(len(loop), middle)], axis=1))
     if not sizes:
-        return mesh, Filled(0, 0.0, left)
-    filled = carried(mesh, np.concatenate(vertices), np.concatenate(faces))
-    return filled, Filled(len(sizes), max(sizes), left)
+        return mesh, FilledHoles(0, 0.0, left)
+    filled = transfer_attributes(mesh, np.concatenate(vertices), np.concatenate(faces))
+    return filled, FilledHoles(len(sizes), max(sizes), left)
 
 
-def smooth(mesh: Mesh, rounds: int) -> tuple[Mesh, Moved]:
+def smooth(mesh: Mesh, rounds: int) -> tuple[Mesh, SurfaceShift]:
     """The mesh after rounds of Taubin's smoothing, which does not shrink it."""
     if rounds < 1:
         raise InputError(f"{rounds} rounds of smoothing were asked for: give 1 or more.")
-    calm = legacy(mesh).filter_smooth_taubin(number_of_iterations=rounds)
-    smoothed = carried(mesh, np.asarray(calm.vertices), mesh.faces)
-    return smoothed, Moved(*moved(mesh, smoothed), len(mesh.faces), len(smoothed.faces))
+    calm = to_open3d_mesh(mesh).filter_smooth_taubin(number_of_iterations=rounds)
+    smoothed = transfer_attributes(mesh, np.asarray(calm.vertices), mesh.faces)
+    return smoothed, SurfaceShift(*surface_shift(mesh, smoothed), len(mesh.faces), len(smoothed.faces))
 
 
-def thin(mesh: Mesh, triangles: int) -> tuple[Mesh, Moved]:
+def decimate(mesh: Mesh, triangles: int) -> tuple[Mesh, SurfaceShift]:
     """The mesh with no more than a number of triangles, merged where that moves the surface least."""
     if triangles < 4:
         raise InputError(f"{triangles} triangles make no mesh: ask for at least 4.")
     if len(mesh.faces) <= triangles:
-        return mesh, Moved(0.0, 0.0, len(mesh.faces), len(mesh.faces))
+        return mesh, SurfaceShift(0.0, 0.0, len(mesh.faces), len(mesh.faces))
     # below an absolute size Open3D no longer solves for the best place of a vertex: small parts lost twice as much
     middle, size = mesh.vertices.mean(axis=0, dtype=np.float64), float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
-    enlarged = legacy(mesh).translate(-middle).scale(_THINNED_AT / size, np.zeros(3))
+    enlarged = to_open3d_mesh(mesh).translate(-middle).scale(_THINNED_AT / size, np.zeros(3))
     fewer = enlarged.simplify_quadric_decimation(triangles)
-    thinned = carried(mesh, np.asarray(fewer.vertices) * (size / _THINNED_AT) + middle, np.asarray(fewer.triangles))
-    return thinned, Moved(*moved(mesh, thinned), len(mesh.faces), len(thinned.faces))
+    thinned = transfer_attributes(
+        mesh, np.asarray(fewer.vertices) * (size / _THINNED_AT) + middle, np.asarray(fewer.triangles)
+    )
+    return thinned, SurfaceShift(*surface_shift(mesh, thinned), len(mesh.faces), len(thinned.faces))

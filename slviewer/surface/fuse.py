@@ -17,7 +17,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.agreement import SurfaceAgreement, agreements, colour_gains
 from slviewer.surface.meeting_kernels import FIELDS, gather, vote
 from slviewer.surface.shapes import PointSet
-from slviewer.surface.view import View, view_of
+from slviewer.surface.view import View, prepare_view
 
 Progress = Callable[[float], None]
 
@@ -65,7 +65,7 @@ def fuse(
     views = {}
     for i, (name, cloud) in enumerate(scans.items()):
         say(0.3 * i / len(scans))
-        views[name] = view_of(name, cloud, T_reference_scan[name])
+        views[name] = prepare_view(name, cloud, T_reference_scan[name])
     names = tuple(views)
     pairs = agreements(views, lambda share: say(0.3 + 0.1 * share))
     left_out = {

@@ -12,14 +12,22 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.mesh import grid_triangles
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.surface.clean import clean, sight
-from slviewer.surface.edit import Dropped, Filled, Moved, fill_holes, smooth, thin, without_small_parts
+from slviewer.surface.clean import clean, sight_cosines
+from slviewer.surface.edit import (
+    DroppedParts,
+    FilledHoles,
+    SurfaceShift,
+    decimate,
+    drop_small_parts,
+    fill_holes,
+    smooth,
+)
 from slviewer.surface.fuse import fuse
-from slviewer.surface.poisson import Trimmed, poisson, trimmed
+from slviewer.surface.poisson import TrimmedPatches, poisson_surface, trim_far_patches
 from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import compact
-from slviewer.surface.topology import Topology, topology
-from slviewer.surface.volume import volume
+from slviewer.surface.tools import select_faces
+from slviewer.surface.topology import Topology, analyse_topology
+from slviewer.surface.volume import volume_surface
 
 Method = Literal["grid", "poisson", "volume"]
 Progress = Callable[[float, str], None]
@@ -58,17 +66,17 @@ class MeshingPlan:
 
 
 @dataclass(frozen=True, eq=False)
-class Meshed:
+class BuiltMesh:
     """A mesh and how it was made; what was not done is None. ``cell_mm``: the spacing of the points."""
 
     mesh: Mesh
     method: Method
     cell_mm: float
-    dropped: Dropped
-    trimmed: Trimmed | None
-    filled: Filled | None
-    smoothed: Moved | None
-    thinned: Moved | None
+    dropped: DroppedParts
+    trimmed: TrimmedPatches | None
+    filled: FilledHoles | None
+    smoothed: SurfaceShift | None
+    thinned: SurfaceShift | None
     topology: Topology
 
     def to_json(self) -> dict[str, Any]:
@@ -113,7 +121,7 @@ class Meshed:
         return "\n".join(lines)
 
 
-def mesh_of(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: Progress | None = None) -> Meshed:
+def build_mesh(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: Progress | None = None) -> BuiltMesh:
     """Mesh one scan's organised cloud, or the points of a merge (with normals), as planned.
 
     ``progress`` receives the share of the work done, 0 to 1, and what is being done; it may raise to cancel.
@@ -134,18 +142,18 @@ def mesh_of(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: 
     say(0.1, f"meshing by {method}")
     cut = None
     if method == "poisson":
-        mesh = poisson(points, cell)
+        mesh = poisson_surface(points, cell)
         say(0.5, "cutting off what was not measured")
-        mesh, cut = trimmed(mesh, points, cell, limit)
+        mesh, cut = trim_far_patches(mesh, points, cell, limit)
     elif method == "volume":
-        mesh = volume(points, cell)
+        mesh = volume_surface(points, cell)
     else:
         assert isinstance(shape, Cloud)
         mesh = grid_mesh(shape)
     if not len(mesh.faces):
         raise SlviewerError("No surface could be laid through the points: merge scans that overlap more.")
     say(0.6, "leaving out floating parts")
-    mesh, dropped = without_small_parts(mesh, SMALL_PART * cell**2)
+    mesh, dropped = drop_small_parts(mesh, SMALL_PART * cell**2)
     filled = smoothed = thinned = None
     if method != "poisson" and limit > 0:
         say(0.65, "filling holes")
@@ -155,13 +163,13 @@ def mesh_of(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: 
         mesh, smoothed = smooth(mesh, plan.smooth)
     if plan.triangles is not None:
         say(0.8, f"thinning to {plan.triangles} triangles")
-        mesh, thinned = thin(mesh, plan.triangles)
+        mesh, thinned = decimate(mesh, plan.triangles)
     say(0.95, "checking")
-    found = topology(mesh)
+    found = analyse_topology(mesh)
     if plan.watertight:
         _refuse_if_open(found, cut, method)
     say(1.0, "meshed")
-    return Meshed(mesh, method, cell, dropped, cut, filled, smoothed, thinned, found)
+    return BuiltMesh(mesh, method, cell, dropped, cut, filled, smoothed, thinned, found)
 
 
 def spacing(points: PointSet) -> float:
@@ -177,7 +185,7 @@ def spacing(points: PointSet) -> float:
     return found
 
 
-def _refuse_if_open(found: Topology, cut: Trimmed | None, method: Method) -> None:
+def _refuse_if_open(found: Topology, cut: TrimmedPatches | None, method: Method) -> None:
     if not found.watertight:
         remedy = (
             "fill larger holes, or scan there" if method == "poisson" else "fill holes of that size, or use poisson"
@@ -202,10 +210,10 @@ def grid_mesh(cloud: Cloud) -> Mesh:
     faces = grid_triangles(points, JUMP * float(np.median(points[..., 2][kept]))) if kept.any() else np.zeros((0, 3))
     if not len(faces):
         raise InputError("No two neighbouring pixels of this scan lie on a surface: reconstruct it again.")
-    along = sight(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]
+    along = sight_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]
     sigma = (cloud.sigma * along)[kept]
     colours = None if cloud.texture is None else cloud.texture[kept]
     if colours is not None and colours.ndim == 1:
         colours = np.repeat(colours[:, None], 3, axis=1)
     mesh = Mesh(points[kept], faces, normals[kept], colours, sigma if np.isfinite(sigma).all() else None)
-    return compact(mesh, np.ones(len(faces), bool))
+    return select_faces(mesh, np.ones(len(faces), bool))

@@ -9,8 +9,8 @@ from slviewer.errors import InputError
 from slviewer.registration.open3d_loader import open3d
 from slviewer.surface.edit import fill_holes
 from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import carried, compact
-from slviewer.surface.topology import areas, extent_across, face_groups, rims
+from slviewer.surface.tools import select_faces, transfer_attributes
+from slviewer.surface.topology import extent_across, face_areas, face_groups, opening_loops
 
 LEAST_POINTS = 100
 DEEPEST = 11
@@ -22,7 +22,7 @@ BULGE = 1.3
 
 
 @dataclass(frozen=True)
-class Trimmed:
+class TrimmedPatches:
     """What became of the surface where nothing was measured: ``filled`` patches stayed (the largest ``largest_mm``
     across, together the share ``imagined`` of the whole area), of which ``flattened`` had bulged; ``cut`` went."""
 
@@ -33,7 +33,7 @@ class Trimmed:
     cut: int
 
 
-def poisson(points: PointSet, cell_mm: float) -> Mesh:
+def poisson_surface(points: PointSet, cell_mm: float) -> Mesh:
     """A closed surface through points with normals, no finer than cells of ``cell_mm``, also where there are none.
 
     Raises InputError for points without normals, or too few.
@@ -51,12 +51,12 @@ def poisson(points: PointSet, cell_mm: float) -> Mesh:
     depth = int(np.clip(np.ceil(np.log2(1.1 * extent / cell_mm)), 4, DEEPEST))
     # one thread: its own pool spins, and where other programs hold the cores it takes a hundred times as long
     surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
-    mesh = carried(points, np.asarray(surface.vertices) + middle, np.asarray(surface.triangles))
+    mesh = transfer_attributes(points, np.asarray(surface.vertices) + middle, np.asarray(surface.triangles))
     closed, _ = fill_holes(mesh, np.inf)  # where the box around the points cut it
     return closed
 
 
-def trimmed(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> tuple[Mesh, Trimmed]:
+def trim_far_patches(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> tuple[Mesh, TrimmedPatches]:
     """The mesh without the patches that lie far from all points and whose rims are more than ``fill_mm`` across.
 
     Smaller ones stay: holes filled by the surface that fits around them best. One that bulges, as where the object
@@ -66,11 +66,11 @@ def trimmed(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> 
     far = ~np.isfinite(distance)
     imagined = far[mesh.faces].any(axis=1)
     if not imagined.any():
-        return mesh, Trimmed(0, 0, 0.0, 0.0, 0)
+        return mesh, TrimmedPatches(0, 0, 0.0, 0.0, 0)
     groups = face_groups(mesh.faces, len(mesh.vertices), imagined)
     measured = np.zeros(len(mesh.vertices), bool)
     measured[mesh.faces[~imagined]] = True
-    area = areas(mesh)
+    area = face_areas(mesh)
     kept, filled, flattened, largest = ~imagined, 0, 0, 0.0
     order = np.argsort(groups, kind="stable")
     starts = np.searchsorted(groups[order], np.arange(groups.max() + 2))
@@ -83,19 +83,19 @@ def trimmed(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> 
             bulges = area[patch].sum() > BULGE * _flat_area(mesh.vertices, mesh.faces[patch])
             kept[patch] = not bulges
             filled, flattened, largest = filled + 1, flattened + bulges, max(largest, across)
-    left, cut = compact(mesh, kept), int(groups.max() + 1 - filled)
+    left, cut = select_faces(mesh, kept), int(groups.max() + 1 - filled)
     invented = area[kept & imagined].sum()
     if flattened:
-        open_area = areas(left).sum()
+        open_area = face_areas(left).sum()
         left, _ = fill_holes(left, fill_mm)
-        invented += areas(left).sum() - open_area
-    share = float(invented / max(areas(left).sum(), 1e-12))
-    return left, Trimmed(filled, int(flattened), largest, share, cut)
+        invented += face_areas(left).sum() - open_area
+    share = float(invented / max(face_areas(left).sum(), 1e-12))
+    return left, TrimmedPatches(filled, int(flattened), largest, share, cut)
 
 
 def _flat_area(vertices: np.ndarray, patch: np.ndarray) -> float:
     """Area in mm2 of the fan about the middle of a patch's rim; infinite where the patch joins several rims."""
-    loops = rims(patch)
+    loops = opening_loops(patch)
     longest = max(loops, key=len, default=np.empty(0, int))
     if len(longest) < 0.8 * sum(map(len, loops)):
         return float("inf")

@@ -10,7 +10,7 @@ from slviewer.registration.open3d_loader import open3d
 from slviewer.surface.shapes import Mesh, PointSet
 
 
-def carried(known: Mesh | PointSet, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+def transfer_attributes(known: Mesh | PointSet, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """A mesh of new vertices (n, 3) and faces (m, 3) with the colours and sigmas of the nearest known points, and its
     own normals."""
     mesh = Mesh(vertices, faces)
@@ -23,7 +23,7 @@ def carried(known: Mesh | PointSet, vertices: np.ndarray, faces: np.ndarray) -> 
     return replace(mesh, colours=colours, sigma_mm=sigma, normals=vertex_normals(mesh))
 
 
-def compact(mesh: Mesh, kept: np.ndarray) -> Mesh:
+def select_faces(mesh: Mesh, kept: np.ndarray) -> Mesh:
     """The faces ``kept`` (m,) bool, and the vertices that they use."""
     faces = mesh.faces[kept]
     used = np.zeros(len(mesh.vertices), bool)
@@ -52,7 +52,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0]).astype(np.float32)
 
 
-def moved(before: Mesh, after: Mesh) -> tuple[float, float]:
+def surface_shift(before: Mesh, after: Mesh) -> tuple[float, float]:
     """How far the vertices of a mesh lie from the surface that it became, mm: root mean square and largest."""
     o3d = open3d()
     middle = before.vertices.mean(axis=0)
@@ -63,7 +63,7 @@ def moved(before: Mesh, after: Mesh) -> tuple[float, float]:
     return float(np.sqrt(np.mean(distance**2))), float(distance.max())
 
 
-def legacy(mesh: Mesh) -> Any:
+def to_open3d_mesh(mesh: Mesh) -> Any:
     """Open3D's triangle mesh of the same vertices and faces."""
     o3d = open3d()
     return o3d.geometry.TriangleMesh(

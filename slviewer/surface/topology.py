@@ -42,7 +42,7 @@ class Topology:
         return ", ".join(found)
 
 
-def topology(mesh: Mesh) -> Topology:
+def analyse_topology(mesh: Mesh) -> Topology:
     """Judge a mesh."""
     if not len(mesh.faces):
         return Topology((), 0, 0, 0.0)
@@ -55,7 +55,9 @@ def topology(mesh: Mesh) -> Topology:
     corners -= mesh.vertices.mean(axis=0, dtype=np.float64)
     volume = float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
     return Topology(
-        openings_mm=tuple(sorted((extent_across(mesh.vertices[loop]) for loop in rims(mesh.faces)), reverse=True)),
+        openings_mm=tuple(
+            sorted((extent_across(mesh.vertices[loop]) for loop in opening_loops(mesh.faces)), reverse=True)
+        ),
         crowded=int((count > 2).sum()),
         turned=int(((count == 2) & (balance != 0)).sum()),
         volume_mm3=volume,
@@ -80,7 +82,7 @@ def face_groups(faces: np.ndarray, n_vertices: int, chosen: np.ndarray | None = 
     return groups
 
 
-def areas(mesh: Mesh) -> np.ndarray:
+def face_areas(mesh: Mesh) -> np.ndarray:
     """(m,) mm2 of each face."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
@@ -94,7 +96,7 @@ def extent_across(points: np.ndarray) -> float:
     return float(np.ptp(along, axis=0).max())
 
 
-def rims(faces: np.ndarray) -> list[np.ndarray]:
+def opening_loops(faces: np.ndarray) -> list[np.ndarray]:
     """The loops around openings: vertices (k,) in the order in which the faces (m, 3) beside them run.
 
     Where a vertex is on several openings, or on one twice, its loops are told apart; what closes no loop is left out.

@@ -8,7 +8,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.surface.clean import Cleaned, clean, sight, without_pinholes
+from slviewer.surface.clean import ExcludedPixels, clean, close_pinholes, sight_cosines
 
 LEAST_POINTS = 200
 FEATHER = 0.02
@@ -40,7 +40,7 @@ class View:
     colours: np.ndarray | None
     to_pixel: np.ndarray
     spacing: float
-    cleaned: Cleaned
+    cleaned: ExcludedPixels
 
     @property
     def mask(self) -> np.ndarray:
@@ -52,7 +52,7 @@ class View:
         return replace(self, points=np.where(pixels[..., None], np.float32(np.nan), self.points))
 
 
-def view_of(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
+def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
     """Prepare a scan. Raises InputError, naming it, where too little of it is a surface seen from one place."""
     T = np.asarray(T_reference_scan, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
@@ -67,7 +67,7 @@ def view_of(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
     crop = _box(kept)
     kept, normals = kept[crop], normals[crop]
     points = np.where(kept[..., None], cloud.points[crop], np.float32(np.nan))
-    cosine = sight(points, normals)
+    cosine = sight_cosines(points, normals)
     noise = _known_noise(cloud.sigma_z[crop], points, cosine, kept)
     lasting = np.zeros_like(noise) if cloud.sigma_lasting is None else cloud.sigma_lasting[crop]
     # depth's error along the normal: moved by dz, a point moves by dz along its ray (x/z, y/z, 1)
@@ -116,7 +116,7 @@ def _box(mask: np.ndarray) -> tuple[slice, slice]:
 
 def _inwards(kept: np.ndarray) -> np.ndarray:
     """(h, w) float32: 0 outside, rising smoothly to 1; pinholes are no border."""
-    distance = cv2.distanceTransform(np.pad(without_pinholes(kept), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    distance = cv2.distanceTransform(np.pad(close_pinholes(kept), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
     width = max(4.0, FEATHER * float(np.hypot(*kept.shape)))
     share = np.clip((distance - 0.5) / width, 0, 1)
     return np.where(kept, np.maximum(share * share * (3 - 2 * share), _LEAST_WEIGHT), 0).astype(np.float32)

@@ -6,7 +6,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.jit import kernel
 from slviewer.registration.open3d_loader import open3d
 from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import carried
+from slviewer.surface.tools import transfer_attributes
 
 BLOCK = 8
 REACH = 2.0
@@ -14,7 +14,7 @@ REACH = 2.0
 _MOST_BLOCKS = 20_000_000
 
 
-def volume(points: PointSet, cell_mm: float) -> Mesh:
+def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
     """The surface of points with normals, in cells of ``cell_mm``; it ends where the points end, two cells further.
 
     Points count by 1 / sigma2 where that is known. Takes memory by the surface's area, not by the box around it.
@@ -52,7 +52,7 @@ def volume(points: PointSet, cell_mm: float) -> Mesh:
     if not len(found.vertex.positions):
         raise InputError("No surface was found between the points: the cells are too fine for them.")
     vertices, faces = _in_order(found.vertex.positions.numpy(), found.triangle.indices.numpy())
-    return carried(points, vertices.astype(np.float64) * cell_mm + origin, faces)
+    return transfer_attributes(points, vertices.astype(np.float64) * cell_mm + origin, faces)
 
 
 def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 from slviewer.inspection.deviation import deviation
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.fuse import fuse
-from slviewer.surface.meshing import Meshed, MeshingPlan, mesh_of
+from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.validation.prove_accuracy import BandCheck
 
@@ -26,7 +26,7 @@ class SurfaceProof:
     single_mm: Mapping[str, float]
     fused_mm: float
     turned_mm: float
-    meshed: Meshed
+    meshed: BuiltMesh
 
     @property
     def checks(self) -> tuple[BandCheck, ...]:
@@ -78,7 +78,7 @@ def prove_surface(
     reference = next(name for name, T in lying.items() if np.allclose(T, np.eye(4)))
     fused = _rms(fuse(depths, lying).surface, nominal, poses[reference])
     whole, at = turn_true
-    meshed = mesh_of(fuse(turn, turned).surface, MeshingPlan(watertight=True))
+    meshed = build_mesh(fuse(turn, turned).surface, MeshingPlan(watertight=True))
     return SurfaceProof(single, fused, _rms(PointSet(meshed.mesh.vertices), whole, at), meshed)
 
 

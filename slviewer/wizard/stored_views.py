@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.session.measurements import FOLDER, NAMES, Measurement, as_saved
+from slviewer.session.measurements import FOLDER, NAMES, Measurement, measurement_from_meta
 from slviewer.session.store import Session
 from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 
@@ -79,7 +79,7 @@ def read_measurements(
                 scales = meta.get("scales", {})
             stale = _changed(meta.get("inputs", {}), known) or _changed(scales, factors)
             if kind == f"{FOLDER}/":
-                found.append(as_saved(result.removeprefix(kind), meta, names, stale))
+                found.append(measurement_from_meta(result.removeprefix(kind), meta, names, stale))
             if not stale:
                 known[result] = meta["hash"]
     return tuple(found)

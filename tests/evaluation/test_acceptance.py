@@ -11,9 +11,9 @@ from artefact_places import bar_places, plane_places, sphere_places
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact, Limits
-from slviewer.evaluation.acceptance.figures import AcceptanceFigure, decide, narrowest
+from slviewer.evaluation.acceptance.figures import AcceptanceFigure, decide, narrowest_range
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure
-from slviewer.evaluation.acceptance.result import conclude
+from slviewer.evaluation.acceptance.result import conclude_test
 from slviewer.evaluation.budget import Contribution, budget
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.fringe.decode import decode
@@ -71,7 +71,7 @@ def bars():
 
 
 def outcome(artefact, bars, model):
-    return conclude(
+    return conclude_test(
         artefact, "stereo", [measure(artefact, reconstruct(model, p), words, words, R2) for words, p in bars]
     )
 
@@ -121,7 +121,7 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
     errors = [0.005, -0.003, 0.001]
     u = unsure.at_measurement(unsure.spacing)[1]
     assert decide([AcceptanceFigure.of_length(SPACING, "", error, u) for error in errors], limit) == decision
-    judged = conclude(replace(unsure, limits=Limits(spacing_mm=limit)), "stereo", true_test.positions)
+    judged = conclude_test(replace(unsure, limits=Limits(spacing_mm=limit)), "stereo", true_test.positions)
     assert judged.decision in ("pass", "fail", "undecided") and judged.decision.upper() in judged.text()
     assert "claims conformity with neither" in judged.text()
 
@@ -134,7 +134,7 @@ def test_planes_are_flat_to_their_noise():
         plate = blank_board(Pose(T[:3, :3], T[:3, 3]), (140.0, 110.0))
         cloud = reconstruct(true_model(), phases_of(plate, 50 + i))
         found.append(measure(artefact, cloud, place.words, "plane", R2))
-    test = conclude(artefact, "stereo", found)
+    test = conclude_test(artefact, "stereo", found)
     for position in found:
         assert position.rms_mm[0] == pytest.approx(position.floor_mm[0], rel=0.08)
         width = position.error(FLATNESS).within_95_mm[1]
@@ -155,8 +155,8 @@ def test_places_are_seen_by_both_devices():
 
 def test_the_narrowest_interval_ignores_strays():
     values = np.r_[np.random.default_rng(0).normal(0, 1, 100_000), 50.0, -80.0]
-    assert narrowest(values, 0.95) == pytest.approx(2 * 1.96, rel=0.02)
-    assert narrowest(values, 0.997) == pytest.approx(2 * 2.97, rel=0.04)
+    assert narrowest_range(values, 0.95) == pytest.approx(2 * 1.96, rel=0.02)
+    assert narrowest_range(values, 0.997) == pytest.approx(2 * 2.97, rel=0.04)
 
 
 @pytest.mark.parametrize("name", ["ball_bar_100", "sphere_196", "plane"])

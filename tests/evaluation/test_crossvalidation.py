@@ -9,7 +9,13 @@ import pytest
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
-from slviewer.evaluation.crossvalidation import CrossValidation, HeldOut, gathered, measure_held_out, split
+from slviewer.evaluation.crossvalidation import (
+    CrossValidation,
+    HeldOutPose,
+    gather_results,
+    measure_held_out,
+    split_folds,
+)
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import fit_polynomial
@@ -69,16 +75,16 @@ class Stretched:
 
 def test_poses_are_dealt_by_depth() -> None:
     depths = {f"p{k}": 500.0 + 37 * k % 200 for k in range(12)}
-    folds = split(depths, 5)
+    folds = split_folds(depths, 5)
     assert sorted(name for fold in folds for name in fold) == sorted(depths)
     assert sorted(map(len, folds)) == [2, 2, 2, 3, 3]
     order = sorted(depths, key=lambda name: depths[name])
     assert all(order.index(fold[1]) - order.index(fold[0]) == 5 for fold in folds)
-    assert len(split({f"p{k}": float(k) for k in range(6)}, 9)) == 6
+    assert len(split_folds({f"p{k}": float(k) for k in range(6)}, 9)) == 6
     with pytest.raises(InputError, match="4 target poses"):
-        split({f"p{k}": float(k) for k in range(4)})
+        split_folds({f"p{k}": float(k) for k in range(4)})
     with pytest.raises(InputError, match="leave no pose out"):
-        split(depths, 1)
+        split_folds(depths, 1)
 
 
 def test_a_perfect_model_leaves_nothing_and_an_imperfect_one_its_error() -> None:
@@ -114,8 +120,8 @@ def test_pixels_that_one_model_does_not_measure_count_for_none() -> None:
     assert measure_held_out({"true": Stretched(true)}, nothing, "x", true) == {}
 
 
-def held(board_mm: float) -> HeldOut:
-    return HeldOut(board_mm / 2, board_mm, 100.0, 0.1, 0.2, 1000, 600.0)
+def held(board_mm: float) -> HeldOutPose:
+    return HeldOutPose(board_mm / 2, board_mm, 100.0, 0.1, 0.2, 1000, 600.0)
 
 
 def test_the_best_is_recommended_and_of_equals_the_simpler() -> None:
@@ -123,7 +129,7 @@ def test_the_best_is_recommended_and_of_equals_the_simpler() -> None:
 
     def recommended(*errors: float) -> str:
         fold = {f"p{k}": {name: held(e) for name, e in zip(names, errors, strict=True)} for k in range(4)}
-        return gathered(names, [fold], (("p0", "p1", "p2", "p3"),), {}).recommended
+        return gather_results(names, [fold], (("p0", "p1", "p2", "p3"),), {}).recommended
 
     assert recommended(0.3, 0.2, 0.1) == "splined"
     assert recommended(0.3, 0.2, 0.199) == "pixelwise"
@@ -132,9 +138,9 @@ def test_the_best_is_recommended_and_of_equals_the_simpler() -> None:
 
 def test_it_survives_saving_and_says_what_failed() -> None:
     fold = {"p0": {"stereo": held(0.2)}, "p1": {"stereo": held(0.4)}}
-    found = gathered(("stereo", "pixelwise"), [fold], (("p0",), ("p1",)), {"pixelwise": "3 usable poses"})
+    found = gather_results(("stereo", "pixelwise"), [fold], (("p0",), ("p1",)), {"pixelwise": "3 usable poses"})
     assert found.rms("stereo", "board_mm") == pytest.approx(np.sqrt(0.1))
     assert "recommended: stereo" in found.text() and "pixelwise is not judged: 3 usable poses" in found.text()
     assert from_plain(json.loads(json.dumps(found.to_json())), CrossValidation) == found
     with pytest.raises(InputError, match="no model"):
-        gathered(("stereo",), [], (), {"stereo": "why"})
+        gather_results(("stereo",), [], (), {"stereo": "why"})

@@ -9,7 +9,7 @@ from slviewer.inspection import placing
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.inspection.tolerance import ToleranceVerdict, judged
+from slviewer.inspection.tolerance import ToleranceVerdict, judge_deviation
 from slviewer.records import from_plain, to_plain
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import MeshScene, demo_object
@@ -116,13 +116,13 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     away = np.hypot(x, y) > 6
     height = np.nanmean(found.signed[:12_000][plateau]) - np.nanmean(found.signed[:12_000][away])
     assert height == pytest.approx(0.1, abs=0.005)
-    verdict = judged(found, np.full(len(points), 0.01), 0.06)
+    verdict = judge_deviation(found, np.full(len(points), 0.01), 0.06)
     assert verdict.decision == "fail" and verdict.highest[1] == "fail" and verdict.lowest[1] == "pass"
     assert verdict.inside > 90 and 0.05 < verdict.outside < 5
     assert verdict.inside + verdict.outside + verdict.close == pytest.approx(100)
     assert from_plain(to_plain(verdict), ToleranceVerdict) == verdict
-    assert judged(found, np.full(len(points), 0.01), 0.3).decision == "pass"
-    assert judged(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
+    assert judge_deviation(found, np.full(len(points), 0.01), 0.3).decision == "pass"
+    assert judge_deviation(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
 
 
 def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch) -> None:

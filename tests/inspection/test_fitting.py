@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature, least_squares
 from slviewer.inspection.quantities import Quantity
-from slviewer.inspection.uncertainty import scatter
+from slviewer.inspection.uncertainty import scatter_covariance
 from slviewer.records import from_plain
 from slviewer.session.atomic import to_json
 
@@ -78,7 +78,7 @@ def test_stated_uncertainties_cover_the_truth_as_often_as_they_say() -> None:
         points = sphere(800, 50.0, 0.7, 0.04, seed)
         found = least_squares("sphere", points, None)
         J = found.jacobian(points)
-        sigma = np.sqrt(np.diag(scatter(points, J, found.distance(points))))
+        sigma = np.sqrt(np.diag(scatter_covariance(points, J, found.distance(points))))
         misses.append((found.radius - 50.0) / sigma[3])
     off = np.abs(misses)
     assert np.count_nonzero(off < 2) >= 35 and np.count_nonzero(off < 0.5) <= 24
@@ -93,7 +93,7 @@ def test_errors_that_neighbours_share_make_a_fit_less_sure_than_noise_of_their_s
     across = points @ np.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]
     waves = 0.03 * np.sqrt(2) * np.sin(across / 6.0)
     J = flat.jacobian(points)
-    sigmas = [np.sqrt(np.diag(scatter(points, J, errors))) for errors in (noise, waves)]
+    sigmas = [np.sqrt(np.diag(scatter_covariance(points, J, errors))) for errors in (noise, waves)]
     assert (sigmas[1].max() > 4 * sigmas[0].max()) and (sigmas[1] > 0.9 * sigmas[0]).all()
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from slviewer.errors import InputError
 from slviewer.inspection.regions import Region
-from slviewer.inspection.section import CutPlane, between, nearest_on, radius_through, section
+from slviewer.inspection.section import CutPlane, measure_cursors, nearest_on_section, radius_through, section
 from slviewer.records import from_plain, to_plain
 
 
@@ -47,9 +47,11 @@ def test_a_ball_is_cut_in_a_circle_that_its_cursors_read() -> None:
     assert (turns > 0).all() or (turns < 0).all()  # one point after the other
     a, b, c = line[[0, 40, 90]]
     assert radius_through(a, b, c).value == pytest.approx(32.0, abs=0.3)
-    top = nearest_on([line], 1.0)
-    assert top[1] == pytest.approx(32.0, abs=0.2) and nearest_on([line], 1.0, -20)[1] == pytest.approx(-32.0, abs=0.2)
-    read = {q.name: q.value for q in between(np.array([0.0, 1.0]), np.array([3.0, 5.0]))}
+    top = nearest_on_section([line], 1.0)
+    assert top[1] == pytest.approx(32.0, abs=0.2) and nearest_on_section([line], 1.0, -20)[1] == pytest.approx(
+        -32.0, abs=0.2
+    )
+    read = {q.name: q.value for q in measure_cursors(np.array([0.0, 1.0]), np.array([3.0, 5.0]))}
     assert read == {"distance": 5.0, "along": 3.0, "height difference": 4.0}
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from slviewer.inspection.features import KINDS, Feature
 from slviewer.inspection.relations import MEANINGS, distance, relation
-from slviewer.inspection.uncertainty import Spread, propagated
+from slviewer.inspection.uncertainty import Spread, propagate_covariance
 
 X, Y, Z = np.eye(3)
 A, B = np.array([1.0, 2.0, 600.0]), np.array([31.0, 42.0, 600.0])
@@ -71,4 +71,4 @@ def test_what_one_calibration_leaves_uncertain_of_both_cancels() -> None:
 def test_an_angle_of_zero_has_an_uncertainty() -> None:
     found = relation(flat, spread(flat, 1e-3), other, spread(other, 1e-3))[0]
     assert found.value == pytest.approx(0.0, abs=1e-9) and 0.05 < found.sigma < 0.2  # degrees
-    assert propagated(lambda step: float(np.linalg.norm(step)), np.diag([9.0, 0.0])) == pytest.approx(3.0)
+    assert propagate_covariance(lambda step: float(np.linalg.norm(step)), np.diag([9.0, 0.0])) == pytest.approx(3.0)

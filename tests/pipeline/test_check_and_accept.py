@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from artefact_places import bar_places
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.places import bar_places
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.accept import accept

@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration import graph
-from slviewer.registration.agreeing import agreeing
+from slviewer.registration.consistency import select_consistent_edges
 from slviewer.registration.graph import Edge
 from slviewer.registration.multiway import Alignment, Scan, Starts, register_all
 from slviewer.registration.refusal import Refused
-from slviewer.registration.turntable import Axis, axis_of
+from slviewer.registration.turntable import TurntableAxis, fit_turntable_axis
 
 DEPTHS = {"object_r1": -120.0, "object_r2": 0.0, "object_r3": 120.0}
 
@@ -104,7 +104,7 @@ def knob(directions: np.ndarray) -> np.ndarray:
     return directions * radius[:, None]
 
 
-TABLE = Axis(np.array([5.0, 0.0, 610.0]), np.array([0.05, -1.0, 0.1]))
+TABLE = TurntableAxis(np.array([5.0, 0.0, 610.0]), np.array([0.05, -1.0, 0.1]))
 
 
 def turned_scans(count: int, step: float) -> dict[str, Scan]:
@@ -145,14 +145,14 @@ def test_a_turn_closes(turn: Alignment) -> None:
 
 def test_the_axis_is_found_from_two_steps_and_a_wrong_angle_is_told() -> None:
     steps = [TABLE.turned(-40.0)] * 2
-    axis = axis_of(steps, 40.0)
+    axis = fit_turntable_axis(steps, 40.0)
     np.testing.assert_allclose(axis.turned(25.0), TABLE.turned(25.0), atol=1e-9)
-    np.testing.assert_allclose(axis_of(steps, -40.0).turned(-25.0), TABLE.turned(25.0), atol=1e-9)
+    np.testing.assert_allclose(fit_turntable_axis(steps, -40.0).turned(-25.0), TABLE.turned(25.0), atol=1e-9)
     with pytest.raises(InputError, match=r"40\.0 degrees apart and the turntable is said to step by 30"):
-        axis_of(steps, 30.0)
+        fit_turntable_axis(steps, 30.0)
     for angle in (0.0, 180.0):
         with pytest.raises(InputError, match="gives no axis"):
-            axis_of([TABLE.turned(-angle)] * 2, angle)
+            fit_turntable_axis([TABLE.turned(-angle)] * 2, angle)
 
 
 # contradictions, and what poses are worth, on poses alone
@@ -176,9 +176,9 @@ def test_poses_are_as_sure_as_the_pairs_that_lead_there() -> None:
     poses = np.stack([motion(0.0, 0.0)] * 4)
     chain = [Edge(k + 1, k, np.eye(4), covariance, CENTRE) for k in range(3)]
     one = np.sqrt(3 * (sigma**2 + floor**2))
-    open_end = [each.shift_mm for each in graph.uncertainties(poses, chain, 1)]
+    open_end = [each.shift_mm for each in graph.pose_uncertainties(poses, chain, 1)]
     assert open_end == pytest.approx([one, 0.0, one, np.sqrt(2) * one], rel=1e-3, abs=1e-9)
-    closed = graph.uncertainties(poses, [*chain, Edge(0, 3, np.eye(4), covariance, CENTRE)], 0)
+    closed = graph.pose_uncertainties(poses, [*chain, Edge(0, 3, np.eye(4), covariance, CENTRE)], 0)
     assert [each.shift_mm for each in closed] == pytest.approx(
         [0.0, np.sqrt(3 / 4) * one, one, np.sqrt(3 / 4) * one], rel=1e-3, abs=1e-9
     )
@@ -192,12 +192,12 @@ def test_one_bad_edge_among_many_is_dropped() -> None:
     poses, edges = ring(8)
     bad = edges[5]
     edges[5] = Edge(bad.scan, bad.onto, bad.T @ motion(20.0, 5.0), bad.covariance, bad.centre)
-    kept, dropped = agreeing(8, edges, 0, [1.0] * len(edges), never)
+    kept, dropped = select_consistent_edges(8, edges, 0, [1.0] * len(edges), never)
     assert list(dropped) == [5] and sorted([*kept, 5]) == list(range(16))
     assert dropped[5][0] > 3.0 and dropped[5][1] == pytest.approx(20.0, abs=0.1)
     good = [edges[k] for k in kept]
-    start, _ = graph.tree(8, good, 0)
-    for found, true in zip(graph.optimised(start, good, 0), poses, strict=True):
+    start, _ = graph.spanning_poses(8, good, 0)
+    for found, true in zip(graph.optimise_poses(start, good, 0), poses, strict=True):
         assert off(found, true)[0] < 0.01
 
 
@@ -207,9 +207,9 @@ def test_of_three_that_contradict_the_surfaces_decide_or_it_is_refused() -> None
     bad = three[1]
     three[1] = Edge(bad.scan, bad.onto, bad.T @ motion(20.0, 5.0), bad.covariance, bad.centre)
     with pytest.raises(SlviewerError, match=r"contradict one another by .* nothing tells which is wrong"):
-        agreeing(3, three, 0, [1.0] * 3, never)
+        select_consistent_edges(3, three, 0, [1.0] * 3, never)
 
     def lies_well(edge: Edge, T: np.ndarray) -> bool:
         return off(T, np.linalg.inv(poses[edge.onto]) @ poses[edge.scan])[0] < 0.1
 
-    assert list(agreeing(3, three, 0, [1.0] * 3, lies_well)[1]) == [1]
+    assert list(select_consistent_edges(3, three, 0, [1.0] * 3, lies_well)[1]) == [1]

@@ -6,7 +6,7 @@ from bumpy_scans import CENTRE, NOISE, Height, bumpy, error, motion, view
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.registration.pairwise import register
-from slviewer.registration.picked import picked_start
+from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
 
 
@@ -113,7 +113,7 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
     assert refusal.value.reason == "ambiguous"
     corners = CENTRE + np.array([[50.0, 50.0, 0.0], [-50.0, 40.0, 0.0], [40.0, -50.0, 0.0]])
     picks = (corners - T[:3, 3]) @ T[:3, :3] + np.random.default_rng(0).normal(0, 2.0, (3, 3))
-    start, apart = picked_start(picks, corners)
+    start, apart = fit_picked_start(picks, corners)
     assert 0.1 < apart.max() < 6.0
     found = register(scan, reference, initial=start)
     assert found.start == "picked" and error(found, T)[0] < 0.03
@@ -123,15 +123,15 @@ def test_picks_that_fix_no_pose_are_refused() -> None:
     line = CENTRE + np.array([[0.0, 0, 0], [10, 0, 0], [30, 1, 0]])
     triangle = CENTRE + np.array([[0.0, 0, 0], [40, 0, 0], [0, 30, 0]])
     with pytest.raises(Refused, match="lie on one line"):
-        picked_start(line, line)
+        fit_picked_start(line, line)
     with pytest.raises(Refused, match=r"up to .* mm apart"):
-        picked_start(triangle, triangle[[1, 2, 0]])
+        fit_picked_start(triangle, triangle[[1, 2, 0]])
     with pytest.raises(InputError, match="pick 3 or more"):
-        picked_start(triangle[:2], triangle[:2])
+        fit_picked_start(triangle[:2], triangle[:2])
     with pytest.raises(InputError, match="no pairs"):
-        picked_start(triangle, triangle[:2])
+        fit_picked_start(triangle, triangle[:2])
     with pytest.raises(InputError, match="nothing was measured"):
-        picked_start(np.where(triangle == 40, np.nan, triangle), triangle)
+        fit_picked_start(np.where(triangle == 40, np.nan, triangle), triangle)
 
 
 def test_the_predicted_uncertainty_is_the_true_one() -> None:

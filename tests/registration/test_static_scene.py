@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import register_all
 from slviewer.registration.scan import away_from_edges
-from slviewer.registration.static_scene import contradiction, register_object, sampled
+from slviewer.registration.static_scene import contradiction, register_object, sample_surface
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.scenes import Surface
 from slviewer.simulation.turning import AXIS, AXIS_POINT, turning
@@ -108,7 +108,7 @@ def test_steps_within_the_noise_are_no_edges() -> None:
 
 def test_contradictions_are_counted_where_one_scan_sees_through_the_others_points() -> None:
     clouds, wall = scans(2.0, wall=True)
-    views = {name: sampled(cloud.measured) for name, cloud in clouds.items()}
+    views = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
     share = float(wall["b"].sum() / clouds["b"].mask.sum())
     T = np.linalg.inv(turned(2.0))
     moved = contradiction(views["b"], views["a"], T, 1.0).share

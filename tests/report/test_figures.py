@@ -12,8 +12,8 @@ from PIL import Image
 from slviewer.errors import InputError
 from slviewer.report import maps
 from slviewer.report.bars import rms_bars
-from slviewer.report.canvas import DENSITY, FULL, MODELS, finish, new_figure, rounded_up, shrink
-from slviewer.report.clouds import clouds, merged_cloud
+from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up, shrink_map
+from slviewer.report.clouds import draw_clouds, draw_merged_cloud
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CloudView, PixelCurve
 from slviewer.report.page import Figure
@@ -35,7 +35,7 @@ def test_colours_stay_true_where_they_mean_something() -> None:
     axes = drawing.subplots()
     axes.imshow(np.random.default_rng(0).uniform(size=(200, 200, 3)))  # thousands of colours that compete
     drawing.text(0.1, 0.9, "■", fontsize=30, color=MODELS["stereo"])
-    image = opened(finish(drawing, "c", "a")).reshape(-1, 3)
+    image = opened(finish_figure(drawing, "c", "a")).reshape(-1, 3)
     assert (image == 255).all(axis=1).mean() > 0.1
     orange = np.array([int(MODELS["stereo"][i : i + 2], 16) for i in (1, 3, 5)])
     assert (np.abs(image.astype(int) - orange).max(axis=1) == 0).sum() > 100
@@ -58,7 +58,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     def keep(drawing: Any, *words: str) -> Figure:
         kept.append(drawing)
-        return finish(drawing, *words)
+        return finish_figure(drawing, *words)
 
     monkeypatch.setattr(maps, "finish", keep)
     return kept
@@ -99,19 +99,19 @@ def test_nothing_measured_is_drawn_as_nothing() -> None:
     empty = np.full((60, 80), np.nan, np.float32)
     opened(maps.error_maps("pose", {"stereo": empty}, {"stereo": float("nan")}))
     opened(maps.rms_maps(np.full((3, 60, 80), np.nan)))
-    opened(clouds([CloudView("nothing", np.full((60, 80, 3), np.nan, np.float32))]))
-    opened(merged_cloud(CloudView("nothing", np.zeros((0, 3), np.float32))))
+    opened(draw_clouds([CloudView("nothing", np.full((60, 80, 3), np.nan, np.float32))]))
+    opened(draw_merged_cloud(CloudView("nothing", np.zeros((0, 3), np.float32))))
 
 
 def test_shrinking_keeps_means_and_holes() -> None:
     image = np.random.default_rng(1).normal(size=(300, 401)).astype(np.float32)
     image[:, :30] = np.nan
-    small = shrink(image, 101)
+    small = shrink_map(image, 101)
     assert small.shape == (75, 101)
     assert np.isnan(small[:, :7]).all() and np.isfinite(small[:, 8:100]).all()
     assert small[10, 50] == pytest.approx(image[40:44, 200:204].mean(), abs=1e-6)
-    assert shrink(image, 401) is image
-    assert [rounded_up(v) for v in (0.011, 0.4, 7, 0.95, float("nan"))] == pytest.approx([0.015, 0.4, 8, 1, 1])
+    assert shrink_map(image, 401) is image
+    assert [round_up(v) for v in (0.011, 0.4, 7, 0.95, float("nan"))] == pytest.approx([0.015, 0.4, 8, 1, 1])
 
 
 def test_the_pixels_curve_and_its_residuals() -> None:
@@ -147,7 +147,7 @@ def test_reprojection_figures() -> None:
 def test_clouds_are_counted() -> None:
     points = cloud(160, 590)
     count = f"{np.isfinite(points[..., 2]).sum():,} points"
-    figure = clouds([CloudView("scan <1>", points, note="R2")] * 4)
+    figure = draw_clouds([CloudView("scan <1>", points, note="R2")] * 4)
     assert count in figure.alt and "R2" in figure.alt
     opened(figure)
 
@@ -163,7 +163,7 @@ def test_clouds_are_counted() -> None:
         lambda: residual_arrows("t", np.zeros((3, 2)), np.zeros((4, 2)), (10, 10)),
         lambda: pose_bars({}, {}),
         lambda: rms_bars([]),
-        lambda: shrink(np.zeros((2, 2, 3)), 1),
+        lambda: shrink_map(np.zeros((2, 2, 3)), 1),
         lambda: pixel_curves(PixelCurve((0, 0), "x", *(np.zeros(n) for n in (3, 4, 3, 3, 5, 3)))),
     ],
 )

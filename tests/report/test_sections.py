@@ -11,7 +11,7 @@ from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.drift.check import Drift
 from slviewer.calibration.stereo import StereoModel
-from slviewer.evaluation.crossvalidation import CrossValidation, HeldOut
+from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
 from slviewer.report.data import AcceptanceView, CalibrationFigures, DriftRow, ModelsView, PlaneRow, SpacingRow
 from slviewer.report.page import Cell, Figure, PageNotice, Section, Table, write_page
 from slviewer.report.reproduction import (
@@ -21,7 +21,7 @@ from slviewer.report.reproduction import (
     reproduction_title,
 )
 from slviewer.report.session import session_headlines, session_sections, session_title
-from slviewer.report.tables import better_worse, number, plane_table, spacing_table, sphere_table, verdict
+from slviewer.report.tables import better_worse, compare_errors, format_number, plane_table, spacing_table, sphere_table
 
 WIDTH = 240
 
@@ -134,10 +134,10 @@ def test_missing_values_are_dashes_not_winners() -> None:
 
 
 def test_verdicts() -> None:
-    assert verdict(0.1, 0.25) == Cell("2.50 × better", "better")
-    assert verdict(-0.25, 0.1) == Cell("2.50 × worse", "worse")
-    assert verdict(0.100, 0.101) == "equal" and better_worse(0.100, 0.101) == ""
-    assert number(-0.5, signed=True) == "−0.500" and number(0.5, 1, signed=True) == "+0.5"
+    assert compare_errors(0.1, 0.25) == Cell("2.50 × better", "better")
+    assert compare_errors(-0.25, 0.1) == Cell("2.50 × worse", "worse")
+    assert compare_errors(0.100, 0.101) == "equal" and better_worse(0.100, 0.101) == ""
+    assert format_number(-0.5, signed=True) == "−0.500" and format_number(0.5, 1, signed=True) == "+0.5"
 
 
 def test_spheres_are_judged_by_their_radius_and_spacing() -> None:
@@ -199,7 +199,9 @@ def test_how_good_a_calibration_is() -> None:
     )
     held = {"stereo": 0.2, "splined": 0.02}
     compared = CrossValidation(
-        {m: {"pose_01": HeldOut(mm, mm, 100 * mm, mm, mm, 900, 550.0)} for m, mm in held.items()}, (("pose_01",),), {}
+        {m: {"pose_01": HeldOutPose(mm, mm, 100 * mm, mm, mm, 900, 550.0)} for m, mm in held.items()},
+        (("pose_01",),),
+        {},
     )
     splined = {
         "noise_px": {"camera": 0.01, "x": 0.011, "y": 0.012},

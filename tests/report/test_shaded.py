@@ -5,7 +5,7 @@ import pytest
 
 from slviewer.errors import InputError
 from slviewer.report.clouds import _mosaic
-from slviewer.report.shaded import BACKGROUND, render, view_rotation
+from slviewer.report.shaded import BACKGROUND, render_points, view_rotation
 
 SIZE = (120, 90)
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
@@ -17,7 +17,7 @@ def sheet(z: float, half: float, n: int = 120) -> np.ndarray:
 
 
 def drawn(points: np.ndarray, colours: np.ndarray, normal: tuple[float, float, float] = (0, 0, -1)) -> np.ndarray:
-    return render(points, np.broadcast_to(normal, points.shape), colours, SIZE, np.eye(3)).astype(int)
+    return render_points(points, np.broadcast_to(normal, points.shape), colours, SIZE, np.eye(3)).astype(int)
 
 
 def test_nearer_points_hide_farther_ones() -> None:
@@ -43,7 +43,7 @@ def test_light_comes_from_above() -> None:
     tilt = np.sqrt(0.5)
     up, down = (drawn(points, grey, (0, s * tilt, -tilt))[45, 60, 0] for s in (-1, 1))
     assert up > down + 60
-    unknown = render(points, np.full(points.shape, np.nan), grey, SIZE, np.eye(3))
+    unknown = render_points(points, np.full(points.shape, np.nan), grey, SIZE, np.eye(3))
     assert down < unknown[45, 60, 0] < 255
 
 
@@ -69,4 +69,4 @@ def test_a_mosaic_shows_one_scan_in_each_square_and_leaves_no_hole() -> None:
 
 def test_shapes_are_checked() -> None:
     with pytest.raises(InputError, match="make no view"):
-        render(np.zeros((3, 3)), np.zeros((4, 3)), np.zeros((3, 3)), SIZE, np.eye(3))
+        render_points(np.zeros((3, 3)), np.zeros((4, 3)), np.zeros((3, 3)), SIZE, np.eye(3))

@@ -7,7 +7,7 @@ import pytest
 from ball_scans import ball, looking_from, off, rms
 
 from slviewer.errors import Cancelled, InputError
-from slviewer.surface.clean import far_clusters
+from slviewer.surface.clean import detect_far_clusters
 from slviewer.surface.fuse import Fused, fuse
 
 SIDE = (0.1, -0.05, -1.0)
@@ -96,9 +96,9 @@ def test_small_clusters_far_from_everything_else_are_removed_and_counted() -> No
     v, u = np.mgrid[:200, :200]
     large[...] = np.stack([u * 0.2, v * 0.2, np.full(u.shape, 500.0)], axis=2)
     large[5:10, 5:10, 2] = 900.0
-    assert far_clusters(large, np.ones((200, 200), bool)).sum() == 25
+    assert detect_far_clusters(large, np.ones((200, 200), bool)).sum() == 25
     large[5:10, 5:10, 2] = 502.0
-    assert far_clusters(large, np.ones((200, 200), bool)).sum() == 0
+    assert detect_far_clusters(large, np.ones((200, 200), bool)).sum() == 0
 
 
 def test_colours_show_no_seam() -> None:

@@ -7,14 +7,14 @@ from ball_scans import RADIUS, around, ball, off, rms
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.surface.edit import fill_holes, smooth, thin, without_small_parts
+from slviewer.surface.edit import decimate, drop_small_parts, fill_holes, smooth
 from slviewer.surface.fuse import fuse
-from slviewer.surface.meshing import Meshed, MeshingPlan, grid_mesh, mesh_of, spacing
-from slviewer.surface.poisson import trimmed
+from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh, grid_mesh, spacing
+from slviewer.surface.poisson import trim_far_patches
 from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import compact
-from slviewer.surface.topology import topology
-from slviewer.surface.volume import volume
+from slviewer.surface.tools import select_faces
+from slviewer.surface.topology import analyse_topology
+from slviewer.surface.volume import volume_surface
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
 
@@ -25,8 +25,8 @@ def points() -> PointSet:
 
 
 @pytest.fixture(scope="module")
-def closed(points: PointSet) -> Meshed:
-    return mesh_of(points, MeshingPlan(watertight=True))
+def closed(points: PointSet) -> BuiltMesh:
+    return build_mesh(points, MeshingPlan(watertight=True))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def open_points() -> PointSet:
     return fuse(*around(without=("bottom",))).surface
 
 
-def test_scans_all_around_close(points: PointSet, closed: Meshed) -> None:
+def test_scans_all_around_close(points: PointSet, closed: BuiltMesh) -> None:
     assert closed.topology.watertight and closed.topology.faults() == ""
     assert closed.topology.volume_mm3 == pytest.approx(VOLUME, rel=2e-3)
     assert rms(off(closed.mesh.vertices)) < rms(off(points.points)) < 0.04
@@ -45,13 +45,13 @@ def test_scans_all_around_close(points: PointSet, closed: Meshed) -> None:
 
 
 def test_what_no_scan_saw_stays_open_or_is_closed_as_asked(open_points: PointSet) -> None:
-    plain = mesh_of(open_points)
+    plain = build_mesh(open_points)
     assert len(plain.topology.openings_mm) == 1 and not plain.topology.watertight
     across = plain.topology.openings_mm[0]
     assert 20 < across < 75
     with pytest.raises(SlviewerError, match="does not close: 1 opening, the largest"):
-        mesh_of(open_points, MeshingPlan(fill_holes_mm=0.8 * across, watertight=True))
-    wide = mesh_of(open_points, MeshingPlan(fill_holes_mm=1.2 * across))
+        build_mesh(open_points, MeshingPlan(fill_holes_mm=0.8 * across, watertight=True))
+    wide = build_mesh(open_points, MeshingPlan(fill_holes_mm=1.2 * across))
     assert wide.topology.watertight and wide.trimmed is not None
     assert wide.trimmed.filled == 1 and 0.01 < wide.trimmed.imagined < 0.15
     assert wide.topology.volume_mm3 == pytest.approx(VOLUME, rel=0.03)
@@ -65,7 +65,7 @@ def test_what_floats_where_nothing_was_measured_goes_whatever_holes_are_filled(p
         np.concatenate([ball.vertices, ball.vertices + np.array([200, 0, 0])]),
         np.concatenate([ball.faces, ball.faces + n]),
     )
-    kept, report = trimmed(two, points, spacing(points), np.inf)
+    kept, report = trim_far_patches(two, points, spacing(points), np.inf)
     assert len(kept.faces) == len(ball.faces) and (report.filled, report.imagined, report.cut) == (0, 0.0, 1)
 
 
@@ -75,7 +75,7 @@ def test_a_foot_is_closed_flat() -> None:
     ball = trimesh.creation.icosphere(5, RADIUS)
     directions = ball.vertices[ball.vertices[:, 2] > -0.5 * RADIUS] / RADIUS
     points = PointSet(RADIUS * directions + rng.normal(0, 0.01, directions.shape), directions)
-    found = mesh_of(points, MeshingPlan("poisson", watertight=True))
+    found = build_mesh(points, MeshingPlan("poisson", watertight=True))
     assert found.trimmed is not None and (found.trimmed.filled, found.trimmed.flattened) == (1, 1)
     cap = np.pi * RADIUS**3 * (0.5**2 * (3 - 0.5)) / 3
     beyond = 3.0 * spacing(points)  # so far the surface still counts as measured
@@ -86,14 +86,14 @@ def test_a_foot_is_closed_flat() -> None:
 
 def test_one_side_alone_is_not_closed() -> None:
     with pytest.raises(SlviewerError, match=r"does not close|would be imagined"):
-        mesh_of(ball(300.0, 0.03, 0), MeshingPlan(watertight=True))
+        build_mesh(ball(300.0, 0.03, 0), MeshingPlan(watertight=True))
 
 
 def test_a_volume(points: PointSet) -> None:
-    found = mesh_of(points, MeshingPlan("volume", fill_holes_mm=6.0))
+    found = build_mesh(points, MeshingPlan("volume", fill_holes_mm=6.0))
     assert found.topology.watertight and found.topology.volume_mm3 == pytest.approx(VOLUME, rel=3e-3)
     assert rms(off(found.mesh.vertices)) < 0.04
-    one, other = (volume(points, found.cell_mm) for _ in range(2))  # whatever thread is first
+    one, other = (volume_surface(points, found.cell_mm) for _ in range(2))  # whatever thread is first
     assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
 
 
@@ -106,7 +106,7 @@ def test_a_scans_grid_ends_where_depth_jumps() -> None:
     assert np.ptp(depths, axis=1).max() == 0 and set(np.unique(depths)) == {300.0, 330.0}
     assert mesh.normals is not None and np.allclose(mesh.normals, [0, 0, -1], atol=1e-3)
     assert mesh.sigma_mm is not None and np.allclose(mesh.sigma_mm, 0.02, rtol=0.05)
-    assert len(topology(mesh).openings_mm) == 2  # the rims of two sheets
+    assert len(analyse_topology(mesh).openings_mm) == 2  # the rims of two sheets
 
 
 def sheet(holes: list[tuple[slice, slice]]) -> Mesh:
@@ -118,67 +118,72 @@ def sheet(holes: list[tuple[slice, slice]]) -> Mesh:
         kept[hole] = False
     a, b, c, d = (index[s][kept] for s in (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]))
     faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
-    return compact(Mesh(points.reshape(-1, 3), faces), np.ones(len(faces), bool))
+    return select_faces(Mesh(points.reshape(-1, 3), faces), np.ones(len(faces), bool))
 
 
 def test_holes_are_filled_up_to_their_size() -> None:
     mesh = sheet([np.s_[5:8, 5:8], np.s_[20:30, 20:30], np.s_[8:10, 8:10]])  # the first and last share a corner
-    assert topology(mesh).openings_mm == pytest.approx((62.6, 14.1, 4.2, 2.8), rel=0.05)
+    assert analyse_topology(mesh).openings_mm == pytest.approx((62.6, 14.1, 4.2, 2.8), rel=0.05)
     filled, report = fill_holes(mesh, 5.0)
     assert (report.holes, report.left) == (2, 2) and report.largest_mm == pytest.approx(4.2, rel=0.05)
-    found = topology(filled)
+    found = analyse_topology(filled)
     assert len(found.openings_mm) == 2 and not found.crowded and not found.turned
     assert filled.normals is not None and np.allclose(filled.normals[:, 2], filled.normals[0, 2])
     assert fill_holes(mesh, 1.0)[1] == type(report)(0, 0.0, 4)
 
 
-def test_small_parts_go(closed: Meshed) -> None:
+def test_small_parts_go(closed: BuiltMesh) -> None:
     chip = Mesh([[90, 0, 0], [91, 0, 0], [90, 1, 0]], [[0, 1, 2]])
     n = len(closed.mesh.vertices)
     both = Mesh(
         np.concatenate([closed.mesh.vertices, chip.vertices]), np.concatenate([closed.mesh.faces, chip.faces + n])
     )
-    assert without_small_parts(both, 0.1)[1].parts == 0  # it is large, for all that the other is larger
-    cleaned, report = without_small_parts(both, 1.0)
+    assert drop_small_parts(both, 0.1)[1].parts == 0  # it is large, for all that the other is larger
+    cleaned, report = drop_small_parts(both, 1.0)
     assert len(cleaned.faces) == len(closed.mesh.faces) and report.parts == 1
     assert report.largest_mm2 == pytest.approx(0.5)
 
 
-def test_thinning_and_smoothing_tell_how_far_they_moved_the_surface(closed: Meshed) -> None:
-    thinned, report = thin(closed.mesh, 3000)
-    assert 2900 <= len(thinned.faces) <= 3000 and topology(thinned).watertight
+def test_decimating_and_smoothing_report_how_far_they_moved_the_surface(closed: BuiltMesh) -> None:
+    thinned, report = decimate(closed.mesh, 3000)
+    assert 2900 <= len(thinned.faces) <= 3000 and analyse_topology(thinned).watertight
     assert 0.001 < report.rms_mm < 0.2 and report.rms_mm < report.max_mm < 1.0
     assert thinned.colours is not None and thinned.sigma_mm is not None
     small = Mesh(0.01 * closed.mesh.vertices, closed.mesh.faces)
-    assert thin(small, 3000)[1].rms_mm == pytest.approx(0.01 * report.rms_mm, rel=0.1)
+    assert decimate(small, 3000)[1].rms_mm == pytest.approx(0.01 * report.rms_mm, rel=0.1)
     rough = Mesh(
         closed.mesh.vertices + np.random.default_rng(0).normal(0, 0.1, closed.mesh.vertices.shape), closed.mesh.faces
     )
     calm, moved = smooth(rough, 10)
     assert rms(off(calm.vertices)) < 0.8 * rms(off(rough.vertices))
     assert 0.01 < moved.rms_mm < 0.1 < moved.max_mm < 1.0
-    assert topology(calm).volume_mm3 == pytest.approx(VOLUME, rel=5e-3)
+    assert analyse_topology(calm).volume_mm3 == pytest.approx(VOLUME, rel=5e-3)
 
 
-def test_what_is_wrong_with_a_mesh_is_said(closed: Meshed) -> None:
+def test_what_is_wrong_with_a_mesh_is_said(closed: BuiltMesh) -> None:
     faces = closed.mesh.faces
-    inside_out = topology(Mesh(closed.mesh.vertices, faces[:, ::-1]))
+    inside_out = analyse_topology(Mesh(closed.mesh.vertices, faces[:, ::-1]))
     assert inside_out.faults() == "its inside is outside"
     turned = faces.copy()
     turned[10] = turned[10, ::-1]
-    assert topology(Mesh(closed.mesh.vertices, turned)).faults() == "3 edges whose triangles wind against each other"
+    assert (
+        analyse_topology(Mesh(closed.mesh.vertices, turned)).faults()
+        == "3 edges whose triangles wind against each other"
+    )
     crowded = np.concatenate([faces, [[faces[0, 0], faces[0, 1], faces[len(faces) // 2, 0]]]])
-    assert "1 edges where more than two triangles meet" in topology(Mesh(closed.mesh.vertices, crowded)).faults()
-    assert "1 opening" in topology(Mesh(closed.mesh.vertices, faces[1:])).faults()
+    assert (
+        "1 edges where more than two triangles meet" in analyse_topology(Mesh(closed.mesh.vertices, crowded)).faults()
+    )
+    assert "1 opening" in analyse_topology(Mesh(closed.mesh.vertices, faces[1:])).faults()
 
 
 def test_refusals(points: PointSet) -> None:
     with pytest.raises(InputError, match="have no pixels"):
-        mesh_of(points, MeshingPlan("grid"))
+        build_mesh(points, MeshingPlan("grid"))
     with pytest.raises(InputError, match="no normals"):
-        mesh_of(PointSet(points.points))
+        build_mesh(PointSet(points.points))
     with pytest.raises(InputError, match="Some points are NaN"):
-        mesh_of(PointSet(np.full((300, 3), np.nan), np.zeros((300, 3))))
+        build_mesh(PointSet(np.full((300, 3), np.nan), np.zeros((300, 3))))
     for plan in ({"triangles": 2}, {"smooth": -1}, {"fill_holes_mm": float("nan")}):
         with pytest.raises(InputError):
             MeshingPlan(**plan)

@@ -20,7 +20,7 @@ RULE = (
 )
 
 
-def narrowest(deviations: np.ndarray, share: float) -> float:
+def narrowest_range(deviations: np.ndarray, share: float) -> float:
     """Width of the narrowest interval that holds so great a share of the deviations (n,)."""
     values = np.sort(deviations[np.isfinite(deviations)])
     inside = max(int(np.ceil(share * len(values))), 1)
@@ -45,7 +45,7 @@ class AcceptanceFigure:
     @classmethod
     def of_form(cls, name: str, position: str, deviations: np.ndarray, U_mm: float) -> "AcceptanceFigure":
         """The form that points' deviations from their shape show."""
-        inner, outer = narrowest(deviations, 0.95), narrowest(deviations, 0.997)
+        inner, outer = narrowest_range(deviations, 0.95), narrowest_range(deviations, 0.997)
         return cls(name, position, inner, U_mm, (0.0, inner), (0.0, outer))
 
     @classmethod

@@ -141,7 +141,7 @@ class Acceptance:
         }
 
 
-def conclude(artefact: Artefact, model: str, positions: Sequence[Position]) -> Acceptance:
+def conclude_test(artefact: Artefact, model: str, positions: Sequence[Position]) -> Acceptance:
     """The test's result from its positions. Raises InputError where there is none."""
     if not positions:
         raise InputError(f"no capture shows {artefact.name}: name some in [measured] captures of its file")

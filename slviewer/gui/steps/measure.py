@@ -17,7 +17,7 @@ from slviewer.gui.widgets import Html, Tone, Words, block, boxed, cell, toned
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import Place
-from slviewer.report.canvas import rounded_up
+from slviewer.report.canvas import round_up
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import MM
 from slviewer.wizard.snapshot import SessionView, Snapshot
@@ -220,7 +220,7 @@ class Panel:
             if self._sized != on.source:
                 self._sized = on.source
                 low, high = np.nanpercentile(on.points.reshape(-1, 3), [2, 98], axis=0)
-                most = rounded_up(0.6 * float(np.linalg.norm(high - low)))
+                most = round_up(0.6 * float(np.linalg.norm(high - low)))
                 self._radius.max, self._radius.step, self._radius.min = most, most / 200, most / 200
                 self._radius.value = most / 5
 

@@ -15,7 +15,7 @@ _GATES = 0.5
 was registered in the right place ends much nearer, and one in the wrong place nearly always farther."""
 
 
-def agreeing(
+def select_consistent_edges(
     nodes: int,
     edges: Sequence[Edge],
     root: int,
@@ -33,7 +33,7 @@ def agreeing(
     costs = np.array([edge.variance for edge in edges])
     found: dict[frozenset[int], np.ndarray] = {}
     for trial in range(_TREES):
-        poses, by = graph.tree(
+        poses, by = graph.spanning_poses(
             nodes, edges, root, costs if trial == 0 else costs * np.exp(rng.normal(0, 3, len(edges)))
         )
         open_ones = frozenset(k for k, edge in enumerate(edges) if k not in by and _gapes(k, edges, by, poses, gates))
@@ -45,7 +45,9 @@ def agreeing(
     if len(best) > 1:
         best = [(one, poses) for one, poses in best if all(fits(edges[k], _put(edges[k], poses)) for k in one)]
     if len(best) != 1:
-        worst = max((graph.gap(edges[k], poses) for one, poses in found.items() for k in one), key=lambda g: g.shift_mm)
+        worst = max(
+            (graph.loop_gap(edges[k], poses) for one, poses in found.items() for k in one), key=lambda g: g.shift_mm
+        )
         raise Refused(
             "ambiguous",
             f"Pairs of scans contradict one another by {worst.shift_mm:.1f} mm and {worst.turn_deg:.1f} degrees, and "
@@ -53,13 +55,13 @@ def agreeing(
             "angle.",
         )
     dropped, poses = best[0]
-    gaps = {k: graph.gap(edges[k], poses) for k in dropped}
+    gaps = {k: graph.loop_gap(edges[k], poses) for k in dropped}
     kept = [k for k in range(len(edges)) if k not in dropped]
     return kept, {k: (gap.shift_mm, gap.turn_deg) for k, gap in gaps.items()}
 
 
 def _gapes(k: int, edges: Sequence[Edge], by: Sequence[int], poses: np.ndarray, gates: Sequence[float]) -> bool:
-    left = graph.gap(edges[k], poses)
+    left = graph.loop_gap(edges[k], poses)
     at_rim = left.shift_mm + np.radians(left.turn_deg) * 50.0
     return bool(at_rim > max(_SIGMAS * graph.expected_mm(edges[k], edges, by), _GATES * gates[k]))
 
