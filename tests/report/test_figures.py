@@ -60,7 +60,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         kept.append(drawing)
         return finish_figure(drawing, *words)
 
-    monkeypatch.setattr(maps, "finish", keep)
+    monkeypatch.setattr(maps, "finish_figure", keep)
     return kept
 
 
