@@ -1,4 +1,4 @@
-"""Starting the wizard: the engine, the server, and one thread that draws."""
+"""Starts the wizard: the operator, the server, and one thread that draws."""
 
 import logging
 import signal
@@ -14,19 +14,17 @@ import viser
 
 from slviewer.devices.channel import Channel, Standing
 from slviewer.errors import SlviewerError, UsageError
-from slviewer.gui import shell as frame
-from slviewer.gui.panel import Stage
+from slviewer.gui.panel import PanelContext
 from slviewer.gui.scene import ViewerScene
-from slviewer.gui.shell import Shell
+from slviewer.gui.shell import Shell, greet_viewer, notify
 from slviewer.gui.viewpoints import FIELD_OF_VIEW, OVERVIEW, Viewpoints
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import load_rig
 from slviewer.server.projector_page import serve_projector
 from slviewer.server.secure import SafeServer, serve
-from slviewer.server.text import escape
 from slviewer.server.viewers import Viewers
 from slviewer.session.store import Session
-from slviewer.wizard.notices import words_for
+from slviewer.wizard.notices import describe_error
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Level
 
@@ -38,7 +36,7 @@ _BRAND = (25, 113, 194)
 
 
 class App:
-    """A running wizard: its engine, its server, and the thread that draws the newest snapshot."""
+    """A running wizard: its operator, its server, and the thread that draws the newest snapshot."""
 
     def __init__(
         self,
@@ -49,9 +47,9 @@ class App:
         channel: Channel | None = None,
         **options: Any,
     ) -> None:
-        """Serve `operator`, and the projector page where `channel` is given, the one that its rigs are set up with.
+        """Serve `operator`, and the projector page if `channel` is given, the one that its rigs are set up with.
 
-        `options` are those of `serve`. Raises SlviewerError where the address can't be served.
+        `options` are those of `serve`. Raises SlviewerError where the address cannot be served.
         """
         self.operator = operator
         self.channel = channel
@@ -65,11 +63,11 @@ class App:
             raise
 
     def close(self) -> None:
-        """End drawing and serving; the operator is whoever's started it."""
+        """End drawing and serving; the operator stays open."""
         self._closing = True
         self._changed.set()
         self._unsubscribe()
-        self._turns.shutdown(wait=False, cancel_futures=True)
+        self._executor.shutdown(wait=False, cancel_futures=True)
         self._thread.join(5.0)
         self.server.stop()
 
@@ -80,72 +78,69 @@ class App:
         page.initial_camera.fov = FIELD_OF_VIEW
         page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
         self._closing = False
-        self._turns = ThreadPoolExecutor(1, "slviewer requests")
+        self._executor = ThreadPoolExecutor(1, "slviewer requests")
         self._changed = threading.Event()
         self._offers: dict[Path, str] = {}
         self._folder: Path | None = None
-        self._problem = ""
-        self._stage = Stage(
+        self._failure = ""
+        context = PanelContext(
             page.gui,
             ViewerScene(page.scene),
             Viewpoints(lambda: page.get_clients().values()),
             operator,
             self._offer,
-            self._tell,
-            escape,
+            self._notify,
             self._go,
-            self._failed,
-            self._turns,
+            self._report_failure,
+            self._executor,
             partial(Viewers, page),
-            self._page_standing,
+            self._projector_page,
         )
         snapshot = operator.snapshot()
-        self._told = snapshot.notices[-1].number if snapshot.notices else 0
-        self.shell = Shell(page.gui, self._stage, snapshot.steps, operator.open_session)
+        self._notified = snapshot.notices[-1].number if snapshot.notices else 0
+        self.shell = Shell(context, snapshot.steps)
         page.on_client_connect(self._greet)
-        self._unsubscribe = operator.subscribe(self._wake, self._wake)
+        self._unsubscribe = operator.subscribe(lambda _: self._changed.set(), lambda _: self._changed.set())
         self._thread = threading.Thread(target=self._draw_forever, name="slviewer drawing", daemon=True)
         self._thread.start()
 
     # drawing
 
-    def _wake(self, _news: object) -> None:
-        self._changed.set()
-
     def _draw_forever(self) -> None:
-        version, number, standing = -1, -1, None
+        version, number, page = -1, -1, None
         while not self._closing:
             begun = time.monotonic()
             self._changed.wait(0.5)
             self._changed.clear()
             if self._closing:
                 return
-            if standing != (standing := self._page_standing()):
+            if page != (page := self._projector_page()):
                 version = -1
             try:
                 version, number = self._draw(version, number)
             except Exception as error:
                 version = -1
-                if repr(error) != self._problem:  # it is tried again, and need not be told again
-                    self._problem = repr(error)
-                    self._failed(error)
+                if repr(error) != self._failure:  # it is tried again, and reported once
+                    self._failure = repr(error)
+                    self._report_failure(error)
                 time.sleep(1.0)
             time.sleep(max(0.0, 1 / DRAWN_PER_S - (time.monotonic() - begun)))
 
     def _draw(self, version: int, number: int) -> tuple[int, int]:
+        """Draw what is newer than this version of the snapshot and number of the preview; returns those drawn."""
         snapshot, preview = self.operator.snapshot(), self.operator.preview()
         folder = snapshot.session.folder if snapshot.session else None
         if folder != self._folder:
             self._folder = folder
             self._offers.clear()
             self.server.downloads.clear()
-        if snapshot.version != version or self.shell.due:
+        if snapshot.version != version or self.shell.needs_drawing:
             with self.server.viser.atomic():
                 self.shell.draw(snapshot)
             for notice in snapshot.notices:
-                if notice.number > self._told:
-                    self._told = notice.number
-                    self._tell(notice.level, notice.text)
+                if notice.number > self._notified:
+                    self._notified = notice.number
+                    self._notify(notice.level, notice.text)
         if preview is not None and preview.number != number:
             self.shell.draw_preview(preview)
             number = preview.number
@@ -153,12 +148,12 @@ class App:
 
     # what panels use
 
-    def _tell(self, level: Level, text: str) -> None:
+    def _notify(self, level: Level, text: str) -> None:
         for client in self.server.viser.get_clients().values():
-            frame.notify(client, level, text)
+            notify(client, level, text)
 
-    def _failed(self, error: BaseException) -> None:
-        self._tell("error", words_for("This", error))
+    def _report_failure(self, error: BaseException) -> None:
+        self._notify("error", describe_error("This", error))
 
     def _go(self, key: str) -> None:
         self.shell.go(key)
@@ -171,12 +166,12 @@ class App:
             self._offers[path] = self.server.downloads.offer(path, within=folder)
         return self._offers[path]
 
-    def _page_standing(self) -> Standing | None:
+    def _projector_page(self) -> Standing | None:
         return None if self.channel is None else self.channel.standing()
 
     def _greet(self, client: viser.ClientHandle) -> None:
         if self.server.role(client.client_id) == "viewer":
-            frame.greet_viewer(client)
+            greet_viewer(client)
 
 
 def run(
@@ -186,28 +181,28 @@ def run(
     port: int = 8080,
     open_browser: bool = True,
 ) -> None:
-    """Serve the wizard until Ctrl-C. `rig` as `rig_choice` reads it; empty: the session's, else the simulated one.
+    """Serve the wizard until Ctrl-C. `rig` as in `rig_choice`; empty: the session's, else the simulated one.
 
     Raises SlviewerError where the session, the rig or the address cannot be used.
     """
     channel = Channel()
     with Operator(set_up=partial(set_up, channel=channel)) as operator:
-        _granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
+        _check_granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
         remembered = operator.session is not None and operator.session.decision("rig")
-        if rig or not remembered:  # one that is remembered and not connected now is not given up for the simulated one
-            _granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
+        if rig or not remembered:  # a remembered rig that is not connected now is not replaced by the simulated one
+            _check_granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
         app = App(operator, host, port, channel=channel)
         try:
             print(f"slviewer is ready: {app.server.url}")
-            print(f"to watch only:     {app.server.view_url}")
+            print(f"view-only link:    {app.server.view_url}")
             print(f"projector page:    {app.server.link('/projector')}", flush=True)
             if not app.server.loopback:
-                print("Others on this network can read what is sent: use a network that you trust.", flush=True)
+                print("The connection is not encrypted: use a network that you trust.", flush=True)
             if open_browser:
-                _open(app.server.url)
-            _until_stopped()
+                _open_browser(app.server.url)
+            _wait_for_stop()
         except KeyboardInterrupt:
-            print("\nslviewer ends; the session is kept.")
+            print("\nslviewer has stopped; the session is saved.")
         finally:
             app.close()
 
@@ -223,22 +218,22 @@ def rig_choice(text: str, session: Session | None = None) -> dict[str, Any]:
         raise UsageError(f"{text!r} is no rig: write simulated, or simulated:0.25 for a quarter of the size") from None
 
 
-def _until_stopped() -> None:
-    """Wait for Ctrl-C, or for the request to end that a service manager sends."""
+def _wait_for_stop() -> None:
+    """Wait for Ctrl-C, or for the signal of a service manager."""
     stopped = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stopped.set())
-    while not stopped.wait(1.0):  # in pieces: some systems deliver Ctrl-C only between waits
+    while not stopped.wait(1.0):  # some systems deliver Ctrl-C only between waits
         pass
 
 
-def _granted(operator: Operator, granted: bool) -> None:
-    """Raise what kept a request from being granted."""
+def _check_granted(operator: Operator, granted: bool) -> None:
+    """Raise SlviewerError with the notice of a request that was refused."""
     if not granted:
         failed = operator.wait_for(lambda s: any(n.level == "error" for n in s.notices), 2.0)
-        raise SlviewerError(failed.notices[-1].text if failed else "the wizard could not begin: its log says why")
+        raise SlviewerError(failed.notices[-1].text if failed else "the wizard could not start: see its log")
 
 
-def _open(url: str) -> None:
+def _open_browser(url: str) -> None:
     try:
         webbrowser.get()
     except webbrowser.Error:

@@ -1,6 +1,6 @@
-"""Live clouds on the browsers' screens: to each the newest, as soon as it has drawn the one before.
+"""Live clouds in the browsers: each gets the newest as soon as it has drawn the previous one.
 
-A browser that stalls gets nothing more until it has caught up; it holds nobody up, and one cloud at most waits for it.
+A browser that stalls gets nothing more until it has caught up, and delays no other.
 """
 
 import threading
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from slviewer.gui.panel import Stage
+from slviewer.gui.panel import PanelContext
 from slviewer.gui.scene import spacing
 from slviewer.wizard.live_scan import LiveCloud
 
@@ -19,23 +19,23 @@ _SLOW_S, _QUICK_S = 0.09, 0.05  # a browser that takes longer, or less, for a cl
 
 
 class LiveScreen:
-    """Draws live clouds, on a thread of its own from the first one on. Every method may be called from any thread."""
+    """Draws live clouds on a thread of its own. Every method may be called from any thread."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
-        self._viewers = stage.viewers(self._wake)
+    def __init__(self, context: PanelContext) -> None:
+        self._context = context
+        self._viewers = context.viewers(self._wake)
         self._condition = threading.Condition()
         self._cloud: LiveCloud | None = None
         self._nodes: dict[int, Any] = {}
         self._drawn: dict[int, int] = {}
-        self._limit, self._told = MOST_POINTS, 0
-        self._looked = False
+        self._limit, self._counted = MOST_POINTS, 0
+        self._is_in_view = False
         self._thread: threading.Thread | None = None
         self.points = 0
-        """How many were drawn of the last cloud."""
+        """Number of points drawn of the last cloud."""
 
     def offer(self, cloud: LiveCloud) -> None:
-        """Draw this one next, instead of any that was not drawn yet."""
+        """Draw this one next, instead of any that is still waiting."""
         with self._condition:
             self._cloud = cloud
             if self._thread is None:
@@ -44,9 +44,9 @@ class LiveScreen:
             self._condition.notify_all()
 
     def clear(self) -> None:
-        """Show no live cloud any more."""
+        """Remove the live cloud."""
         with self._condition:
-            self._cloud, self._looked = None, False
+            self._cloud, self._is_in_view = None, False
             self._condition.notify_all()
 
     def _wake(self) -> None:
@@ -60,15 +60,15 @@ class LiveScreen:
             try:
                 drawn = self._draw(cloud) if cloud is not None else self._remove()
             except Exception as error:
-                self._stage.failed(error)
+                self._context.failed(error)
                 drawn = False
             with self._condition:
                 if not drawn and self._cloud is cloud:
-                    # a browser that has come meanwhile is found without being told
+                    # a browser that connects does not notify this thread
                     self._condition.wait(None if cloud is None else 0.5)
 
     def _draw(self, cloud: LiveCloud) -> bool:
-        """Send it to the browsers that are ready for it; whether there was any."""
+        """Send it to the browsers that are ready for it; returns whether there was any."""
         clients = [c for c in self._viewers.ready() if self._drawn.get(c.client_id) != cloud.number]
         if not clients:
             return False
@@ -81,12 +81,12 @@ class LiveScreen:
         for client in clients:
             self._send(client, points, colours, size)
             self._drawn[client.client_id] = cloud.number
-        if not self._looked:
-            self._looked = True
-            self._stage.viewpoints.at(f"{LAYER} {cloud.begun}", points)
-        if cloud.number != self._told:
-            self._told = cloud.number
-            self._stage.operator.live_shown(cloud)
+        if not self._is_in_view:
+            self._is_in_view = True
+            self._context.viewpoints.show(f"{LAYER} {cloud.begun}", points)
+        if cloud.number != self._counted:
+            self._counted = cloud.number
+            self._context.operator.count_live_shown(cloud)
         return True
 
     def _send(self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray, size: float) -> None:

@@ -1,4 +1,4 @@
-"""Measurements in the 3D view: what stands at their places, and in which words."""
+"""Measurements in the 3D view: their lines, and the labels beside them."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,15 +14,15 @@ from slviewer.session.measurements import Measurement
 _UNITS = {"deg": "°", "%": " %", "": ""}
 _ROUND = 48
 _OFF = 0.01
-"""What lies on the surface is drawn off it by this share of its size: the surface would hide it."""
+"""Lines on the surface are drawn above it by this share of its size, so as to be visible."""
 _LEG, _SHORTEST_LEG_MM = 0.15, 5.0
-"""Of a dimension's length."""
+"""Length of a dimension's legs, as a share of the dimension and at least."""
 _EXTENT_MM = 15.0
-"""Of a plane or a cylinder whose region says no size."""
+"""Half size of a plane or a cylinder whose region has none."""
 
 
-def value_words(quantity: Quantity) -> str:
-    """Value ± U (k = 2) with the unit; a star where the calibration's part of U is not known."""
+def format_quantity(quantity: Quantity) -> str:
+    """Value ± U (k = 2) with the unit; a star where the calibration's part of U is unknown."""
     digits = 1 if quantity.unit == "%" else 3
     unit = _UNITS.get(quantity.unit, f" {quantity.unit}")
     value = f"{round(quantity.value, digits) + 0.0:.{digits}f}".replace("-", "−")  # no minus before nothing
@@ -32,18 +32,18 @@ def value_words(quantity: Quantity) -> str:
 
 
 def label(measured: Measurement) -> str:
-    """What stands beside it in 3D: its name, and the number that it is about."""
+    """Its label in 3D: the name, and the first quantity."""
     if measured.kind in ("point", "section", "deviation"):
         return measured.name
     first = quantities_of(measured)[0]
     named = "" if measured.kind in ("distance", "relation") else f"{first.name} "
-    return f"{measured.name}: {named}{value_words(first)}" + (" (stale)" if measured.stale else "")
+    return f"{measured.name}: {named}{format_quantity(first)}" + (" (stale)" if measured.stale else "")
 
 
 def drawn(
     measured: Measurement, others: Mapping[str, Measurement], lines: Sequence[np.ndarray] = ()
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """((n, 2, 3) segments, (3,) place of its words) mm; None where there is nothing to be seen of it.
+    """((n, 2, 3) segments, (3,) position of its label) mm; None where nothing can be drawn.
 
     ``others``: all measurements by id; ``lines`` (k, 2) mm: of a section.
     """
@@ -57,8 +57,8 @@ def drawn(
         place = cut[0][np.argmax(cut[0] @ plane.up)] if cut else plane.origin
         return np.concatenate([_chain(each) for each in cut]) if cut else np.empty((0, 2, 3)), place
     if measured.kind == "relation":
-        found = (feature_of(others[each]) for each in measured.of if each in others)
-        ends = [feature for feature in found if feature is not None]
+        related = (feature_of(others[each]) for each in measured.of if each in others)
+        ends = [feature for feature in related if feature is not None]
         if len(ends) != 2:
             return None
         # from outside of both; a point lies on the surface already
@@ -69,7 +69,7 @@ def drawn(
 
 
 def feature_of(measured: Measurement) -> Feature | None:
-    """The point, plane, sphere or cylinder that a measurement is."""
+    """The point, plane, sphere or cylinder of a measurement; None of other kinds."""
     found = measured.data.get("feature") or measured.data.get("fit", {}).get("feature")
     return None if found is None else from_plain(found, Feature)
 
@@ -99,7 +99,7 @@ def _outline(feature: Feature, extent: float) -> np.ndarray:
 
 
 def _dimension(a: np.ndarray, b: np.ndarray, clear_mm: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """As on a technical drawing: a line beside the part, here towards the camera, with a leg down to either end."""
+    """A dimension line, offset towards the camera, with a leg to either end, as in a technical drawing."""
     middle = (a + b) / 2
     leg = max(_LEG * float(np.linalg.norm(b - a)), _SHORTEST_LEG_MM, clear_mm)
     up = -leg * middle / max(float(np.linalg.norm(middle)), 1e-9)

@@ -1,4 +1,4 @@
-"""The surface that is measured on: chosen, drawn in 3D, and asked where it was clicked."""
+"""The surface to measure on: chosen, drawn in 3D, and picked on."""
 
 from collections.abc import Callable
 from itertools import count
@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.gui.inputs import Choice, change, titled
-from slviewer.gui.measure_words import deviation_bar
-from slviewer.gui.panel import Stage
-from slviewer.gui.pictures import Painter, opened, spread
-from slviewer.gui.steps.scan import ordered
-from slviewer.gui.widgets import Html, Words, colour_bar, colours
+from slviewer.gui.inputs import Choice, change, display_name
+from slviewer.gui.measure_html import deviation_bar
+from slviewer.gui.panel import PanelContext
+from slviewer.gui.pictures import Painter, colour_range
+from slviewer.gui.steps.scan import sort_scans
+from slviewer.gui.widgets import Html, Text, colour_bar, colours
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.session.measurements import Measurement, measurement_arrays
@@ -23,11 +23,11 @@ DEVIATION = "deviation"
 SHOWN = 150_000
 
 
-class SurfaceBox:
-    """What is measured on; ``loaded()`` is called once another one is there, on the painter's thread."""
+class SurfaceView:
+    """The chosen surface; ``loaded()`` is called once another one is shown, on the painter's thread."""
 
-    def __init__(self, stage: Stage, painter: Painter, layer: str, loaded: Callable[[], None]) -> None:
-        self._stage, self._painter, self._layer, self._loaded = stage, painter, layer, loaded
+    def __init__(self, context: PanelContext, painter: Painter, layer: str, loaded: Callable[[], None]) -> None:
+        self._context, self._painter, self._layer, self._loaded = context, painter, layer, loaded
         self._clicks = count()
         self._deviation: Measurement | None = None
         self._versions: dict[str, Any] = {}
@@ -36,111 +36,111 @@ class SurfaceBox:
 
     def build(self) -> None:
         """The inputs."""
-        gui, safely = self._stage.gui, self._stage.safely
-        self._choice = Choice(gui, "Measure on")
-        self._choice.on_change(safely(self.ask))
-        self._colour = gui.add_dropdown("Colour by", COLOURS)
-        self._colour.on_update(safely(self.ask))
-        self._legend = Words(gui)
-        self._stage.bring_button(lambda: None if self.on is None else self.on.points)
+        gui, context = self._context.gui, self._context
+        self._choice = Choice(gui, "Surface")
+        self._choice.on_change(context.callback(self.request))
+        self._colour = gui.add_dropdown("Colour", COLOURS)
+        self._colour.on_update(context.callback(self.request))
+        self._legend = Text(gui)
+        context.view_button(lambda: None if self.on is None else self.on.points)
 
     @property
     def name(self) -> str:
-        """The scan or the merge that was chosen; empty where there is none."""
+        """The chosen scan or merge; empty where there is none."""
         return self._choice.value
 
     def choose(self, name: str) -> None:
-        """Measure on this one, if it can be."""
+        """Choose this one, if it is offered."""
         self._choice.choose(name)
 
     def offer(self, session: SessionView | None) -> None:
-        """Offer what can be measured on now, and draw what is chosen."""
-        scans = [scan for scan in ordered(session.scans) if scan.cloud == "fresh"] if session else []
-        offered = [(scan.name, titled(scan.name, scan.label)) for scan in scans]
-        where = session.folder if session else None
-        self._versions = {s.name: (where, s.model, s.points, s.noise_mm, s.scale) for s in scans}
+        """Offer the surfaces that can be measured on, and draw the chosen one."""
+        scans = [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"] if session else []
+        offered = [(scan.name, display_name(scan.name, scan.label)) for scan in scans]
+        folder = session.folder if session else None
+        self._versions = {s.name: (folder, s.model, s.points, s.noise_mm, s.scale) for s in scans}
         merge = session.merge if session else None
         if merge is not None and not merge.stale:
             name = f"{MERGED}{merge.name}"
             offered.append((name, f"Merge of {len(merge.scans)} scans"))
-            self._versions[name] = (where, merge.points)
+            self._versions[name] = (folder, merge.points)
         self._choice.offer(offered)
-        self.ask()
+        self.request()
 
-    def deviate(self, measured: Measurement | None) -> None:
-        """Offer to colour by this deviation, and do so; None: offer it no longer."""
+    def show_deviation(self, measured: Measurement | None) -> None:
+        """Colour by this deviation; None: by another quantity."""
         self._deviation = measured
         if measured is not None:
             change(self._colour, options=(*COLOURS, DEVIATION))
             change(self._colour, value=DEVIATION)
         elif DEVIATION in self._colour.options:
-            kept = COLOURS[0] if self._colour.value == DEVIATION else self._colour.value
+            colour = COLOURS[0] if self._colour.value == DEVIATION else self._colour.value
             self._colour.options = COLOURS
-            change(self._colour, value=kept)
-        self.ask()
+            change(self._colour, value=colour)
+        self.request()
 
     def show(self, visible: bool) -> None:
-        """The panel is shown, or hidden."""
+        """The panel is shown or hidden."""
         self._visible = visible
-        self._stage.scene.show(self._layer, visible)
-        self._look()
+        self._context.scene.show(self._layer, visible)
+        self._show_view()
 
-    def clicked(self, origin: np.ndarray, direction: np.ndarray, do: Callable[[Place], None]) -> None:
-        """Call ``do(place)`` soon with what a ray meets; nothing happens where it passes the surface by."""
-        on, wish = self.on, f"click {next(self._clicks)}"
+    def pick(self, origin: np.ndarray, direction: np.ndarray, do: Callable[[Place], None]) -> None:
+        """Call ``do(place)`` soon with the point that a ray meets; nothing happens where it misses the surface."""
+        on, slot = self.on, f"click {next(self._clicks)}"
         if on is None:
             return
 
-        def found(place: Place | None) -> None:
-            self._painter.forget(wish)
+        def picked(place: Place | None) -> None:
+            self._painter.cancel(slot)
             if place is not None and on is self.on:
                 do(place)
 
-        self._painter.ask(wish, None, lambda: place_at(on, origin, direction), found)
+        self._painter.request(slot, None, lambda: place_at(on, origin, direction), picked)
 
-    def ask(self) -> None:
-        """Ask for what is chosen, in the colours that are."""
+    def request(self) -> None:
+        """Request the chosen surface in the chosen colours."""
         name, colour, shown = self.name, self._colour.value, self._deviation
         if not name:
             self.on = None
-            self._painter.forget("surface")
-            self._stage.scene.remove(self._layer, "surface")
+            self._painter.cancel("surface")
+            self._context.scene.remove(self._layer, "surface")
             self._legend.set("")
             return
         if shown is not None and (shown.source != name or colour != DEVIATION):
             shown = None
         key = (name, self._versions.get(name), colour if shown is None else shown.id)
-        operator = self._stage.operator
+        context = self._context
 
         def make() -> tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]:
-            on = operator.surface(name)
+            on = context.operator.surface(name)
             if shown is None:
                 return (on, *painting(on, COLOURS[0] if colour == DEVIATION else colour))
-            arrays = measurement_arrays(opened(operator), shown.id)
+            arrays = measurement_arrays(context.session, shown.id)
             return (on, *_deviating(arrays, shown))
 
-        self._painter.ask("surface", key, make, self._draw)
+        self._painter.request("surface", key, make, self._draw)
 
     def _draw(self, made: tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]) -> None:
         on, points, painted, bar = made
-        fresh = on is not self.on
+        is_new = on is not self.on
         self.on = on
-        self._stage.scene.cloud(self._layer, "surface", points, painted)
-        self._stage.scene.show(self._layer, self._visible)
+        self._context.scene.cloud(self._layer, "surface", points, painted)
+        self._context.scene.show(self._layer, self._visible)
         self._legend.set(bar)
-        if fresh:
+        if is_new:
             self._loaded()
-        self._look()
+        self._show_view()
 
-    def _look(self) -> None:
+    def _show_view(self) -> None:
         if self._visible and self.on is not None:
-            self._stage.viewpoints.at(f"{self._layer} {self.on.source}", self.on.points)
+            self._context.viewpoints.show(f"{self._layer} {self.on.source}", self.on.points)
 
 
 def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
     """(points (..., 3), their colours likewise, the legend) of a surface in one of COLOURS, thinned to be drawn."""
     step = 1
-    if on.organised:  # row by row, so that what is drawn has no stripes
+    if on.organised:  # thinned in rows and columns alike, so that no stripes appear
         step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(on.measured) / SHOWN))))
     part = (slice(None, None, step),) * (2 if on.organised else 1)
     points = on.points[part]
@@ -150,17 +150,17 @@ def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, 
     if colour == "uncertainty":
         sigma = on.sigma_mm if on.left_mm is None else np.hypot(on.sigma_mm, on.left_mm)
         sigma = np.where(on.measured, sigma, np.nan)
-        low, high = spread(sigma)
-        said = "uncertainty of z (1 sigma)" if on.organised else "uncertainty along the normal (1 sigma)"
-        said += "" if on.left_mm is not None else ", of noise alone"
-        return points, colours(sigma[part], low, high), colour_bar(f"{low:.3f} mm", f"{high:.3f} mm", "value", said)
-    low, high = spread(on.points[..., 2])
+        low, high = colour_range(sigma)
+        title = "uncertainty of z (1 sigma)" if on.organised else "uncertainty along the normal (1 sigma)"
+        title += "" if on.left_mm is not None else ", noise only"
+        return points, colours(sigma[part], low, high), colour_bar(f"{low:.3f} mm", f"{high:.3f} mm", "value", title)
+    low, high = colour_range(on.points[..., 2])
     bar = colour_bar(f"{low:.1f} mm", f"{high:.1f} mm", "value", "depth")
     return points, colours(points[..., 2], low, high), bar
 
 
 def _deviating(arrays: dict[str, np.ndarray], measured: Measurement) -> tuple[np.ndarray, np.ndarray, Html]:
-    """The same of a kept deviation; what of the nominal was not measured in grey."""
+    """As `painting`, of a stored deviation; grey where the nominal was not measured."""
     verdict = measured.data["verdict"]
     limit = colour_limit(arrays["signed"], None if verdict is None else float(verdict["tolerance_mm"]))
     uncovered = arrays["uncovered"].reshape(-1, 3)

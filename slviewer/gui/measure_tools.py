@@ -1,38 +1,35 @@
-"""The tools of the step Measure: which there are, what each asks for now, and what was clicked so far."""
+"""The tools of the step Measure, their instructions, and the points picked so far."""
 
 from slviewer.pipeline.measured_surface import Place
 
 PICK = ("Point", "Distance", "Section")
 FIT = ("Plane", "Sphere", "Cylinder")
-COMPARE = ("Two results", "Nominal model")
+COMPARE = ("Relation", "Deviation")
 _CLICKS = {
     "Point": ("Click the point.",),
     "Distance": ("Click the first point.", "Click the second point."),
-    "Section": (
-        "Click where the cut begins.",
-        "Click where it ends: it goes through both points and, as nearly as can be, through the camera.",
-    ),
+    "Section": ("Click the start of the section.", "Click the end of the section."),
 }
-_REST = {
-    "Two results": "Choose two points or fits, and press Measure between them.",
-    "Nominal model": "Upload the model (STL, PLY, OBJ) or choose one, give the limit, if any, and press Compare.",
+_WITHOUT_CLICKS = {
+    "Relation": "Choose two points or fits, and measure their distances and angles.",
+    "Deviation": "Choose or upload a nominal model (STL, PLY, OBJ), and compare.",
 }
 
 
 class Tool:
-    """The tool in hand, its name empty where there is none, and the places that were picked with it."""
+    """The current tool, its name empty for none, and the points picked with it."""
 
     def __init__(self) -> None:
         self.name = ""
         self.picked: list[Place] = []
 
-    def take(self, name: str) -> None:
-        """Take another tool, or none, in hand; what was picked is forgotten."""
+    def select(self, name: str) -> None:
+        """Select another tool, or none; picked points are dropped."""
         self.name, self.picked = name, []
 
     @property
     def fits(self) -> bool:
-        """Whether it fits a shape to a region around the picked place."""
+        """Whether it fits a shape to a region around the picked point."""
         return self.name in FIT
 
     @property
@@ -41,9 +38,9 @@ class Tool:
         return self.fits or self.name in _CLICKS
 
     def pick(self, place: Place) -> tuple[Place, ...] | None:
-        """A click on the surface; all the places where with it the tool has what it needs, and begins anew.
+        """Add a click on the surface; returns all points once the tool has enough, and starts again.
 
-        A tool that fits keeps the last one instead, until the operator is content with the region.
+        A tool that fits replaces its point instead, until the operator accepts the region.
         """
         if self.fits:
             self.picked = [place]
@@ -55,18 +52,15 @@ class Tool:
         return done
 
     @property
-    def sentence(self) -> str:
+    def instruction(self) -> str:
         """What to do now."""
         if not self.name:
             return "Choose a tool."
         if self.fits:
             shape = self.name.lower()
             if not self.picked:
-                return f"Click the middle of the {shape}."
-            return (
-                f"Set the radius so that the ball holds nothing but the {shape}, and press Fit {shape}; or click "
-                "elsewhere."
-            )
-        if self.name in _REST:
-            return _REST[self.name]
+                return f"Click the centre of the {shape}."
+            return f"Set the radius so that the ball contains only the {shape}, then press Fit {shape}."
+        if self.name in _WITHOUT_CLICKS:
+            return _WITHOUT_CLICKS[self.name]
         return _CLICKS[self.name][len(self.picked)]

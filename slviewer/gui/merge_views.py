@@ -1,4 +1,4 @@
-"""What the step Merge draws of scans and of the surface that they became."""
+"""Clouds of the step Merge: the scans, and the merged surface."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,17 +6,17 @@ from functools import cached_property
 
 import numpy as np
 
-from slviewer.gui.pictures import spread
+from slviewer.gui.pictures import colour_range
 from slviewer.gui.scene import Colour
-from slviewer.gui.widgets import Html, block, cell, colour_bar, colours, toned
+from slviewer.gui.widgets import Html, colour_bar, coloured, colours, paragraph, to_html
 from slviewer.session.ply import Ply
 from slviewer.session.store import Session
 from slviewer.wizard import result_views
 
-AFTER, BEFORE = "after, coloured by scan", "before, coloured by scan"
-OWN = "merged points in their own colours"
-BY_SCAN = "merged points by the scan they come from"
-BY_SIGMA = "merged points by uncertainty"
+AFTER, BEFORE = "scans, aligned", "scans, as captured"
+OWN = "merged, texture"
+BY_SCAN = "merged, by scan"
+BY_SIGMA = "merged, uncertainty"
 MERGED = (OWN, BY_SCAN, BY_SIGMA)
 SCAN_COLOURS: tuple[Colour, ...] = (
     (91, 143, 208), (224, 161, 60), (99, 178, 138), (200, 113, 143), (143, 131, 201), (120, 120, 120),
@@ -26,10 +26,10 @@ _SHOWN = 60_000
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """Clouds by name, each its points (n, 3) mm and colours, and the legend; ``about`` changes with their places."""
+class ColouredClouds:
+    """Clouds by name, each its points (n, 3) mm and colours, and the legend; ``view`` changes with their positions."""
 
-    about: str
+    view: str
     clouds: Mapping[str, tuple[np.ndarray, np.ndarray | Colour]]
     legend: Html
 
@@ -39,9 +39,9 @@ class Drawn:
         return np.concatenate([points for points, _ in self.clouds.values()]) if self.clouds else None
 
 
-def scans_drawn(
+def colour_scans(
     session: Session, names: Sequence[str], places: Mapping[str, np.ndarray], titles: Mapping[str, str]
-) -> Drawn:
+) -> ColouredClouds:
     """Scans, each in a colour, where ``places`` (4, 4) put them, or where they were measured."""
     clouds: dict[str, tuple[np.ndarray, np.ndarray | Colour]] = {}
     for i, name in enumerate(names):
@@ -50,14 +50,14 @@ def scans_drawn(
         points = cloud.points[rows, columns].reshape(-1, 3)
         T = places.get(name, np.eye(4))
         clouds[name] = ((points @ T[:3, :3].T + T[:3, 3]).astype(np.float32), SCAN_COLOURS[i % len(SCAN_COLOURS)])
-    return Drawn("after" if places else "before", clouds, _patches([titles.get(name, name) for name in names]))
+    return ColouredClouds("after" if places else "before", clouds, _patches([titles.get(name, name) for name in names]))
 
 
-def merged_drawn(session: Session, merge: str, view: str, titles: Sequence[str]) -> Drawn:
+def colour_merge(session: Session, merge: str, view: str, titles: Sequence[str]) -> ColouredClouds:
     """The surface of a merge, in one of MERGED; ``titles`` are those of its scans, in their order."""
     surface = result_views.merged_cloud(session, merge)
     legend, painted = _painted(surface, view, titles)
-    return Drawn("merged", {"merged": (surface.points, painted)}, legend)
+    return ColouredClouds("merged", {"merged": (surface.points, painted)}, legend)
 
 
 def patch(colour: Colour) -> Html:
@@ -72,19 +72,18 @@ def _painted(surface: Ply, view: str, titles: Sequence[str]) -> tuple[Html, np.n
         return _patches(titles), palette[source.astype(np.int64) % len(palette)]
     if view == BY_SIGMA and sigma is not None:
         known = np.where(sigma > 0, sigma, np.nan)
-        low, high = spread(known)
-        said = "expected error along the normal (1 sigma)"
-        said += "" if np.isfinite(known).all() else "; grey where it is not known"
-        return colour_bar(f"{low:.3f} mm", f"{high:.3f} mm", "value", said), colours(known, low, high)
+        low, high = colour_range(known)
+        title = "uncertainty along the normal (1 sigma)" + ("" if np.isfinite(known).all() else "; grey: unknown")
+        return colour_bar(f"{low:.3f} mm", f"{high:.3f} mm", "value", title), colours(known, low, high)
     if view == OWN and own is not None:
         return Html(""), np.repeat(own[:, None], 3, axis=1) if own.ndim == 1 else own
-    missing = "The file of this merge does not hold it: merge again." if view != OWN else "The scans have no colours."
-    return block(toned(missing, "warning")), _GREY
+    missing = "Not stored with this merge: merge again." if view != OWN else "The scans have no texture."
+    return paragraph(coloured(missing, "warning")), _GREY
 
 
 def _patches(titles: Sequence[str]) -> Html:
-    words = [
-        f"<span>{patch(SCAN_COLOURS[i % len(SCAN_COLOURS)])} {cell(title)}</span>" for i, title in enumerate(titles)
+    items = [
+        f"<span>{patch(SCAN_COLOURS[i % len(SCAN_COLOURS)])} {to_html(title)}</span>" for i, title in enumerate(titles)
     ]
-    row = f'<div style="display:flex;flex-wrap:wrap;gap:0 1em;align-items:center">{"".join(words)}</div>'
-    return block(Html(row)) if words else Html("")
+    row = f'<div style="display:flex;flex-wrap:wrap;gap:0 1em;align-items:center">{"".join(items)}</div>'
+    return paragraph(Html(row)) if items else Html("")

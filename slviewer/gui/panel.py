@@ -1,53 +1,65 @@
-"""What a step's panel is, and what it is given: where to draw, whom to ask, and how to hear of failures."""
+"""What every step's panel shares: its context, its buttons, and the callbacks that report failures."""
 
+import threading
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import viser
 
 from slviewer.devices.channel import Standing
+from slviewer.errors import InputError
+from slviewer.gui.pictures import Painter
 from slviewer.gui.scene import ViewerScene
-from slviewer.gui.viewpoints import Viewpoints, bring
+from slviewer.gui.viewpoints import Viewpoints, look_at_points
 from slviewer.server.viewers import Viewers
+from slviewer.session.store import Session
+from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Level, PreviewView, Snapshot
+
+ButtonColour = Literal["gray", "red", "orange", "green", "teal", "cyan"]
 
 
 @dataclass(frozen=True)
-class Stage:
+class PanelContext:
     """What a panel works with.
 
-    `gui` builds inputs, `scene` draws in 3D, `viewpoints` turns the browsers' views, `operator` takes requests.
-    `offer(path)` gives the address at which a file of the session is downloaded; `tell(level, text)` shows a
-    notification in every browser; `escape(text)` makes text that was typed or read harmless inside HTML and
-    Markdown. `go(key)` brings another step to the front. `turns` does one callback after the other.
-    `projector_page()` says where the projector page stands; None where none is served. `viewers(answered)` tells
+    `gui` builds inputs, `scene` draws in 3D, `viewpoints` moves the browsers' views, `operator` takes requests.
+    `offer(path)` returns the address at which a file of the session is downloaded; `notify(level, text)` shows a
+    notification in every browser; `go(key)` shows another step. `executor` runs one callback after the other.
+    `projector_page()` returns the state of the projector page; None where none is served. `viewers(answered)` tracks
     which browsers have drawn what they were sent.
     """
 
     gui: viser.GuiApi
     scene: ViewerScene
     viewpoints: Viewpoints
-    operator: Any
+    operator: Operator
     offer: Callable[[Path], str]
-    tell: Callable[[Level, str], None]
-    escape: Callable[[str], str]
+    notify: Callable[[Level, str], None]
     go: Callable[[str], None]
     failed: Callable[[BaseException], None]
-    turns: Executor
+    executor: Executor
     viewers: Callable[[Callable[[], None]], Viewers]
     projector_page: Callable[[], Standing | None] = lambda: None
 
-    def safely(self, do: Callable[[], Any], *, at_once: bool = False) -> Callable[[Any], None]:
-        """A callback for viser that calls `do()`; whatever it raises becomes a notification in plain words.
+    @property
+    def session(self) -> Session:
+        """The open session. Raises InputError where it was closed meanwhile."""
+        if self.operator.session is None:
+            raise InputError("no session is open: open one first")
+        return self.operator.session
 
-        ``button.on_click(stage.safely(lambda: stage.operator.calibrate()))``. Viser calls back from a pool of threads,
-        one event beside the other: here they take their turns, so that the board is placed before it is captured by
-        whoever clicks fast. `at_once`: for what must not wait, as cancelling.
+    def callback(self, do: Callable[[], Any], *, by_user: bool = False, at_once: bool = False) -> Callable[[Any], None]:
+        """A callback for viser that calls `do()`; whatever it raises becomes a notification.
+
+        Viser calls back from a pool of threads, several events at a time: here they are queued, so that the board is
+        placed before it is captured by someone who clicks fast. `by_user`: only for changes made in a browser, not by
+        the program. `at_once`: for what must not wait, such as cancelling.
         """
 
         def call() -> None:
@@ -56,43 +68,74 @@ class Stage:
             except Exception as error:
                 self.failed(error)
 
-        return (lambda _event: call()) if at_once else (lambda _event: self._queue(call))
+        def handle(event: Any) -> None:
+            if by_user and event.client_id is None:
+                return
+            if at_once:
+                call()
+            else:
+                with suppress(RuntimeError):  # the wizard ends
+                    self.executor.submit(call)
 
-    def safely_with(self, do: Callable[[Any], Any]) -> Callable[[Any], None]:
-        """The same for a callback that needs viser's event, as those of gizmos and of the scene do."""
-        return lambda event: self.safely(lambda: do(event))(event)
+        return handle
 
-    def bring_button(self, points: Callable[[], np.ndarray | None]) -> viser.GuiButtonHandle:
-        """A button that turns the view of whoever clicks it to the points (..., 3) mm that it is given then, if any."""
-        button = self.gui.add_button("Bring into view", icon=viser.Icon.FOCUS_2, color="gray")
-        button.on_click(self.safely_with(lambda event: _bring(event, points())))
+    def button(
+        self,
+        label: str,
+        do: Callable[[], Any],
+        icon: viser.IconName | None = None,
+        color: ButtonColour | None = "gray",
+        *,
+        hint: str | None = None,
+        visible: bool = True,
+        at_once: bool = False,
+    ) -> viser.GuiButtonHandle:
+        """A button that calls `do()`; without a colour it is the panel's main action."""
+        handle = self.gui.add_button(label, icon=icon, color=color, hint=hint, visible=visible)
+        handle.on_click(self.callback(do, at_once=at_once))
+        return handle
+
+    def view_button(self, points: Callable[[], np.ndarray | None]) -> viser.GuiButtonHandle:
+        """A button that moves the view of whoever clicks it to the points (..., 3) mm, if there are any."""
+
+        def look(event: Any) -> None:
+            shown = points()
+            if event.client is not None and shown is not None:
+                look_at_points(event.client, shown)
+
+        button = self.gui.add_button("Zoom to fit", icon=viser.Icon.FOCUS_2, color="gray")
+        button.on_click(lambda event: self.callback(lambda: look(event))(event))
         return button
 
-    def _queue(self, call: Callable[[], None]) -> None:
-        with suppress(RuntimeError):  # the wizard ends
-            self.turns.submit(call)
 
-
-def _bring(event: Any, points: np.ndarray | None) -> None:
-    if event.client is not None and points is not None:
-        bring(event.client, points)
-
-
-class Panel(Protocol):
+class StepPanel:
     """One step's controls. Every method is called by the drawing thread, and only handles that changed are touched."""
 
-    key: str
+    key: ClassVar[str]
+    layers: ClassVar[tuple[str, ...]] = ()
+    """Of the scene, shown with the panel."""
 
-    def __init__(self, stage: Stage) -> None: ...
+    def __init__(self, context: PanelContext) -> None:
+        self._context, self._gui, self._scene = context, context.gui, context.scene
+        self._operator = context.operator
+        self._painter = Painter(context.failed)
+        self._lock = threading.RLock()
+        self._snapshot: Snapshot | None = None
+        self._visible = False
 
     def build(self) -> None:
-        """Make the handles; called once, inside the panel's own container."""
+        """Create the handles; called once, inside the panel's own container."""
+        raise NotImplementedError
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show this. Called whenever the snapshot changed while the panel is shown, and right after `shown(True)`."""
+        """Show this. Called whenever the snapshot changed while the panel is shown, and right after `show(True)`."""
+        raise NotImplementedError
 
     def draw_preview(self, preview: PreviewView) -> None:
-        """Show the latest frame; called while the panel is shown, ten times a second at most."""
+        """Show the latest frame; called while the panel is shown, at most ten times a second."""
 
-    def shown(self, visible: bool) -> None:
-        """The panel is brought to the front, or hidden: show or hide its layers of the scene."""
+    def show(self, visible: bool) -> None:
+        """The panel is shown or hidden: so are its layers of the scene."""
+        self._visible = visible
+        for layer in self.layers:
+            self._scene.show(layer, visible)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from slviewer.gui.scene import Colour, ViewerScene
-from slviewer.gui.widgets import Html, Tone, block, cell, thumbnail, toned
+from slviewer.gui.widgets import Html, Tone, coloured, paragraph, thumbnail, to_html
 from slviewer.target.board import Board
 from slviewer.wizard.snapshot import PoseView
 
@@ -17,7 +17,7 @@ TONES: dict[str, Tone] = {
     "used": "good",
     "refused": "error",
     "excluded": "dim",
-    "left out": "warning",
+    "unused": "warning",
 }
 COLOURS: dict[str, Colour] = {
     "judging": (34, 139, 230),
@@ -25,38 +25,38 @@ COLOURS: dict[str, Colour] = {
     "used": (47, 158, 68),
     "refused": (224, 49, 49),
     "excluded": (140, 140, 140),
-    "left out": (232, 119, 0),
+    "unused": (232, 119, 0),
 }
 _PICTURE_PX = 160
 
 
 def pose_table(poses: Sequence[PoseView]) -> Html:
-    """All poses, the latest first, with what became of each and why."""
+    """All poses, the latest first, with the state of each and its reason."""
     if not poses:
-        return block(toned("None yet: hold the board in view, and capture.", "dim"))
+        return paragraph(coloured("None yet.", "dim"))
     rows = []
     for pose in reversed(poses):
         rms = f"{pose.rms_px[0]:.2f} / {pose.rms_px[1]:.2f} px" if pose.rms_px is not None else ""
-        says = toned(pose.state, TONES[pose.state], bold=True)
-        why = f'<div style="color:var(--mantine-color-dimmed)">{cell(pose.why or rms)}</div>'
+        state = coloured(pose.state, TONES[pose.state], bold=True)
+        why = f'<div style="color:var(--mantine-color-dimmed)">{to_html(pose.why or rms)}</div>'
         rows.append(
             '<div style="display:flex;gap:0.6em;align-items:center;padding:0.25em 0;'
             'border-top:1px solid var(--mantine-color-default-border)">'
             f"{thumbnail(pose.thumbnail, 52, pose.name)}"
-            f'<div style="min-width:0"><b>{cell(pose.name)}</b>&ensp;{says}{why}</div></div>'
+            f'<div style="min-width:0"><b>{to_html(pose.name)}</b>&ensp;{state}{why}</div></div>'
         )
-    return block(Html(f'<div style="max-height:15em;overflow-y:auto">{"".join(rows)}</div>'))
+    return paragraph(Html(f'<div style="max-height:15em;overflow-y:auto">{"".join(rows)}</div>'))
 
 
 class PoseBoards:
-    """Keeps a layer's boards in step with the poses; `chosen(name)` is called for the one that is clicked on."""
+    """Keeps a layer's boards up to date with the poses; `chosen(name)` is called when one is clicked."""
 
     def __init__(self, scene: ViewerScene, layer: str, chosen: Callable[[str], None]) -> None:
         self._scene, self._layer, self._chosen = scene, layer, chosen
         self._drawn: dict[str, Any] = {}
 
     def draw(self, poses: Sequence[PoseView], board: Board | None, camera: tuple[int, int] | None, chosen: str) -> None:
-        """Show the poses whose place is known."""
+        """Show the poses whose position is known."""
         known = {pose.name: pose for pose in poses if pose.T_camera_board is not None} if board is not None else {}
         for name in set(self._drawn) - set(known):
             self._scene.remove(self._layer, name)
@@ -80,7 +80,7 @@ class PoseBoards:
 
 
 def rectified(pose: PoseView, board: Board, camera: tuple[int, int] | None) -> np.ndarray | None:
-    """(h, w, 3) uint8: the board's face, cut out of the pose's thumbnail; None where either is not known yet."""
+    """(h, w, 3) uint8: the board's front, cut out of the pose's thumbnail; None where either is unknown."""
     if not pose.thumbnail or pose.board_px is None or camera is None:
         return None
     image = cv2.imdecode(np.frombuffer(pose.thumbnail, np.uint8), cv2.IMREAD_COLOR)

@@ -1,20 +1,20 @@
-"""The live picture as the operator sees it: what is saturated, the board that is found, and where to hold it next."""
+"""The live image: saturated pixels, the detected board, and where to hold it next."""
 
 import cv2
 import numpy as np
 
-from slviewer.gui.widgets import PICTURE_PX, Html, block, cell, fitted, toned
+from slviewer.gui.widgets import PICTURE_PX, Html, coloured, fitted, paragraph, to_html
 from slviewer.target.board import Board
 from slviewer.wizard.snapshot import PreviewView
 
-_FOUND, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
+_DETECTED, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
 DIM = 0.35
 """Share of the camera's range below which the brightest parts of an image are called dim."""
 
 
-def drawn(preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None) -> np.ndarray:
-    """(h, w, 3) uint8: the frame with saturated pixels marked, the found board's features joined row by row, and the
-    outline (4, 2), in camera px, of where to hold the board.
+def draw_preview(preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None) -> np.ndarray:
+    """(h, w, 3) uint8: the frame with saturated pixels marked, the detected board's features joined row by row, and the
+    outline (4, 2), in camera px, of the suggested pose.
     """
     picture = fitted(preview.image)
     clipped = preview.image >= 255
@@ -27,38 +27,38 @@ def drawn(preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray
     if preview.board is not None:
         _grid(picture, preview.board.pixels * to_picture, board)
         corners = np.round(preview.board.outline * to_picture * 16).astype(np.int32)
-        cv2.polylines(picture, [corners], True, _FOUND, 2, cv2.LINE_AA, shift=4)
+        cv2.polylines(picture, [corners], True, _DETECTED, 2, cv2.LINE_AA, shift=4)
     return picture
 
 
-def light_words(preview: PreviewView) -> Html:
-    """How bright the frame is, in words with a colour."""
+def exposure_html(preview: PreviewView) -> Html:
+    """Whether the frame is well exposed, and what to do."""
     if preview.saturated > 0.002:
         share = 100 * preview.saturated
-        return toned(f"{share:.1f} % saturated, marked red: lower the exposure", "error", bold=True)
+        return coloured(f"{share:.1f} % saturated (red): lower the exposure", "error", bold=True)
     if preview.brightest < DIM:
-        return toned(f"Dim: the brightest parts reach {100 * preview.brightest:.0f} %. Raise the exposure", "warning")
-    return toned(f"Well exposed: the brightest parts reach {100 * preview.brightest:.0f} %", "good")
+        return coloured(f"Dim, peak at {100 * preview.brightest:.0f} %: raise the exposure", "warning")
+    return coloured(f"Well exposed, peak at {100 * preview.brightest:.0f} %", "good")
 
 
-def board_words(preview: PreviewView, board: Board | None) -> Html:
-    """Whether the board is seen, and why not."""
+def board_html(preview: PreviewView, board: Board | None) -> Html:
+    """Whether the board is detected, and why not."""
     if board is None:
-        return toned("No board is chosen yet", "dim")
+        return coloured("No board is chosen", "dim")
     if preview.board is None:
-        return toned(preview.missing or "The board is not looked for yet", "warning")
-    seen, all_of_it = len(preview.board.pixels), len(board.points)
-    return toned(f"Board found: {seen} of {all_of_it} features", "good")
+        return coloured(preview.missing or "Searching for the board …", "warning")
+    detected, total = len(preview.board.pixels), len(board.points)
+    return coloured(f"Board detected: {detected} of {total} features", "good")
 
 
-def legend(preview: PreviewView, *words: Html) -> Html:
-    """Lines below the picture, the frame rate beside the first."""
-    rate = toned(f"{preview.frames_per_s:.0f} pictures/s", "dim")
+def legend(preview: PreviewView, *lines: Html) -> Html:
+    """Lines below the image, the frame rate beside the first."""
+    rate = coloured(f"{preview.frames_per_s:.0f} frames/s", "dim")
     first = (
         '<div style="display:flex;justify-content:space-between;gap:1em">'
-        f'<span>{words[0]}</span><span style="white-space:nowrap">{rate}</span></div>'
+        f'<span>{lines[0]}</span><span style="white-space:nowrap">{rate}</span></div>'
     )
-    return block(Html(first + "".join(f"<div>{word}</div>" for word in words[1:])))
+    return paragraph(Html(first + "".join(f"<div>{line}</div>" for line in lines[1:])))
 
 
 def histogram_chart(preview: PreviewView) -> Html:
@@ -70,14 +70,15 @@ def histogram_chart(preview: PreviewView) -> Html:
         for k, share in enumerate(shares)
     )
     axis = "".join(
-        f'<span style="color:var(--mantine-color-dimmed);font-size:0.75rem">{cell(text)}</span>'
+        f'<span style="color:var(--mantine-color-dimmed);font-size:0.75rem">{to_html(text)}</span>'
         for text in ("dark", "grey level", "saturated")
     )
-    return block(
+    return paragraph(
         Html(
             f'<svg viewBox="0 0 {4 * len(shares)} 40" preserveAspectRatio="none" '
             f'style="width:100%;height:48px;display:block;border-bottom:1px solid var(--mantine-color-dimmed)">{bars}'
-            f'</svg><div style="display:flex;justify-content:space-between">{axis}</div>'
+            "</svg>"
+            f'<div style="display:flex;justify-content:space-between">{axis}</div>'
         )
     )
 
@@ -87,9 +88,9 @@ def _grid(picture: np.ndarray, pixels: np.ndarray, board: Board | None) -> None:
     if board is not None and len(pixels) == len(board.points):
         columns = board.features[0]
         for row in at.reshape(-1, columns, 2):
-            cv2.polylines(picture, [row], False, _FOUND, 1, cv2.LINE_AA, shift=4)
+            cv2.polylines(picture, [row], False, _DETECTED, 1, cv2.LINE_AA, shift=4)
     for point in at:
-        cv2.circle(picture, (int(point[0]), int(point[1])), 40, _FOUND, -1, cv2.LINE_AA, shift=4)
+        cv2.circle(picture, (int(point[0]), int(point[1])), 40, _DETECTED, -1, cv2.LINE_AA, shift=4)
 
 
 def _dashed(picture: np.ndarray, corners: np.ndarray) -> None:

@@ -1,94 +1,91 @@
-"""The check of the rig: what it found, what to do about it, and what it offers to set."""
+"""The check of the rig: its results, their remedies, and the settings that it recommends."""
 
 import viser
 
-from slviewer.gui.inputs import Follows, change
-from slviewer.gui.panel import Stage
-from slviewer.gui.widgets import Html, Tone, Words, block, cell, toned
+from slviewer.gui.inputs import SessionValue, change
+from slviewer.gui.panel import PanelContext
+from slviewer.gui.widgets import Html, Text, Tone, coloured, paragraph, to_html
 from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.wizard.snapshot import Snapshot
 
 _TONES: dict[CheckVerdict, Tone] = {"good": "good", "warning": "warning", "bad": "error", "unknown": "dim"}
 _MARKS: dict[CheckVerdict, str] = {"good": "✓", "warning": "!", "bad": "✕", "unknown": "?"}
 _EXPOSURES: dict[str, tuple[float, ...]] = {
-    "one": (),
-    "two: once and 4 times": (1.0, 4.0),
-    "three: ¼, once and 4 times": (0.25, 1.0, 4.0),
+    "1": (),
+    "2: 1×, 4×": (1.0, 4.0),
+    "3: ¼×, 1×, 4×": (0.25, 1.0, 4.0),
 }
 
 
 class RigCheck:
-    """The part of the step Rig below the picture: the check, and how captures are taken."""
+    """The part of the step Rig below the image: the check, and the exposures of captures."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
+    def __init__(self, context: PanelContext) -> None:
+        self._context = context
         self._drawn: Preflight | None = None
-        gui, operator = stage.gui, stage.operator
+        gui, operator = context.gui, context.operator
         self._exposures = gui.add_dropdown(
-            "Exposures", tuple(_EXPOSURES), hint="Several, for shiny and dark parts: each pixel keeps the best"
+            "Exposures", tuple(_EXPOSURES), hint="Several for shiny and dark parts: each pixel uses the best"
         )
-        self._exposures.on_update(stage.safely_with(lambda event: self._expose() if event.client else None))
-        self._exposures_follow = Follows(self._exposures)
-        self._exposures_say = Words(gui)
-        self._check = gui.add_button("Check the rig, about 10 s", icon=viser.Icon.STETHOSCOPE)
-        self._check.on_click(stage.safely(operator.check_rig))
-        self._found = Words(gui)
-        self._better = gui.add_button("Set the exposure", icon=viser.Icon.SUN, color="gray", visible=False)
-        self._better.on_click(stage.safely(self._set_exposure))
+        self._exposures.on_update(context.callback(self._set_exposures, by_user=True))
+        self._exposures_value = SessionValue(self._exposures)
+        self._exposures_note = Text(gui)
+        self._check = context.button(
+            "Check rig", operator.check_rig, viser.Icon.STETHOSCOPE, None, hint="Takes about 10 s"
+        )
+        self._results = Text(gui)
+        self._recommended = context.button("Set exposure", self._set_exposure, viser.Icon.SUN, visible=False)
         self._linear = gui.add_checkbox(
-            "Linear light", False, hint="Projects through the table that the check has measured", visible=False
+            "Linear light", False, hint="Corrects the grey levels by the table of the check", visible=False
         )
-        self._linear_follows = Follows(self._linear)
-        self._linear.on_update(
-            stage.safely_with(lambda event: operator.linearise(self._linear.value) if event.client else None)
-        )
+        self._linear_value = SessionValue(self._linear)
+        self._linear.on_update(context.callback(lambda: operator.set_linear_light(self._linear.value), by_user=True))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """What was found last."""
-        session, found, rig = snapshot.session, snapshot.preflight, snapshot.rig
-        recorded = rig.choice is not None and rig.choice.get("driver") == "replay"  # it shows what it was shown
+        """Show the last results."""
+        session, result, rig = snapshot.session, snapshot.preflight, snapshot.rig
+        recorded = rig.choice is not None and rig.choice.get("driver") == "replay"  # a recording cannot be checked
         change(self._check, disabled=rig.state != "open" or rig.capture is not None or recorded)
         exposures = session.exposures_ms if session else ()
-        told = next((words for words, times in _EXPOSURES.items() if len(times) == len(exposures)), None)
-        if told is not None:
-            self._exposures_follow.tell(told)
+        label = next((label for label, times in _EXPOSURES.items() if len(times) == len(exposures)), None)
+        if label is not None:
+            self._exposures_value.update(label)
         each = ", ".join(f"{exposure:g}" for exposure in exposures)
-        self._exposures_say.say(f"Each capture is taken at {each} ms." if exposures else "", "dim")
+        self._exposures_note.write(f"Exposures of each capture: {each} ms." if exposures else "", "dim")
         change(self._exposures, visible=rig.exposure_ms is not None, disabled=rig.state != "open")
-        change(self._linear, visible=bool((found and found.levels) or (session and session.linear)))
-        self._linear_follows.tell(bool(session and session.linear))
-        better = found.exposure_ms if found else None
+        change(self._linear, visible=bool((result and result.levels) or (session and session.is_linear)))
+        self._linear_value.update(bool(session and session.is_linear))
+        better = result.exposure_ms if result else None
         if better is not None:
-            change(self._better, label=f"Set the exposure to {better:.3g} ms")
-        unlike = better is not None and (rig.exposure_ms is None or abs(better / rig.exposure_ms - 1) > 0.02)
-        change(self._better, visible=unlike)  # a camera takes the nearest that it has
-        if found is not self._drawn:
-            self._drawn = found
-            self._found.set(checks_table(found) if found else "")
+            change(self._recommended, label=f"Set exposure {better:.3g} ms")
+        differs = better is not None and (rig.exposure_ms is None or abs(better / rig.exposure_ms - 1) > 0.02)
+        change(self._recommended, visible=differs)  # a camera uses the nearest exposure that it has
+        if result is not self._drawn:
+            self._drawn = result
+            self._results.set(checks_table(result) if result else "")
 
-    def _expose(self) -> None:
-        now = self._stage.operator.snapshot().rig.exposure_ms
+    def _set_exposures(self) -> None:
+        now = self._context.operator.snapshot().rig.exposure_ms
         if now is not None:
-            self._stage.operator.set_exposures([now * times for times in _EXPOSURES[self._exposures.value]])
+            self._context.operator.set_exposures([now * times for times in _EXPOSURES[self._exposures.value]])
 
     def _set_exposure(self) -> None:
-        found = self._stage.operator.snapshot().preflight
-        if found is not None and found.exposure_ms is not None:
-            self._stage.operator.set_exposure(found.exposure_ms)
+        result = self._context.operator.snapshot().preflight
+        if result is not None and result.exposure_ms is not None:
+            self._context.operator.set_exposure(result.exposure_ms)
 
 
 _ROW = "display:flex;gap:0.6em;padding:0.3em 0;border-top:1px solid var(--mantine-color-default-border)"
 
 
-def checks_table(found: Preflight) -> Html:
-    """Each check in its colour, with what to do about it."""
+def checks_table(result: Preflight) -> Html:
+    """Each check in its colour, with its remedy."""
     lines = []
-    for check in found.checks:
-        mark = toned(_MARKS[check.verdict], _TONES[check.verdict], bold=True)
-        remedy = f"<div>{toned(check.remedy, _TONES[check.verdict])}</div>" if check.remedy else ""
+    for check in result.checks:
+        mark = coloured(_MARKS[check.verdict], _TONES[check.verdict], bold=True)
+        remedy = f"<div>{coloured(check.remedy, _TONES[check.verdict])}</div>" if check.remedy else ""
         lines.append(
-            f'<div style="{_ROW}">'
-            f'<div style="width:1em;text-align:center">{mark}</div><div style="flex:1"><b>{cell(check.name)}</b>&ensp;'
-            f"{cell(check.sentence)}{remedy}</div></div>"
+            f'<div style="{_ROW}"><div style="width:1em;text-align:center">{mark}</div>'
+            f'<div style="flex:1"><b>{to_html(check.name)}</b>&ensp;{to_html(check.sentence)}{remedy}</div></div>'
         )
-    return block(Html("".join(lines)))
+    return paragraph(Html("".join(lines)))

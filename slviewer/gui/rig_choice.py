@@ -1,4 +1,4 @@
-"""Which camera and which projector: a rig by name, or devices put together here, and kept under a name."""
+"""The choice of the rig: by name, or from single devices, which can be saved under a name."""
 
 import inspect
 from typing import Any
@@ -7,171 +7,173 @@ import viser
 
 from slviewer.devices.drivers import Driver, available
 from slviewer.errors import InputError
-from slviewer.gui.inputs import Follows, change
-from slviewer.gui.panel import Stage
-from slviewer.gui.widgets import Html, Tone, Words, block, boxed, cell, toned
+from slviewer.gui.inputs import SessionValue, change
+from slviewer.gui.panel import PanelContext
+from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, paragraph, to_html
 from slviewer.pipeline.rig_choice import Choice
 from slviewer.pipeline.rig_presets import Preset, check_choice, presets
 from slviewer.wizard.snapshot import RigView, SessionView, Snapshot
 
 SIMULATED: dict[str, dict[str, Any]] = {
-    "Simulated, half resolution": {"driver": "simulated", "scale": 0.5},
-    "Simulated, full resolution": {"driver": "simulated", "scale": 1.0},
-    "Simulated, quarter resolution": {"driver": "simulated", "scale": 0.25},
+    "Simulated, half size": {"driver": "simulated", "scale": 0.5},
+    "Simulated, full size": {"driver": "simulated", "scale": 1.0},
+    "Simulated, quarter size": {"driver": "simulated", "scale": 0.25},
 }
-_CHOOSE, _OWN, _REPLAY = "Choose …", "A camera and a projector …", "replay"
+_CHOOSE, _CUSTOM, _REPLAY = "Choose …", "Custom …", "replay"
 _FIRST = "opencv"
-"""What most have: a webcam."""
-_WHICH = ("source", "serial")
-"""What drivers call the one device among several, or where it is."""
+"""The most common driver: a webcam."""
+_ADDRESSES = ("source", "serial")
+"""Names of the drivers' options that choose one device among several."""
 
 
 class RigChoice:
-    """The part of the step Rig that says which devices are used."""
+    """The part of the step Rig that chooses the devices."""
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
+    def __init__(self, context: PanelContext) -> None:
+        self._context = context
         self._presets: dict[str, Preset] = {}
         self._session: SessionView | None = None
-        gui = stage.gui
-        self._choice: Any = gui.add_dropdown("Rig", (_CHOOSE, *SIMULATED, _OWN))
-        self._follows = Follows(self._choice)
-        self._choice.on_update(stage.safely_with(self._choose))
-        self._says = Words(gui)
-        self._again = gui.add_button("Try this rig again", icon=viser.Icon.REFRESH, visible=False)
-        self._again.on_click(stage.safely(self._try_again))
+        gui = context.gui
+        self._choice: Any = gui.add_dropdown("Rig", (_CHOOSE, *SIMULATED, _CUSTOM))
+        self._chosen_value = SessionValue(self._choice)
+        self._choice.on_update(context.callback(self._choose, by_user=True))
+        self._status = Text(gui)
+        self._retry = context.button("Try again", self._use_again, viser.Icon.REFRESH, None, visible=False)
         with gui.add_folder("Devices", visible=False) as self._devices:
-            self._cameras = _by_words([d for d in available() if d.camera])
-            self._projectors = _by_words([d for d in available() if d.projector])
+            self._cameras = _label_drivers([d for d in available() if d.camera])
+            self._projectors = _label_drivers([d for d in available() if d.projector])
             self._camera = gui.add_dropdown("Camera", tuple(self._cameras))
-            self._camera.on_update(stage.safely(self._draw_devices))
-            self._source = gui.add_text("Which", "", hint="A webcam's number, a file, an address, a serial number")
+            self._camera.on_update(context.callback(self._draw_devices))
+            self._source = gui.add_text("Camera ID", "", hint="Number of a webcam, file, address, or serial number")
             self._projector = gui.add_dropdown("Projector", tuple(self._projectors))
-            self._projector.on_update(stage.safely(self._draw_devices))
-            self._size = gui.add_text("Its pixels", "", hint="Such as 1920x1080; empty: as its screen has")
-            self._lacking = Words(gui)
-            self._use = gui.add_button("Use these devices", icon=viser.Icon.PLUG_CONNECTED)
-            self._use.on_click(stage.safely(lambda: stage.operator.choose_rig(self._entered())))
-        self._page = Words(gui)
-        with gui.add_folder("Recording", visible=False) as self._recording:
-            self._folder = gui.add_text("Folder", "", hint="A session, or folders of images that can be imported")
-            play = gui.add_button("Play it back", icon=viser.Icon.PLAYER_PLAY)
-            play.on_click(
-                stage.safely(lambda: stage.operator.choose_rig({"driver": "replay", "source": self._folder.value}))
+            self._projector.on_update(context.callback(self._draw_devices))
+            self._size = gui.add_text("Resolution", "", hint="For example 1920x1080; empty: that of its screen")
+            self._missing = Text(gui)
+            self._use = context.button(
+                "Use these devices",
+                lambda: context.operator.choose_rig(self._entered()),
+                viser.Icon.PLUG_CONNECTED,
+                None,
             )
-        with gui.add_folder("Keep this rig", visible=False, expand_by_default=False) as self._keeping:
-            self._name = gui.add_text("Name", "", hint="It is then offered by this name, with its exposure")
-            keep = gui.add_button("Keep", icon=viser.Icon.DEVICE_FLOPPY, color="gray")
-            keep.on_click(stage.safely(lambda: stage.operator.save_rig(self._name.value)))
+        self._page = Text(gui)
+        with gui.add_folder("Recording", visible=False) as self._recording:
+            self._folder = gui.add_text(
+                "Source folder", "", hint="A session, or folders of images that can be imported"
+            )
+            context.button(
+                "Play back",
+                lambda: context.operator.choose_rig({"driver": "replay", "source": self._folder.value}),
+                viser.Icon.PLAYER_PLAY,
+                None,
+            )
+        with gui.add_folder("Save this rig", visible=False, expand_by_default=False) as self._saving:
+            self._name = gui.add_text("Name", "", hint="The rig is then offered by this name, with its exposure")
+            context.button("Save", lambda: context.operator.save_rig(self._name.value), viser.Icon.DEVICE_FLOPPY)
         self._needs_page = False
         self._draw_devices()
         self._offer()
 
     def draw(self, snapshot: Snapshot) -> None:
-        """What is used now, and what else is offered."""
+        """Show the rig in use, and offer the others."""
         if snapshot.session is not self._session:  # its own rigs may have changed
             self._session = snapshot.session
             self._offer()
         rig = snapshot.rig
-        self._follows.tell(self._chosen(rig))
+        self._chosen_value.update(self._chosen(rig))
         preset = self._presets.get(self._choice.value)
-        what = "" if preset is None else block(toned(preset.problem or preset.what, "dim"))
-        self._says.set(what + _described(rig))
-        change(self._again, visible=rig.state == "lost")
+        about = "" if preset is None else paragraph(coloured(preset.problem or preset.what, "dim"))
+        self._status.set(about + _rig_html(rig))
+        change(self._retry, visible=rig.state == "lost")
         self._draw_folders()
-        change(self._keeping, visible=rig.state == "open" and not rig.simulated)
-        self._needs_page = rig.page
+        change(self._saving, visible=rig.state == "open" and not rig.simulated)
+        self._needs_page = rig.needs_page
         self._draw_page()
 
     def _offer(self) -> None:
-        session = self._stage.operator.session
+        session = self._context.operator.session
         self._presets = {p.name: p for p in presets(session) if p.choice.get("driver") != "simulated"}
-        options = (_CHOOSE, *SIMULATED, *self._presets, _OWN)
+        options = (_CHOOSE, *SIMULATED, *self._presets, _CUSTOM)
         if tuple(self._choice.options) != options:
             value = self._choice.value
             self._choice.options = options
             self._choice.value = value if value in options else _CHOOSE
 
     def _chosen(self, rig: RigView) -> str:
-        """What gave this rig."""
+        """The option that gave this rig."""
         if rig.choice is None:
             return _CHOOSE
         if rig.choice.get("driver") == "simulated":
             scale = rig.choice.get("scale", 1.0)
-            return next((words for words, how in SIMULATED.items() if how["scale"] == scale), _CHOOSE)
+            return next((label for label, rig in SIMULATED.items() if rig["scale"] == scale), _CHOOSE)
         if rig.choice.get("driver") == _REPLAY:
             return _REPLAY
-        return next((name for name, p in self._presets.items() if _same(p.choice, rig.choice)), _OWN)
+        return next((name for name, p in self._presets.items() if _same(p.choice, rig.choice)), _CUSTOM)
 
-    def _choose(self, event: Any) -> None:
-        if event.client is None:
-            return
+    def _choose(self) -> None:
         chosen = self._choice.value
         self._draw_folders()
-        operator, preset = self._stage.operator, self._presets.get(chosen)
+        operator, preset = self._context.operator, self._presets.get(chosen)
         if chosen in SIMULATED:
             granted = operator.choose_rig(SIMULATED[chosen])
         elif preset is None or chosen == _REPLAY:
             return
         elif preset.problem:
             granted = False
-            operator.tell("error", f"{chosen} cannot be used here: {preset.problem}")
+            operator.notify("error", f"{chosen} cannot be used here: {preset.problem}")
         else:
             granted = operator.choose_rig(preset.choice)
-        if not granted:  # so that it says what is used, and the other can be chosen again
+        if not granted:  # show what is in use; the other can be chosen again
             self._choice.value = self._chosen(operator.snapshot().rig)
             self._draw_folders()
 
-    def _try_again(self) -> None:
-        choice = self._stage.operator.snapshot().rig.choice
+    def _use_again(self) -> None:
+        choice = self._context.operator.snapshot().rig.choice
         if choice is not None:
-            self._stage.operator.choose_rig(choice)
+            self._context.operator.choose_rig(choice)
 
     def _draw_folders(self) -> None:
-        change(self._devices, visible=self._choice.value == _OWN)
+        change(self._devices, visible=self._choice.value == _CUSTOM)
         change(self._recording, visible=self._choice.value == _REPLAY)
         self._draw_page()
 
     def _draw_page(self) -> None:
-        own = self._choice.value == _OWN and self._projectors[self._projector.value].channel
-        self._page.set(_page_words(self._stage.projector_page()) if self._needs_page or own else "")
-
-    # devices of one's own
+        own = self._choice.value == _CUSTOM and self._projectors[self._projector.value].channel
+        self._page.set(_page_html(self._context.projector_page()) if self._needs_page or own else "")
 
     def _draw_devices(self) -> None:
         chosen = (self._cameras[self._camera.value], self._projectors[self._projector.value])
-        lacking = "; ".join(f"{d.name} cannot be used here, {d.missing}" for d in chosen if d.missing)
-        self._lacking.say(lacking, "warning")
-        change(self._use, disabled=bool(lacking))
-        change(self._source, visible=_which(chosen[0]) is not None)
+        missing = "; ".join(f"{d.name} cannot be used here, {d.missing}" for d in chosen if d.missing)
+        self._missing.write(missing, "warning")
+        change(self._use, disabled=bool(missing))
+        change(self._source, visible=_address_option(chosen[0]) is not None)
         self._draw_page()
 
     def _entered(self) -> Choice:
         camera, projector = self._cameras[self._camera.value], self._projectors[self._projector.value]
-        eye: dict[str, Any] = {"driver": camera.name}
-        which, where = _which(camera), self._source.value.strip()
-        if which is not None and where:
-            eye[which] = int(where) if where.isdecimal() and which == "source" else where
-        lamp: dict[str, Any] = {"driver": projector.name}
-        page = self._stage.projector_page() if projector.channel else None
+        camera_choice: dict[str, Any] = {"driver": camera.name}
+        option, address = _address_option(camera), self._source.value.strip()
+        if option is not None and address:
+            camera_choice[option] = int(address) if address.isdecimal() and option == "source" else address
+        projector_choice: dict[str, Any] = {"driver": projector.name}
+        page = self._context.projector_page() if projector.channel else None
         if self._size.value.strip():
-            lamp["size"] = _size(self._size.value)
-        elif page is not None and page.size is not None:  # written down: the page may be opened after the session
-            lamp["size"] = list(page.size)
-        choice = {"name": f"{camera.name} and {projector.name}", "camera": eye, "projector": lamp}
+            projector_choice["size"] = _size(self._size.value)
+        elif page is not None and page.size is not None:  # saved, since the page may be opened after the session
+            projector_choice["size"] = list(page.size)
+        choice = {"name": f"{camera.name} and {projector.name}", "camera": camera_choice, "projector": projector_choice}
         check_choice(choice, "this rig")
         return choice
 
 
-def _by_words(drivers: list[Driver]) -> dict[str, Driver]:
-    likely = sorted(drivers, key=lambda driver: driver.name != _FIRST)
-    return {f"{driver.name}: {driver.what}": driver for driver in likely}
+def _label_drivers(drivers: list[Driver]) -> dict[str, Driver]:
+    shape_of = sorted(drivers, key=lambda driver: driver.name != _FIRST)
+    return {f"{driver.name}: {driver.what}": driver for driver in shape_of}
 
 
-def _which(driver: Driver) -> str | None:
-    """The option by which this driver is told which device it is."""
+def _address_option(driver: Driver) -> str | None:
+    """The driver's option that chooses one device among several; None where it has none."""
     known = inspect.signature(driver.camera).parameters if driver.camera else {}
-    return next((name for name in _WHICH if name in known), None)
+    return next((name for name in _ADDRESSES if name in known), None)
 
 
 def _size(text: str) -> list[int]:
@@ -182,31 +184,32 @@ def _size(text: str) -> list[int]:
 
 
 def _same(preset: Choice, choice: Choice) -> bool:
-    """Whether a rig was chosen by this preset; what is measured of it later does not count."""
+    """Whether a rig was chosen by this preset; the delay, which is measured later, may differ."""
     return {**preset, "settle_ms": None} == {**choice, "settle_ms": None}
 
 
-def _described(rig: RigView) -> str:
+def _rig_html(rig: RigView) -> str:
+    """The state of the rig."""
     if rig.state == "none":
-        return boxed("No rig yet: the simulated one needs nothing but this program.", "info")
+        return alert("No rig yet. The simulated rig needs no devices.", "info")
     if rig.state == "lost":
-        return boxed(rig.fault or "The rig does not answer.", "error")
+        return alert(rig.fault or "The rig does not answer.", "error")
     if rig.state == "opening":
-        return block(toned("Opening …", "dim"))
+        return paragraph(coloured("Opening …", "dim"))
     sizes = [
         f"{what} {size[0]} × {size[1]} px"
         for what, size in (("camera", rig.camera), ("projector", rig.projector))
         if size is not None
     ]
-    said = block(Html(f"{toned('●', 'good')} {cell(rig.name)} · {cell(', '.join(sizes))}"))
-    return said + "".join(boxed(note, "warning") for note in rig.notes)
+    html = paragraph(Html(f"{coloured('●', 'good')} {to_html(rig.name)} · {to_html(', '.join(sizes))}"))
+    return html + "".join(alert(note, "warning") for note in rig.notes)
 
 
-def _page_words(standing: Any) -> str:
-    """Where the projector page stands, and how to open it; without the token, which is not for those who only watch."""
+def _page_html(standing: Any) -> str:
+    """The state of the projector page, and how to open it; without the token, which is not for viewers."""
     if standing is None:
-        return boxed("This rig needs the projector page, which is not served here.", "error")
+        return alert("This rig needs the projector page, which is not served here.", "error")
     link = '<a href="/projector" target="_blank" rel="noopener">Open the projector page</a>'
-    how = f"{link} and move its window onto the projector's screen; on another computer, open the link in the terminal."
+    how = f"{link} and move its window to the projector's screen; on another computer, use the link in the terminal."
     tone: Tone = {"waiting": "info", "refused": "warning", "ready": "good"}[standing.state]  # type: ignore[assignment]
-    return boxed(Html(f"Projector page: {cell(standing.words)}" + ("" if tone == "good" else f"<br>{how}")), tone)
+    return alert(Html(f"Projector page: {to_html(standing.words)}" + ("" if tone == "good" else f"<br>{how}")), tone)

@@ -1,4 +1,4 @@
-"""Viewpoints of the browsers: each operator turns the 3D view alone; a new cloud is brought into every view."""
+"""Viewpoints of the browsers: each turns its own 3D view; a new cloud is shown in every view."""
 
 from collections.abc import Callable, Iterable
 
@@ -6,11 +6,11 @@ import numpy as np
 import viser
 
 _FROM = np.array([-0.45, -0.35, -0.82])
-"""From a little to the left and above of where the camera looks from: depth is seen, and nothing is upside down."""
-ASIDE = np.cross([0.0, 1.0, 0.0], -_FROM) / np.linalg.norm(_FROM[[0, 2]])
-"""(3,): to the right as one looks from there, at the same distance."""
+"""Viewing direction: from the upper left of the camera, so that depth is visible and nothing is upside down."""
+TO_THE_RIGHT = np.cross([0.0, 1.0, 0.0], -_FROM) / np.linalg.norm(_FROM[[0, 2]])
+"""(3,): to the right in that view, at the same distance."""
 OVERVIEW = ((-430.0, -560.0, -820.0), (55.0, 40.0, 330.0))
-"""Position and point looked at, mm: the rig and what stands at its working distance, in a narrow window too."""
+"""Camera position and target, mm: the rig and objects at its working distance, in a narrow window too."""
 FIELD_OF_VIEW = 0.75  # rad
 
 
@@ -19,26 +19,26 @@ class Viewpoints:
 
     def __init__(self, clients: Callable[[], Iterable[viser.ClientHandle]]) -> None:
         self._clients = clients
-        self._about = ""
+        self._shown = ""
 
     def overview(self) -> None:
-        """Look at the whole rig again, where a cloud has been looked at."""
-        if self._about:
-            self._about = ""
+        """Show the whole rig again, after a cloud was shown."""
+        if self._shown:
+            self._shown = ""
             for client in self._clients():
                 _look(client, *(np.array(each) for each in OVERVIEW))
 
-    def at(self, about: str, points: np.ndarray | None) -> None:
-        """Look at the points (..., 3) mm, unless what they are `about` is looked at already."""
-        if points is None or about == self._about:
+    def show(self, name: str, points: np.ndarray | None) -> None:
+        """Show the points (..., 3) mm, unless those of the same `name` are shown already."""
+        if points is None or name == self._shown:
             return
-        self._about = about
+        self._shown = name
         for client in self._clients():
-            bring(client, points)
+            look_at_points(client, points)
 
 
-def bring(client: viser.ClientHandle, points: np.ndarray) -> None:
-    """Let one browser look at the points (..., 3) mm; nothing happens where none is valid."""
+def look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
+    """Move one browser's view to the points (..., 3) mm; nothing happens where none is valid."""
     flat = points.reshape(-1, 3)
     flat = flat[np.isfinite(flat[:, 2])][:: max(1, len(flat) // 20_000)]
     if not len(flat):
@@ -51,5 +51,5 @@ def bring(client: viser.ClientHandle, points: np.ndarray) -> None:
 
 def _look(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
     with client.atomic():
-        client.camera.position = tuple(position)  # which moves the point looked at along
+        client.camera.position = tuple(position)  # this also moves the target
         client.camera.look_at = tuple(at)

@@ -1,11 +1,12 @@
-"""What several panels draw: sentences in colour, tables, pictures with a legend, colours for values.
+"""HTML for panels: coloured text, alerts, tables, pictures with a legend, colour scales.
 
-HTML takes viser's own colours, so that it is readable in its light and in its dark theme. Texts given to `cell`,
-`table` and `Words.say` are escaped here; a `Html` is taken as it is.
+HTML uses viser's own colours, so that it is readable in the light and in the dark theme. Texts given to `to_html`,
+`table` and `Text.write` are escaped here; a `Html` is used as it is.
 """
 
 import base64
 import io
+import re
 import wave
 from collections.abc import Sequence
 from typing import ClassVar, Literal
@@ -18,6 +19,11 @@ from slviewer.server.text import escape
 
 PICTURE_PX = 720
 """Width at which pictures are sent: viser shrinks a picture to its panel but never enlarges it."""
+
+_UNIT = re.compile(
+    r"(?<=\d) (?=(?:mm|px|ms|µm|rad|ppm|kB|MB|GB|s|x \d|&#37;|&#176;|&#215;|&#181;m)(?![a-z]))|(?<=&#177;) (?=\d)"
+)
+"""The space between a figure and its unit, in escaped text."""
 
 Tone = Literal["plain", "dim", "info", "good", "warning", "error"]
 _TONES = {
@@ -39,68 +45,71 @@ _BOXES = {
 
 
 class Html(str):
-    """Text that is HTML already, made by code from escaped parts."""
+    """Text that is HTML already, made by code from escaped parts; adding to it gives HTML."""
+
+    def __add__(self, other: str) -> "Html":
+        return Html(str(self) + other)
 
 
-def cell(text: object) -> Html:
-    """Any text as HTML that shows exactly it."""
-    return text if isinstance(text, Html) else Html(escape(str(text)))
+def to_html(text: object) -> Html:
+    """Any text as HTML that shows exactly it, without a line break between a figure and its unit."""
+    return text if isinstance(text, Html) else Html(_UNIT.sub("&#160;", escape(str(text))))
 
 
-def toned(text: object, tone: Tone, *, bold: bool = False) -> Html:
+def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:
     """Text in a tone's colour."""
     weight = ";font-weight:600" if bold else ""
-    return Html(f'<span style="color:{_TONES[tone]}{weight}">{cell(text)}</span>')
+    return Html(f'<span style="color:{_TONES[tone]}{weight}">{to_html(text)}</span>')
 
 
-def block(content: object) -> Html:
-    """HTML with the margins that viser gives its inputs."""
-    return Html(f'<div style="padding:0 0.75em 0.5em;font-size:0.875em;line-height:1.45">{cell(content)}</div>')
+def paragraph(content: object) -> Html:
+    """HTML with the margins of viser's inputs."""
+    return Html(f'<div style="padding:0 0.75em 0.5em;font-size:0.875em;line-height:1.45">{to_html(content)}</div>')
 
 
-def boxed(content: object, tone: Tone) -> Html:
-    """A box in a tone's colour, for a sentence that must not be overlooked."""
+def alert(content: object, tone: Tone) -> Html:
+    """A box in a tone's colour, for a message that must not be overlooked."""
     style = f"background:{_BOXES[tone]};border-left:3px solid {_TONES[tone]};border-radius:4px;padding:0.5em 0.7em"
-    return block(Html(f'<div style="{style}">{cell(content)}</div>'))
+    return paragraph(Html(f'<div style="{style}">{to_html(content)}</div>'))
 
 
 def table(titles: Sequence[object], rows: Sequence[Sequence[object]]) -> Html:
-    """Rows below their titles: the first column to the left, the others, figures mostly, to the right."""
+    """Rows below their titles: the first column left-aligned, the others right-aligned and without line breaks."""
 
     def line(tag: str, cells: Sequence[object], style: str) -> str:
-        sides = ["left"] + ["right"] * (len(cells) - 1)
+        sides = ["left"] + [f"right{';white-space:nowrap' * (tag == 'td')}"] * (len(cells) - 1)
         return "".join(
-            f'<{tag} style="text-align:{side};padding:0.2em 0.4em;{style}">{cell(c)}</{tag}>'
+            f'<{tag} style="text-align:{side};padding:0.2em 0 0.2em 0.6em;{style}">{to_html(c)}</{tag}>'
             for side, c in zip(sides, cells, strict=True)
         )
 
     head = line("th", titles, f"color:{_TONES['dim']};font-weight:600;vertical-align:bottom")
     rule = "border-top:1px solid var(--mantine-color-default-border);font-variant-numeric:tabular-nums"
     body = "".join(f"<tr>{line('td', row, rule)}</tr>" for row in rows)
-    return block(
+    return paragraph(
         Html(f'<div style="overflow-x:auto"><table style="width:100%;border-collapse:collapse">'
              f"<tr>{head}</tr>{body}</table></div>")
     )  # fmt: skip
 
 
 def link(address: str, text: str) -> Html:
-    """A link that downloads what is offered at this address of the server."""
+    """A link that downloads the file at this address of the server."""
     style = (
         "display:inline-block;padding:0.35em 0.9em;border-radius:4px;text-decoration:none;font-weight:600;"
         "background:var(--mantine-primary-color-filled);color:#fff"
     )
-    return Html(f'<a href="{cell(address)}" download style="{style}">{cell(text)}</a>')
+    return Html(f'<a href="{to_html(address)}" download style="{style}">{to_html(text)}</a>')
 
 
 def thumbnail(jpeg: bytes, width_px: int = 72, alt: str = "") -> Html:
-    """A small picture inside HTML; an empty box where there is none yet."""
+    """A small picture inside HTML; an empty box until there is one."""
     height = round(0.75 * width_px)
     if not jpeg:
         style = f"width:{width_px}px;height:{height}px;border-radius:4px;background:var(--mantine-color-gray-light)"
         return Html(f'<div style="{style}"></div>')
     data = base64.b64encode(jpeg).decode()
     style = f"width:{width_px}px;height:{height}px;object-fit:cover;border-radius:4px;display:block"
-    return Html(f'<img alt="{cell(alt)}" src="data:image/jpeg;base64,{data}" style="{style}">')
+    return Html(f'<img alt="{to_html(alt)}" src="data:image/jpeg;base64,{data}" style="{style}">')
 
 
 def meter(share: float, tone: Tone = "good") -> Html:
@@ -112,7 +121,7 @@ def meter(share: float, tone: Tone = "good") -> Html:
     )
 
 
-class Words:
+class Text:
     """One piece of HTML in a panel, sent only when it changes, hidden while it is empty."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
@@ -120,21 +129,21 @@ class Words:
         self._content = ""
 
     def set(self, content: str) -> None:
-        """Show this HTML, as `block`, `boxed`, `table` and the like give it."""
+        """Show this HTML, as `paragraph`, `alert`, `table` and the like give it."""
         if content != self._content:
             self._content = content
             self._handle.content = str(content)  # an Html would not be sent
             if self._handle.visible != bool(content):
                 self._handle.visible = bool(content)
 
-    def say(self, text: str, tone: Tone = "plain") -> None:
-        """Show a sentence, in a box where its tone asks for attention; nothing where it is empty."""
+    def write(self, text: str, tone: Tone = "plain") -> None:
+        """Show a sentence, in a box where its tone requires attention; nothing where it is empty."""
         if not text:
             self.set("")
         elif tone in ("plain", "dim"):
-            self.set(block(toned(text, tone)))
+            self.set(paragraph(coloured(text, tone)))
         else:
-            self.set(boxed(text, tone))
+            self.set(alert(text, tone))
 
 
 class Picture:
@@ -144,7 +153,7 @@ class Picture:
         self._width = width_px
         empty = np.full((3 * width_px // 4, width_px, 3), 128, np.uint8)
         self._image = gui.add_image(empty, label=label, format="jpeg", jpeg_quality=80, visible=False)
-        self._legend = Words(gui)
+        self._legend = Text(gui)
 
     def set(self, image: np.ndarray, legend: str = "") -> None:
         """Show (h, w) or (h, w, 3) uint8 RGB, scaled to the panel, and the legend (HTML, empty: none)."""
@@ -161,11 +170,11 @@ class Picture:
 
 
 class Sound:
-    """Short tones in the browsers that show the page; they stay silent until someone has clicked in them."""
+    """Short tones in the browsers that show the page; a browser stays silent until someone has clicked in it."""
 
     _TONES_HZ: ClassVar[dict[str, tuple[float, ...]]] = {
         "tick": (880.0,),
-        "taken": (1320.0, 1760.0),
+        "captured": (1320.0, 1760.0),
         "good": (880.0, 1320.0),
         "bad": (330.0, 220.0),
     }
@@ -174,7 +183,7 @@ class Sound:
         self._handle = gui.add_html("")
         self._count = 0
 
-    def play(self, name: Literal["tick", "taken", "good", "bad"]) -> None:
+    def play(self, name: Literal["tick", "captured", "good", "bad"]) -> None:
         """Play it once."""
         self._count += 1
         data = base64.b64encode(_wav(self._TONES_HZ[name])).decode()
@@ -183,8 +192,8 @@ class Sound:
 
 def _wav(tones_hz: Sequence[float], rate: int = 8000, seconds: float = 0.12) -> bytes:
     t = np.arange(int(rate * seconds)) / rate
-    swell = np.minimum(1, np.minimum(t, seconds - t) / 0.01)  # without it, tones click
-    samples = np.concatenate([swell * np.sin(2 * np.pi * f * t) for f in tones_hz])
+    envelope = np.minimum(1, np.minimum(t, seconds - t) / 0.01)  # without it, tones click
+    samples = np.concatenate([envelope * np.sin(2 * np.pi * f * t) for f in tones_hz])
     file = io.BytesIO()
     with wave.open(file, "wb") as out:
         out.setnchannels(1)
@@ -221,12 +230,12 @@ def colours(values: np.ndarray, low: float, high: float, scale: Literal["value",
 def colour_bar(low: str, high: str, scale: Literal["value", "error"] = "value", title: str = "") -> Html:
     """The legend of `colours`: its scale from `low` to `high`, both with their units."""
     stops = ",".join(f"#{stop}" for stop in _STOPS[scale])
-    return block(
+    return paragraph(
         Html(
-            f'<div style="display:flex;gap:0.6em;align-items:center"><span>{cell(low)}</span>'
+            f'<div style="display:flex;gap:0.6em;align-items:center"><span>{to_html(low)}</span>'
             f'<div style="flex:1;height:10px;border-radius:3px;background:linear-gradient(90deg,{stops})"></div>'
-            f"<span>{cell(high)}</span></div>"
-            + (f'<div style="text-align:center">{cell(title)}</div>' if title else "")
+            f"<span>{to_html(high)}</span></div>"
+            + (f'<div style="text-align:center">{to_html(title)}</div>' if title else "")
         )
     )
 

@@ -51,7 +51,7 @@ class LiveFigures:
     one that has stalled.
 
     Captures a second before and after that; clouds a second decoded, reconstructed and sent to the viewer that draws;
-    `behind_ms`: the median from the first frame's light until a cloud is sent, NaN where none was; `growth_mb`: how
+    `latency_ms`: the median from the first frame's light until a cloud is sent, NaN where none was; `growth_mb`: how
     much more memory the program used in the last quarter than in the second, None where the system does not tell.
     """
 
@@ -61,7 +61,7 @@ class LiveFigures:
     captures_per_s_stalled: float
     clouds_per_s: float
     shown_per_s: float
-    behind_ms: float
+    latency_ms: float
     points: int
     growth_mb: float | None
 
@@ -74,7 +74,7 @@ class LiveFigures:
         growth = "unknown" if self.growth_mb is None else f"{self.growth_mb:+.1f} MB"
         return (
             f"live at {self.size[0]}x{self.size[1]} for {self.seconds:.0f} s: {self.shown_per_s:.1f} clouds/s sent to "
-            f"a viewer, {self.behind_ms:.0f} ms behind the light ({self.clouds_per_s:.1f}/s made of {self.points:,} "
+            f"a viewer, {self.latency_ms:.0f} ms behind the light ({self.clouds_per_s:.1f}/s made of {self.points:,} "
             f"points); captures {self.captures_per_s:.1f}/s, beside a stalled viewer "
             f"{self.captures_per_s_stalled:.1f}/s; memory {growth}"
         )
@@ -117,7 +117,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
                 raise SlviewerError(f"the live scan ended: {_told(operator)}")
             made.append(live.clouds_per_s)
             shown.append(live.shown_per_s)
-            behind += [] if live.behind_ms is None else [live.behind_ms]
+            behind += [] if live.latency_ms is None else [live.latency_ms]
             points = live.points
             memory.append((passed / seconds, _memory_mb()))
             progress(min(passed / seconds, 0.999), f"live: {live.shown_per_s:.1f} clouds/s")
@@ -133,7 +133,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
         captures_per_s_stalled=(taken - then) / (time.monotonic() - begun - halfway),
         clouds_per_s=statistics.median(made),
         shown_per_s=statistics.median(shown),
-        behind_ms=statistics.median(behind) if behind else float("nan"),
+        latency_ms=statistics.median(behind) if behind else float("nan"),
         points=points,
         growth_mb=statistics.median(last) - statistics.median(quarter) if known else None,
     )

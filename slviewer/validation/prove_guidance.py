@@ -25,7 +25,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.target.board import Board
 from slviewer.validation.faulty_captures import BOARD, FaultBench
-from slviewer.wizard.pose_plan import PoseFeatures, plan
+from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, plan
 
 POSES, RIGS = 12, 5
 MOST_OVER_FLOOR, LEAST_SUPPORTED = 1.3, 0.85
@@ -177,7 +177,7 @@ def _guided(bench: FaultBench, told: Progress) -> tuple[list[Observation], float
     refused = 0
     while True:
         features = {o.name: _features(o) for o in seen}
-        planned = plan(board, rig.camera.size, rig.projector.size, features, None, None, refused)
+        planned = plan(PlanInput(board, rig.camera.size, rig.projector.size, features, refused=refused))
         if len(seen) == bench.count:
             return seen, np.nan if planned.sigma_mm is None else planned.sigma_mm
         i = len(seen) + refused

@@ -1,4 +1,4 @@
-"""Plays the whole wizard on the simulated rig, by the same requests as an operator: so that a newcomer sees it done."""
+"""Runs the whole wizard on the simulated rig, by the same requests as an operator, to show it to a newcomer."""
 
 import threading
 import time
@@ -27,7 +27,7 @@ PATIENCE_S = 120.0
 
 
 class Autopilot:
-    """The whole wizard once. The snapshot says which act it is at; `before(act)` paces it."""
+    """The whole wizard once. The snapshot names the current act; `before(act)` is called at the start of each."""
 
     def __init__(
         self,
@@ -47,26 +47,26 @@ class Autopilot:
         return self._thread.is_alive()
 
     def start(self) -> None:
-        """Begin, on a thread of its own."""
+        """Begin on a thread of its own."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask for nothing more; what was asked for goes on."""
+        """Send no more requests; those under way are completed."""
         self._stopped.set()
 
     def _play(self) -> None:
         try:
             self.run()
-            self._operator.tell("good", "autopilot has played the whole wizard: every step is done")
+            self._operator.notify("good", "autopilot has finished: every step is done")
         except Cancelled:
-            self._operator.tell("info", "autopilot has stopped")
+            self._operator.notify("info", "autopilot has stopped")
         except SlviewerError as error:
-            self._operator.tell("error", f"autopilot gave up: {error}")
+            self._operator.notify("error", f"autopilot has failed: {error}")
 
     def run(self) -> None:
         """Do all acts on this thread. Raises Cancelled when stopped, SlviewerError with the notice of a failed act."""
         try:
-            self._operator.show_act("Getting ready")
+            self._operator.set_autopilot_status("Getting ready")
             self._prepare()
             self._calibrate()
             self._verify()
@@ -74,7 +74,7 @@ class Autopilot:
             self._measure()
             self._act("Writing the report", self._operator.report)
         finally:
-            self._operator.show_act("")
+            self._operator.set_autopilot_status("")
 
     def _prepare(self) -> None:
         operator = self._operator
@@ -84,7 +84,7 @@ class Autopilot:
             raise SlviewerError("the simulated rig does not open")
         session = self._settled().session
         if session is None:
-            raise SlviewerError("no session is open: open one first, or make a new one")
+            raise SlviewerError("no session is open: open or create one first")
         if session.target != TARGET:
             self._act(f"Choosing the target {TARGET}", lambda: operator.choose_target(TARGET))
 
@@ -94,17 +94,17 @@ class Autopilot:
         while (good := _good_poses(now := self._settled())) < self._poses and not (now.session and now.session.enough):
             tried += 1
             if tried > 2 * self._poses:
-                raise SlviewerError(f"only {good} of {tried} poses could be used: look at why the others were refused")
+                raise SlviewerError(f"only {good} of {tried} poses could be used: see why the others were refused")
             session = operator.snapshot().session
-            words = session.suggestion.sentence if session and session.suggestion else "Placing the board"
-            self._act(words, operator.place_at_suggestion)
+            act = session.suggestion.sentence if session and session.suggestion else "Placing the board"
+            self._act(act, operator.place_at_suggestion)
             self._act(f"Capturing pose {good + 1} of {self._poses}", operator.capture_pose)
         self._act("Calibrating", operator.calibrate)
 
     def _verify(self) -> None:
         operator = self._operator
         self._place("plane", planes()[PLANE])
-        self._act("Capturing a plane, and comparing the models on it", lambda: operator.capture_plane("A flat plate"))
+        self._act("Capturing a plane", lambda: operator.capture_plane("A flat plate"))
         self._place("sphere", spheres()[SPHERE])
         self._act("Capturing a sphere", lambda: operator.capture_sphere("A sphere of 196 mm"))
 
@@ -118,7 +118,7 @@ class Autopilot:
         self._act("Merging the three scans", lambda: operator.merge(names, names[-1]))
 
     def _measure(self) -> None:
-        """The sphere's radius, and how wide the object is."""
+        """Measure the sphere's radius and the object's width."""
         operator = self._operator
         scans = operator.snapshot().session.scans  # type: ignore[union-attr]
         sphere = next(scan.name for scan in reversed(scans) if scan.purpose == "sphere")
@@ -126,7 +126,7 @@ class Autopilot:
         self._act("Measuring the sphere", partial(operator.measure_shape, sphere, "sphere", region))
         latest = _scans(operator.snapshot())[-1].name
         a, b = _across(operator.surface(latest))
-        self._act("Measuring how wide the object is", partial(operator.measure_distance, latest, a, b))
+        self._act("Measuring the width of the object", partial(operator.measure_distance, latest, a, b))
 
     def _place(self, thing: Thing, scene: Scene) -> None:
         T = np.eye(4)
@@ -138,8 +138,8 @@ class Autopilot:
         self._act(f"Placing the {thing}", lambda: self._operator.place(thing, T))
 
     def _act(self, act: str, request: Callable[[], bool]) -> None:
-        """One request, and the end of all that follows from it."""
-        self._operator.show_act(act)
+        """One request, until all that follows from it has ended."""
+        self._operator.set_autopilot_status(act)
         self._before(act)
         if self._stopped.wait(self._pause_s):
             raise Cancelled("autopilot was stopped")
@@ -156,7 +156,7 @@ class Autopilot:
             if self._stopped.is_set():
                 raise Cancelled("autopilot was stopped")
             try:
-                return self._operator.settle(0.5)
+                return self._operator.wait_until_idle(0.5)
             except SlviewerError:
                 if time.monotonic() > end:
                     raise
@@ -164,11 +164,11 @@ class Autopilot:
 
 def _good_poses(snapshot: Snapshot) -> int:
     poses = snapshot.session.poses if snapshot.session else ()
-    return sum(pose.state in ("good", "used", "left out") for pose in poses)
+    return sum(pose.state in ("good", "used", "unused") for pose in poses)
 
 
 def _cap(on: MeasuredSurface) -> Region:
-    """What lies around the point that is nearest to the camera, half as far as anything measured."""
+    """A ball around the point nearest to the camera, of half the measured extent."""
     z = np.where(on.measured, on.points[..., 2], np.inf)
     top = on.points[np.unravel_index(int(np.argmin(z)), z.shape)]
     away = np.linalg.norm(on.points[on.measured] - top, axis=-1)

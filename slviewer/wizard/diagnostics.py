@@ -1,6 +1,6 @@
-"""What helps to find out why something went wrong elsewhere: versions, settings, logs, small previews.
+"""A zip to be sent with a bug report: versions, settings, logs, small previews.
 
-No frames, and no passwords, which may stand in the addresses of cameras.
+It holds no frames, and no passwords, which addresses of cameras may contain.
 """
 
 import importlib.metadata
@@ -21,7 +21,7 @@ import cv2
 from slviewer import __version__
 from slviewer.session.atomic import to_json
 from slviewer.session.store import Session
-from slviewer.wizard.export_files import delivered
+from slviewer.wizard.export_files import staged_export
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.snapshot import PreviewView, Snapshot
 
@@ -31,7 +31,7 @@ PACKAGES = ("numpy", "opencv-python-headless", "numba", "scipy", "zarr", "open3d
 
 
 class LogKeeper(logging.Handler):
-    """The latest lines that slviewer logged, until `close`."""
+    """The latest lines of slviewer's log, until `close`."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -43,11 +43,11 @@ class LogKeeper(logging.Handler):
         self._logger.addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep one record."""
+        """Store one record."""
         self.lines.append(self.format(record))
 
     def close(self) -> None:
-        """Listen no longer."""
+        """Stop logging here."""
         self._logger.removeHandler(self)
         super().close()
 
@@ -57,7 +57,7 @@ def write_bundle(
 ) -> str:
     """Write ``diagnostics_<time>.zip`` into the exports; returns its name."""
     name = f"diagnostics_{datetime.now():%Y%m%d_%H%M%S}.zip"
-    with delivered(session, name, report) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
+    with staged_export(session, name, report) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
         report(0.1, "versions and settings")
         bundle.writestr("versions.json", to_json(_versions()))
         bundle.writestr("state.json", _without_passwords(to_json(_state(snapshot)).decode()))
@@ -88,10 +88,10 @@ def _without_passwords(text: str) -> str:
 
 
 def _versions() -> dict[str, Any]:
-    found = {}
+    versions = {}
     for package in PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             continue
     return {
@@ -99,7 +99,7 @@ def _versions() -> dict[str, Any]:
         "python": sys.version,
         "system": platform.platform(),
         "processors": os.cpu_count(),
-        "packages": found,
+        "packages": versions,
     }
 
 

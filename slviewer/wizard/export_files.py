@@ -17,7 +17,7 @@ from slviewer.wizard.snapshot import ExportView
 
 
 @contextmanager
-def delivered(session: Session, name: str, report: Reporter) -> Iterator[Path]:
+def staged_export(session: Session, name: str, report: Reporter) -> Iterator[Path]:
     """A path to write `name` to; when the block ends the file appears in the exports, unless the work was cancelled."""
     target = session.exports / safe_name(name)
     with atomic.staged_folder(target, 0) as folder:
@@ -30,21 +30,15 @@ def delivered(session: Session, name: str, report: Reporter) -> Iterator[Path]:
 def export_file(
     session: Session, what: What, name: str, file_format: str, plan: MeshingPlan | None, report: Reporter, warn: Warn
 ) -> str:
-    """Write one file, as `pipeline.export.export` does; returns what it is, in words that begin with its name."""
-    with delivered(session, file_name(what, name, file_format), report) as path:
+    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with its name."""
+    with staged_export(session, file_name(what, name, file_format), report) as path:
         insist, progress = insisted(session), report.within(0, 0.98)
         found = export(session, what, name, out=path, plan=plan, accept_rejected=insist, progress=progress, warn=warn)
     report(1.0, "exported")
     return f"{path.name} is ready to download: {found.words}"
 
 
-def listed(session: Session) -> tuple[ExportView, ...]:
-    """What the exports folder holds."""
-    folder = session.folder / "exports"
-    if not folder.is_dir():
-        return ()
-    found = []
-    for entry in sorted(folder.iterdir()):
-        if entry.is_file() and not entry.name.startswith("."):
-            found.append(ExportView(entry.name, entry, entry.stat().st_size))
-    return tuple(found)
+def list_exports(session: Session) -> tuple[ExportView, ...]:
+    """The files in the exports folder."""
+    files = sorted(each for each in (session.folder / "exports").glob("[!.]*") if each.is_file())
+    return tuple(ExportView(each.name, each, each.stat().st_size) for each in files)

@@ -1,11 +1,10 @@
-"""What an operator can ask of folders that other tools made: to bring their captures into the session."""
+"""Requests to import captures that other tools made."""
 
 import io
-from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from slviewer.errors import InputError
 from slviewer.pipeline.import_captures import import_captures
@@ -17,39 +16,43 @@ from slviewer.wizard.requests import RequestHandler, request
 
 IMPORTING = "Importing"
 UNPACKED = "import"
-"""Beside which an upload is unpacked, in the session's folder: what a crash leaves of it is cleared with the rest."""
-T = TypeVar("T")
+"""Name in the session's folder beside which an upload is unpacked: the session clears what a crash leaves of it."""
 
 
 class ImportRequests(RequestHandler):
-    """Importing by the worker, with the function of the command line."""
+    """Imports by the worker, with the function of the command line."""
 
     @request(IMPORTING)
     def import_folder(self, folder: Path | str, layout: str = "detect", **options: Any) -> None:
         """Import the captures in a folder of this computer; `options` as `import_captures` takes them."""
-        if not str(folder).strip():
-            raise InputError("no folder is named: type the path of a folder on the computer that runs slviewer")
-        self._import(partial(self._read_folder, Path(str(folder).strip()).expanduser()), layout, options)
+        path = str(folder).strip()
+        if not path:
+            raise InputError("no folder is named: enter the path of a folder on the computer that runs slviewer")
+        store = self._engine.store
+
+        def work(report: Reporter) -> list[str]:
+            session = store.guarded(report.saving)
+            source = Path(path).expanduser()
+            return import_captures(source, session, layout, progress=report, warn=self._warn, **options)
+
+        self._submit_import(work)
 
     @request(IMPORTING)
     def import_zip(self, name: str, content: bytes, layout: str = "detect", **options: Any) -> None:
-        """Import the captures in a zip that was uploaded under `name`; images outside of folders become one capture,
-        named after it."""
-        self._import(partial(self._read_zip, name, content), layout, options)
+        """Import the captures in a zip that was uploaded as `name`; images outside of folders become one capture of
+        that name."""
+        self._submit_import(partial(self._read_zip, name, content, layout, options))
 
-    def _import(self, read: Callable[..., list[str]], layout: str, options: dict[str, Any]) -> None:
-        engine = self._engine
+    def _submit_import(self, work: Callable[[Reporter], list[str]]) -> None:
+        def import_and_process(report: Reporter) -> list[str]:
+            names = work(report)
+            self._engine.queue_processing()
+            return names
 
-        def done(names: list[str]) -> None:
-            engine.notices.tell("good", f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}")
-            engine.queue_unfinished()
-            engine.publisher.changed(session=True)
+        def describe(names: list[str]) -> str:
+            return f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}"
 
-        engine.jobs.submit(IMPORTING, partial(read, layout, options), done)
-
-    def _read_folder(self, folder: Path, layout: str, options: dict[str, Any], report: Reporter) -> list[str]:
-        store = self._engine.store.guarded(report.saving)
-        return import_captures(folder, store, layout, progress=report, warn=self._warn, **options)
+        self._submit(IMPORTING, import_and_process, describe)
 
     def _read_zip(self, name: str, content: bytes, layout: str, options: dict[str, Any], report: Reporter) -> list[str]:
         store, archive = self._engine.store, io.BytesIO(content)
@@ -68,9 +71,6 @@ class ImportRequests(RequestHandler):
                 )  # fmt: skip
             finally:
                 atomic.discard(staged)
-
-    @abstractmethod
-    def _warn(self, text: str) -> None: ...
 
 
 def _capture_name(name: str) -> str:

@@ -1,14 +1,13 @@
-"""One worker that computes, one job after the other, and never keeps the operator waiting.
+"""One worker that computes, one job after the other, and never blocks the operator.
 
-A job's `work(reporter)` runs in a thread of its own. Cancelling is cooperative first: the next `reporter(share, doing)`
+A job's `work(reporter)` runs in a thread of its own. Cancelling is cooperative first: the next `reporter(share, stage)`
 raises Cancelled. Work that is inside a call that cannot be interrupted (OpenCV, Open3D) is abandoned after
 `PATIENCE_S`: the worker goes on with the next job, and the abandoned thread ends at its next report.
 
-Abandoned work never saves anything afterwards. `calibrate` and `merge` report right before they write, which stops them
-there, but `calibrate` also saves each pose's reading on its way, without a report. So jobs are given the session as
-`session.guarded(reporter.saving)`, and write files for export through `export_files.delivered`: both ask right before a
-save takes effect. The other way round, work that has begun to save is no longer cancelled but awaited, so that a
-calibration of two models is never saved by half. `done(result)` runs on the worker where the job was not cancelled.
+Abandoned work never saves anything afterwards: jobs get the session as `session.guarded(reporter.saving)`, and write
+exports through `export_files.staged_export`; both call `saving` right before a save takes effect. Conversely, work that
+has begun to save is no longer cancelled but awaited, so that a calibration of two models is never half saved.
+`done(result)` runs on the worker if the job was not cancelled.
 """
 
 import threading
@@ -23,24 +22,24 @@ from slviewer.wizard.notices import Notices, log
 from slviewer.wizard.snapshot import JobView
 
 PATIENCE_S = 0.5
-"""How long cancelled work may take to stop by itself."""
+"""How long cancelled work may take to end by itself."""
 
 
 class Reporter:
-    """What work speaks to: a `Progress` that raises Cancelled once the operator has cancelled."""
+    """A job's `Progress`, which raises Cancelled once the operator has cancelled."""
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self._changed = changed
         self._lock = threading.Lock()
         self._cancelled, self._saving = False, False
-        self.share, self.doing = 0.0, ""
+        self.share, self.stage = 0.0, ""
 
-    def __call__(self, share: float, doing: str) -> None:
-        if share < 1:  # with the last report all is done, saved things too
+    def __call__(self, share: float, stage: str) -> None:
+        if share < 1:  # with the last report everything is saved
             with self._lock:
                 self._saving = False
             self.check()
-        self.share, self.doing = min(max(float(share), 0.0), 1.0), doing
+        self.share, self.stage = min(max(float(share), 0.0), 1.0), stage
         self._changed()
 
     def check(self) -> None:
@@ -49,38 +48,38 @@ class Reporter:
             raise Cancelled("cancelled")
 
     def saving(self) -> None:
-        """Called right before a save takes effect: raises Cancelled, or holds off cancelling until the next report."""
+        """Called right before a save takes effect: raises Cancelled, or defers cancelling until the next report."""
         with self._lock:
             if self._cancelled and not self._saving:
                 raise Cancelled("cancelled")
             self._saving = True
 
     def cancel(self) -> None:
-        """Let the next report raise."""
+        """Make the next report raise Cancelled."""
         with self._lock:
             self._cancelled = True
 
     def within(self, begin: float, end: float) -> "Reporter":
-        """For one stage of the work, which counts its own share from 0 to 1."""
-        return _Stage(self, begin, min(end, 0.999))  # the last report is the whole work's own
+        """The reporter of one part of the work, whose own share goes from 0 to 1."""
+        return _PartReporter(self, begin, min(end, 0.999))  # the last report is the whole work's own
 
     @property
     def cancelled(self) -> bool:
         return self._cancelled
 
     @property
-    def saves(self) -> bool:
-        """Whether what was computed is being saved, or was."""
+    def has_saved(self) -> bool:
+        """Whether results are being saved, or were."""
         return self._saving
 
 
-class _Stage(Reporter):
+class _PartReporter(Reporter):
     def __init__(self, whole: Reporter, begin: float, end: float) -> None:
         super().__init__(whole._changed)
         self._whole, self._begin, self._end = whole, begin, end
 
-    def __call__(self, share: float, doing: str) -> None:
-        self._whole(self._begin + (self._end - self._begin) * share, doing)
+    def __call__(self, share: float, stage: str) -> None:
+        self._whole(self._begin + (self._end - self._begin) * share, stage)
 
     def check(self) -> None:
         self._whole.check()
@@ -125,7 +124,7 @@ class Jobs:
         failed: Callable[[BaseException], None] | None = None,
         background: bool = False,
     ) -> None:
-        """Queue `work`. `name` says what is being done ("Calibrating"), as the operator reads it.
+        """Queue `work`, named as the operator reads it ("Calibrating").
 
         Background work waits until no other job does, and cannot be cancelled by the operator. `failed(error)` runs on
         the worker in place of a notice.
@@ -139,17 +138,17 @@ class Jobs:
         self._changed()
 
     def cancel(self) -> None:
-        """Cancel the job that the operator sees, if there is one; what waits behind it goes on."""
+        """Cancel the job that the operator sees, if there is one; those that wait behind it go on."""
         with self._condition:
             if self._running is not None and not self._running.background:
                 self._running.reporter.cancel()
                 self._condition.notify_all()
             elif self._waiting:
-                self._notices.tell("info", f"{self._waiting.popleft().name}: cancelled")
+                self._notices.add("info", f"{self._waiting.popleft().name}: cancelled")
         self._changed()
 
     def cancel_all(self) -> None:
-        """Cancel what runs and forget what waits, background work too."""
+        """Cancel the running job and drop those that wait, background work too."""
         with self._condition:
             self._waiting.clear()
             self._waiting_behind.clear()
@@ -166,7 +165,7 @@ class Jobs:
         reporter = job.reporter
         can_cancel = not job.background and not reporter.cancelled
         return JobView(
-            job.name, reporter.share, reporter.doing, time.monotonic() - job.begun, can_cancel, job.background, waiting
+            job.name, reporter.share, reporter.stage, time.monotonic() - job.begun, can_cancel, job.background, waiting
         )
 
     @property
@@ -206,7 +205,7 @@ class Jobs:
             try:
                 self._run(job)
             except Exception as error:  # whatever it was, the worker lives on
-                self._notices.fail(job.name, error)
+                self._notices.add_failure(job.name, error)
 
     def _run(self, job: _Job) -> None:
         thread = threading.Thread(target=self._work, args=(job,), name=f"slviewer: {job.name}", daemon=True)
@@ -216,17 +215,17 @@ class Jobs:
             self._condition.wait_for(lambda: job.ended.is_set() or reporter.cancelled)
         if reporter.cancelled:
             job.ended.wait(PATIENCE_S)
-            while reporter.saves and not job.ended.wait(0.05):
+            while reporter.has_saved and not job.ended.wait(0.05):
                 pass
             if not job.ended.is_set():
                 log.info("%s: abandoned in the middle of a call that cannot be interrupted", job.name)
-        if reporter.cancelled and not (job.ended.is_set() and job.error is None and reporter.saves):
+        if reporter.cancelled and not (job.ended.is_set() and job.error is None and reporter.has_saved):
             if not job.background:
-                self._notices.tell("info", f"{job.name}: cancelled")
+                self._notices.add("info", f"{job.name}: cancelled")
         elif job.error is not None and job.failed is not None:
             job.failed(job.error)
         elif job.error is not None:
-            self._notices.fail(job.name, job.error)
+            self._notices.add_failure(job.name, job.error)
         elif job.done is not None:
             job.done(job.result)
 

@@ -1,4 +1,4 @@
-"""The frames of a live scan: short captures one after the other, in a few buffers, of which the newest counts."""
+"""The frames of a live scan: short captures one after the other, in a few buffers; only the newest counts."""
 
 import threading
 import time
@@ -15,7 +15,7 @@ from slviewer.geometry.cuda_device import allocate_frames
 
 @dataclass(eq=False)
 class LiveCapture:
-    """One short capture: frames (n, h, w); when its first frame was asked for, by `time.monotonic`; the settings."""
+    """One short capture: frames (n, h, w), the time of its first frame by `time.monotonic`, and the settings."""
 
     frames: np.ndarray
     begun: float
@@ -23,11 +23,11 @@ class LiveCapture:
 
 
 class Stream:
-    """A sequence that is shown and grabbed over and over; whoever reads gets the newest capture that is whole.
+    """A sequence that is shown and grabbed repeatedly; a reader gets the newest complete capture.
 
-    `take` is called by the thread that owns the devices, `next` by one that reads, the others by any. At most three
-    buffers exist: one that is filled, one that waits, and one that is read.
-    `on_end` is called once, on whichever thread ends it.
+    `capture` is called by the thread that owns the devices, `wait_next` by one that reads, the others by any. At most
+    three buffers exist: one being filled, one waiting, and one being read. `on_end` is called once, on the thread that
+    ends it.
     """
 
     def __init__(self, sequence: PatternSequence, on_end: Callable[[], None]) -> None:
@@ -36,18 +36,18 @@ class Stream:
         self._free: list[np.ndarray] = []
         self._waiting: LiveCapture | None = None
         self._read: LiveCapture | None = None
-        self._over = False
-        self.taken = 0
-        """Captures that are whole, those included that nobody read."""
+        self.has_ended = False
+        self.captured = 0
+        """Number of complete captures, including those that nobody read."""
 
-    def take(self, rig: Rig, settings: CameraSettings, stopped: Callable[[], bool]) -> np.ndarray | None:
+    def capture(self, rig: Rig, settings: CameraSettings, stopped: Callable[[], bool]) -> np.ndarray | None:
         """Show and grab every frame of the sequence, which the rig's projector has loaded. Returns a copy of the last
-        frame; None where it was `stopped` before, and then nobody gets anything of it.
+        frame; None where it was `stopped` before, and the capture is dropped.
 
         Raises DeviceError.
         """
         count, (width, height) = len(self.sequence.frames), rig.camera.size
-        frames = self._room((count, height, width), rig.camera.dtype)
+        frames = self._allocate((count, height, width), rig.camera.dtype)
         begun = time.monotonic()
         for k in range(count):
             if stopped():
@@ -58,56 +58,51 @@ class Stream:
         else:
             rig.projector.show(count - 1)  # one that changed during this exposure says so only when it is asked again
             last = frames[-1].copy()
-            self._give(LiveCapture(frames, begun, settings))
+            self._offer(LiveCapture(frames, begun, settings))
             return last
         with self._condition:
             self._free.append(frames)
         return None
 
-    def next(self) -> LiveCapture | None:
-        """Wait for a capture that was not read yet, the newest; its frames stay as they are until the next call.
-        None once the stream has ended.
+    def wait_next(self) -> LiveCapture | None:
+        """Wait for the newest capture that was not read yet; its frames stay valid until the next call. None once the
+        stream has ended.
         """
         with self._condition:
-            self._condition.wait_for(lambda: self._over or self._waiting is not None)
-            if self._over:
+            self._condition.wait_for(lambda: self.has_ended or self._waiting is not None)
+            if self.has_ended:
                 return None
             self._recycle(self._read)
             self._read, self._waiting = self._waiting, None
             return self._read
 
-    def kept(self) -> LiveCapture | None:
+    def copy_latest(self) -> LiveCapture | None:
         """A copy of the capture that was read last; None before the first."""
         with self._condition:
             if self._read is None:
                 return None
             return LiveCapture(self._read.frames.copy(), self._read.begun, self._read.settings)
 
-    @property
-    def over(self) -> bool:
-        """Whether it has ended."""
-        return self._over
-
-    def ended(self) -> None:
-        """No more is taken."""
+    def end(self) -> None:
+        """End it: nothing more is captured."""
         with self._condition:
-            first, self._over = not self._over, True
+            first, self.has_ended = not self.has_ended, True
             self._condition.notify_all()
         if first:
             self._on_end()
 
-    def _room(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    def _allocate(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
         with self._condition:
             found = self._free.pop() if self._free else None
         if found is None or found.shape != shape or found.dtype != dtype:
             return allocate_frames(shape, dtype)
         return found
 
-    def _give(self, shot: LiveCapture) -> None:
+    def _offer(self, shot: LiveCapture) -> None:
         with self._condition:
-            self._recycle(self._waiting)  # nobody was quick enough for it
+            self._recycle(self._waiting)  # nobody has read it
             self._waiting = shot
-            self.taken += 1
+            self.captured += 1
             self._condition.notify_all()
 
     def _recycle(self, shot: LiveCapture | None) -> None:

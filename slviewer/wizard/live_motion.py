@@ -1,4 +1,4 @@
-"""What moved while a short sequence was taken: a handful of frames still contradict each other where it did.
+"""Masks what moved during a short sequence: there, even a handful of frames contradict each other.
 
 The frames of every period have the same mean, the background, at a pixel that stands still; and where the finest has an
 even number of steps, its frames added with alternating signs leave nothing but noise and what the projector adds
@@ -17,10 +17,10 @@ SIGMAS = 5.0
 PART = 0.1
 """A contradiction of so many standard deviations of its noise, and this part of the modulation besides, is motion: some
 0.2 rad from one frame to the next."""
-_SPARSE = 8  # every so many rows and columns tell the projector's second harmonic
+_SPARSE = 8  # step of the rows and columns from which the projector's second harmonic is estimated
 
 
-def hide_moved(
+def mask_motion(
     sequence: PatternSequence,
     frames: np.ndarray,
     axis: Axis,
@@ -37,7 +37,7 @@ def hide_moved(
     shifts = layout(sequence, axis).shifts
     finest = np.array(shifts[-1].indices, np.int64)
     if len(finest) % 2:
-        raise InputError(f"{len(finest)} steps of the finest period do not tell what moved: use an even number")
+        raise InputError(f"{len(finest)} steps of the finest period do not reveal motion: use an even number")
     begins = np.cumsum([0, *(len(shift.indices) for shift in shifts)])
     indices = np.concatenate([np.array(shift.indices, np.int64) for shift in shifts])
     signs = np.where(np.arange(len(finest)) % 2, -1.0, 1.0).astype(np.float32) / np.float32(len(finest))

@@ -1,7 +1,7 @@
-"""Scanning live: short captures become clouds while the next is taken, and whoever looks gets the newest.
+"""Live scanning: a short capture becomes a cloud while the next one is captured, and listeners get the newest.
 
-The devices' thread fills a `Stream`, a thread of this file's makes clouds of it, and each listener hears of them on
-that thread, and must return at once. Nothing is saved but what the operator keeps.
+The devices' thread fills a `Stream`, and a thread of the live scan computes the clouds and calls the listeners, which
+must return at once. Nothing is saved unless the operator saves it.
 """
 
 import threading
@@ -25,20 +25,20 @@ from slviewer.reconstruction.reconstruct import Model
 from slviewer.session.store import Session
 from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.live_frames import LiveCapture, Stream
-from slviewer.wizard.live_motion import hide_moved
+from slviewer.wizard.live_motion import mask_motion
 from slviewer.wizard.notices import Notices
 from slviewer.wizard.snapshot import LiveView
 
-TOLD_PER_S = 3.0
-_OVER_S = 2.0  # figures are those of so many seconds
-_LOOK_S = 1.0  # so often it is asked whether the calibration is another by now
+REPORTS_PER_S = 3.0
+_AVERAGED_S = 2.0  # rates are averages over this time
+_RELOAD_S = 1.0  # between two checks whether the calibration has changed
 
 
 @dataclass(frozen=True, eq=False)
 class LiveCloud:
     """One cloud on the camera's grid: points (h, w, 3) float32 mm, NaN where not measured, and texture (h, w).
 
-    `begun`: when the first of its frames was asked for, by `time.monotonic`. Its arrays are never written again.
+    `begun`: the time of its first frame, by `time.monotonic`. Its arrays are never written again.
     """
 
     number: int
@@ -47,11 +47,11 @@ class LiveCloud:
     begun: float
 
 
-class Live:
+class LiveScan:
     """A live scan, from its start to its end.
 
     `publish(cloud)` is called with every cloud on the scan's own thread, `changed()` when figures changed or it ended.
-    `figures` and `shown` may be called from any thread.
+    `figures` and `count_shown` may be called from any thread.
     """
 
     def __init__(
@@ -70,59 +70,59 @@ class Live:
         self._lock = threading.Lock()
         self._made: deque[float] = deque()
         self._sent: deque[tuple[float, float]] = deque()
-        self._points, self._number, self._told = 0, 0, 0.0
-        self._model: Calibrated | None = None
+        self._points, self._number, self._reported = 0, 0, 0.0
+        self._model: LiveCalibration | None = None
         self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
 
     def start(self) -> None:
-        """Begin. Raises DeviceError where the rig cannot, SlviewerError where the session has no calibration to use."""
-        self._model = Calibrated(self._store, self.stream.sequence, self.axis)
+        """Begin. Raises DeviceError if the rig is not ready, SlviewerError if the session has no usable calibration."""
+        self._model = LiveCalibration(self._store, self.stream.sequence, self.axis)
         self._acquisition.stream(self.stream)
         self._thread.start()
 
     @property
-    def running(self) -> bool:
+    def is_running(self) -> bool:
         """Whether it has not ended."""
-        return not self.stream.over
+        return not self.stream.has_ended
 
-    def shown(self, cloud: LiveCloud) -> None:
-        """A cloud was sent to those who look."""
+    def count_shown(self, cloud: LiveCloud) -> None:
+        """A cloud was sent to the browsers."""
         now = time.monotonic()
         with self._lock:
             self._sent.append((now, now - cloud.begun))
-            _forget(self._sent, now)
+            _drop_old(self._sent, now)
 
     def figures(self) -> LiveView:
         """Rates of the last two seconds."""
         now = time.monotonic()
         with self._lock:
-            _forget(self._made, now)
-            _forget(self._sent, now)
-            behind = float(np.median([late for _, late in self._sent])) if self._sent else None
+            _drop_old(self._made, now)
+            _drop_old(self._sent, now)
+            latency_s = float(np.median([late for _, late in self._sent])) if self._sent else None
             return LiveView(
                 clouds_per_s=_rate(self._made),
                 shown_per_s=_rate([at for at, _ in self._sent]),
-                behind_ms=None if behind is None else 1e3 * behind,
+                latency_ms=None if latency_s is None else 1e3 * latency_s,
                 points=self._points,
             )
 
     def _serve(self) -> None:
-        while (shot := self.stream.next()) is not None:
+        while (shot := self.stream.wait_next()) is not None:
             try:
                 cloud = self._cloud(shot)
             except Exception as error:
-                self._notices.fail("Live", error)
-                self._acquisition.unstream()
+                self._notices.add_failure("Live", error)
+                self._acquisition.stop_stream()
                 return
             now = time.monotonic()
             with self._lock:
                 self._made.append(now)
-                _forget(self._made, now)
-            if not self.running:
+                _drop_old(self._made, now)
+            if not self.is_running:
                 return
             self._publish(cloud)
-            if now - self._told > 1 / TOLD_PER_S:
-                self._told = now
+            if now - self._reported > 1 / REPORTS_PER_S:
+                self._reported = now
                 self._changed()
 
     def _cloud(self, shot: LiveCapture) -> LiveCloud:
@@ -134,7 +134,7 @@ class Live:
 
 
 @dataclass(eq=False)
-class Measuring:
+class LiveModel:
     """A short sequence, a calibration, and the scale that was applied to it; ``calibrated``: the rig whose sizes the
     frames must have. For one thread at a time."""
 
@@ -153,49 +153,49 @@ class Measuring:
     def cloud(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(points (h, w, 3) float32 mm, texture (h, w)) of the frames (n, h, w); both are new arrays.
 
-        As `reconstruct` has them, but that what moved between the frames is NaN too. Raises InputError for frames that
-        are not those of the sequence, or of another camera.
+        As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for frames of another
+        sequence or camera.
         """
         if self.calibrated is not None:
             height, width = frames.shape[1:]
             check_sizes("the live scan", (width, height), self.sequence.projector_size, self.calibrated)
         if self._fast is not None:
-            scan = self._fast.run(frames, out=self._room())
+            scan = self._fast.run(frames, out=self._workspace())
             self._before, points = scan, scan.points
             phase, modulation, noise = scan.phase, scan.modulation, scan.light.noise
         else:
             decoded = decode(self.sequence, frames, self.axis)
             points = self.model.points(decoded)
             phase, modulation, noise = decoded.phase, decoded.modulation, decoded.noise
-        hide_moved(self.sequence, frames, self.axis, phase, modulation, noise, points)
+        mask_motion(self.sequence, frames, self.axis, phase, modulation, noise, points)
         if self.factor != 1.0:
             points *= np.float32(self.factor)
         return points, frames[-1].copy()
 
-    def _room(self) -> PassResult | None:
-        """The arrays of the scan before, but its points, which somebody may be drawing."""
+    def _workspace(self) -> PassResult | None:
+        """The arrays of the previous scan, except its points, which may still be drawn."""
         before = self._before
         return None if before is None else replace(before, points=np.empty_like(before.points))
 
 
-class Calibrated:
-    """The calibration that the session uses, also when it becomes another one meanwhile."""
+class LiveCalibration:
+    """The calibration that the session uses, also after it has changed."""
 
     def __init__(self, store: Session, sequence: PatternSequence, axis: Axis) -> None:
         self._store, self._sequence, self._axis = store, sequence, axis
         self._key: tuple[object, ...] = ()
-        self._looked = 0.0
+        self._loaded = 0.0
         self._current = self._load()
 
-    def current(self) -> Measuring:
-        """As it is now, or was up to a second ago. Raises SlviewerError where there is none to use any more."""
-        if time.monotonic() - self._looked > _LOOK_S:
+    def current(self) -> LiveModel:
+        """The model now, at most a second old. Raises SlviewerError where none is usable any more."""
+        if time.monotonic() - self._loaded > _RELOAD_S:
             self._current = self._load()
         return self._current
 
-    def _load(self) -> Measuring:
+    def _load(self) -> LiveModel:
         store = self._store
-        self._looked = time.monotonic()
+        self._loaded = time.monotonic()
         name = preferred(store)
         factor = scale_factor(store, name)
         key = (name, factor, insisted(store), *sorted(store.input_hashes(f"calibration/{name}").items()))
@@ -208,7 +208,7 @@ class Calibrated:
                 f"the {name} calibration has no axis {self._axis}, which a live scan needs: capture a scan"
             )
         self._key = key
-        return Measuring(self._sequence, self._axis, model, factor, load_stereo(store).rig)
+        return LiveModel(self._sequence, self._axis, model, factor, load_stereo(store).rig)
 
 
 def _rate(times: "deque[float] | list[float]") -> float:
@@ -216,6 +216,6 @@ def _rate(times: "deque[float] | list[float]") -> float:
     return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
 
 
-def _forget(times: "deque[float] | deque[tuple[float, float]]", now: float) -> None:
-    while times and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _OVER_S:
+def _drop_old(times: "deque[float] | deque[tuple[float, float]]", now: float) -> None:
+    while times and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _AVERAGED_S:
         times.popleft()

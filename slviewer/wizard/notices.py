@@ -1,4 +1,4 @@
-"""What the operator is told: one sentence at a time, whatever happened."""
+"""Messages for the operator, one sentence each."""
 
 import logging
 import threading
@@ -11,7 +11,7 @@ from slviewer.wizard.snapshot import Level, Notice
 
 log = logging.getLogger("slviewer.wizard")
 
-KEPT = 100
+MOST_NOTICES = 100
 
 
 class Notices:
@@ -20,35 +20,35 @@ class Notices:
     def __init__(self, changed: Callable[[], None]) -> None:
         self._changed = changed
         self._lock = threading.Lock()
-        self._kept: deque[Notice] = deque(maxlen=KEPT)
+        self._latest: deque[Notice] = deque(maxlen=MOST_NOTICES)
         self._count = 0
 
-    def tell(self, level: Level, text: str) -> None:
+    def add(self, level: Level, text: str) -> None:
         """Add a sentence."""
         log.log({"warning": logging.WARNING, "error": logging.ERROR}.get(level, logging.INFO), "%s", text)
         with self._lock:
             self._count += 1
-            self._kept.append(Notice(self._count, level, text, datetime.now().astimezone()))
+            self._latest.append(Notice(self._count, level, text, datetime.now().astimezone()))
         self._changed()
 
-    def fail(self, doing: str, error: BaseException) -> None:
-        """Say that something failed, in the words of `words_for`."""
-        self.tell("error", words_for(doing, error))
+    def add_failure(self, action: str, error: BaseException) -> None:
+        """Add what `describe_error` returns for the error that ended an action ("Calibrating")."""
+        self.add("error", describe_error(action, error))
 
     def all(self) -> tuple[Notice, ...]:
-        """What is kept."""
+        """The latest notices."""
         with self._lock:
-            return tuple(self._kept)
+            return tuple(self._latest)
 
 
-def words_for(doing: str, error: BaseException) -> str:
-    """One plain sentence for an error; what nobody foresaw goes to the log with its traceback."""
+def describe_error(action: str, error: BaseException) -> str:
+    """One sentence for the operator; an unexpected error is logged with its traceback."""
     if isinstance(error, SlviewerError):
         return str(error)
-    log.error("%s failed", doing, exc_info=error)
+    log.error("%s failed", action, exc_info=error)
     if isinstance(error, MemoryError):
-        return f"{doing} failed: the memory is full; close other programs, or use a smaller camera image"
+        return f"{action} failed: out of memory. Close other programs, or use a smaller camera image"
     if isinstance(error, OSError):
         where = f" ({error.filename})" if error.filename else ""
-        return f"{doing} failed: {error.strerror or error}{where}"
-    return f"{doing} failed because of an error in the program ({type(error).__name__}); the log holds its details"
+        return f"{action} failed: {error.strerror or error}{where}"
+    return f"{action} failed because of an error in the program ({type(error).__name__}); see the log for details"

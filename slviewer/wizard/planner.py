@@ -1,96 +1,91 @@
-"""Who chooses the next pose, which takes about a second: a thread of its own, so that no snapshot waits for it."""
+"""Computes the plan of the next pose, which takes about a second, on a thread of its own."""
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 from slviewer.wizard.notices import log
-from slviewer.wizard.pose_plan import PosePlan
-from slviewer.wizard.preview_watcher import Latest
+from slviewer.wizard.pose_plan import PlanInput, PosePlan, plan, quick_plan
+from slviewer.wizard.preview_watcher import LatestWorker
 
-KEPT = 8
-"""Plans remembered: who excludes a pose and includes it again need not wait twice."""
-
-
-class PlanRequest(NamedTuple):
-    """What a plan depends on: the board's notation, the sizes of camera and projector, (name, hash) of each pose's
-    frames, the hash of the calibration (empty: none), the nominal focal length, and how many poses were refused."""
-
-    target: str
-    camera: tuple[int, int]
-    projector: tuple[int, int]
-    poses: tuple[tuple[str, str], ...]
-    model: str
-    focal_px: float | None
-    refused: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Task:
-    asked: PlanRequest
-    think: Callable[[], PosePlan]
-    at_hand: PosePlan
+MOST_PLANS = 8
+"""Plans cached, so that excluding a pose and including it again does not compute one twice."""
 
 
 class Planner:
-    """Answers with the best plan there is. `changed()` is called, on the planner's thread, when a better one is found.
+    """The best plan at any time. `changed()` is called, on the planner's thread, when a better one is ready.
 
-    Only the latest question is thought about, on that thread: what it is about must not change.
+    Only the latest request is computed. `compute` and `quick` are `plan` and `quick_plan`.
     """
 
-    def __init__(self, changed: Callable[[], None]) -> None:
-        self._changed = changed
+    def __init__(
+        self,
+        changed: Callable[[], None],
+        compute: Callable[[PlanInput], PosePlan] = plan,
+        quick: Callable[[PlanInput, PosePlan | None], PosePlan] = quick_plan,
+    ) -> None:
+        self._changed, self._compute, self._quick = changed, compute, quick
         self._lock = threading.Lock()
-        self._plans: dict[PlanRequest, PosePlan] = {}
-        self._last: tuple[PlanRequest, PosePlan] | None = None
-        self._task: _Task | None = None
-        self._thread = Latest("slviewer planner", self._work)
+        self._plans: dict[object, PosePlan] = {}
+        self._latest: tuple[PlanInput, PosePlan] | None = None  # the last one that was computed and looked up
+        self._interim: tuple[object, PosePlan] | None = None
+        self._requested: object = None
+        self._worker = LatestWorker("slviewer planner", self._work)
 
-    def plan(
-        self, asked: PlanRequest, at_hand: Callable[[PosePlan | None], PosePlan], think: Callable[[], PosePlan]
-    ) -> tuple[PosePlan, bool]:
-        """(the plan, whether `think()` is still at it).
+    def look_up(self, given: PlanInput) -> tuple[PosePlan, bool]:
+        """(the best plan now, whether it is final). One that is not final is improved by `request`.
 
-        Meanwhile `at_hand(before)` answers, where `before` is the last plan for the same board and devices, with those
-        of its poses that are still the same. What that one suggested and foretold holds while poses are only added.
+        Until then its poses stand where the last final plan for the same board and devices had them, and its
+        suggestion and sigma are that plan's as long as poses were only added.
         """
         with self._lock:
-            found = self._plans.get(asked)
-            if found is not None:
-                self._task, self._last = None, (asked, found)
-                return found, False
-            if self._task is not None and self._task.asked == asked:
-                return self._task.at_hand, True
-            last = self._last
+            final = self._plans.get(given.key)
+            if final is not None:
+                self._latest = (given, final) if given.takes_time else self._latest
+                return final, True
+            if self._interim is not None and self._interim[0] == given.key:
+                return self._interim[1], False
+            latest = self._latest
+        if not given.takes_time:
+            return self._add(given, self._compute(given)), True
         before, grown = None, False
-        if last is not None and last[0][:3] == asked[:3]:
-            same = {name for name, _ in {*last[0].poses} & {*asked.poses}}
-            before = replace(last[1], poses={name: T for name, T in last[1].poses.items() if name in same})
-            grown = len(same) == len(last[0].poses)
-        found = at_hand(before)
+        if latest is not None and latest[0].rig_key == given.rig_key:
+            same = {name for name, _ in {*latest[0].hashes} & {*given.hashes}}
+            before = replace(latest[1], poses={name: T for name, T in latest[1].poses.items() if name in same})
+            grown = latest[0].features.keys() <= same
+        interim = self._quick(given, before)
         if before is not None and grown:
-            found = replace(found, sigma_mm=before.sigma_mm, suggestion=before.suggestion or found.suggestion)
-        task = _Task(asked, think, found)
+            interim = replace(interim, sigma_mm=before.sigma_mm, suggestion=before.suggestion or interim.suggestion)
         with self._lock:
-            self._task = task
-        self._thread.offer(task)
-        return found, True
+            self._interim = given.key, interim
+        return interim, False
+
+    def request(self, given: PlanInput) -> None:
+        """Compute the plan for this input, instead of any requested before; nothing happens where it is under way."""
+        with self._lock:
+            if self._requested == given.key or given.key in self._plans:
+                return
+            self._requested = given.key
+        self._worker.offer(given)
 
     def close(self) -> None:
         """End the thread."""
-        self._thread.close()
+        self._worker.close()
 
-    def _work(self, task: _Task) -> None:
-        if task is not self._task:  # poses changed since
+    def _work(self, given: PlanInput) -> None:
+        if given.key != self._requested:
             return
         try:
-            found = task.think()
-        except Exception:  # the operator's own poses decide
-            log.exception("the next pose could not be chosen")
-            found = task.at_hand
-        with self._lock:
-            while len(self._plans) >= KEPT:
-                self._plans.pop(next(iter(self._plans)))
-            self._plans[task.asked] = found
+            found = self._compute(given)
+        except Exception:  # the operator can go on without a suggestion
+            log.exception("the next pose could not be computed")
+            found = self.look_up(given)[0]
+        self._add(given, found)
         self._changed()
+
+    def _add(self, given: PlanInput, found: PosePlan) -> PosePlan:
+        with self._lock:
+            while len(self._plans) >= MOST_PLANS:
+                self._plans.pop(next(iter(self._plans)))
+            self._plans[given.key] = found
+        return found

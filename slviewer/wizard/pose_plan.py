@@ -1,18 +1,19 @@
 """Where the target has been and should be held next, from the poses of a session.
 
-The first poses are spread by what they cover; from the third on the rig is known well enough to ask its information
-what it lacks most.
+The first poses are spread by what they cover; from the third on, the rig is known well enough for its information
+matrix to say which pose adds most.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceBench
-from slviewer.calibration.guidance.initial_rig import MIN_POSES as LEAST_FOR_A_RIG
+from slviewer.calibration.guidance.initial_rig import MIN_POSES as MIN_POSES_FOR_RIG
 from slviewer.calibration.guidance.initial_rig import estimate_rig
-from slviewer.calibration.guidance.pose_selection import Guidance, suggest_poses
+from slviewer.calibration.guidance.pose_selection import suggest_poses
 from slviewer.calibration.next_pose import (
     Coverage,
     Suggestion,
@@ -28,14 +29,13 @@ from slviewer.calibration.next_pose import (
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rig import StereoRig
 from slviewer.target.board import Board
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFeatures:
-    """What a pose's observation says of its board: points (n, 3) mm, camera and projector (n, 2) px; and how noisy the
-    projector's coordinates of its bright places are, px (NaN: not known)."""
+    """What was read of one pose: points (n, 3) mm on the board, camera and projector (n, 2) px, and the noise of the
+    projector's coordinates on bright places, px (NaN: unknown)."""
 
     points: np.ndarray
     camera: np.ndarray
@@ -43,11 +43,54 @@ class PoseFeatures:
     noise_px: float = np.nan
 
 
+@dataclass(frozen=True, eq=False)
+class PlanInput:
+    """What a plan depends on: the board, the sizes (width, height) px of both devices, the features of each pose that
+    counts, a stereo calibration (None: none that can be used), the lens's nominal focal length px, and how many poses
+    were refused (as many suggestions were tried in vain and are passed over). `hashes`: {pose: hash of its frames}, and
+    that of the calibration under an empty name; equal inputs have equal `key`."""
+
+    board: Board
+    camera: tuple[int, int]
+    projector: tuple[int, int]
+    features: Mapping[str, PoseFeatures]
+    stereo: StereoModel | None = None
+    focal_px: float | None = None
+    refused: int = 0
+    hashes: tuple[tuple[str, str], ...] = ()
+
+    @cached_property
+    def rig_key(self) -> tuple[object, ...]:
+        """Equal for inputs of the same board and devices."""
+        return str(self.board), self.camera, self.projector
+
+    @cached_property
+    def key(self) -> tuple[object, ...]:
+        return *self.rig_key, self.hashes, self.focal_px, self.refused
+
+    @cached_property
+    def calibrated(self) -> StereoModel | None:
+        """The calibration, if it is one of this camera."""
+        return self.stereo if self.stereo is not None and self.stereo.rig.camera.size == self.camera else None
+
+    @property
+    def takes_time(self) -> bool:
+        """Whether `plan` evaluates a rig's information matrix, rather than what the poses cover."""
+        return self.calibrated is not None or len(self.features) >= MIN_POSES_FOR_RIG
+
+    def initial_lens(self) -> Lens:
+        """The nominal lens, else one estimated from the features."""
+        if self.focal_px is not None:
+            return nominal_lens(self.camera, self.focal_px)
+        seen = self.features.values()
+        return estimated_lens([f.points for f in seen], [f.camera for f in seen], self.camera)
+
+
 USUAL_SIGMA = 4e-5
-"""Of the middle depth, wanted where nobody says: less than a camera's noise does to a single point, so that more poses
-would hardly show in a scan."""
-LEAST_POSES = 8
-"""Before which none is enough: what is not as it should be shows in what poses have in common."""
+"""Default of the wanted sigma, as a share of the middle depth: below a single point's noise, so that more poses would
+hardly improve a scan."""
+MIN_POSES = 8
+"""Fewer are never enough: errors show only where poses can be compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +98,8 @@ class PosePlan:
     """Poses as far as they are known, what they cover, and what should come next.
 
     ``sigma_mm``: the 3D standard deviation that a calibration from these poses is predicted to have over the working
-    volume (RMS), None before the rig is known well enough; ``sigma_next_mm``: with the suggested pose besides.
-    ``usual_mm``: what suffices where nobody says.
+    volume (RMS), None before the rig is known well enough; ``sigma_next_mm``: with the suggested pose added.
+    ``usual_mm``: the default of the wanted sigma.
     """
 
     lens: Lens
@@ -68,118 +111,66 @@ class PosePlan:
     sigma_next_mm: float | None = None
 
     def reaches(self, wanted_mm: float) -> bool:
-        """Whether a sigma is reached, and no pose need follow."""
-        return self.sigma_mm is not None and self.sigma_mm <= wanted_mm and len(self.poses) >= LEAST_POSES
+        """Whether a sigma is reached and no further pose is needed."""
+        return self.sigma_mm is not None and self.sigma_mm <= wanted_mm and len(self.poses) >= MIN_POSES
 
 
-def plan(
-    board: Board,
-    camera: tuple[int, int],
-    projector: tuple[int, int],
-    features: Mapping[str, PoseFeatures],
-    stereo: StereoModel | None,
-    focal_px: float | None,
-    refused: int,
-) -> PosePlan:
-    """The plan after poses with these `features`.
-
-    The rig is the calibrated one if there is a `stereo` calibration of this camera, else what the poses tell; the lens,
-    before they tell anything, is one of `focal_px`. `refused`: so many suggestions were tried in vain and are passed
-    over.
-    """
-    seen = list(features.values())
-    known: tuple[StereoRig, dict[str, np.ndarray]] | None = None
-    if _calibrated(stereo, camera):
-        assert stereo is not None
-        known = stereo.rig, dict(stereo.poses)
+def plan(given: PlanInput) -> PosePlan:
+    """The plan after the poses of `given`. The rig is the calibrated one, else what the poses tell."""
+    seen = list(given.features.values())
+    if given.calibrated is not None:
+        rig, known = given.calibrated.rig, given.calibrated.poses
     else:
         rough = estimate_rig(
-            [f.points for f in seen], [f.camera for f in seen], [f.projector for f in seen], (camera, projector)
-        )
-        if rough is not None:
-            known = rough[0], dict(zip(features, rough[1], strict=True))
-    lens = _lens(seen, camera, focal_px) if known is None else known[0].camera
-    poses = _placed(features, lens, {} if known is None else known[1])
-    usual = USUAL_SIGMA * float(np.mean(depth_range(board, lens)))
-    covered = coverage(board, lens, list(poses.values()))
-    guidance: Guidance | None = None
-    if known is not None:
-        expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in seen]) / projector[0])
-        try:
-            guidance = suggest_poses(GuidanceBench(known[0], board, expected), list(poses.values()))
-        except (InputError, np.linalg.LinAlgError):  # devices that share no view: what covers most may mend it
-            guidance = None
+            [f.points for f in seen], [f.camera for f in seen], [f.projector for f in seen],
+            (given.camera, given.projector),
+        )  # fmt: skip
+        if rough is None:
+            return _spread_poses(given, given.initial_lens(), {})
+        rig, known = rough[0], dict(zip(given.features, rough[1], strict=True))
+    spread = _spread_poses(given, rig.camera, known)
+    expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in seen]) / given.projector[0])
+    try:
+        guidance = suggest_poses(GuidanceBench(rig, given.board, expected), list(spread.poses.values()))
+    except (InputError, np.linalg.LinAlgError):  # devices that share no view: better coverage may repair it
+        return spread
     if guidance is None:
-        return PosePlan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
-    T = guidance.poses[refused % len(guidance.poses)]
-    next_mm = guidance.sigma_next_mm
-    return PosePlan(lens, poses, covered, describe_suggestion(board, lens, T), usual, guidance.sigma_mm, next_mm)
+        return spread
+    T = guidance.poses[given.refused % len(guidance.poses)]
+    return replace(
+        spread,
+        suggestion=describe_suggestion(given.board, rig.camera, T),
+        sigma_mm=guidance.sigma_mm,
+        sigma_next_mm=guidance.sigma_next_mm,
+    )
 
 
-def takes_time(features: Mapping[str, PoseFeatures], stereo: StereoModel | None, camera: tuple[int, int]) -> bool:
-    """Whether `plan` has to ask a rig's information, rather than what poses cover."""
-    return _calibrated(stereo, camera) or len(features) >= LEAST_FOR_A_RIG
+def quick_plan(given: PlanInput, before: PosePlan | None) -> PosePlan:
+    """As `plan`, in a few milliseconds: poses by the calibration or by the lens of the plan `before`, and a suggestion
+    by what they cover."""
+    if given.calibrated is not None:
+        return _spread_poses(given, given.calibrated.rig.camera, given.calibrated.poses)
+    if before is not None:
+        return _spread_poses(given, before.lens, before.poses)
+    return _spread_poses(given, given.initial_lens(), {})
 
 
-def plan_at_hand(
-    board: Board,
-    camera: tuple[int, int],
-    projector: tuple[int, int],
-    features: Mapping[str, PoseFeatures],
-    stereo: StereoModel | None,
-    focal_px: float | None,
-    refused: int,
-    before: PosePlan | None,
-) -> PosePlan:
-    """What can be said at once, as in `plan`: where the poses are by the calibration, or by the lens of the plan
-    `before`, and a suggestion by what they cover."""
-    if _calibrated(stereo, camera):
-        assert stereo is not None
-        lens, known = stereo.rig.camera, dict(stereo.poses)
-    elif before is not None:
-        lens, known = before.lens, dict(before.poses)
-    else:
-        lens, known = _lens(list(features.values()), camera, focal_px), {}
-    poses = _placed(features, lens, known)
-    usual = USUAL_SIGMA * float(np.mean(depth_range(board, lens)))
-    covered = coverage(board, lens, list(poses.values()))
-    return PosePlan(lens, poses, covered, _spread(board, lens, projector, features, poses, refused), usual)
-
-
-def _calibrated(stereo: StereoModel | None, camera: tuple[int, int]) -> bool:
-    return stereo is not None and stereo.rig.camera.size == camera
-
-
-def _lens(seen: list[PoseFeatures], camera: tuple[int, int], focal_px: float | None) -> Lens:
-    if focal_px is not None:
-        return nominal_lens(camera, focal_px)
-    return estimated_lens([f.points for f in seen], [f.camera for f in seen], camera)
-
-
-def _placed(features: Mapping[str, PoseFeatures], lens: Lens, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """T_camera_board (4, 4) of each pose: as `known`, else as the lens says; without those that it cannot tell."""
+def _spread_poses(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarray]) -> PosePlan:
+    """The plan that suggests what poses cover least; poses that are not `known` are placed by the lens."""
     poses = {}
-    for name, one in features.items():
+    for name, one in given.features.items():
         T = known[name] if name in known else approximate_pose(one.points, one.camera, lens)
         if T is not None:
             poses[name] = T
-    return poses
-
-
-def _spread(
-    board: Board,
-    lens: Lens,
-    projector: tuple[int, int],
-    features: Mapping[str, PoseFeatures],
-    poses: Mapping[str, np.ndarray],
-    refused: int,
-) -> Suggestion | None:
-    """What poses cover least, where little is known of the rig."""
-    lit = None
+    reached = None
     if poses:
-        points = np.concatenate([features[n].points @ T[:3, :3].T + T[:3, 3] for n, T in poses.items()])
-        lit = projector_reach(points, np.concatenate([features[n].projector for n in poses]), projector)
+        points = np.concatenate([given.features[n].points @ T[:3, :3].T + T[:3, 3] for n, T in poses.items()])
+        projected = np.concatenate([given.features[n].projector for n in poses])
+        reached = projector_reach(points, projected, given.projector)
+    placed = list(poses.values())
     try:
-        return suggest(board, lens, list(poses.values()), lit=lit, skip=refused)
-    except InputError:  # nothing fits: the operator's own poses decide
-        return None
+        suggestion = suggest(given.board, lens, placed, lit=reached, skip=given.refused)
+    except InputError:  # nothing fits into the view
+        suggestion = None
+    usual_mm = USUAL_SIGMA * float(np.mean(depth_range(given.board, lens)))
+    return PosePlan(lens, poses, coverage(given.board, lens, placed), suggestion, usual_mm)

@@ -1,7 +1,7 @@
-"""What the latest preview frame shows: the board, how bright it is, and whether anything moves.
+"""Analyses the latest preview frame: the board, how bright it is, and whether anything moves.
 
-One thread makes previews and another looks for the board, which takes longer, above all where there is none. For both,
-frames that come while they are busy replace one another, so that what is seen is always now.
+One thread makes previews and another detects the board, which takes longer, above all where there is none. Frames that
+arrive while a thread is busy replace one another, so that the latest is always the one analysed next.
 """
 
 import threading
@@ -25,23 +25,23 @@ from slviewer.wizard.snapshot import BoardSeen, PreviewView
 Item = TypeVar("Item")
 
 SEARCH_PX = 800
-"""Longest side of the image in which the board is looked for, and which panels show."""
+"""Longest side of the image in which the board is detected, and which panels show."""
 BINS = 64
 STILL_PX = 0.004
 """A board whose features move less than this share of the image's width between two looks is held still."""
-_REST = 2.0  # a search for the board is followed by a rest so many times as long: a third of one core at most
+_REST = 2.0  # pause after a detection, as a multiple of its duration: a third of one core at most
 
 
 @dataclass(frozen=True)
 class Watch:
-    """What to look for: no board where None; `lens` gives its approximate pose."""
+    """What to detect: no board where None; `lens` gives its approximate pose."""
 
     board: Board | None = None
     lens: Lens | None = None
 
 
-class Latest(Generic[Item]):
-    """A thread that does `work(item)` for the latest item it was offered, and forgets those that came before."""
+class LatestWorker(Generic[Item]):
+    """A thread that calls `work(item)` for the latest item offered, and drops those that came before."""
 
     def __init__(self, name: str, work: Callable[[Item], None], rest: float = 0.0) -> None:
         self._work, self._rest = work, rest
@@ -52,7 +52,7 @@ class Latest(Generic[Item]):
         self._thread.start()
 
     def offer(self, item: Item) -> None:
-        """Work on this next, instead of any that was not begun yet."""
+        """Work on this next, instead of any that is still waiting."""
         with self._condition:
             self._item = item
             self._condition.notify_all()
@@ -75,82 +75,82 @@ class Latest(Generic[Item]):
             begun = time.monotonic()
             try:
                 self._work(item)
-            except Exception:  # a frame that cannot be looked at must not end the preview
-                log.exception("a preview frame could not be looked at")
+            except Exception:  # one bad item must not end the thread
+                log.exception("%s failed", threading.current_thread().name)
             with self._condition:
                 self._condition.wait_for(lambda: self._closing, self._rest * (time.monotonic() - begun))
 
 
 class Watcher:
-    """Looks at frames; `seen(view)` is called, on one thread, for each one it looked at."""
+    """Analyses frames; `analysed(view)` is called, on one thread, after each."""
 
-    def __init__(self, seen: Callable[[PreviewView], None]) -> None:
-        self._seen = seen
+    def __init__(self, analysed: Callable[[PreviewView], None]) -> None:
+        self._analysed = analysed
         self._watch = Watch()
-        self._found: tuple[Watch, BoardSeen | None, str] = (self._watch, None, "")
+        self._result: tuple[Watch, BoardSeen | None, str] = (self._watch, None, "")
         self._stillness = Stillness()
         self._number, self._rate, self._last = 0, 0.0, 0.0
-        self._finder = Latest("slviewer board finder", self._find, _REST)
-        self._viewer = Latest("slviewer watcher", self._look)
+        self._detector = LatestWorker("slviewer board detection", self._detect, _REST)
+        self._viewer = LatestWorker("slviewer preview", self._make_preview)
 
     def offer(self, frame: np.ndarray) -> None:
-        """Look at `frame` (h, w) next, instead of any that was not looked at yet."""
+        """Analyse `frame` (h, w) next, instead of any that is still waiting."""
         self._viewer.offer(frame)
 
-    def look_for(self, watch: Watch) -> None:
-        """Look for another board from now on."""
-        self._watch = watch
+    def watch(self, target: Watch) -> None:
+        """Detect another board from now on."""
+        self._watch = target
 
     def close(self) -> None:
         """End both threads."""
         self._viewer.close()
-        self._finder.close()
+        self._detector.close()
 
-    def _look(self, frame: np.ndarray) -> None:
+    def _make_preview(self, frame: np.ndarray) -> None:
         now = time.monotonic()
         image, scale = reduced(frame)
         if self._watch.board is not None:
-            self._finder.offer((image, scale, now))
+            self._detector.offer((image, scale, now))
         if self._last:
             self._rate += 0.2 * (1 / max(now - self._last, 1e-3) - self._rate)
         self._last = now
         self._number += 1
-        watch, board, missing = self._found
+        watch, board, missing = self._result
         if watch.board != self._watch.board:
             board, missing = None, ""
         rate = round(self._rate, 1)
-        self._seen(PreviewView(self._number, image, scale, *brightness(frame), board, missing, None, rate))
+        self._analysed(PreviewView(self._number, image, scale, *brightness(frame), board, missing, None, rate))
 
-    def _find(self, item: tuple[np.ndarray, float, float]) -> None:
-        image, scale, taken = item
+    def _detect(self, item: tuple[np.ndarray, float, float]) -> None:
+        image, scale, time_s = item
         watch, board = self._watch, None
-        found, missing = find(watch.board, image)
+        found, missing = detect_board(watch.board, image)
         if found is not None and watch.board is not None:
             # centres of reduced pixels to those of the camera's
             found = replace(found, pixels=(found.pixels + 0.5) / scale - 0.5)
-            still = self._stillness.of(found.pixels, STILL_PX * image.shape[1] / scale, taken)
-            board = board_seen(watch.board, found, still, watch.lens, taken)
+            still = self._stillness.update(found.pixels, STILL_PX * image.shape[1] / scale, time_s)
+            board = board_seen(watch.board, found, still, watch.lens, time_s)
         else:
-            self._stillness.lose()
-        self._found = (watch, board, missing)
+            self._stillness.reset()
+        self._result = (watch, board, missing)
 
 
 class Stillness:
-    """Since when features have stayed where they are."""
+    """For how long features have not moved."""
 
     def __init__(self) -> None:
         self._pixels: np.ndarray | None = None
         self._since = 0.0
 
-    def of(self, pixels: np.ndarray, tolerance_px: float, now: float) -> float:
+    def update(self, pixels: np.ndarray, tolerance_px: float, now: float) -> float:
         """Seconds since the features (n, 2) px last moved further than `tolerance_px` from where they came to rest."""
         before = self._pixels
         if before is None or before.shape != pixels.shape or np.abs(pixels - before).max() > tolerance_px:
             self._pixels, self._since = pixels, now
         return now - self._since
 
-    def lose(self) -> None:
-        """Nothing is seen any more."""
+    def reset(self) -> None:
+        """The board is no longer seen."""
         self._pixels = None
 
 
@@ -171,7 +171,7 @@ def brightness(frame: np.ndarray) -> tuple[float, float, np.ndarray]:
     return float((some >= top).mean()), float(np.percentile(some, 99.5)) / top, counts / some.size
 
 
-def find(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:
+def detect_board(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:
     """The board in a reduced image, or why there is none."""
     if board is None:
         return None, ""
@@ -181,14 +181,14 @@ def find(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]
         return None, str(error)
 
 
-def board_seen(board: Board, found: Detection, still_s: float, lens: Lens | None, taken: float) -> BoardSeen | None:
+def board_seen(board: Board, found: Detection, still_s: float, lens: Lens | None, time_s: float) -> BoardSeen | None:
     """The detected board as a panel draws it."""
     points = board.points[found.ids]
     if len(points) < 4:
         return None
     H = fit_homography(points[:, :2], found.pixels)
     T = None if lens is None else approximate_pose(points, found.pixels, lens)
-    return BoardSeen(found.pixels, to_image(H, board.outline()[:, :2]), still_s, T, taken)
+    return BoardSeen(found.pixels, to_image(H, board.outline()[:, :2]), still_s, T, time_s)
 
 
 def _top(frame: np.ndarray) -> int:
@@ -200,42 +200,39 @@ def _top(frame: np.ndarray) -> int:
 
 
 class HandsFree:
-    """Decides when to capture by itself: the board held still for a while, in a place where it was not before."""
+    """Decides when to capture without a key: when the board is held still for a while in a new place."""
 
     HOLD_S = 1.0
     COUNT_S = 1.0
 
     def __init__(self) -> None:
-        self.on = False
-        self._taken: np.ndarray | None = None
-        self._just_took = False
-        self._asked = 0.0
+        self.is_on = False
+        self._captured: np.ndarray | None = None  # the board's outline at the last capture
+        self._requested: float | None = None  # when the last capture was, until the board is seen after it
         self._begun: float | None = None
+
+    def switch(self, on: bool) -> None:
+        """Switch it on or off."""
+        self.is_on = on
 
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
         """Seconds until the capture, 0 or less: now; None where none is coming."""
-        if self._just_took and not busy and board is not None and board.taken > self._asked:
-            self._taken, self._just_took = board.outline, False
-        if (
-            not self.on
-            or self._just_took
-            or board is None
-            or busy
-            or board.still_s < self.HOLD_S
-            or self._same(board.outline)
-        ):
+        if self._requested is not None and not busy and board is not None and board.time_s > self._requested:
+            self._captured, self._requested = board.outline, None
+        held = self.is_on and self._requested is None and board is not None and not busy
+        if not held or board is None or board.still_s < self.HOLD_S or self._is_captured(board.outline):
             self._begun = None
             return None
         if self._begun is None:
             self._begun = now
         return self.COUNT_S - (now - self._begun)
 
-    def took(self) -> None:
-        """A capture was asked for, by whatever means; where a later picture shows the board counts as taken."""
-        self._just_took, self._asked, self._begun = True, time.monotonic(), None
+    def note_capture(self) -> None:
+        """A capture was requested, by whatever means; the next image of the board shows where it was taken."""
+        self._requested, self._begun = time.monotonic(), None
 
-    def _same(self, outline: np.ndarray) -> bool:
-        if self._taken is None:
+    def _is_captured(self, outline: np.ndarray) -> bool:
+        if self._captured is None:
             return False
         size = np.linalg.norm(np.ptp(outline, axis=0))
-        return bool(np.abs(outline - self._taken).max() < 0.03 * size)
+        return bool(np.abs(outline - self._captured).max() < 0.03 * size)

@@ -1,74 +1,98 @@
-"""Snapshots for subscribers: one thread makes and publishes them, one for many changes that come together."""
+"""Snapshots for listeners: one thread builds and publishes them, one for many changes that come together."""
 
 import threading
 import time
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 from slviewer.wizard.notices import log
 from slviewer.wizard.snapshot import Snapshot
 
 PAUSE_S = 0.05
 """Between two snapshots: a panel needs no more than twenty a second."""
+REFRESH_S = 30.0
+
+Item = TypeVar("Item")
+
+
+class Listeners(Generic[Item]):
+    """Callbacks that are all called by one thread; they may be added and removed by any."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._callbacks: tuple[Callable[[Item], None], ...] = ()
+
+    def add(self, callback: Callable[[Item], None]) -> Callable[[], None]:
+        """Call back with every item from now on; returns a function that ends this."""
+
+        def remove() -> None:
+            with self._lock:
+                self._callbacks = tuple(each for each in self._callbacks if each is not callback)
+
+        with self._lock:
+            self._callbacks += (callback,)
+        return remove
+
+    def call(self, item: Item) -> None:
+        """Call all of them; a callback that fails is logged, and the others are called all the same."""
+        for callback in self._callbacks:
+            try:
+                callback(item)
+            except Exception:
+                log.exception("a listener failed")
 
 
 class Publisher:
-    """Makes a snapshot when something has changed, and publishes it to every listener.
+    """Builds a snapshot when something has changed, and publishes it to every listener.
 
-    `make(version, session_changed)` is called on this thread, or by `now`; never by two at a time.
+    `build(version, session_changed)` and the listeners are called on the publisher's thread alone.
     """
 
-    def __init__(self, make: Callable[[int, bool], Snapshot], first: Snapshot) -> None:
-        self._make = make
-        self._making = threading.Lock()
+    def __init__(self, build: Callable[[int, bool], Snapshot], first: Snapshot) -> None:
+        self._build = build
         self._condition = threading.Condition()
-        self._changed, self._session_changed, self._closing = False, False, False
-        self._latest = first
-        self._listeners: dict[int, Callable[[Snapshot], None]] = {}
+        self._requested = self._published = 0  # changes: counted, and those that listeners know
+        self._session_changed = self._urgent = self._closing = False
         self._thread = threading.Thread(target=self._serve, name="slviewer publisher", daemon=True)
+        self.latest = first
+        self.listeners = Listeners[Snapshot]()
 
     def start(self) -> None:
-        """Begin to make snapshots: once everything is there that `make` looks at."""
+        """Begin to build snapshots, once everything exists that `build` reads."""
         self._thread.start()
 
-    def changed(self, session: bool = False) -> None:
-        """Something changed; `session`: also what the session's files say."""
+    def mark_changed(self, session: bool = False) -> None:
+        """Request a snapshot; `session`: the session's files have changed too."""
         with self._condition:
-            self._changed = True
+            self._requested += 1
             self._session_changed |= session
             self._condition.notify_all()
 
-    @property
-    def latest(self) -> Snapshot:
-        return self._latest
-
-    def now(self) -> Snapshot:
-        """A snapshot of this moment, published to every listener."""
-        self.changed(session=True)
-        self._publish()
-        return self._latest
-
-    def listen(self, callback: Callable[[Snapshot], None]) -> Callable[[], None]:
-        """Call back with every snapshot from now on, on the publisher's thread; returns how to stop that."""
+    def refresh(self) -> Snapshot:
+        """A snapshot of this moment, published to every listener. Not to be called by a listener."""
+        self.mark_changed(session=True)
         with self._condition:
-            number = max(self._listeners, default=0) + 1
-            self._listeners[number] = callback
+            wanted, self._urgent = self._requested, True
+            self._condition.notify_all()
+            self._condition.wait_for(lambda: self._published >= wanted or self._closing, REFRESH_S)
+            return self.latest
 
-        def stop() -> None:
-            with self._condition:
-                self._listeners.pop(number, None)
-
-        return stop
+    @property
+    def is_current(self) -> bool:
+        """Whether the latest snapshot shows every change, and every listener has been called with it."""
+        with self._condition:
+            return self._requested == self._published
 
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
-        """The first snapshot for which `condition` holds; None where none came in time."""
+        """The first snapshot for which `condition` holds; None after `timeout_s` without one."""
         end = time.monotonic() + timeout_s
         with self._condition:
-            while not condition(self._latest):
+            while not condition(self.latest):
                 left = end - time.monotonic()
                 if left <= 0 or self._closing:
                     return None
                 self._condition.wait(left)
-            return self._latest
+            return self.latest
 
     def close(self) -> None:
         """End the thread."""
@@ -80,31 +104,22 @@ class Publisher:
     def _serve(self) -> None:
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: self._changed or self._closing)
+                self._condition.wait_for(lambda: self._requested > self._published or self._closing)
                 if self._closing:
                     return
-            self._publish()
-            time.sleep(PAUSE_S)
-
-    def _publish(self) -> None:
-        with self._making:
-            with self._condition:
-                if not self._changed:
-                    return
-                session = self._session_changed
-                self._changed, self._session_changed = False, False
-                version = self._latest.version + 1
+                requested, session = self._requested, self._session_changed
+                self._session_changed = self._urgent = False
             try:
-                snapshot = self._make(version, session)
+                snapshot = self._build(self.latest.version + 1, session)
             except Exception:
                 log.exception("no snapshot could be made")
-                return
+                snapshot = None
+            if snapshot is not None:
+                with self._condition:
+                    self.latest = snapshot
+                    self._condition.notify_all()
+                self.listeners.call(snapshot)
             with self._condition:
-                self._latest = snapshot
-                listeners = list(self._listeners.values())
+                self._published = requested
                 self._condition.notify_all()
-            for listener in listeners:
-                try:
-                    listener(snapshot)
-                except Exception:
-                    log.exception("a listener failed")
+                self._condition.wait_for(lambda: self._urgent or self._closing, PAUSE_S)

@@ -1,38 +1,59 @@
-"""How a request is granted or refused: at once, without raising, and in words."""
+"""How requests are granted or refused: at once, without raising."""
 
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from slviewer.wizard.engine import Engine
+from slviewer.wizard.jobs import Reporter
+
+T = TypeVar("T")
 
 
 class RequestHandler:
-    """Whoever takes requests for an engine."""
+    """Handles requests to an engine: what every group of requests shares."""
 
     _engine: Engine
 
+    def _warn(self, text: str) -> None:
+        self._engine.notices.add("warning", text)
+
+    def _submit(
+        self,
+        name: str,
+        work: Callable[[Reporter], T],
+        describe: Callable[[T], str],
+        failed: Callable[[BaseException], None] | None = None,
+    ) -> None:
+        """Queue a job; `describe(result)` becomes a notice, and `failed(error)` replaces the notice of a failure."""
+
+        def done(result: T) -> None:
+            self._engine.notices.add("good", describe(result))
+            self._engine.publisher.mark_changed(session=True)
+
+        self._engine.jobs.submit(name, work, done, failed=failed)
+
 
 P = ParamSpec("P")
-Self = TypeVar("Self", bound=RequestHandler)
+Handler = TypeVar("Handler", bound=RequestHandler)
 Request = Callable[Concatenate[Any, P], bool]
 
 
-def request(doing: str) -> Callable[[Callable[Concatenate[Self, P], None]], Request[P]]:
-    """Turns what a request raises into a notice, and tells everybody that something changed."""
+def request(action: str) -> Callable[[Callable[Concatenate[Handler, P], None]], Request[P]]:
+    """Decorates a method: it then returns whether the request was granted, and a refusal becomes a notice."""
 
-    def decorate(function: Callable[Concatenate[Self, P], None]) -> Request[P]:
+    def decorate(function: Callable[Concatenate[Handler, P], None]) -> Request[P]:
         @wraps(function)
-        def ask(self: Self, /, *args: P.args, **kwargs: P.kwargs) -> bool:
+        def handle(self: Handler, /, *args: P.args, **kwargs: P.kwargs) -> bool:
             try:
                 function(self, *args, **kwargs)
             except Exception as error:
-                self._engine.notices.fail(doing, error)
+                self._engine.notices.add_failure(action, error)
                 return False
             finally:
-                self._engine.publisher.changed(session=True)
+                self._engine.publisher.mark_changed(session=True)
             return True
 
-        return ask
+        return handle
 
     return decorate

@@ -1,23 +1,25 @@
-"""What panels draw from a session beyond the snapshot: clouds, error maps, curves. Nothing here changes anything."""
+"""What panels draw from a session beyond the snapshot: clouds, error maps, curves. Nothing here changes the session."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.errors import InputError
-from slviewer.evaluation.compare import Histogram, histogram
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.models import load_model, load_residuals, load_stereo
+from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
 from slviewer.report.data import PixelCurve
 from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply
 from slviewer.session.store import Session
+from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 
 THUMBNAIL_PX = 240
 
@@ -79,23 +81,56 @@ def error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
     return {key.removeprefix("error_"): array for key, array in arrays.items()}
 
 
-def error_histogram(session: Session, name: str) -> Histogram:
-    """The models' errors on one scale."""
-    return histogram(error_maps(session, name))
-
-
 def merged_cloud(session: Session, name: str) -> Ply:
     """The merged points of a merge."""
     return read_ply(session.exports / str(session.load_result(f"merge/{name}", only=())[0]["ply"]))
 
 
-def residuals(session: Session, pose: str) -> tuple[np.ndarray, np.ndarray]:
-    """((n, 2) px, (n, 4) px): where a pose's features are in the camera, and their camera and projector residuals."""
-    found = load_residuals(session)
-    observed = load_observations(session, [pose])
-    if pose not in found or not observed:
-        raise InputError(f"the calibration has no residuals of {pose}: calibrate with it first")
-    return observed[0].camera, found[pose]
+def merge_view(name: str, meta: Mapping[str, Any], stale: bool) -> MergeView:
+    """The view of a saved merge; files of older versions lack some of it."""
+    pairs = meta["pairs"]
+    onto = [{"scan": scan, "onto": meta["reference"], **pair} for scan, pair in pairs.items()]
+    stray: Counter[str] = Counter()
+    for counts in meta.get("left_out", {}).values():
+        stray.update(counts)
+    return MergeView(
+        name=name,
+        reference=meta["reference"],
+        scans=tuple(meta["scans"]),
+        points=meta["points"],
+        pairs={
+            scan: (pair["rms_mm"], pair["overlap"], np.array(pair["T_reference_scan"])) for scan, pair in pairs.items()
+        },
+        stale=stale,
+        registered=tuple(_merged_pair(pair) for pair in meta.get("registered", onto)),
+        loops=tuple(
+            MergedLoop(tuple(loop["scans"]), *(loop[key] for key in ("error_mm", "error_deg", "left_mm", "left_deg")))
+            for loop in meta.get("loops", ())
+        ),
+        dropped=tuple(pair["why"] for pair in meta.get("dropped", ())),
+        refused=tuple(f"{pair['scan']} → {pair['onto']}: {pair['why']}" for pair in meta.get("refused", ())),
+        stray=stray,
+        shared=meta.get("shared"),
+    )
+
+
+def _merged_pair(pair: Mapping[str, Any]) -> MergedPair:
+    T = np.array(pair["T_reference_scan"])
+    moved = None
+    if "middle" in pair:
+        middle = np.array(pair["middle"])
+        moved = float(np.linalg.norm(middle - T[:3, :3].T @ (middle - T[:3, 3])))
+    return MergedPair(
+        pair["scan"],
+        pair["onto"],
+        pair["rms_mm"],
+        pair["overlap"],
+        pair.get("sigma_shift_mm"),
+        pair.get("sigma_turn_deg"),
+        moved,
+        float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))),
+        pair.get("point_to_point_rms_mm"),
+    )
 
 
 def pixel_fits(session: Session) -> Mapping[Axis, PixelFit]:

@@ -1,8 +1,8 @@
-"""What a session's files say, as the panels see it. Nothing is remembered but what would be read again the same."""
+"""Reads what a session's files contain, for the panels. Nothing is cached but what would be read again the same."""
 
 import threading
 from collections.abc import Callable, Mapping
-from functools import partial
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -30,19 +30,18 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.session.capture import Capture
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
+from slviewer.session.measurements import NAMES, Measurement, as_saved
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.wizard.export_files import listed
-from slviewer.wizard.planner import Planner, PlanRequest
-from slviewer.wizard.pose_plan import PoseFeatures, PosePlan, plan, plan_at_hand, takes_time
+from slviewer.wizard.export_files import list_exports
+from slviewer.wizard.planner import Planner
+from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
+from slviewer.wizard.result_views import merge_view
 from slviewer.wizard.snapshot import (
     CalibrationView,
     CentreDistance,
-    ComparisonView,
-    Foreseen,
     MergeView,
-    ModelFigures,
     PoseState,
     PoseView,
     RigView,
@@ -51,34 +50,50 @@ from slviewer.wizard.snapshot import (
     SplinedView,
     VerificationRow,
 )
-from slviewer.wizard.stored_views import merge_view, read_measurements
-from slviewer.wizard.surfaces import nominals
-from slviewer.wizard.tasks import lacking_for_splined
+from slviewer.wizard.surfaces import list_nominals
+from slviewer.wizard.tasks import missing_for_splined
+
+MOST_CACHED = 500
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """What results are compared with to see whether they are stale: captures by name, the operator's labels, hashes of
+    captures and of fresh calibrations, and {model: correction of scale}."""
+
+    captures: Mapping[str, Capture]
+    labels: Mapping[str, str]
+    hashes: Mapping[str, str]
+    factors: Mapping[str, float]
+
+    def is_fresh(self, meta: Mapping[str, Any]) -> bool:
+        """Whether every input of a result exists with the hash it had, and no scale has changed since."""
+        return not (_differs(meta.get("inputs", {}), self.hashes) or _differs(meta.get("scales", {}), self.factors))
 
 
 class SessionReader:
-    """Reads one session again and again, and keeps what is dear to read under its content hash."""
+    """Reads one session again and again, and caches what is slow to read under its content hash."""
 
     def __init__(self, session: Session, planner: Planner) -> None:
         self.session = session
         self._planner = planner
-        self._kept: dict[Any, Any] = {}
+        self._cache: dict[Any, Any] = {}
         self._lock = threading.Lock()
         self._thumbnails: dict[str, bytes] = {}
         self._unreadable: dict[tuple[str, str], str] = {}
 
     def add_thumbnail(self, capture: Capture, jpeg: bytes) -> None:
-        """A small picture that was made of a capture."""
+        """Store the thumbnail of a capture."""
         with self._lock:
             self._thumbnails[capture.hash] = jpeg
 
     def add_unreadable(self, capture: Capture, why: str) -> None:
-        """A pose whose judging failed, and why: it would fail again, and the session keeps no answer."""
+        """Store why a pose cannot be judged: it would fail again, and the session holds no result."""
         with self._lock:
             self._unreadable[capture.hash, self.target()] = why
 
     def target(self) -> str:
-        """The board's notation: as decided, else that of the calibration or of the poses; empty where none says."""
+        """The board's notation: as decided, else that of the calibration or of the poses; empty where unknown."""
         decided = self.session.decision("target")
         if decided:
             return str(decided)
@@ -92,303 +107,238 @@ class SessionReader:
         return str(self.session.decision("patterns") or PATTERNS)
 
     def has_thumbnail(self, capture: Capture) -> bool:
-        """Whether a small picture was made of it."""
+        """Whether its thumbnail is stored."""
         return capture.hash in self._thumbnails
 
-    def lacks_judgement(self, capture: Capture, target: str) -> bool:
-        """Whether this is a pose that nobody has tried to read with this target."""
+    def needs_judging(self, capture: Capture, target: str) -> bool:
+        """Whether this is a pose that was not read with this target yet."""
         if capture.role != "calibration" or not target or (capture.hash, target) in self._unreadable:
             return False
-        return self._judged(capture, target) is None
+        return self._judgement(capture, target) is None
 
-    def frames_of_a_pose(self, rig: RigView) -> int | None:
-        """How many frames the next pose will have; None where no rig says."""
+    def count_frames(self, rig: RigView) -> int | None:
+        """The number of frames of the next pose; None where the projector's size is unknown."""
         if rig.projector is None:
             return None
         patterns, projector = self.patterns(), rig.projector
-        shown = self._keep(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
-        return shown * max(1, len(self.exposures_ms()))
+        shown = self._cached(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
+        return int(shown) * max(1, len(self.exposures_ms()))
 
     def levels(self) -> tuple[int, ...] | None:
-        """The table of grey levels that makes the projector's light proportional, where the operator wants it."""
-        decided = self.session.decision("levels")
-        return tuple(int(level) for level in decided) if decided else None
+        """The table of grey levels that linearises the projector, where the operator uses it."""
+        return tuple(int(level) for level in self.session.decision("levels") or ()) or None
 
     def exposures_ms(self) -> tuple[float, ...]:
         """The exposures of every capture; empty: a single one, the camera's."""
         return tuple(float(exposure) for exposure in self.session.decision("exposures") or ())
 
-    def sigma_wanted_mm(self) -> float | None:
-        """The 3D sigma that poses are to reach, where the operator says so."""
-        decided = self.session.decision("sigma_wanted_mm")
-        return float(decided) if decided else None
-
     def read(self, rig: RigView, focal_px: float | None) -> SessionView:
-        """The session now. `rig` tells sizes before there are poses; `focal_px` is its lens's nominal focal length."""
+        """The session now. `rig` has the sizes until there are poses; `focal_px` is its lens's nominal focal length."""
         session, target = self.session, self.target()
         captures = {capture.name: capture for capture in session.captures()}
-        stereo, calibration = self._calibration(captures)
-        labels = session.decision("names") or {}
+        calibration = self._read_calibration(captures)
+        models = calibration.models if calibration else ()
         hashes = {name: capture.hash for name, capture in captures.items()}
-        if calibration is not None:
-            for model in calibration.models:
-                name = f"calibration/{model}"
-                if self._fresh(name, hashes):
-                    hashes[name] = self._meta(name)["hash"]
-        poses, planned, planning = self._poses(captures, target, stereo, calibration, rig, focal_px)
-        factors = {model: scale_factor(session, model) for model in calibration.models} if calibration else {}
-        rows, distances = self._verifications(captures, labels, hashes, factors)
+        for name in (f"calibration/{model}" for model in models):
+            meta = self._meta(name)
+            if not _differs(meta["inputs"], hashes):
+                hashes[name] = meta["hash"]
+        factors = {model: scale_factor(session, model) for model in models}
+        inputs = _Inputs(captures, session.decision("names") or {}, hashes, factors)
+        poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
+        rows, distances = self._read_verifications(inputs)
         verdict = last_verdict(session)
+        of_calibration = calibration is not None and _is_verdict_of(verdict, self._meta("calibration/stereo"))
         merges = [name for name in self._results("merge/") if set(self._meta(name)["scans"]) <= set(captures)]
         return SessionView(
             folder=session.folder,
             target=target,
             patterns=self.patterns(),
             poses=poses,
-            lens=None if planned is None else planned.lens,
-            coverage=None if planned is None else planned.coverage,
-            suggestion=None if planned is None else planned.suggestion,
-            foreseen=None if planned is None else self._foreseen(planned),
-            planning=planning,
+            plan=plan,
+            pending_plan=pending,
+            wanted_mm=float(session.decision("sigma_wanted_mm") or 0.0) or (plan.usual_mm if plan else 0.0),
             calibration=calibration,
             verdict=verdict,
-            verdict_of_calibration=self._is_of_calibration(verdict, stereo),
+            verdict_of_calibration=of_calibration,
             verifications=rows,
             distances=distances,
-            scans=tuple(self._scan(c, labels, hashes, factors) for c in captures.values() if c.role == "scan"),
-            merge=self._merge(merges[-1], hashes, factors) if merges else None,
+            scans=tuple(self._read_scan(c, inputs) for c in captures.values() if c.role == "scan"),
+            merge=self._read_merge(merges[-1], inputs) if merges else None,
             merges=len(merges),
-            measurements=read_measurements(session, hashes, factors),
+            measurements=self._read_measurements(inputs),
             deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}-") for name in session.deleted_results()),
-            nominals=nominals(session.folder),
-            exports=listed(session),
+            nominals=list_nominals(session.folder),
+            exports=list_exports(session),
             exposures_ms=self.exposures_ms(),
-            linear=self.levels() is not None,
+            is_linear=self.levels() is not None,
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
         )
 
     # poses
 
-    def _judged(self, capture: Capture, target: str) -> dict[str, Any] | None:
-        """The `meta` of what the session knows of a pose, if it is of these frames and this board."""
+    def _judgement(self, capture: Capture, target: str) -> dict[str, Any] | None:
+        """The `meta` of a pose's result, if it is of these frames and this board."""
         if not self.session.has_result(f"poses/{capture.name}"):
             return None
         meta = self._meta(f"poses/{capture.name}")
         return meta if meta["inputs"].get(capture.name) == capture.hash and meta["target"] == target else None
 
-    def _poses(
+    def _read_poses(
         self,
         captures: Mapping[str, Capture],
         target: str,
-        stereo: StereoModel | None,
         calibration: CalibrationView | None,
         rig: RigView,
         focal_px: float | None,
-    ) -> tuple[tuple[PoseView, ...], PosePlan | None, bool]:
-        """(the poses, the plan after them, whether it is still being thought of)."""
-        excluded = self.session.excluded()
-        used = self._meta("calibration/stereo").get("inputs", {}) if stereo is not None else {}
-        features: dict[str, PoseFeatures] = {}
-        states: dict[str, tuple[PoseState, str]] = {}
-        for name, capture in captures.items():
-            if capture.role != "calibration":
-                continue
-            meta = self._judged(capture, target) if target else None
-            if meta is not None and not meta["refused"]:
-                features[name] = self._features(name, meta["hash"])
-            states[name] = self._state(capture, target, meta, excluded, used, calibration)
-        if not target:
-            return self._views(captures, states, {}, None, calibration, ""), None, False
-        first = next((c for c in captures.values() if c.role == "calibration"), None)
-        camera, projector = (first.size, first.sequence.projector_size) if first else (rig.camera, rig.projector)
-        planned, planning = None, False
-        if camera is not None and projector is not None:
-            counted = {name: f for name, f in features.items() if states[name][0] not in ("excluded", "refused")}
+    ) -> tuple[tuple[PoseView, ...], PosePlan | None, PlanInput | None]:
+        """(the poses, the plan after them, the input of the final plan where this one is interim)."""
+        poses = [capture for capture in captures.values() if capture.role == "calibration"]
+        judged = {pose.name: self._judgement(pose, target) if target else None for pose in poses}
+        states = {pose.name: self._state(pose, target, judged[pose.name], calibration) for pose in poses}
+        camera, projector = (poses[0].size, poses[0].sequence.projector_size) if poses else (rig.camera, rig.projector)
+        plan = given = None
+        is_final = True
+        if target and camera is not None and projector is not None:
+            features = {
+                name: self._load_features(name, meta["hash"])
+                for name, meta in judged.items()
+                if meta is not None and not meta["refused"] and states[name][0] not in ("excluded", "refused")
+            }
+            stereo = None if calibration is None or calibration.refused else calibration.stereo
+            hashes = [(name, captures[name].hash) for name in features]
+            if stereo is not None:
+                hashes.append(("", self._meta("calibration/stereo")["hash"]))
             refused = sum(state == "refused" for state, _ in states.values())
-            trusted = None if calibration is not None and calibration.refused else stereo
-            model = self._meta("calibration/stereo")["hash"] if trusted is not None else ""
-            poses = tuple((name, captures[name].hash) for name in counted)
-            board = Board.parse(target)
-            asked = PlanRequest(target, camera, projector, poses, model, focal_px, refused)
-            known = board, camera, projector, counted, trusted, focal_px, refused
-            if takes_time(counted, trusted, camera):
-                at_hand = partial(plan_at_hand, *known)
-                planned, planning = self._planner.plan(asked, at_hand, partial(plan, *known))
-            else:
-                planned = self._keep(asked, partial(plan, *known))
-        return self._views(captures, states, features, planned, calibration, target), planned, planning
-
-    def _foreseen(self, planned: PosePlan) -> Foreseen:
-        decided = self.sigma_wanted_mm()
-        wanted = planned.usual_mm if decided is None else decided
-        return Foreseen(planned.sigma_mm, planned.sigma_next_mm, wanted, planned.reaches(wanted))
+            given = PlanInput(
+                Board.parse(target), camera, projector, features, stereo, focal_px, refused, tuple(hashes)
+            )
+            plan, is_final = self._planner.look_up(given)
+        views = []
+        for pose in poses:
+            state, why = states[pose.name]
+            T = plan.poses.get(pose.name) if plan else None
+            rms = calibration.stereo.pose_rms_px.get(pose.name) if calibration and state == "used" else None
+            views.append(
+                PoseView(
+                    name=pose.name,
+                    state=state,
+                    why=why,
+                    created=str(pose.meta.get("created", "")),
+                    T_camera_board=T,
+                    calibrated=state == "used",
+                    board_px=None if plan is None or T is None else outline_px(Board.parse(target), plan.lens, T),
+                    rms_px=rms,
+                    thumbnail=self._thumbnails.get(pose.hash, b""),
+                )
+            )
+        return tuple(views), plan, None if is_final else given
 
     def _state(
-        self,
-        capture: Capture,
-        target: str,
-        meta: Mapping[str, Any] | None,
-        excluded: Mapping[str, str],
-        used: Mapping[str, str],
-        calibration: CalibrationView | None,
+        self, pose: Capture, target: str, meta: Mapping[str, Any] | None, calibration: CalibrationView | None
     ) -> tuple[PoseState, str]:
-        if capture.name in excluded:
-            return "excluded", excluded[capture.name]
-        if (capture.hash, target) in self._unreadable:
-            return "refused", self._unreadable[capture.hash, target]
+        excluded = self.session.excluded()
+        if pose.name in excluded:
+            return "excluded", excluded[pose.name]
+        if (pose.hash, target) in self._unreadable:
+            return "refused", self._unreadable[pose.hash, target]
         if meta is None:
             return "judging", ""
         if meta["refused"]:
             return "refused", str(meta["refused"])
-        if used.get(capture.name) == capture.hash:
-            return "used", ""
-        if calibration is not None and capture.name in calibration.left_out:
-            why = calibration.left_out[capture.name]
-            if not why.startswith("excluded by the operator"):  # it was included again since
-                return "left out", why
+        if calibration is not None:
+            if self._meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
+                return "used", ""
+            why = calibration.stereo.left_out.get(pose.name, "")
+            if why and not why.startswith("excluded by the operator"):  # such a pose was included again since
+                return "unused", why
         return "good", ""
 
-    def _views(
-        self,
-        captures: Mapping[str, Capture],
-        states: Mapping[str, tuple[PoseState, str]],
-        features: Mapping[str, PoseFeatures],
-        planned: PosePlan | None,
-        calibration: CalibrationView | None,
-        target: str,
-    ) -> tuple[PoseView, ...]:
-        views = []
-        for name, (state, why) in states.items():
-            T = None if planned is None else planned.poses.get(name)
-            board_px = None
-            if planned is not None and T is not None:
-                board_px = outline_px(Board.parse(target), planned.lens, T)
-            views.append(
-                PoseView(
-                    name=name,
-                    state=state,
-                    why=why,
-                    created=str(captures[name].meta.get("created", "")),
-                    T_camera_board=T,
-                    calibrated=state == "used",
-                    board_px=board_px,
-                    rms_px=calibration.pose_rms_px.get(name) if calibration and state == "used" else None,
-                    thumbnail=self._thumbnails.get(captures[name].hash, b""),
-                )
-            )
-        return tuple(views)
-
-    def _features(self, name: str, content_hash: str) -> PoseFeatures:
+    def _load_features(self, name: str, content_hash: str) -> PoseFeatures:
         def load() -> PoseFeatures:
-            said = ("points", "camera", "projector")
+            names = ("points", "camera", "projector")
             try:
-                arrays = self.session.load_result(f"poses/{name}", only=(*said, "samples_sigma"))[1]
-            except InputError:  # read before samples were kept
-                arrays = self.session.load_result(f"poses/{name}", only=said)[1]
+                arrays = self.session.load_result(f"poses/{name}", only=(*names, "samples_sigma"))[1]
+            except InputError:  # saved before samples were
+                arrays = self.session.load_result(f"poses/{name}", only=names)[1]
             sigma = arrays.pop("samples_sigma", np.zeros(0))
             known = sigma[np.isfinite(sigma)]
             return PoseFeatures(**arrays, noise_px=float(np.median(known)) if known.size else np.nan)
 
-        return self._keep(("features", content_hash), load)
+        return self._cached(("features", content_hash), load)  # type: ignore[no-any-return]
 
     # calibration
 
-    def _calibration(self, captures: Mapping[str, Capture]) -> tuple[StereoModel | None, CalibrationView | None]:
+    def _read_calibration(self, captures: Mapping[str, Capture]) -> CalibrationView | None:
         session = self.session
         models = available(session)
         if "stereo" not in models:
-            return None, None
-        meta = self._meta("calibration/stereo")
-        made_of = ("stereo", meta["hash"], tuple(captures)[:1])
-        stereo: StereoModel | None = self._keep(made_of, lambda: load_stereo_if_complete(session))
+            return None
+        hashes = {model: self._meta(f"calibration/{model}")["hash"] for model in models}
+        made_of = ("stereo", hashes["stereo"], tuple(captures)[:1])
+        stereo: StereoModel | None = self._cached(made_of, lambda: load_stereo_if_complete(session))
         if stereo is None:
-            return None, None
-        fit_rms: dict[str, Mapping[str, float]] = {}
-        if "pixelwise" in models:
-            key = ("pixelwise", self._meta("calibration/pixelwise")["hash"])
-            fit_rms = self._keep(key, lambda: _fit_rms(session))
+            return None
+        fit_rms: Mapping[str, Mapping[str, float]] | None = {}
         splined = None
+        if "pixelwise" in models:
+            fit_rms = self._cached(("pixelwise", hashes["pixelwise"]), lambda: _load_fit_rms(session))
         if "splined" in models:
-            splined = self._keep(("splined", self._meta("calibration/splined")["hash"]), lambda: _splined(session))
+            splined = self._cached(("splined", hashes["splined"]), lambda: _load_splined(session))
         foreign = ""
-        if ("pixelwise" in models and not fit_rms) or ("splined" in models and splined is None):
+        if fit_rms is None or ("splined" in models and splined is None):
             foreign = "it was saved by another version of slviewer: calibrate again"
-        rig = stereo.rig
-        return stereo, CalibrationView(
+        return CalibrationView(
+            stereo=stereo,
             models=models,
             best=preferred(session),
-            stale=foreign or self._stale(meta["inputs"], captures),
-            target=stereo.board,
-            poses=tuple(stereo.poses),
-            left_out=stereo.left_out,
-            reprojection_px=stereo.reprojection_rms_px,
-            pose_rms_px=stereo.pose_rms_px,
-            depth_range_mm=stereo.depth_range_mm,
-            baseline_mm=stereo.baseline_mm,
-            K_camera=rig.camera.K,
-            D_camera=rig.camera.D,
-            K_projector=rig.projector.K,
-            D_projector=rig.projector.D,
-            R=rig.R,
-            t=rig.t,
-            focal_sigma_px=stereo.focal_sigma_px,
-            fit_rms_mm=fit_rms,
+            stale=foreign or self._describe_changes(self._meta("calibration/stereo")["inputs"], captures),
+            fit_rms_mm=fit_rms or {},
             recommended=recommended(session),
             chosen=str(decided) if (decided := session.decision("model")) in models else "",
             rejected=rejection(session),
-            insisted=insisted(session),
-            features_set_aside=stereo.features_set_aside,
+            is_pinned=insisted(session),
             splined=splined,
-            comparison=_comparison(session),
+            comparison=validation(session),
             scales={model: words for model in models if (words := told_scale(session, model))},
-            lacks="" if "splined" in models or not stereo.poses else lacking_for_splined(session),
+            missing="" if "splined" in models or not stereo.poses else missing_for_splined(session),
         )
 
-    def _is_of_calibration(self, verdict: Verdict | None, stereo: StereoModel | None) -> bool:
-        if verdict is None or stereo is None:
-            return False
-        judged = self._meta("calibration/stereo").get("verdict")
-        return bool(judged == verdict.to_json())
-
-    def _stale(self, inputs: Mapping[str, str], captures: Mapping[str, Capture]) -> str:
+    def _describe_changes(self, inputs: Mapping[str, str], captures: Mapping[str, Capture]) -> str:
+        """Which poses of a calibration were retaken, deleted or excluded since; empty where none was."""
         excluded = self.session.excluded()
         gone = [n for n, used in inputs.items() if n not in captures or captures[n].hash != used]
-        left = [n for n in inputs if n in excluded]
-        if gone:
-            return f"{_listed(gone)} {'was' if len(gone) == 1 else 'were'} retaken or deleted since: calibrate again"
-        if left:
-            return f"{_listed(left)} {'was' if len(left) == 1 else 'were'} excluded since: calibrate again"
+        dropped = [n for n in inputs if n in excluded]
+        for names, change in ((gone, "retaken or deleted"), (dropped, "excluded")):
+            if names:
+                more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+                verb = "was" if len(names) == 1 else "were"
+                return f"{', '.join(names[:3])}{more} {verb} {change} since: calibrate again"
         return ""
 
-    # verifications, scans, merges
+    # verifications, scans, merges, measurements
 
-    def _verifications(
-        self,
-        captures: Mapping[str, Capture],
-        labels: Mapping[str, str],
-        hashes: Mapping[str, str],
-        factors: Mapping[str, float],
-    ) -> tuple[tuple[VerificationRow, ...], tuple[CentreDistance, ...]]:
+    def _read_verifications(self, inputs: _Inputs) -> tuple[tuple[VerificationRow, ...], tuple[CentreDistance, ...]]:
         rows, centres = [], {}
         for result in self._results("verify/"):
             name, meta = result.removeprefix("verify/"), self._meta(result)
-            if name not in captures:
+            if name not in inputs.captures:
                 continue
-            stale = not self._fresh(result, hashes, factors)
-            for model, figures in meta["models"].items():
-                rows.append(
-                    VerificationRow(
-                        capture=name,
-                        label=str(labels.get(name, name)),
-                        shape=meta["shape"],
-                        model=model,
-                        incidence=meta["incidence"],
-                        stale=stale,
-                        masked=meta.get("masked", {}).get(model),
-                        **figures,
-                    )
+            stale = not inputs.is_fresh(meta)
+            rows += [
+                VerificationRow(
+                    capture=name,
+                    label=str(inputs.labels.get(name, name)),
+                    shape=meta["shape"],
+                    model=model,
+                    incidence=meta["incidence"],
+                    stale=stale,
+                    masked=meta.get("masked", {}).get(model),
+                    **figures,
                 )
+                for model, figures in meta["models"].items()
+            ]
             if not stale:
                 centres.update({(name, model): np.array(c) for model, c in meta["centres_mm"].items()})
         distances = [
@@ -398,33 +348,47 @@ class SessionReader:
         ]
         return tuple(rows), tuple(distances)
 
-    def _scan(
-        self, capture: Capture, labels: Mapping[str, str], hashes: Mapping[str, str], factors: Mapping[str, float]
-    ) -> ScanView:
+    def _read_scan(self, capture: Capture, inputs: _Inputs) -> ScanView:
         result = f"clouds/{capture.name}"
-        meta = self._meta(result) if self.session.has_result(result) else None
-        depths = None if meta is None else (float(meta["depth_mm"][0]), float(meta["depth_mm"][1]))
+        meta = self._meta(result) if self.session.has_result(result) else {}
+        depths = meta.get("depth_mm")
         return ScanView(
             name=capture.name,
-            label=str(labels.get(capture.name, capture.name)),
+            label=str(inputs.labels.get(capture.name, capture.name)),
             purpose=capture.meta.get("settings", {}).get("purpose", "scan"),
             created=str(capture.meta.get("created", "")),
-            cloud="absent" if meta is None else "fresh" if self._fresh(result, hashes, factors) else "stale",
-            model="" if meta is None else meta["model"],
-            points=0 if meta is None else meta["points"],
-            depth_mm=depths,
-            noise_mm=None if meta is None else meta["noise_mm"],
-            masked=None if meta is None else meta.get("masked"),
-            scale="" if meta is None else meta.get("scale", ""),
+            cloud="absent" if not meta else "fresh" if inputs.is_fresh(meta) else "stale",
+            model=meta.get("model", ""),
+            points=meta.get("points", 0),
+            depth_mm=(float(depths[0]), float(depths[1])) if depths else None,
+            noise_mm=meta.get("noise_mm"),
+            masked=meta.get("masked"),
+            scale=meta.get("scale", ""),
             thumbnail=self._thumbnails.get(capture.hash, b""),
         )
 
-    def _merge(self, result: str, hashes: Mapping[str, str], factors: Mapping[str, float]) -> MergeView:
+    def _read_merge(self, result: str, inputs: _Inputs) -> MergeView:
+        meta = self._meta(result)
+        stale = not inputs.is_fresh(meta)
         name = result.removeprefix("merge/")
-        return self._keep(  # type: ignore[no-any-return]
-            ("merge", self._meta(result)["hash"], stale := not self._fresh(result, hashes, factors)),
-            lambda: merge_view(name, self._meta(result), stale),
-        )
+        return self._cached(("merge", meta["hash"], stale), lambda: merge_view(name, meta, stale))  # type: ignore[no-any-return]
+
+    def _read_measurements(self, inputs: _Inputs) -> tuple[Measurement, ...]:
+        """All measurements, in the order in which they were made, stale as ``pipeline.measurements`` defines it."""
+        known, read, names = dict(inputs.hashes), [], self.session.decision(NAMES) or {}
+        results = self.session.result_names()
+        for kind in ("scale/", "merge/", f"{MEASUREMENTS}/"):  # each is made from captures and from those before it
+            for result in (name for name in results if name.startswith(kind)):
+                meta = self._meta(result)
+                scales = meta.get("scales", {})
+                if kind == f"{MEASUREMENTS}/":
+                    scales = {meta["model"]: used} if (used := meta["data"].get("scale")) is not None else {}
+                stale = _differs(meta.get("inputs", {}), known) or _differs(scales, inputs.factors)
+                if kind == f"{MEASUREMENTS}/":
+                    read.append(as_saved(result.removeprefix(kind), meta, names, stale))
+                if not stale:
+                    known[result] = meta["hash"]
+        return tuple(read)
 
     # files
 
@@ -434,61 +398,48 @@ class SessionReader:
     def _meta(self, result: str) -> dict[str, Any]:
         return self.session.load_result(result, only=())[0]
 
-    def _fresh(self, result: str, hashes: Mapping[str, str], factors: Mapping[str, float] | None = None) -> bool:
-        """Whether every input is there with the hash it had, and is fresh itself, and no scale was changed since."""
-        meta = self._meta(result)
-        scales = meta.get("scales", {}) if factors is not None else {}
-        return all(hashes.get(name) == used for name, used in meta.get("inputs", {}).items()) and all(
-            (factors or {}).get(model) == factor for model, factor in scales.items()
-        )
-
-    def _keep(self, key: Any, make: Callable[[], Any]) -> Any:
-        if key not in self._kept:
-            if len(self._kept) > 500:
-                self._kept.clear()
-            self._kept[key] = make()
-        return self._kept[key]
+    def _cached(self, key: Any, make: Callable[[], Any]) -> Any:
+        if key not in self._cache:
+            if len(self._cache) > MOST_CACHED:
+                self._cache.clear()
+            self._cache[key] = make()
+        return self._cache[key]
 
 
-def _fit_rms(session: Session) -> dict[str, Mapping[str, float]]:
-    """By axis and coefficients; nothing of a calibration that another version has saved."""
+def _differs(used: Mapping[str, object], now: Mapping[str, object]) -> bool:
+    return any(now.get(name) != value for name, value in used.items())
+
+
+def _is_verdict_of(verdict: Verdict | None, meta: Mapping[str, Any]) -> bool:
+    return verdict is not None and meta.get("verdict") == verdict.to_json()
+
+
+def _load_fit_rms(session: Session) -> dict[str, Mapping[str, float]] | None:
+    """{axis: {coefficient: median mm}}; None where another version has saved the model."""
     try:
         model = load_model(session, "pixelwise")
     except SessionError:
-        return {}
+        return None
     assert isinstance(model, PixelwiseModel)
     return {axis: model.median_rms_mm(axis) for axis in model.axes}
 
 
-def _splined(session: Session) -> SplinedView | None:
-    """None of a calibration that another version has saved."""
+def _load_splined(session: Session) -> SplinedView | None:
+    """None where another version has saved the model."""
     try:
         model = load_model(session, "splined")
     except SessionError:
         return None
     assert isinstance(model, SplinedModel)
-    found, fits = model.summary(), model.bundle.fits
-    low, high = found["board_height_mm"]
+    summary = model.summary()
+    low, high = summary["board_height_mm"]
     return SplinedView(
-        noise_px=found["noise_px"],
-        local_px=found["local_distortion_rms_px"],
+        noise_px=summary["noise_px"],
+        distortion_px=summary["local_distortion_rms_px"],
         height_mm=(low, high),
-        misplaced_mm=found["board_offsets_rms_mm"],
-        lit=found["cells_lit"],
-        left_out=found["left_out"],
-        trust={name: (fit.camera_trust, fit.projector_trust) for name, fit in fits.items()},
+        offset_mm=summary["board_offsets_rms_mm"],
+        covered=summary["cells_lit"],
+        excluded=summary["left_out"],
+        weights={name: (fit.camera_trust, fit.projector_trust) for name, fit in model.bundle.fits.items()},
         turned=model.bundle.turned,
     )
-
-
-def _comparison(session: Session) -> ComparisonView | None:
-    found = validation(session)
-    if found is None:
-        return None
-    figures = ("plane_mm", "board_mm", "scale_ppm", "camera_px", "projector_px")
-    rows = (ModelFigures(model, *(found.rms(model, figure) for figure in figures)) for model in found.models)
-    return ComparisonView(tuple(rows), len(next(iter(found.poses.values()))), len(found.folds), found.failed)
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

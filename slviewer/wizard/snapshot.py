@@ -1,4 +1,4 @@
-"""All that a panel draws: frozen, plain values, taken at one moment."""
+"""Everything that panels draw: frozen values of one moment."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,19 +10,21 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import Coverage, Suggestion
-from slviewer.geometry.lens import Lens
+from slviewer.calibration.stereo import StereoModel
+from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.pipeline.check_results import Preflight
 from slviewer.session.measurements import Measurement
+from slviewer.wizard.pose_plan import PlanInput, PosePlan
 
 Level = Literal["info", "good", "warning", "error"]
-PoseState = Literal["judging", "good", "refused", "excluded", "used", "left out"]
+PoseState = Literal["judging", "good", "refused", "excluded", "used", "unused"]
 StepState = Literal["blocked", "ready", "done"]
 RigState = Literal["none", "opening", "open", "lost"]
 
 
 @dataclass(frozen=True)
 class Notice:
-    """One sentence for the operator; `number` counts up and never repeats."""
+    """A message for the operator; `number` increases with each."""
 
     number: int
     level: Level
@@ -32,11 +34,11 @@ class Notice:
 
 @dataclass(frozen=True)
 class JobView:
-    """What the worker does now: `share` 0 ... 1, `doing` in words, since how many seconds, and how many jobs wait."""
+    """The running job: the `share` done, 0 ... 1, its current `stage`, for how many seconds, and how many jobs wait."""
 
     name: str
     share: float
-    doing: str
+    stage: str
     seconds: float
     can_cancel: bool
     background: bool
@@ -45,21 +47,21 @@ class JobView:
 
 @dataclass(frozen=True)
 class CaptureProgress:
-    """A capture on its way: frames taken, of how many, and how many captures wait behind it.
+    """A running capture: frames captured, of how many, and how many captures wait behind it.
 
-    Other work with the devices says what it is `doing`, and its `frame` of `frames` are percent.
+    Other work with the devices has a `stage`, and its `frame` of `frames` are percent.
     """
 
     name: str
     frame: int
     frames: int
     waiting: int
-    doing: str = ""
+    stage: str = ""
 
 
 @dataclass(frozen=True)
 class RigView:
-    """The devices: `camera` and `projector` sizes are (width, height) px; what a device does not tell is None."""
+    """The devices: `camera` and `projector` sizes are (width, height) px; what a device does not report is None."""
 
     state: RigState = "none"
     name: str = ""
@@ -69,17 +71,17 @@ class RigView:
     exposure_ms: float | None = None
     gain: float | None = None
     light: str = "white"  # what the projector shows between captures
-    fault: str = ""  # why it is lost, in a sentence
+    fault: str = ""  # why it is lost
     capture: CaptureProgress | None = None
-    choice: Mapping[str, Any] | None = None  # what the operator chose
-    page: bool = False  # whether it needs the projector page
-    notes: tuple[str, ...] = ()  # what its camera could not be set to
+    choice: Mapping[str, Any] | None = None  # as the operator chose it
+    needs_page: bool = False  # whether it needs the projector page
+    notes: tuple[str, ...] = ()  # settings that its camera refused
 
 
 @dataclass(frozen=True, eq=False)
 class PoseView:
-    """One target pose. `T_camera_board` (4, 4) mm is calibrated where `calibrated`, else approximate, None if unknown;
-    `rms_px` is (camera, projector) reprojection; `thumbnail` a JPEG, empty until it is made; `board_px` (4, 2) the
+    """One target pose. `T_camera_board` (4, 4) mm is exact where `calibrated`, else approximate, None if unknown;
+    `rms_px` is (camera, projector) reprojection; `thumbnail` a JPEG, empty until made; `board_px` (4, 2) the
     board's outline in the camera's px.
     """
 
@@ -96,88 +98,51 @@ class PoseView:
 
 @dataclass(frozen=True)
 class SplinedView:
-    """What the joint adjustment found: residual noise px of the camera and along the projector's x and y, each device's
-    local distortion px RMS, the board's lowest and highest place and its features' misplacement in mm, and the shares
-    of both devices' cells that target poses lit. `left_out`: poses that contradict the others, with the reason; `trust`
-    of each pose in camera and projector, 0 ... 1. `turned`: poses whose board was numbered from its other end.
+    """Results of the joint adjustment: residual noise px of the camera and along the projector's x and y, each device's
+    local distortion px RMS, the board's lowest and highest point and the RMS offset of its features in mm, the share of
+    each device's cells that target poses covered, `excluded` poses that contradict the others, with the reason, the
+    weight 0 ... 1 of each pose in camera and projector, and the `turned` poses, numbered from the board's other end.
     """
 
     noise_px: Mapping[str, float]
-    local_px: Mapping[str, float]
+    distortion_px: Mapping[str, float]
     height_mm: tuple[float, float]
-    misplaced_mm: float
-    lit: Mapping[str, float]
-    left_out: Mapping[str, str]
-    trust: Mapping[str, tuple[float, float]]
+    offset_mm: float
+    covered: Mapping[str, float]
+    excluded: Mapping[str, str]
+    weights: Mapping[str, tuple[float, float]]
     turned: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class ModelFigures:
-    """One model on poses that it was not made from, RMS: as `evaluation.crossvalidation.HeldOut` has them."""
-
-    model: str
-    plane_mm: float
-    board_mm: float
-    scale_ppm: float
-    camera_px: float
-    projector_px: float
-
-
-@dataclass(frozen=True)
-class ComparisonView:
-    """The models compared on `poses` poses, each left out with its fold; `failed`: {model: why it is not judged}."""
-
-    models: tuple[ModelFigures, ...]
-    poses: int
-    folds: int
-    failed: Mapping[str, str]
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
-    """The session's calibration; `stale` says in a sentence what changed since, empty where nothing did.
+    """The session's calibration: the `stereo` model, and what is known of the others.
 
-    `target` is empty for one made elsewhere.
-    `fit_rms_mm`: {axis: {z, x, y: median mm}} of the pixel-wise fit, empty where there is none.
-    `best` is the model that is used, `recommended` the one that would be if the operator had not `chosen` (empty: he
-    has not). `rejected` says why it was, empty where it was not; `insisted`: it is used all the same.
-    `scales`: {model: what correction of scale was applied, in words}. `lacks`: what the poses lack for the splined
-    model, empty where they allow it.
+    `stale` names what changed since, empty where nothing did. `fit_rms_mm`: {axis: {z, x, y: median mm}} of the
+    pixel-wise fit, empty where there is none. `best` is the model in use, `recommended` the one that would be if the
+    operator had not `chosen` one (empty: he has not). `rejected` is the reason why the calibration was, empty where it
+    was not; `is_pinned`: it is used all the same. `scales`: {model: the correction of scale applied, in words}.
+    `missing`: what the poses lack for the splined model, empty where they allow it.
     """
 
+    stereo: StereoModel
     models: tuple[str, ...]
     best: str
-    stale: str
-    target: str
-    poses: tuple[str, ...]
-    left_out: Mapping[str, str]
-    reprojection_px: Mapping[str, float]
-    pose_rms_px: Mapping[str, tuple[float, float]]
-    depth_range_mm: tuple[float, float] | None
-    baseline_mm: float
-    K_camera: np.ndarray
-    D_camera: np.ndarray
-    K_projector: np.ndarray
-    D_projector: np.ndarray
-    R: np.ndarray
-    t: np.ndarray
-    focal_sigma_px: Mapping[str, float]
-    fit_rms_mm: Mapping[str, Mapping[str, float]]
+    stale: str = ""
+    fit_rms_mm: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     recommended: str = ""
     chosen: str = ""
     rejected: str = ""
-    insisted: bool = False
-    features_set_aside: int = 0
+    is_pinned: bool = False
     splined: SplinedView | None = None
-    comparison: ComparisonView | None = None
+    comparison: CrossValidation | None = None
     scales: Mapping[str, str] = field(default_factory=dict)
-    lacks: str = ""
+    missing: str = ""
 
     @property
     def refused(self) -> str:
         """Why later steps do not use it; empty where they do."""
-        return "" if self.insisted else self.rejected
+        return "" if self.is_pinned else self.rejected
 
 
 @dataclass(frozen=True)
@@ -192,16 +157,16 @@ class VerificationRow:
     noise_floor_mm: float | None
     radius_mm: float | None
     points: int
-    set_aside: int
+    set_aside: int  # outliers excluded from the fit
     coverage: float | None
     incidence: Mapping[str, float] | None  # percent in R1, R2, R3
     stale: bool
-    masked: float | None = None  # share of the shape that looks where no target pose was; None: the model masks nothing
+    masked: float | None = None  # share of the shape outside the calibrated region; None: the model masks nothing
 
 
 @dataclass(frozen=True)
 class CentreDistance:
-    """How far apart two spheres' centres are by one model."""
+    """The distance of two spheres' centres by one model."""
 
     captures: tuple[str, str]
     model: str
@@ -224,14 +189,14 @@ class ScanView:
     depth_mm: tuple[float, float] | None
     noise_mm: float | None
     thumbnail: bytes = field(repr=False)
-    masked: float | None = None  # share of the pixels that look where no target pose was; None: nothing is masked so
-    scale: str = ""  # what correction of scale is in the cloud
+    masked: float | None = None  # share of the pixels outside the calibrated region; None: nothing is masked
+    scale: str = ""  # the correction of scale in the cloud, in words
 
 
 @dataclass(frozen=True)
 class MergedPair:
-    """How one scan lies on another: RMS along the normal, and from point to point; the overlap, 0 ... 1; one standard
-    deviation of the pose, and how far the overlap's middle was moved. None where a merge of before did not keep it.
+    """The alignment of one scan to another: RMS along the normal, and from point to point; the overlap, 0 ... 1; one
+    standard deviation of the pose, and how far the overlap's centre was moved. None where an older merge lacks it.
     """
 
     scan: str
@@ -247,13 +212,13 @@ class MergedPair:
 
 @dataclass(frozen=True)
 class MergedLoop:
-    """How far the pairs round these scans fail to lead back: as registered, and as adjusted together."""
+    """The closure error of the pairs round these scans: as registered, and after the joint adjustment."""
 
     scans: tuple[str, ...]
     error_mm: float
     error_deg: float
-    left_mm: float
-    left_deg: float
+    adjusted_mm: float
+    adjusted_deg: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,8 +226,8 @@ class MergeView:
     """The current merge: `pairs` maps each scan but the reference to (RMS mm, overlap 0 ... 1, T_reference_scan).
 
     `registered`: the pairs that it was made from; `loops` that these close, the worst first; `dropped`: pairs that the
-    others contradict, and `refused` ones that did not register, in sentences. `stray`: how many pixels of all scans lie
-    on no surface, by what they are; `shared`: the share of the points that more than one scan measured.
+    others contradict, and `refused` ones that did not register, in sentences. `stray`: {kind: number of pixels that lie
+    on no surface}; `shared`: the share of the points that more than one scan measured.
     """
 
     name: str
@@ -290,19 +255,19 @@ class ExportView:
 
 @dataclass(frozen=True)
 class StepView:
-    """One step: what to do now, in a sentence; `wrong`: what is wrong and how to mend it; `because`: why it waits."""
+    """One step: its `instruction`, its `problems` with their remedies, and `blocked_by`: why it cannot be done yet."""
 
     key: str
     title: str
-    now: str
+    instruction: str
     state: StepState
-    because: str
-    wrong: tuple[str, ...]
+    blocked_by: str
+    problems: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Space:
-    """Free disk space, and what the next capture needs; None where no rig says."""
+    """Free disk space, and what the next capture needs (None: unknown)."""
 
     free_bytes: int
     capture_bytes: int | None
@@ -314,72 +279,69 @@ class Space:
 
 @dataclass(frozen=True, eq=False)
 class WorldView:
-    """The simulated world: what stands there, its T_camera_thing (4, 4) mm, and its turn about the vertical."""
+    """The simulated scene: the object in it, its T_camera_object (4, 4) mm, and its turn about the vertical."""
 
     standing: Literal["board", "plane", "sphere", "object"]
-    T_camera_thing: np.ndarray
+    T_camera_object: np.ndarray
     turn_deg: float
-
-
-@dataclass(frozen=True)
-class Foreseen:
-    """The 3D standard deviation mm that a calibration from the poses so far is predicted to have over the working
-    volume; ``next_mm``: with the suggested pose besides. None before enough is known of the rig.
-
-    ``wanted_mm``: what the operator wants, or a default; ``enough``: it is reached, and no pose is asked for.
-    """
-
-    sigma_mm: float | None
-    next_mm: float | None
-    wanted_mm: float
-    enough: bool
 
 
 @dataclass(frozen=True, eq=False)
 class SessionView:
-    """What the session's files say."""
+    """The content of a session's files.
+
+    `plan`: what the poses cover and where the next should be, None before the devices' sizes are known; while it is
+    interim, `pending_plan` is the input of the final one. `wanted_mm`: the 3D standard deviation that a calibration is
+    to reach, the operator's or a default.
+    """
 
     folder: Path
     target: str  # notation of the board, empty until one is chosen
     patterns: str  # name of the pattern sequence
     poses: tuple[PoseView, ...] = ()
-    lens: Lens | None = None  # calibrated, or a guess to place boards with; None before sizes are known
-    coverage: Coverage | None = None
-    suggestion: Suggestion | None = None
-    foreseen: Foreseen | None = None  # None before sizes are known
-    planning: bool = False  # whether a better suggestion is being thought of: these two are of fewer poses
+    plan: PosePlan | None = None
+    pending_plan: PlanInput | None = None
+    wanted_mm: float = 0.0
     calibration: CalibrationView | None = None
-    verdict: Verdict | None = None  # on the last attempt to calibrate, also where nothing came of it
+    verdict: Verdict | None = None  # on the last attempt to calibrate, even if it gave no calibration
     verdict_of_calibration: bool = True  # whether that attempt made `calibration`
     verifications: tuple[VerificationRow, ...] = ()
     distances: tuple[CentreDistance, ...] = ()
     scans: tuple[ScanView, ...] = ()
     merge: MergeView | None = None
-    merges: int = 0  # how many undo can take back
+    merges: int = 0  # how many can be undone
     measurements: tuple[Measurement, ...] = ()
-    deleted_measurements: int = 0  # how many can be brought back
+    deleted_measurements: int = 0  # how many can be restored
     nominals: tuple[str, ...] = ()  # names of the nominal models that were uploaded
     exports: tuple[ExportView, ...] = ()
-    deleted_poses: tuple[str, ...] = ()  # what can be brought back, the last deleted first
+    deleted_poses: tuple[str, ...] = ()  # what can be restored, the last deleted first
     deleted_scans: tuple[str, ...] = ()
-    linear: bool = False  # whether patterns pass the table of grey levels that makes the light proportional
+    is_linear: bool = False  # whether patterns are corrected by the measured table of grey levels
     exposures_ms: tuple[float, ...] = ()  # of every capture; empty: a single one, the camera's
 
     @property
     def enough(self) -> bool:
-        """Whether the poses reach the accuracy wanted."""
-        return self.foreseen is not None and self.foreseen.enough
+        """Whether the poses reach the wanted accuracy."""
+        return self.plan is not None and self.plan.reaches(self.wanted_mm)
+
+    @property
+    def coverage(self) -> Coverage | None:
+        return None if self.plan is None else self.plan.coverage
+
+    @property
+    def suggestion(self) -> Suggestion | None:
+        return None if self.plan is None else self.plan.suggestion
 
 
 @dataclass(frozen=True)
 class LiveView:
-    """A live scan: clouds made a second, and of those shown a second; `behind_ms`: from the first frame's light of a
-    cloud until it is sent to the screens, the median, None where nobody looks; `points` of the latest cloud.
+    """A live scan: clouds computed per second, and of those shown; `latency_ms`: the median from the start of a cloud's
+    capture until it is sent to the screens, None where nobody watches; `points` of the latest cloud.
     """
 
     clouds_per_s: float
     shown_per_s: float
-    behind_ms: float | None
+    latency_ms: float | None
     points: int
 
 
@@ -396,10 +358,21 @@ class Snapshot:
     steps: tuple[StepView, ...]
     space: Space | None
     hands_free: bool
-    autopilot: str  # what it does now; empty where it rests
-    preflight: Preflight | None = None  # what the last check of the rig in use said
-    live: LiveView | None = None  # None while nothing is scanned live
-    not_merged: str = ""  # why the latest merge that was asked for was refused, or failed
+    autopilot: str  # what it does now; empty where it is off
+    preflight: Preflight | None = None  # result of the last check of the rig in use
+    live: LiveView | None = None  # None while no live scan runs
+    merge_failure: str = ""  # why the last merge was refused, or failed
+    read_failure: str = ""  # why the session's files could not be read just now
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a job runs that the operator requested."""
+        return self.job is not None and not self.job.background
+
+    @property
+    def calibration(self) -> CalibrationView | None:
+        """The session's calibration, if there is one."""
+        return self.session.calibration if self.session else None
 
     def step(self, key: str) -> StepView:
         """The step called `key`."""
@@ -418,14 +391,14 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class BoardSeen:
-    """The board in the preview: features (n, 2) and outline (4, 2), camera px; `still_s` since it moved last; `taken`:
-    when the picture was, by the monotonic clock: the search takes its time."""
+    """The board in the preview: features (n, 2) and outline (4, 2), camera px; `still_s` since it last moved; `time_s`:
+    when the image was taken, by the monotonic clock."""
 
     pixels: np.ndarray
     outline: np.ndarray
     still_s: float
     T_camera_board: np.ndarray | None
-    taken: float
+    time_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -433,8 +406,8 @@ class PreviewView:
     """The latest frame as a panel shows it, apart from the snapshot since it changes many times a second.
 
     `image` (h, w) uint8 is `scale` times the camera's size. `histogram` (64,) are shares of the pixels by grey level.
-    `board` is None where none is seen or none is looked for, and `missing` then says why. `countdown_s`: seconds until
-    a hands-free capture, None where none is coming.
+    `board` is None where none is detected, and `missing` is then the reason. `countdown_s`: seconds until a hands-free
+    capture, None where none is coming.
     """
 
     number: int

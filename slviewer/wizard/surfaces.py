@@ -1,4 +1,4 @@
-"""The surfaces that the wizard measures on: reconstructed scans and merges, read from what the session keeps."""
+"""The surfaces that the wizard measures on: reconstructed scans and merges, read from the session."""
 
 import threading
 from pathlib import Path
@@ -18,14 +18,14 @@ NOMINALS = "nominal"
 
 
 class Surfaces:
-    """Keeps the surface that was asked for last: each click asks for the same one. For any thread."""
+    """Loads surfaces, and caches the last one: each click needs the same. For any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._key: tuple[str, str, str] | None = None
-        self._kept: MeasuredSurface | None = None
+        self._cached: MeasuredSurface | None = None
 
-    def of(self, store: Session, name: str) -> MeasuredSurface:
+    def load(self, store: Session, name: str) -> MeasuredSurface:
         """A capture's cloud as it was reconstructed, or a merge (``merge/<number>``).
 
         Raises InputError where there is none, or where what it was made from has changed since.
@@ -37,20 +37,20 @@ class Surfaces:
         again = "merge again" if result == name else "reconstruct it again in the step Scan"
         scaled = all(scale_factor(store, model) == factor for model, factor in meta.get("scales", {}).items())
         if store.state_of(result) == "stale" or not scaled:
-            raise InputError(f"{name} was made with what has changed since: {again}, and measure then")
+            raise InputError(f"the inputs of {name} have changed: {again}, then measure")
         key = (str(store.folder), result, str(meta["hash"]))
         with self._lock:
-            if self._key != key or self._kept is None:
-                self._kept = merged_surface(store, name) if result == name else _scanned(store, name)
+            if self._key != key or self._cached is None:
+                self._cached = merged_surface(store, name) if result == name else _load_scan(store, name)
                 self._key = key
-            return self._kept
+            return self._cached
 
 
-def _scanned(store: Session, name: str) -> MeasuredSurface:
+def _load_scan(store: Session, name: str) -> MeasuredSurface:
     meta, arrays = store.load_result(f"clouds/{name}")
-    left = arrays.get("sigma_calibration")
+    systematic = arrays.get("sigma_calibration")
     points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
-    cloud = Cloud(points, meta["axis"], meta["model"], sigma, texture, left, arrays.get("sigma_edges"))
+    cloud = Cloud(points, meta["axis"], meta["model"], sigma, texture, systematic, arrays.get("sigma_edges"))
     return surface_of(store, name, cloud, load_model(store, meta["model"]))
 
 
@@ -69,7 +69,7 @@ def point_at(on: MeasuredSurface, place: Place) -> np.ndarray:
     return np.asarray(on.points[index], np.float64)
 
 
-def nominals(folder: Path) -> tuple[str, ...]:
+def list_nominals(folder: Path) -> tuple[str, ...]:
     """Names of the nominal models in a session's folder."""
-    held = folder / NOMINALS
-    return tuple(sorted(entry.name for entry in held.iterdir() if entry.name[0] != ".")) if held.is_dir() else ()
+    entries = (folder / NOMINALS).glob("[!.]*")
+    return tuple(sorted(entry.name for entry in entries))

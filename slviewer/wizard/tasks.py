@@ -1,13 +1,13 @@
-"""What the worker computes, and what it leaves in the session: one function a job.
+"""The worker's jobs, one function each, and the results that they save in the session.
 
 =====================  ============================================================================================
-`poses/<capture>`      what a target pose says (`pipeline.poses`)
+`poses/<capture>`      the features of a target pose (`pipeline.poses`)
 `clouds/<capture>`     the organised cloud, with phase and modulation at each pixel
 `verify/<capture>`     error maps and figures of a plane or a sphere, model by model
-`merge/<number>`       how scans lie on their reference; the points are in `exports/merged_<number>.ply`
+`merge/<number>`       the alignment of scans; the points are in `exports/merged_<number>.ply`
 =====================  ============================================================================================
 
-All of them name their inputs, so that what has become stale is seen.
+All of them name their inputs, so that stale results are detected.
 """
 
 import numpy as np
@@ -24,17 +24,17 @@ from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.validate import validate
 from slviewer.pipeline.verify import Shape, verify
 from slviewer.session.store import Session
-from slviewer.wizard.export_files import delivered
+from slviewer.wizard.export_files import staged_export
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.snapshot import Level
 
 
-def make_calibration(session: Session, target: str, report: Reporter, warn: Warn) -> CalibrationResult:
-    """Calibrate every model that the poses which are not excluded allow; models of before do not outlive it."""
+def calibrate_session(session: Session, target: str, report: Reporter, warn: Warn) -> CalibrationResult:
+    """Calibrate every model that the included poses allow; models that they no longer allow go to the trash."""
     guarded = session.guarded(report.saving)
     models = ["stereo", "pixelwise"]
-    if lacking := lacking_for_splined(session):
-        warn(f"no splined model: {lacking}")
+    if missing := missing_for_splined(session):
+        warn(f"no splined model: {missing}")
     else:
         models.append("splined")
     made = calibrate(guarded, target, models=models, progress=report, warn=warn)
@@ -44,15 +44,15 @@ def make_calibration(session: Session, target: str, report: Reporter, warn: Warn
     return made
 
 
-def told_calibration(made: CalibrationResult) -> tuple[Level, str]:
-    """How it went, in a sentence."""
+def describe_calibration(made: CalibrationResult) -> tuple[Level, str]:
+    """The result in one sentence, and its level."""
     rms = made.stereo.reprojection_rms_px["stereo"]
-    said = f"calibrated from {len(made.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
-    return ("good", said) if made.verdict.level == "good" else ("warning", f"{said}; doubtful: {made.verdict.reason}")
+    text = f"calibrated from {len(made.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
+    return ("good", text) if made.verdict.level == "good" else ("warning", f"{text}; doubtful: {made.verdict.reason}")
 
 
-def lacking_for_splined(session: Session) -> str:
-    """What the poses lack for the splined model, in words; empty where they allow it."""
+def missing_for_splined(session: Session) -> str:
+    """What the poses lack for the splined model; empty where they allow it."""
     excluded = session.excluded()
     poses = [capture for capture in session.captures("calibration") if capture.name not in excluded]
     both = sum(len(capture.sequence.axes) == 2 for capture in poses)
@@ -65,35 +65,35 @@ def lacking_for_splined(session: Session) -> str:
 
 
 def compare_models(session: Session, report: Reporter, warn: Warn) -> CrossValidation:
-    """Measure each pose by calibrations made without it, model by model, and keep how they compare."""
+    """Measure each pose by calibrations made without it, and save how the models compare."""
     return validate(session.guarded(report.saving), progress=report, warn=warn)
 
 
-def told_comparison(found: CrossValidation) -> str:
-    """How it went, in a sentence."""
-    figures = ", ".join(f"{model} {found.rms(model, 'board_mm'):.3f} mm" for model in found.models)
-    return f"boards that were left out come out wrong by {figures}: {found.recommended} is recommended"
+def describe_comparison(compared: CrossValidation) -> str:
+    """The result in one sentence."""
+    figures = ", ".join(f"{model} {compared.rms(model, 'board_mm'):.3f} mm" for model in compared.models)
+    return f"held-out error of the models: {figures}; {compared.recommended} is recommended"
 
 
-def make_cloud(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
-    """Reconstruct a capture, keep its cloud, and put its PLY into the exports; returns how many points it has."""
+def reconstruct_capture(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
+    """Reconstruct a capture, save its cloud, and write its PLY into the exports; returns the number of points."""
     insist = insisted(session)
     model = model or best(session, insist)
-    with delivered(session, f"{name}_{model}.ply", report) as ply:
+    with staged_export(session, f"{name}_{model}.ply", report) as ply:
         progress = report.within(0, 0.9)
-        found = reconstruct(session, name, model=model, out=ply, accept_rejected=insist, progress=progress, warn=warn)
-        cloud, phase = found.cloud, found.phases[found.cloud.axis]
+        made = reconstruct(session, name, model=model, out=ply, accept_rejected=insist, progress=progress, warn=warn)
+        cloud, phase = made.cloud, made.phases[made.cloud.axis]
         z = cloud.points[..., 2][cloud.mask]
         near, far = np.percentile(z, [1, 99])
         calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
         meta = {
             "model": model,
             "axis": cloud.axis,
-            "points": found.points,
+            "points": made.points,
             "depth_mm": [float(near), float(far)],
             "noise_mm": float(np.median(cloud.sigma_z[cloud.mask])),
-            "masked": found.masked,
-            "scale": found.scale,
+            "masked": made.masked,
+            "scale": made.scale,
             "scales": {model: scale_factor(session, model)},
             "inputs": session.input_hashes(name, *calibrations),
         }
@@ -113,13 +113,14 @@ def make_cloud(session: Session, name: str, model: str | None, report: Reporter,
         report(0.95, "saving")
         session.guarded(report.saving).save_result(f"clouds/{name}", meta, arrays)
     report(1.0, "reconstructed")
-    return found.points
+    return made.points
 
 
-def measure(
+def verify_captures(
     session: Session, names: list[str], shape: Shape, radius: float | None, report: Reporter, warn: Warn
 ) -> dict[str, dict[str, float]]:
-    """Compare the models on captures of a plane or a sphere, keep error maps and clouds; {capture: {model: RMS mm}}."""
+    """Compare the models on captures of a plane or a sphere, save error maps and clouds; returns {capture: {model: RMS
+    mm}}."""
     rms = {}
     for i, name in enumerate(names):
         span = report.within(i / len(names), (i + 1) / len(names))
@@ -145,16 +146,16 @@ def measure(
         arrays = {f"error_{model}": result.error_map for model, result in found.results.items()}
         span(0.5, "saving")
         session.guarded(report.saving).save_result(f"verify/{name}", meta, arrays)
-        make_cloud(session, name, None, span.within(0.5, 1), warn)
+        reconstruct_capture(session, name, None, span.within(0.5, 1), warn)
         rms[name] = {model: result.rms_mm for model, result in found.results.items()}
     report(1.0, "measured")
     return rms
 
 
-def told_measures(rms: dict[str, dict[str, float]]) -> str:
-    """What was measured, in a sentence."""
+def describe_verifications(rms: dict[str, dict[str, float]]) -> str:
+    """The result in one sentence."""
     figures = {name: ", ".join(f"{m} {mm:.3f} mm" for m, mm in models.items()) for name, models in rms.items()}
-    return "; ".join(f"{name}: RMS {said}" for name, said in figures.items())
+    return "; ".join(f"{name}: RMS {text}" for name, text in figures.items())
 
 
 def merge_scans(
@@ -168,11 +169,11 @@ def merge_scans(
     angle: float | None = None,
     picked: Picked | None = None,
 ) -> Merge:
-    """Register scans to a reference, and keep how they lie; the merged PLY goes into the exports."""
+    """Register scans to a reference, save the alignment, and write the merged PLY into the exports."""
     number = next_merge(session)
     insist = insisted(session)
     model = best(session, insist)
-    with delivered(session, f"merged_{number}.ply", report) as ply:
+    with staged_export(session, f"merged_{number}.ply", report) as ply:
         found = merge(
             session, names, reference, ply, model=model, start=start, angle=angle, picked=picked,
             accept_rejected=insist, progress=report.within(0, 0.97), warn=warn,
@@ -182,7 +183,7 @@ def merge_scans(
     return found
 
 
-def told_merge(reference: str, found: Merge) -> str:
-    """How well the scans lie on each other, in a sentence."""
+def describe_merge(reference: str, found: Merge) -> str:
+    """The result in one sentence."""
     pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in found.pairs.items())
     return f"merged on {reference}: {'; '.join(pairs)}"

@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from slviewer.gui.measure_drawing import drawn, label, lifted, value_words
-from slviewer.gui.measure_section import cursor_words, placed, section_figure
+from slviewer.gui.measure_drawing import drawn, format_quantity, label, lifted
+from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table, verdict_html
+from slviewer.gui.measure_section import cursor_html, placed, section_figure
 from slviewer.gui.measure_surface import painting
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
-from slviewer.gui.measure_words import deviation_figure, measurement_words, measurements_table, verdict_words
 from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
@@ -87,9 +87,9 @@ def test_a_section_is_read_off_at_its_cursors() -> None:
     cursors = placed([arc], (10.0, 90.0, 50.0))
     assert cursors[:, 1] == pytest.approx([30, 30, 50], abs=1e-3)
     assert np.allclose(lifted(plane, cursors), [[10, 0, 470], [90, 0, 470], [50, 0, 450]], atol=1e-3)
-    words = text(cursor_words(cursors))
+    words = text(cursor_html(cursors))
     assert "80.000 mm" in words and "50.000 mm" in words and "0.000 mm" in words
-    assert "straight line" in text(cursor_words(np.array([[0.0, 0], [2, 0], [1, 0]])))
+    assert "straight line" in text(cursor_html(np.array([[0.0, 0], [2, 0], [1, 0]])))
     assert "drawn alike" in section_figure("s", [arc], cursors).caption
     flat = arc * [1, 0.01]
     assert "larger than lengths" in section_figure("s", [flat], placed([flat], (10.0, 90.0, 50.0))).caption
@@ -99,18 +99,18 @@ def test_a_section_is_read_off_at_its_cursors() -> None:
 
 
 def test_words_of_measurements() -> None:
-    assert value_words(Quantity("x", -0.00001, "mm")) == "0.000 mm"
-    assert value_words(Quantity("height", -1.5, "mm", 0.1)) == "−1.500 ± 0.200 mm"
-    assert value_words(Quantity("angle", 90.0, "deg", 0.01, whole=False)) == "90.000 ± 0.020°*"
-    full = text(measurement_words(SPHERE, {"scan_01": "Lion <i>"}))
+    assert format_quantity(Quantity("x", -0.00001, "mm")) == "0.000 mm"
+    assert format_quantity(Quantity("height", -1.5, "mm", 0.1)) == "−1.500 ± 0.200 mm"
+    assert format_quantity(Quantity("angle", 90.0, "deg", 0.01, whole=False)) == "90.000 ± 0.020°*"
+    full = text(measurement_html(SPHERE, {"scan_01": "Lion <i>"}))
     assert "25.000 ± 0.020 mm*" in full and "It is rough." in full and "on Lion <i>" in full
-    assert "<b>sphere" not in measurement_words(SPHERE, {}) and "does not know" in full
+    assert "<b>sphere" not in measurement_html(SPHERE, {}) and "does not know" in full
     stale = made("point", [Quantity("x", 1.0, "mm")], stale=True)
     listed = text(measurements_table([SPHERE, stale], "", {}))
     assert listed.index("point on scan_01, stale") < listed.index("sphere on scan_01")
     statistics = {"points": 900, "left_out": 100}
     verdict = {"tolerance_mm": 0.1, "decision": "undecided", "U_mm": 0.02, "inside": 90.0, "close": 9.0, "outside": 1.0}
-    told = text(verdict_words({"verdict": verdict, "statistics_mm": statistics, "reach_mm": 2.0}))
+    told = text(verdict_html({"verdict": verdict, "statistics_mm": statistics, "reach_mm": 2.0}))
     assert "Tolerance ± 0.1 mm: too close to tell" in told and "10.0 % lie farther than 2 mm" in told
     edges = np.linspace(-0.2, 0.2, 9)
     assert deviation_figure("d", edges, np.arange(8), 0.1, 0.1).png.startswith(b"\x89PNG")

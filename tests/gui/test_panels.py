@@ -18,11 +18,11 @@ from wizard_page import SIZE, Opened, button, field
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.gui.app import App
-from slviewer.gui.calibration_words import comparison_table, named_poses, verdict_words
-from slviewer.gui.inputs import titled
-from slviewer.gui.pictures import Painter, spread
-from slviewer.gui.steps.scan import ordered, painting, point_words, uncertainty
-from slviewer.gui.steps.verify import distances_table, likely, results_table
+from slviewer.gui.calibration_html import comparison_table, named_poses, verdict_html
+from slviewer.gui.inputs import display_name
+from slviewer.gui.pictures import Painter, colour_range
+from slviewer.gui.steps.scan import painting, point_html, sort_scans, uncertainty
+from slviewer.gui.steps.verify import distances_table, results_table, shape_of
 from slviewer.pipeline.calibration_verdict import save_verdict
 from slviewer.pipeline.measurements import quantities_of
 from slviewer.session.measurements import Measurement
@@ -109,7 +109,7 @@ def test_models_are_compared_on_request_and_the_comparison_can_be_cancelled(
     button(page, "Cancel").click()
     expect(page.get_by_text("Comparing the models: cancelled").first).to_be_visible()
     expect(again).to_be_enabled()
-    assert engine.settle().session.calibration.comparison == compared  # type: ignore[union-attr]
+    assert engine.wait_until_idle().session.calibration.comparison == compared  # type: ignore[union-attr]
     assert errors == []
 
 
@@ -229,9 +229,9 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
 ) -> None:
     page, operator, errors = measured
     for name in ("object_r2", "sphere_3"):
-        if operator.settle().scan(name).cloud != "fresh":  # type: ignore[union-attr]
+        if operator.wait_until_idle().scan(name).cloud != "fresh":  # type: ignore[union-attr]
             assert operator.reconstruct(name)
-    operator.settle(60)
+    operator.wait_until_idle(60)
     button(page, "8. Measure").click()
     choose(page, "Measure on", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
     tool(page, "Distance", "Click the first point.")
@@ -291,7 +291,7 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
 def titles(operator: Operator, title: str) -> bool:
     """Whether a scan is called so."""
     session = operator.snapshot().session
-    return session is not None and any(titled(scan.name, scan.label) == title for scan in session.scans)
+    return session is not None and any(display_name(scan.name, scan.label) == title for scan in session.scans)
 
 
 def tool(page: Page, name: str, says: str) -> None:
@@ -349,8 +349,8 @@ def test_words_of_a_calibration() -> None:
     rows = tuple(ModelFigures(m, p, 2 * p, 9.0, p, p) for m, p in (("stereo", 0.2), ("splined", 0.02)))
     html = comparison_table(ComparisonView(rows, 8, 5, {"pixelwise": "too <few> poses"}), "splined")
     assert re.search(r"font-weight:600\">0&#46;020", html) and "<few>" not in html and html.index("stereo") > 0
-    assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_words(REJECTED, True, None)
-    assert "Nothing came" in verdict_words(REJECTED, False, None)
+    assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_html(REJECTED, True, None)
+    assert "Nothing came" in verdict_html(REJECTED, False, None)
 
 
 def test_a_painter_draws_the_last_wish_and_survives_failures() -> None:
@@ -364,13 +364,13 @@ def test_a_painter_draws_the_last_wish_and_survives_failures() -> None:
         go.wait(5)
         return "old"
 
-    painter.ask("place", 1, slow, shown.append)
+    painter.request("place", 1, slow, shown.append)
     assert begun.wait(5)
-    painter.ask("place", 2, lambda: 1 / 0, shown.append)
-    painter.ask("place", 3, lambda: "new", shown.append)
-    painter.ask("place", 3, lambda: "the same again", shown.append)
-    painter.ask("broken", 1, lambda: 1 / 0, shown.append)
-    painter.ask("last", 1, lambda: "last", lambda made: (shown.append(made), done.set()))
+    painter.request("place", 2, lambda: 1 / 0, shown.append)
+    painter.request("place", 3, lambda: "new", shown.append)
+    painter.request("place", 3, lambda: "the same again", shown.append)
+    painter.request("broken", 1, lambda: 1 / 0, shown.append)
+    painter.request("last", 1, lambda: "last", lambda made: (shown.append(made), done.set()))
     go.set()
     assert done.wait(5)
     assert shown == ["new", "last"] and [type(f) for f in failures] == [ZeroDivisionError]
@@ -380,9 +380,9 @@ def test_what_a_capture_was_taken_for() -> None:
     def scan(name: str, purpose: str = "scan") -> ScanView:
         return ScanView(name, name, purpose, "", "fresh", "stereo", 1, None, None, b"")  # type: ignore[arg-type]
 
-    assert [likely(scan(n)) for n in ("plane_01", "sphere_2", "object_r1")] == ["plane", "sphere", "scan"]
-    assert likely(scan("scan_01", "plane")) == "plane"
-    names = [s.name for s in ordered([scan("a"), scan("plane_1"), scan("b")])]
+    assert [shape_of(scan(n)) for n in ("plane_01", "sphere_2", "object_r1")] == ["plane", "sphere", "scan"]
+    assert shape_of(scan("scan_01", "plane")) == "plane"
+    names = [s.name for s in sort_scans([scan("a"), scan("plane_1"), scan("b")])]
     assert names == ["b", "a", "plane_1"]
 
 
@@ -409,9 +409,9 @@ def test_a_cloud_is_painted_by_what_is_asked() -> None:
     assert painted.shape == (4, 5, 3) and len(np.unique(painted[1], axis=0)) == 5 and "mm" in words
     noisy = replace(cloud, sigma_z=3 * flat, sigma_calibration=4 * flat)
     np.testing.assert_allclose(uncertainty(noisy)[1:, 1:], 5.0)
-    assert "5&#46;000" in painting(noisy, "uncertainty")[1] and "5&#46;000" in point_words(noisy, 4, 2)
+    assert "5&#46;000" in painting(noisy, "uncertainty")[1] and "5&#46;000" in point_html(noisy, 4, 2)
     assert "noise alone" in painting(cloud, "uncertainty")[1].replace("&#32;", " ")
     assert painting(cloud, "texture")[0][0, 0].tolist() == [7, 7, 7]
     assert "measure this capture" in painting(cloud, "error")[1].replace("&#32;", " ")
-    assert "600&#46;000" in point_words(cloud, 4, 2)
-    assert spread(np.array([np.nan])) == (0.0, 1.0)
+    assert "600&#46;000" in point_html(cloud, 4, 2)
+    assert colour_range(np.array([np.nan])) == (0.0, 1.0)

@@ -74,7 +74,7 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # the joint adjustment takes long, and the autopilot's flight makes it
-    monkeypatch.setattr(tasks, "lacking_for_splined", lambda session: "it is made elsewhere")
+    monkeypatch.setattr(tasks, "missing_for_splined", lambda session: "it is made elsewhere")
     app = App(bare, port=0)
     opened = visit(browser, app.server.url)
     page = opened.page
@@ -131,7 +131,7 @@ def bring(page: Page, operator: Operator, depth: float) -> None:
     for _ in range(4):
         for typed in (depth + 1, depth):
             field(page, "At, mm").fill(str(typed))
-        if operator.wait_for(lambda s: s.world is not None and abs(s.world.T_camera_thing[2, 3] - depth) < 0.5, 15.0):
+        if operator.wait_for(lambda s: s.world is not None and abs(s.world.T_camera_object[2, 3] - depth) < 0.5, 15.0):
             return
     raise AssertionError(f"nothing came to {depth} mm")
 

@@ -94,13 +94,13 @@ def test_exposure_and_light_take_effect(bench: Bench) -> None:
     bench.open()
     bench.previews_go_on()
     bright = bench.previews[-1].mean()
-    bench.acquisition.apply(CameraSettings(0.5))
+    bench.acquisition.set_camera(CameraSettings(0.5))
     bench.until(lambda: bench.acquisition.view().exposure_ms == 0.5)
     bench.previews_go_on()
     assert bench.previews[-1].mean() == pytest.approx(bright / 2, rel=0.1)
-    bench.acquisition.shine("dark")
+    bench.acquisition.set_light("dark")
     bench.until(lambda: bench.previews[-1].mean() < 0.2 * bright)
-    bench.acquisition.apply(CameraSettings(1e6))
+    bench.acquisition.set_camera(CameraSettings(1e6))
     bench.until(lambda: bench.acquisition.view().exposure_ms == 100.0)  # what the camera really took
 
 

@@ -57,13 +57,13 @@ def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) ->
     assert {pose.state for pose in session.poses} == {"used"}
     assert all(pose.rms_px and 0.01 < max(pose.rms_px) < 0.4 for pose in session.poses)
     assert session.coverage is not None and session.coverage.share > 0.6
-    assert session.enough and session.foreseen is not None and 0.005 < session.foreseen.sigma_mm < 0.024  # type: ignore[operator]
+    assert session.enough and session.plan is not None and 0.005 < session.plan.sigma_mm < 0.024  # type: ignore[operator]
     calibration = session.calibration
-    assert calibration is not None and calibration.best == "splined" and abs(calibration.baseline_mm - 180) < 2
+    assert calibration is not None and calibration.best == "splined" and abs(calibration.stereo.baseline_mm - 180) < 2
     assert session.verdict is not None and session.verdict_of_calibration and not calibration.refused
     splined = calibration.splined
-    assert splined is not None and splined.noise_px["x"] < 0.03 and splined.lit["camera"] > 0.8
-    assert set(splined.trust) == set(calibration.poses) and not splined.left_out
+    assert splined is not None and splined.noise_px["x"] < 0.03 and splined.covered["camera"] > 0.8
+    assert set(splined.weights) == set(calibration.stereo.poses) and not splined.excluded
     rows = {(row.capture, row.model): row for row in session.verifications}
     assert rows["plane_01", "splined"].rms_mm < rows["plane_01", "pixelwise"].rms_mm
     assert rows["plane_01", "splined"].masked is not None and rows["plane_01", "stereo"].masked is None
@@ -83,14 +83,15 @@ def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) ->
 
 
 def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:
-    assert operator.want_sigma(0.0001) and operator.set_hands_free(True)
-    snapshot = operator.settle()
-    foreseen = session_of(snapshot).foreseen
-    assert foreseen is not None and foreseen.wanted_mm == 0.0001 and not foreseen.enough
-    assert foreseen.next_mm is not None and foreseen.sigma_mm is not None and foreseen.next_mm < foreseen.sigma_mm
+    assert operator.set_wanted_sigma(0.0001) and operator.set_hands_free(True)
+    snapshot = operator.wait_until_idle()
+    session = session_of(snapshot)
+    plan = session.plan
+    assert plan is not None and session.wanted_mm == 0.0001 and not session.enough
+    assert plan.sigma_next_mm is not None and plan.sigma_mm is not None and plan.sigma_next_mm < plan.sigma_mm
     assert snapshot.hands_free
-    assert operator.want_sigma(None) and not operator.want_sigma(-1.0)
-    snapshot = operator.settle()
+    assert operator.set_wanted_sigma(None) and not operator.set_wanted_sigma(-1.0)
+    snapshot = operator.wait_until_idle()
     assert session_of(snapshot).enough and not snapshot.hands_free
     assert "enough" in snapshot.step("poses").now
 
@@ -118,11 +119,11 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
 @pytest.mark.parametrize(
     ("where", "make"),
     [
-        ("calibrate.calibrate_pixelwise", lambda store, r: tasks.make_calibration(store, TARGET, r, print)),
-        ("poses.observe", lambda store, r: tasks.make_calibration(store, TARGET, r, print)),
-        ("capture_clouds.reconstruct", lambda store, r: tasks.make_cloud(store, "scan_01", None, r, print)),
+        ("calibrate.calibrate_pixelwise", lambda store, r: tasks.calibrate_session(store, TARGET, r, print)),
+        ("poses.observe", lambda store, r: tasks.calibrate_session(store, TARGET, r, print)),
+        ("capture_clouds.reconstruct", lambda store, r: tasks.reconstruct_capture(store, "scan_01", None, r, print)),
         ("merge.fuse", lambda store, r: tasks.merge_scans(store, ["scan_01"], "scan_02", r, print)),
-        ("verify.compare", lambda store, r: tasks.measure(store, ["plane_01"], "plane", None, r, print)),
+        ("verify.compare", lambda store, r: tasks.verify_captures(store, ["plane_01"], "plane", None, r, print)),
     ],
 )
 def test_work_given_up_inside_a_long_call_saves_nothing(
@@ -157,7 +158,7 @@ def test_files_for_other_programs(operator: Operator) -> None:
     assert operator.export("mesh", "scan_01", "stl") and operator.export("mesh", "scan_01", "glb")
     assert operator.export("cloud", "scan_02") and operator.export("calibration") and operator.export("table")
     assert operator.export("merged-mesh") and operator.diagnostic_bundle()
-    session = session_of(operator.settle())
+    session = session_of(operator.wait_until_idle())
     files = {export.name: export for export in session.exports}
     assert all(export.bytes > 100 for export in files.values())
     assert len(trimesh.load(files["scan_01_mesh.stl"].path).faces) > 10_000
@@ -191,12 +192,12 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     inputs = store.input_hashes("calibration/splined")
     store.save_result("scale/splined", {"factor": 1.001, "certificate": "lab 7", "inputs": inputs}, {})
     assert operator.choose_model("splined")
-    session = session_of(operator.settle())
+    session = session_of(operator.wait_until_idle())
     assert session.calibration is not None and session.calibration.chosen == "splined"
     assert session.calibration.scales == {"splined": "scale corrected by +1000 ppm, by certificate lab 7"}
     assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
     assert operator.reconstruct("scan_02")
-    scan = operator.settle().scan("scan_02")
+    scan = operator.wait_until_idle().scan("scan_02")
     assert scan is not None and scan.cloud == "fresh" and scan.scale.startswith("scale corrected by +1000 ppm")
     after = result_views.scan_cloud(store, "scan_02").points
     both = np.isfinite(before[..., 2]) & np.isfinite(after[..., 2])
@@ -207,11 +208,11 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
 
 def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     assert operator.exclude("pose_02")
-    stale = operator.settle()
+    stale = operator.wait_until_idle()
     assert session_of(stale).calibration.stale.startswith("pose_02 was excluded")  # type: ignore[union-attr]
     assert stale.step("calibrate").state == "ready" and stale.step("scan").state == "done"
     assert operator.calibrate()
-    again = operator.settle()
+    again = operator.wait_until_idle()
     session = session_of(again)
     assert session.calibration is not None and session.calibration.stale == "" and len(session.calibration.poses) == 7
     assert session.calibration.models == ("stereo", "pixelwise")  # what was made of other poses is gone
@@ -220,10 +221,10 @@ def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     assert session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
     assert again.pose("pose_02").state == "excluded"  # type: ignore[union-attr]
     assert operator.reconstruct("scan_01")
-    assert again.scan("scan_01") is not None and operator.settle().scan("scan_01").cloud == "fresh"  # type: ignore[union-attr]
+    assert again.scan("scan_01") is not None and operator.wait_until_idle().scan("scan_01").cloud == "fresh"  # type: ignore[union-attr]
     assert operator.undo_merge()
-    undone = session_of(operator.settle())
+    undone = session_of(operator.wait_until_idle())
     assert undone.merge is None and "merged_1.ply" not in {export.name for export in undone.exports}
     assert not operator.undo_merge()
     assert operator.delete("scan_02")
-    assert operator.settle().scan("scan_02") is None
+    assert operator.wait_until_idle().scan("scan_02") is None

@@ -36,11 +36,11 @@ def test_a_task_has_the_open_rig_and_everything_is_restored_after_it(bench: Benc
         return float(frame.mean())
 
     with pytest.raises(DeviceError, match="choose a rig first"):
-        bench.acquisition.run("Checking the rig", task, results.append)
+        bench.acquisition.run_task("Checking the rig", task, results.append)
     bench.open()
     bench.previews_go_on()
     bright = bench.previews[-1].mean()
-    bench.acquisition.run("Checking the rig", task, results.append)
+    bench.acquisition.run_task("Checking the rig", task, results.append)
     bench.until(lambda: bool(results) and bench.acquisition.idle)
     assert 1 < results[0] < bright
     assert (views[0].name, views[0].doing, views[0].frame, views[0].frames) == (
@@ -67,7 +67,7 @@ def test_a_task_can_be_cancelled_and_waits_for_its_turn(bench: Bench) -> None:
 
     bench.open()
     bench.acquisition.capture(bench.request("first"))
-    bench.acquisition.run("Checking the rig", task, done.append)
+    bench.acquisition.run_task("Checking the rig", task, done.append)
     assert bench.acquisition.names() == ["first", "Checking the rig"] or began.is_set()
     assert began.wait(5.0)
     assert [name for name, _, _ in bench.saved] == ["first"] and not bench.acquisition.idle
@@ -89,11 +89,11 @@ def test_a_fault_in_a_task_is_treated_as_in_a_capture(bench: Bench) -> None:
         raise InputError("the scene is too dark: open the aperture")
 
     bench.open()
-    bench.acquisition.run("Checking the rig", refused, lambda _: None)
+    bench.acquisition.run_task("Checking the rig", refused, lambda _: None)
     bench.until(lambda: bool(bench.texts))
     assert bench.texts == ["Checking the rig: the scene is too dark: open the aperture"]
     assert bench.acquisition.view().state == "open"
-    bench.acquisition.run("Checking the rig", lost, lambda _: None)
+    bench.acquisition.run_task("Checking the rig", lost, lambda _: None)
     bench.until(lambda: len(bench.texts) >= 3)
     assert "does not answer" in bench.texts[1] and bench.texts[2] == "the rig answers again"
     bench.previews_go_on()
@@ -171,8 +171,8 @@ def test_another_rig_ends_what_the_one_before_was_doing(bench: Bench) -> None:
             time.sleep(0.01)
 
     bench.open()
-    bench.acquisition.shine("dark")
-    bench.acquisition.run("Checking the rig", task, done.append)
+    bench.acquisition.set_light("dark")
+    bench.acquisition.run_task("Checking the rig", task, done.append)
     assert began.wait(5)
     bench.acquisition.capture(bench.request("waits"))
     other = replace(bench.rig, name="another")

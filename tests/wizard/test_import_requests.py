@@ -54,7 +54,7 @@ def texts(operator: Operator, level: str) -> list[str]:
 
 def test_a_folder_becomes_poses_and_what_is_skipped_is_said(operator: Operator, source: Path) -> None:
     assert operator.import_folder(f" {source} ", projector="120x90")
-    view = operator.settle(60).session
+    view = operator.wait_until_idle(60).session
     assert view is not None and [pose.name for pose in view.poses] == ["capture_0", "capture_2"]
     assert any("2 captures imported" in text for text in texts(operator, "good"))
     assert any("capture_1" in text and "graycode_05" in text for text in texts(operator, "warning"))
@@ -62,14 +62,14 @@ def test_a_folder_becomes_poses_and_what_is_skipped_is_said(operator: Operator, 
 
 def test_a_zip_becomes_scans_and_leaves_nothing_behind(operator: Operator, source: Path) -> None:
     assert operator.import_zip("my scans.zip", archived(source), role="scan", projector="120x90")
-    view = operator.settle(60).session
+    view = operator.wait_until_idle(60).session
     assert view is not None and [scan.name for scan in view.scans] == ["capture_0", "capture_2"]
     assert any("notes.txt" in text for text in texts(operator, "warning"))
     assert operator.session is not None
     assert operator.session.load_capture("capture_0").meta["source"] == "my scans.zip"
     assert not [path for path in operator.session.folder.iterdir() if "import" in path.name]
     assert operator.import_zip("one.zip", archived(source / "capture_0"), role="scan", projector="120x90")
-    operator.settle(60)
+    operator.wait_until_idle(60)
     assert any("capture_0" in text and "already" in text for text in texts(operator, "error"))
 
 
@@ -77,13 +77,13 @@ def test_what_cannot_be_imported_is_said_in_words(operator: Operator, source: Pa
     assert not operator.import_folder("  ")
     for path, fact in ((tmp_path / "absent", "absent"), (tmp_path, "none of the known layouts")):
         assert operator.import_folder(path)
-        operator.settle(60)
+        operator.wait_until_idle(60)
         assert any(fact in text for text in texts(operator, "error")), fact
     assert operator.import_zip("a.zip", b"no zip")
-    operator.settle(60)
+    operator.wait_until_idle(60)
     assert any("no zip" in text for text in texts(operator, "error"))
     assert operator.import_folder(source, projector="wide")
-    operator.settle(60)
+    operator.wait_until_idle(60)
     assert any("'wide'" in text for text in texts(operator, "error"))
     assert operator.session is not None and operator.session.capture_names() == []
 
@@ -91,7 +91,7 @@ def test_what_cannot_be_imported_is_said_in_words(operator: Operator, source: Pa
 def test_a_cancelled_import_saves_nothing(operator: Operator, source: Path) -> None:
     assert operator.import_folder(source, projector="120x90")
     operator.cancel()
-    operator.settle(60)
+    operator.wait_until_idle(60)
     assert operator.session is not None and operator.session.capture_names() == []
 
 
@@ -101,8 +101,8 @@ def test_an_imported_calibration_without_sizes_waits_for_captures(source: Path, 
     write_calibration(tmp_path / "rig.yml", {**matrices, "R": R, "T": np.array([100.0, 0, 0])})
     import_opencv_calibration(tmp_path / "rig.yml", tmp_path / "session")
     with Operator(tmp_path / "session") as operator:
-        view = operator.settle(60).session
+        view = operator.wait_until_idle(60).session
         assert view is not None and view.calibration is None
         assert operator.import_folder(source, projector="120x90")
-        view = operator.settle(60).session
+        view = operator.wait_until_idle(60).session
         assert view is not None and view.calibration is not None and view.calibration.baseline_mm == 100

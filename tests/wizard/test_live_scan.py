@@ -24,7 +24,7 @@ from slviewer.simulation.truth import rig_record
 from slviewer.target.board import Board
 from slviewer.wizard import acquisition
 from slviewer.wizard.live_frames import Stream
-from slviewer.wizard.live_scan import LiveCloud, Measuring
+from slviewer.wizard.live_scan import LiveCloud, LiveModel
 from slviewer.wizard.operator import Operator
 
 pytestmark = pytest.mark.slow
@@ -47,7 +47,7 @@ class Wizard:
             save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
         self.clouds: list[LiveCloud] = []
         self.operator = Operator(folder, RIG, set_up=self._set_up)
-        self.operator.on_live(self.clouds.append)
+        self.operator.subscribe_live(self.clouds.append)
         assert self.operator.wait_for(lambda s: s.rig.state == "open", 10)
         self.operator.place("object")
 
@@ -84,19 +84,19 @@ def wizard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wizard]:
 
 def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> None:
     operator = wizard.operator
-    assert not operator.keep_live() and wizard.told("press Live first")
+    assert not operator.save_live() and wizard.told("no live scan runs")
     assert operator.start_live()
     wizard.goes_on()
     for cloud in wizard.clouds:
-        operator.live_shown(cloud)
+        operator.count_live_shown(cloud)
     live = operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, 10)
     assert live is not None and live.live is not None
     assert live.live.points > 3000 and live.live.clouds_per_s > 0
-    assert live.live.behind_ms is not None and live.live.behind_ms > 1
+    assert live.live.latency_ms is not None and live.live.latency_ms > 1
     numbers = [cloud.number for cloud in wizard.clouds]
     assert numbers == sorted(set(numbers))
 
-    assert operator.keep_live("a <b>face</b>")  # saved when this returns, and it goes on
+    assert operator.save_live("a <b>face</b>")  # saved when this returns, and it goes on
     store = operator.session
     assert store is not None and store.capture_names() == ["scan_01"]
     wizard.goes_on()
@@ -104,7 +104,7 @@ def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> Non
     assert len(kept.sequence.frames) == 11 and kept.sequence.axes == ("x",)
     model = load_stereo(store)
     normal = model.points(decode_capture(kept)["x"])
-    points, _ = Measuring(kept.sequence, "x", model).cloud(kept.stack())
+    points, _ = LiveModel(kept.sequence, "x", model).cloud(kept.stack())
     both = np.isfinite(points[..., 2])
     np.testing.assert_array_equal(points[both], normal[both])
     assert both.sum() > 0.97 * np.isfinite(normal[..., 2]).sum()  # nothing moved
@@ -114,7 +114,7 @@ def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> Non
 
     assert operator.capture_scan()
     wizard.ends()
-    after = operator.settle()
+    after = operator.wait_until_idle()
     assert after.session is not None and after.rig.state == "open"
     assert [(s.label, s.cloud) for s in after.session.scans] == [("a <b>face</b>", "fresh"), ("scan_02", "fresh")]
 
@@ -138,7 +138,7 @@ def test_a_fault_ends_it_with_a_sentence_and_what_was_kept_stays(wizard: Wizard)
     operator = wizard.operator
     assert operator.start_live()
     wizard.goes_on()
-    assert operator.keep_live()
+    assert operator.save_live()
     wizard.faults.plan("unplugged", 4)
     assert wizard.told("the camera does not answer")
     wizard.ends()
@@ -156,28 +156,28 @@ def test_whoever_reads_late_gets_the_newest_and_slows_nobody() -> None:
     stream = Stream(sequence, lambda: ended.append(1))
     with simulated_rig(world).opened() as rig:
         rig.projector.load(sequence)
-        first = stream.take(rig, SETTINGS, lambda: False)
+        first = stream.capture(rig, SETTINGS, lambda: False)
         assert first is not None and first.shape == (120, 160)
-        read = stream.next()
+        read = stream.wait_next()
         assert read is not None
         before = read.frames.copy()
         buffers = set()
         for _ in range(6):  # nobody reads meanwhile
-            assert stream.take(rig, SETTINGS, lambda: False) is not None
+            assert stream.capture(rig, SETTINGS, lambda: False) is not None
             assert stream._waiting is not None
             buffers.add(id(stream._waiting.frames))
         np.testing.assert_array_equal(read.frames, before)
-        assert len(buffers) == 2 and id(read.frames) not in buffers and stream.taken == 7
+        assert len(buffers) == 2 and id(read.frames) not in buffers and stream.captured == 7
         waited = stream._waiting
-        assert stream.next() is waited
+        assert stream.wait_next() is waited
         frames = iter([False] * 4 + [True])
-        assert stream.take(rig, SETTINGS, lambda: next(frames)) is None and stream.taken == 7
-    kept = stream.kept()
+        assert stream.capture(rig, SETTINGS, lambda: next(frames)) is None and stream.captured == 7
+    kept = stream.copy_latest()
     assert kept is not None and waited is not None
     np.testing.assert_array_equal(kept.frames, waited.frames)
-    stream.ended()
-    stream.ended()
-    assert stream.next() is None and ended == [1]
+    stream.end()
+    stream.end()
+    assert stream.wait_next() is None and ended == [1]
 
 
 def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
@@ -201,7 +201,7 @@ def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
         def sigma_z(self, phase, points):
             return points[..., 2]
 
-    still, moved = (Measuring(sequence, "x", Depth()).cloud(each)[0][..., 2] for each in (frames, late))
+    still, moved = (LiveModel(sequence, "x", Depth()).cloud(each)[0][..., 2] for each in (frames, late))
     assert np.isfinite(still).sum() > 0.95 * phases[0].mask.sum() > 1000
     wrong = np.abs(phases[1].phase - phases[0].phase) > 0.5
     assert wrong[moving[1:]].sum() > 200
@@ -217,7 +217,7 @@ def test_one_pass_gives_what_decoding_and_reconstructing_give() -> None:
     terms = [np.full(shape, value) for value in (900.0, -1.0, -9e-4, 0.1, 0.05)]
     fit = PixelFit(np.stack(terms), np.stack([ones] * 3), np.full(shape, 20, np.uint16), low, high, ones)
     model = PixelwiseModel({"x": fit}, {"x": 18.0}, {}, "x")
-    measuring = Measuring(sequence, "x", model, factor=1.5)
+    measuring = LiveModel(sequence, "x", model, factor=1.5)
     clouds = []
     for seed in (1, 2):
         frames = renderer.capture(sequence, seed)

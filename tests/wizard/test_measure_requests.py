@@ -25,7 +25,7 @@ from slviewer.simulation.truth import rig_record
 from slviewer.wizard.measure_requests import plain_name
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import SessionView
-from slviewer.wizard.surfaces import Surfaces, nominals, place_at, point_at
+from slviewer.wizard.surfaces import Surfaces, list_nominals, place_at, point_at
 
 CENTRES = np.array([[-38.0, 0.0, 560.0], [42.0, 6.0, 570.0]])
 RADIUS = 25.0
@@ -47,20 +47,20 @@ def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
     with Operator(folder) as engine:
         for name in scenes:
             assert engine.reconstruct(name)
-        engine.settle(60)
+        engine.wait_until_idle(60)
         yield engine
 
 
 def now(operator: Operator) -> SessionView:
     """The session, once all is done; what it says of measurements is what `measurements` says."""
-    session = operator.settle(60).session
+    session = operator.wait_until_idle(60).session
     assert session is not None and operator.session is not None
     assert list(session.measurements) == measurements(operator.session)
     return session
 
 
 def last(operator: Operator) -> str:
-    operator.settle(60)
+    operator.wait_until_idle(60)
     return operator.snapshot().notices[-1].text
 
 
@@ -89,9 +89,9 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     assert operator.rename_measurement(width.id, "Width <b>") and operator.delete_measurement(right.id)
     session = now(operator)
     assert [each.stale for each in session.measurements if each.id == apart.id] == [True]
-    assert session.deleted_measurements == 1 and "measure again" in operator.snapshot().step("measure").wrong[0]
+    assert session.deleted_measurements == 1 and "measure again" in operator.snapshot().step("measure").problems[0]
     assert operator.restore_measurement() and not any(each.stale for each in now(operator).measurements)
-    assert operator.write_measurements()
+    assert operator.export_measurements_table()
     made = next(each for each in now(operator).exports if each.name == "measurements.csv")
     rows = list(csv.DictReader(made.path.read_text("utf-8-sig").splitlines()))
     assert {row["name"] for row in rows} >= {"Width <b>", left.name}
@@ -115,19 +115,19 @@ def test_a_surface_of_what_has_changed_is_not_measured(operator: Operator) -> No
     kept = {key: value for key, value in meta.items() if key not in ("hash", "arrays")}
     store.save_result("clouds/balls", {**kept, "inputs": {**kept["inputs"], "balls": "other"}}, arrays)
     with pytest.raises(InputError, match="reconstruct it again"):
-        surfaces.of(store, "balls")
+        surfaces.load(store, "balls")
     store.save_result("clouds/balls", kept, arrays)
-    assert surfaces.of(store, "balls").organised
+    assert surfaces.load(store, "balls").organised
 
 
 def test_a_nominal_model_is_looked_at_kept_and_compared_with(operator: Operator, tmp_path: Path) -> None:
     content = asset("objects/ammonite.ply").read_bytes()
-    assert operator.take_nominal("../My ammonite.ply", content) and "triangles" in last(operator)
-    assert operator.take_nominal("broken.stl", b"\0" * 300) and "broken.stl" in last(operator)
+    assert operator.upload_nominal("../My ammonite.ply", content) and "triangles" in last(operator)
+    assert operator.upload_nominal("broken.stl", b"\0" * 300) and "broken.stl" in last(operator)
     trimesh.creation.box((5.6, 5.0, 1.6)).export(tmp_path / "inch.stl")
-    assert operator.take_nominal("inch.stl", (tmp_path / "inch.stl").read_bytes())
+    assert operator.upload_nominal("inch.stl", (tmp_path / "inch.stl").read_bytes())
     session = now(operator)
-    assert session.nominals == ("My_ammonite.ply", "inch.stl") == nominals(session.folder)
+    assert session.nominals == ("My_ammonite.ply", "inch.stl") == list_nominals(session.folder)
     assert sorted(each.name for each in (session.folder / "nominal").iterdir()) == list(session.nominals)
     assert operator.compare_nominal("object", "inch.stl")
     assert "choose its units, inch if it is so, else mm" in last(operator)

@@ -20,8 +20,8 @@ from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import rig_record
 from slviewer.wizard import result_views
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.result_views import merge_view
 from slviewer.wizard.snapshot import MergeView, Snapshot
-from slviewer.wizard.stored_views import merge_view
 
 pytestmark = pytest.mark.slow
 
@@ -55,7 +55,7 @@ def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
 
 
 def settled(operator: Operator) -> tuple[Snapshot, MergeView | None]:
-    snapshot = operator.settle(60)
+    snapshot = operator.wait_until_idle(60)
     assert snapshot.session is not None
     return snapshot, snapshot.session.merge
 
@@ -77,7 +77,7 @@ def off_mm(merge: MergeView, name: str) -> float:
 def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) -> None:
     assert operator.merge(NAMES, "first")
     snapshot, merge = settled(operator)
-    assert merge is not None and snapshot.not_merged == "" and merge.reference == "first"
+    assert merge is not None and snapshot.merge_failure == "" and merge.reference == "first"
     assert {(pair.scan, pair.onto) for pair in merge.registered} == {
         ("second", "first"), ("third", "first"), ("third", "second"),
     }  # fmt: skip
@@ -88,7 +88,7 @@ def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) 
         assert pair.turned_deg == pytest.approx(steps * STEP_DEG, abs=0.1)
         assert 0.5 < pair.moved_mm < 30  # type: ignore[operator]  # the middle of what both see, not the camera's
     (loop,) = merge.loops
-    assert loop.error_mm < 0.3 and loop.left_mm <= loop.error_mm and set(loop.scans) == set(NAMES)
+    assert loop.error_mm < 0.3 and loop.adjusted_mm <= loop.error_mm and set(loop.scans) == set(NAMES)
     assert merge.dropped == merge.refused == () and 0.5 < merge.shared <= 1 and sum(merge.stray.values()) > 0  # type: ignore[operator]
     assert all(off_mm(merge, name) < 0.1 for name in NAMES[1:])
     assert operator.session is not None
@@ -102,17 +102,17 @@ def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_n
     assert operator.merge(NAMES[:2], "first", start="turntable", angle=40.0)
     snapshot, merge = settled(operator)
     assert merge is not None and before is not None and merge.name == before.name
-    assert "12.0 degrees apart and the turntable is said to step by 40" in snapshot.not_merged
-    assert snapshot.notices[-1].text == snapshot.not_merged
+    assert "12.0 degrees apart and the turntable is said to step by 40" in snapshot.merge_failure
+    assert snapshot.notices[-1].text == snapshot.merge_failure
     assert operator.merge(NAMES[:2], "first", start="turntable", angle=STEP_DEG)
     snapshot, merge = settled(operator)
-    assert merge is not None and snapshot.not_merged == "" and merge.name != before.name
+    assert merge is not None and snapshot.merge_failure == "" and merge.name != before.name
     assert off_mm(merge, "second") < 0.1
 
 
 def test_picked_pairs_start_a_merge(operator: Operator) -> None:
     assert operator.reconstruct("third") and operator.session is not None
-    operator.settle(60)
+    operator.wait_until_idle(60)
     cloud = result_views.scan_cloud(operator.session, "third")
     v, u = np.nonzero(np.isfinite(cloud.points[..., 2]))
     chosen = [int(np.argmin(u)), int(np.argmax(u)), int(np.argmin(v)), int(np.argmax(v))]
@@ -125,7 +125,7 @@ def test_picked_pairs_start_a_merge(operator: Operator) -> None:
     assert any("the picked points come within" in notice.text for notice in snapshot.notices)
     line = np.outer([0, 1, 2], [10.0, 0, 0]) + MIDDLE
     assert operator.merge(["first", "third"], "first", picked={("third", "first"): (line, line)})
-    assert "lie on one line" in settled(operator)[0].not_merged
+    assert "lie on one line" in settled(operator)[0].merge_failure
 
 
 def test_scans_as_they_lie_need_no_search_and_a_ball_holds_nothing(operator: Operator) -> None:
@@ -135,8 +135,8 @@ def test_scans_as_they_lie_need_no_search_and_a_ball_holds_nothing(operator: Ope
     assert operator.merge(["ball_0", "ball_1"], "ball_0", start="identity")
     snapshot, after = settled(operator)
     assert after is not None and after.name == merge.name
-    assert "round like a sphere: it turns about any axis" in snapshot.not_merged
-    assert "put something with relief beside the object" in snapshot.not_merged
+    assert "round like a sphere: it turns about any axis" in snapshot.merge_failure
+    assert "put something with relief beside the object" in snapshot.merge_failure
 
 
 def off_mm_between(merge: MergeView) -> float:

@@ -75,40 +75,42 @@ def test_requests_that_cannot_be_granted_become_notices() -> None:
             (lambda: operator.place("board"), "simulated rig"),
         ):
             assert ask() is False
-            assert says in last(operator.settle()), last(operator.settle())
+            assert says in last(operator.wait_until_idle()), last(operator.wait_until_idle())
         assert operator.snapshot().session is None and operator.snapshot().step("poses").state == "blocked"
 
 
 def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: Breakable, tmp_path: Path) -> None:
     versions: list[int] = []
     operator.subscribe(lambda snapshot: versions.append(snapshot.version))
-    before = operator.settle()
+    before = operator.wait_until_idle()
     assert before.session is not None and before.session.suggestion is not None and before.world is not None
     assert before.space is not None and before.space.capture_bytes == 32 * 400 * 300
     for _ in range(2):
         assert operator.place_at_suggestion() and operator.capture_pose()
-        after = operator.settle()
+        after = operator.wait_until_idle()
         assert after.session is not None and after.world is not None
         judged = after.session.poses[-1]
         assert judged.state == "good" and judged.thumbnail[:2] == b"\xff\xd8" and judged.T_camera_board is not None
-        np.testing.assert_allclose(judged.T_camera_board, after.world.T_camera_thing, atol=12)
+        np.testing.assert_allclose(judged.T_camera_board, after.world.T_camera_object, atol=12)
     assert versions == sorted(set(versions)) and len(versions) > 5
     # a board that is not seen is refused, in words, and the suggestion changes
     T = np.eye(4)
     T[:3, 3] = [60, -60, 560]
     assert operator.place("board", T) and operator.capture_pose()
-    refused = operator.settle()
+    refused = operator.wait_until_idle()
     assert states(refused) == {"pose_01": "good", "pose_02": "good", "pose_03": "refused"}
     assert "pose_03 cannot be used" in last(refused) and "in view" in refused.pose("pose_03").why  # type: ignore[union-attr]
     assert operator.exclude("pose_02", "blurred") and operator.rename("pose_01", "<b>first</b>")
-    decided = operator.settle()
+    decided = operator.wait_until_idle()
     operator.close()
     with Operator(tmp_path / "session", set_up=rigs) as again:
         opened(again)
-        resumed = again.settle()
+        resumed = again.wait_until_idle()
         assert resumed.session is not None and decided.session is not None
         assert states(resumed) == states(decided) == {"pose_01": "good", "pose_02": "excluded", "pose_03": "refused"}
-        assert [(s.key, s.state, s.now) for s in resumed.steps] == [(s.key, s.state, s.now) for s in decided.steps]
+        assert [(s.key, s.state, s.instruction) for s in resumed.steps] == [
+            (s.key, s.state, s.instruction) for s in decided.steps
+        ]
         assert resumed.rig.name == decided.rig.name and resumed.session.target == TARGET
         for a, b in zip(resumed.session.poses, decided.session.poses, strict=True):
             assert a.thumbnail == b.thumbnail and a.why == b.why
@@ -116,12 +118,12 @@ def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: Breakab
         # what was decided can be undone, retaken, deleted
         assert again.include("pose_02") and again.delete("pose_03")
         assert again.place_at_suggestion() and again.retake_pose("pose_01")
-        mended = again.settle()
+        mended = again.wait_until_idle()
         assert states(mended) == {"pose_01": "good", "pose_02": "good"}
         assert len(list((tmp_path / "session" / "trash").iterdir())) >= 2
         # another target: what was judged by the old one is judged anew
         assert again.choose_target("circles:20x16:9")
-        assert set(states(again.settle()).values()) == {"refused"}
+        assert set(states(again.wait_until_idle()).values()) == {"refused"}
 
 
 @pytest.mark.parametrize("fault", ["timeout", "unplugged"])
@@ -135,7 +137,7 @@ def test_a_device_that_fails_leaves_no_half_capture(operator: Operator, rigs: Br
     assert store.capture_names() == [] and list((store.folder / "captures").iterdir()) == []
     opened(operator)
     assert operator.capture_pose()
-    assert states(operator.settle()) == {"pose_01": "good"}
+    assert states(operator.wait_until_idle()) == {"pose_01": "good"}
 
 
 def test_a_capture_that_is_killed_leaves_every_earlier_pose(tmp_path: Path) -> None:
@@ -146,11 +148,11 @@ operator.choose_target({TARGET!r})
 operator.wait_for(lambda s: s.rig.state == "open", 20)
 operator.place_at_suggestion()
 operator.capture_pose()
-operator.settle()
+operator.wait_until_idle()
 operator.choose_patterns("p18")
 operator.subscribe(lambda s: print(s.rig.capture.frame if s.rig.capture else "", flush=True))
 operator.capture_pose()
-operator.settle()
+operator.wait_until_idle()
 """
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     assert process.stdout is not None
@@ -159,10 +161,10 @@ operator.settle()
     process.wait()
     with Operator(tmp_path / "session") as operator:
         opened(operator)
-        survived = states(operator.settle())
+        survived = states(operator.wait_until_idle())
         assert survived["pose_01"] == "good" and set(survived) <= {"pose_01", "pose_02"}
         assert operator.capture_pose()
-        assert set(states(operator.settle()).values()) == {"good"}
+        assert set(states(operator.wait_until_idle()).values()) == {"good"}
 
 
 def test_hands_free_captures_a_board_that_is_held_still(operator: Operator, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,7 +178,7 @@ def test_hands_free_captures_a_board_that_is_held_still(operator: Operator, monk
     assert found is not None and found.hands_free and counted and all(0 < c <= 0.3 for c in counted)
     time.sleep(0.8)  # held there, it is not captured again
     assert operator.set_hands_free(False)
-    assert list(states(operator.settle())) == ["pose_01"]
+    assert list(states(operator.wait_until_idle())) == ["pose_01"]
 
 
 def test_a_session_is_opened_for_one_operator_and_changed_for_another(operator: Operator, tmp_path: Path) -> None:
@@ -186,24 +188,24 @@ def test_a_session_is_opened_for_one_operator_and_changed_for_another(operator: 
     assert operator.open_session(tmp_path / "second") and operator.session is not None
     assert operator.session.folder == tmp_path / "second"
     Session.open(tmp_path / "session", write=True).close()
-    view = operator.settle()
+    view = operator.wait_until_idle()
     assert view.session is not None and view.session.target == "" and view.rig.state == "open"
     assert operator.session.decision("rig") == RIG
-    assert not operator.choose_target("charuco:8x6:30") and "ChArUco" in last(operator.settle())
-    assert not operator.capture_pose() and "choose the target first" in last(operator.settle())
-    assert not operator.capture_scan() and "calibrate first" in last(operator.settle())
+    assert not operator.choose_target("charuco:8x6:30") and "ChArUco" in last(operator.wait_until_idle())
+    assert not operator.capture_pose() and "choose the target first" in last(operator.wait_until_idle())
+    assert not operator.capture_scan() and "calibrate first" in last(operator.wait_until_idle())
     assert not operator.calibrate() and not operator.undo_merge() and not operator.verify(["x"], "plane")
 
 
 def test_a_deleted_pose_can_be_brought_back(operator: Operator) -> None:
     operator.capture_pose()
-    operator.settle()
+    operator.wait_until_idle()
     operator.delete("pose_01")
-    gone = operator.settle().session
+    gone = operator.wait_until_idle().session
     assert gone is not None and gone.poses == () and gone.deleted_poses == ("pose_01",) and gone.deleted_scans == ()
     operator.undelete("pose_01")
-    back = operator.settle()
+    back = operator.wait_until_idle()
     assert back.session is not None and back.session.deleted_poses == ()
     assert states(back) == {"pose_01": "good"} and not any(notice.level == "error" for notice in back.notices)
     operator.undelete("pose_01")
-    assert "no deleted capture 'pose_01'" in last(operator.settle())
+    assert "no deleted capture 'pose_01'" in last(operator.wait_until_idle())

@@ -1,7 +1,6 @@
-"""The next pose is thought of elsewhere: what is at hand answers meanwhile, and only the latest question counts."""
+"""The next pose is computed on another thread: a quick plan holds meanwhile, and only the latest request counts."""
 
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -9,9 +8,11 @@ import numpy as np
 import pytest
 
 from slviewer.calibration.next_pose import coverage, describe_suggestion, nominal_lens
+from slviewer.calibration.stereo import StereoModel
+from slviewer.geometry.rig import StereoRig
 from slviewer.target.board import Board
-from slviewer.wizard.planner import Planner, PlanRequest
-from slviewer.wizard.pose_plan import PosePlan
+from slviewer.wizard.planner import Planner
+from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
 
 BOARD = Board.parse("circles:15x12:12")
 SIZE = (400, 300)
@@ -26,24 +27,38 @@ def plan_of(poses: tuple[str, ...], sigma: float | None = None, depth: float = 6
     )
 
 
-def asked(*poses: str, hashes: str = "", target: str = str(BOARD)) -> PlanRequest:
-    return PlanRequest(target, SIZE, (912, 1140), tuple((name, name + hashes) for name in poses), "", None, 0)
+def given(*poses: str, hashes: str = "", target: str = str(BOARD)) -> PlanInput:
+    """An input whose plan takes time: that of a calibrated camera."""
+    rig = StereoRig(nominal_lens(SIZE), nominal_lens((912, 1140)), np.eye(3), np.array([180.0, 0, 0]))
+    stereo = StereoModel(rig, target, ("x",), {}, {}, {}, {}, None, {})
+    features = {name: PoseFeatures(*np.zeros((3, 4, 3))) for name in poses}
+    keys = tuple((name, name + hashes) for name in poses)
+    return PlanInput(Board.parse(target), SIZE, (912, 1140), features, stereo, hashes=keys)
 
 
-class Mind:
-    """Thinks until it is told what it found."""
+class Plans:
+    """Stands in for the computation of plans: each final one is computed once it `may_end`."""
 
     def __init__(self) -> None:
-        self.begun, self.may_end, self.found = threading.Event(), threading.Event(), plan_of(())
+        self.begun: list[PlanInput] = []
+        self.has_begun, self.may_end = threading.Event(), threading.Event()
+        self.final, self.quick = plan_of(()), plan_of(())
+        self.before: list[PosePlan | None] = []
 
-    def __call__(self) -> PosePlan:
-        self.begun.set()
+    def compute(self, given: PlanInput) -> PosePlan:
+        self.begun.append(given)
+        self.has_begun.set()
         assert self.may_end.wait(10)
-        return self.found
+        return replace(self.final, poses=dict.fromkeys(given.features, np.eye(4)))
 
-    def finds(self, found: PosePlan) -> None:
-        self.found = found
-        self.may_end.set()
+    def compute_quickly(self, given: PlanInput, before: PosePlan | None) -> PosePlan:
+        self.before.append(before)
+        return plan_of(tuple(given.features)) if given.features else self.quick
+
+
+@pytest.fixture
+def plans() -> Plans:
+    return Plans()
 
 
 @pytest.fixture
@@ -52,64 +67,64 @@ def changes() -> threading.Semaphore:
 
 
 @pytest.fixture
-def planner(changes: threading.Semaphore) -> Iterator[Planner]:
-    planner = Planner(changes.release)
+def planner(changes: threading.Semaphore, plans: Plans) -> Iterator[Planner]:
+    planner = Planner(changes.release, plans.compute, plans.compute_quickly)
     yield planner
+    plans.may_end.set()
     planner.close()
 
 
-def test_what_is_at_hand_answers_until_the_plan_is_there(planner: Planner, changes: threading.Semaphore) -> None:
-    mind, quick = Mind(), plan_of(("a", "b", "c"))
-    begun = time.monotonic()
-    assert planner.plan(asked("a", "b", "c"), lambda before: quick, mind) == (quick, True)
-    assert time.monotonic() - begun < 0.1 and mind.begun.wait(5)
-    assert planner.plan(asked("a", "b", "c"), lambda before: pytest.fail("asked again"), mind) == (quick, True)
-    good = plan_of(("a", "b", "c"), 0.05, depth=700)
-    mind.finds(good)
+def test_the_quick_plan_holds_until_the_final_one_is_ready(
+    planner: Planner, plans: Plans, changes: threading.Semaphore
+) -> None:
+    three = given("a", "b", "c")
+    quick, is_final = planner.look_up(three)
+    assert not is_final and set(quick.poses) == {"a", "b", "c"} and not plans.begun
+    planner.request(three)
+    assert plans.has_begun.wait(5)
+    assert planner.look_up(given("a", "b", "c")) == (quick, False) and len(plans.before) == 1, "computed once"
+    plans.final = plan_of((), 0.05, depth=700)
+    plans.may_end.set()
     assert changes.acquire(timeout=5)
-    assert planner.plan(asked("a", "b", "c"), lambda before: quick, mind) == (good, False)
+    good, is_final = planner.look_up(three)
+    assert is_final and good.sigma_mm == 0.05
 
-    # one pose more: what was foretold and suggested still holds; one pose less: it does not
-    told: list[PosePlan | None] = []
-
-    def at_hand(before: PosePlan | None) -> PosePlan:
-        told.append(before)
-        return plan_of(("a", "b", "c", "d"))
-
-    more, thinking = planner.plan(asked("a", "b", "c", "d"), at_hand, Mind())
-    assert thinking and more.sigma_mm == 0.05 and more.suggestion is good.suggestion and len(more.poses) == 4
-    assert told[0] is not None and set(told[0].poses) == {"a", "b", "c"}
-    less, _ = planner.plan(asked("a", "b"), at_hand, Mind())
-    assert less.sigma_mm is None and told[1] is not None and set(told[1].poses) == {"a", "b"}
-    retaken, _ = planner.plan(asked("a", "b", "c", hashes="2"), at_hand, Mind())
-    assert retaken.sigma_mm is None and told[2] is not None and not told[2].poses
-    planner.plan(asked("a", "b", "c", target="circles:9x7:20"), at_hand, Mind())
-    assert told[3] is None, "another board"
-    assert planner.plan(asked("a", "b", "c"), at_hand, Mind()) == (good, False), "taken back: remembered"
+    # one pose more: the predicted sigma and the suggestion still hold; one pose less: they do not
+    more, is_final = planner.look_up(given("a", "b", "c", "d"))
+    assert not is_final and more.sigma_mm == 0.05 and more.suggestion is good.suggestion and len(more.poses) == 4
+    assert plans.before[1] is not None and set(plans.before[1].poses) == {"a", "b", "c"}
+    less, _ = planner.look_up(given("a", "b"))
+    assert less.sigma_mm is None and plans.before[2] is not None and set(plans.before[2].poses) == {"a", "b"}
+    retaken, _ = planner.look_up(given("a", "b", "c", hashes="2"))
+    assert retaken.sigma_mm is None and plans.before[3] is not None and not plans.before[3].poses
+    planner.look_up(given("a", "b", "c", target="circles:9x7:20"))
+    assert plans.before[4] is None, "another board"
+    assert planner.look_up(three) == (good, True), "cached"
 
 
-def test_only_the_latest_question_is_thought_of(planner: Planner, changes: threading.Semaphore) -> None:
-    minds = {name: Mind() for name in "abc"}
-    for name, mind in minds.items():
-        planner.plan(asked(name), lambda before: plan_of(()), mind)
-        if name == "a":
-            assert mind.begun.wait(5)
-    for name, mind in minds.items():
-        mind.finds(plan_of((name,), 0.1))
+def test_only_the_latest_request_is_computed(planner: Planner, plans: Plans, changes: threading.Semaphore) -> None:
+    planner.request(given("a"))
+    assert plans.has_begun.wait(5)
+    planner.request(given("b"))
+    planner.request(given("c"))
+    plans.final = plan_of((), 0.1)
+    plans.may_end.set()
     for _ in range(2):
         assert changes.acquire(timeout=5)
-    assert not minds["b"].begun.is_set() and minds["c"].begun.is_set()
-    assert planner.plan(asked("c"), lambda before: plan_of(()), minds["c"])[0].sigma_mm == 0.1
+    assert [list(each.features) for each in plans.begun] == [["a"], ["c"]]
+    assert planner.look_up(given("c"))[0].sigma_mm == 0.1
 
 
-def test_where_thinking_fails_what_is_at_hand_remains(
-    planner: Planner, changes: threading.Semaphore, caplog: pytest.LogCaptureFixture
+def test_where_computing_fails_the_quick_plan_remains(
+    plans: Plans, changes: threading.Semaphore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fails() -> PosePlan:
+    def fail(given: PlanInput) -> PosePlan:
         raise np.linalg.LinAlgError("singular")
 
-    quick = replace(plan_of(("a",)), sigma_mm=None)
-    assert planner.plan(asked("a"), lambda before: quick, fails) == (quick, True)
+    planner = Planner(changes.release, fail, plans.compute_quickly)
+    quick = planner.look_up(given("a"))
+    planner.request(given("a"))
     assert changes.acquire(timeout=5)
-    assert planner.plan(asked("a"), lambda before: quick, fails) == (quick, False)
-    assert "could not be chosen" in caplog.text
+    assert quick[1] is False and planner.look_up(given("a")) == (quick[0], True)
+    assert "could not be computed" in caplog.text
+    planner.close()

@@ -19,9 +19,9 @@ from slviewer.wizard.snapshot import BoardSeen, PreviewView
 BOARD = Board.parse("circles:9x7:20")
 
 
-def seen(still_s: float, shift: float = 0.0, taken: float = math.inf) -> BoardSeen:
+def seen(still_s: float, shift: float = 0.0, time_s: float = math.inf) -> BoardSeen:
     outline = np.array([[10.0, 10], [90, 10], [90, 70], [10, 70]]) + shift
-    return BoardSeen(outline, outline, still_s, None, taken)
+    return BoardSeen(outline, outline, still_s, None, time_s)
 
 
 def test_the_board_is_found_in_the_cameras_pixels() -> None:
@@ -40,7 +40,7 @@ def test_the_board_is_found_in_the_cameras_pixels() -> None:
             arrived.set()
 
     watcher = Watcher(see)
-    watcher.look_for(Watch(BOARD, nominal_lens(rig.camera.size, 3555.6 * 0.6)))
+    watcher.watch(Watch(BOARD, nominal_lens(rig.camera.size, 3555.6 * 0.6)))
     for _ in range(400):
         watcher.offer(frame)
         if arrived.wait(0.05):
@@ -88,21 +88,21 @@ def test_brightness_goes_by_the_cameras_range(dtype: type, white: int) -> None:
 
 def test_stillness_starts_anew_with_every_movement() -> None:
     still, pixels = Stillness(), np.zeros((5, 2))
-    assert still.of(pixels, 1.0, 10.0) == 0
-    assert still.of(pixels + 0.5, 1.0, 11.0) == 1
-    assert still.of(pixels + 2, 1.0, 12.0) == 0
-    assert still.of(pixels + 2, 1.0, 12.7) == pytest.approx(0.7)
+    assert still.update(pixels, 1.0, 10.0) == 0
+    assert still.update(pixels + 0.5, 1.0, 11.0) == 1
+    assert still.update(pixels + 2, 1.0, 12.0) == 0
+    assert still.update(pixels + 2, 1.0, 12.7) == pytest.approx(0.7)
     still.lose()
-    assert still.of(pixels + 2, 1.0, 13.0) == 0
+    assert still.update(pixels + 2, 1.0, 13.0) == 0
     # a slow drift is movement too
     drift = Stillness()
-    assert max(drift.of(pixels + 0.3 * k, 1.0, float(k)) for k in range(10)) <= 3
+    assert max(drift.update(pixels + 0.3 * k, 1.0, float(k)) for k in range(10)) <= 3
 
 
 def test_hands_free_counts_down_once_a_place() -> None:
     hands_free = HandsFree()
     assert hands_free.countdown(seen(7), False, 0) is None
-    hands_free.on = True
+    hands_free.switch(True)
     assert hands_free.countdown(None, False, 0) is None and hands_free.countdown(seen(0.5), False, 0) is None
     assert hands_free.countdown(seen(7), False, 1.0) == 1.0  # a slow look skips no countdown
     assert hands_free.countdown(seen(7.25), False, 1.25) == pytest.approx(0.75)
@@ -112,9 +112,9 @@ def test_hands_free_counts_down_once_a_place() -> None:
     assert hands_free.countdown(seen(1.5), False, 4.0) == 1.0
     last = hands_free.countdown(seen(2.6), False, 5.1)
     assert last is not None and last < 0
-    hands_free.took()
+    hands_free.note_capture()
     assert hands_free.countdown(seen(2.6), True, 6.0) is None
     # what is still known from before the capture is of the place before, perhaps
-    assert hands_free.countdown(seen(9, shift=-30, taken=0.0), False, 6.5) is None
+    assert hands_free.countdown(seen(9, shift=-30, time_s=0.0), False, 6.5) is None
     assert hands_free.countdown(seen(5), False, 7.0) is None
     assert hands_free.countdown(seen(1.5, shift=30), False, 8.0) == 1.0

@@ -8,6 +8,7 @@ import pytest
 from test_operator import TARGET, last, opened, states
 
 from slviewer.pipeline.capture import capture
+from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.rig_presets import load_rig
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
@@ -26,22 +27,22 @@ def operator(tmp_path: Path):
 
 
 def test_poses_in_several_exposures_are_judged_as_others_are(operator: Operator) -> None:
-    once = operator.settle()
+    once = operator.wait_until_idle()
     assert once.rig.exposure_ms == 0.8 and once.session is not None and once.session.exposures_ms == ()
     assert operator.set_exposures((4.0, 0.5))
-    before = operator.settle()
+    before = operator.wait_until_idle()
     assert before.session is not None and before.session.exposures_ms == (0.5, 4.0)
     assert before.space is not None and once.space is not None and once.space.capture_bytes is not None
     assert before.space.capture_bytes == 2 * once.space.capture_bytes
     assert operator.capture_pose()
-    after = operator.settle()
+    after = operator.wait_until_idle()
     assert states(after) == {"pose_01": "good"} and after.session is not None and after.session.poses[0].thumbnail
     assert operator.session is not None and operator.session.load_capture("pose_01").exposures_ms == (0.5, 4.0)
-    assert operator.settle().rig.exposure_ms == 0.8
-    assert operator.set_exposures((4.0, 4.0)) is False and "each once" in last(operator.settle())
+    assert operator.wait_until_idle().rig.exposure_ms == 0.8
+    assert operator.set_exposures((4.0, 4.0)) is False and "each once" in last(operator.wait_until_idle())
     assert operator.set_exposures(())
     assert operator.capture_pose()
-    operator.settle()
+    operator.wait_until_idle()
     assert operator.session.load_capture("pose_02").exposures_ms == ()
 
 
@@ -52,7 +53,7 @@ def test_a_rig_is_kept_under_a_name_with_its_exposure(operator: Operator) -> Non
     assert operator.save_rig("mine", "With a longer exposure.")
     assert operator.session is not None
     assert load_rig("mine", operator.session) == {**RIG, "exposure_ms": 2.5, "gain": 1.0}
-    assert operator.save_rig("../mine") is False and "cannot be a name" in last(operator.settle())
+    assert operator.save_rig("../mine") is False and "cannot be a name" in last(operator.wait_until_idle())
     assert operator.choose_rig({**RIG, "exposure_ms": 1.5})
     now = operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, 5.0)
     assert now is not None and now.session is not None and now.session.exposures_ms == ()
@@ -68,7 +69,8 @@ def test_several_exposures_follow_the_one_that_they_were_chosen_by(operator: Ope
 def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operator) -> None:
     session = operator.session
     assert session is not None and operator.set_exposure(2.0)
-    operator._engine.set_delay(37.0)
+    engine = operator._engine
+    assert engine.set_preflight(engine.bench, Preflight((), 37.0, None, None, 1.0))
     assert operator.choose_rig(RIG)
     assert session.decision("rig") == {**RIG, "settle_ms": 37.0} and session.decision("exposure")["exposure_ms"] == 2.0
     assert operator.choose_rig({**RIG, "settle_ms": 5.0})  # said by whoever chose it
@@ -83,7 +85,7 @@ def test_what_a_check_finds_belongs_to_the_rig_that_was_checked(operator: Operat
     other = {**RIG, "scale": 0.2}
     assert operator.choose_rig(other)
     assert operator.wait_for(lambda s: s.rig.state == "open" and s.rig.choice == other, 10.0)
-    after = operator.settle()
+    after = operator.wait_until_idle()
     assert after.preflight is None and after.rig.choice == other and last(after) == "Checking the rig: cancelled"
 
 
@@ -96,9 +98,9 @@ def test_a_session_opens_without_the_rig_that_it_remembers(operator: Operator, t
         store.decide("rig", missing)
         store.decide("exposure", {"exposure_ms": 3.0, "gain": None})
     assert operator.open_session(tmp_path / "other") and operator.session is not None
-    view = operator.settle()
+    view = operator.wait_until_idle()
     assert view.rig.state == "lost" and "no.avi does not exist" in view.rig.fault and view.rig.choice == missing
-    assert "Try it again" in view.step("rig").wrong[0]
+    assert "Try it again" in view.step("rig").problems[0]
     assert not operator.choose_rig(missing)  # as the button "Try this rig again" asks
     assert operator.session.decision("rig") == missing and operator.session.decision("exposure")["exposure_ms"] == 3.0
     assert operator.choose_rig(RIG) and operator.wait_for(lambda s: s.rig.state == "open", 10.0)
@@ -114,11 +116,11 @@ def test_sessions_of_one_rig_have_exposures_of_their_own(operator: Operator, tmp
 
 def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(operator: Operator, tmp_path: Path) -> None:
     capture(tmp_path / "recorded", "a", RIG, patterns="p18")
-    assert operator.shine("pattern") and operator.wait_for(lambda s: s.rig.light == "pattern", 5.0)
+    assert operator.set_light("pattern") and operator.wait_for(lambda s: s.rig.light == "pattern", 5.0)
     assert operator.choose_rig({"driver": "replay", "source": str(tmp_path / "recorded")})
     now = operator.wait_for(lambda s: s.rig.name == "replay" and s.rig.state != "opening", 10.0)
     assert now is not None and now.rig.state == "open", now and now.rig.fault
-    assert not operator.shine("dark") and "no dark frame" in last(operator.settle())
+    assert not operator.set_light("dark") and "no dark frame" in last(operator.wait_until_idle())
 
 
 def test_a_diagnostic_bundle_tells_no_password(tmp_path: Path) -> None:
@@ -128,7 +130,7 @@ def test_a_diagnostic_bundle_tells_no_password(tmp_path: Path) -> None:
         operator.session.decide("rig", {"camera": camera, "projector": {"driver": "browser", "size": [8, 8]}})
         logging.getLogger("slviewer").info("rtsp://somebody:s3cret@camera.local/1 is slow")
         assert operator.diagnostic_bundle()
-        operator.settle()
+        operator.wait_until_idle()
         with zipfile.ZipFile(next(operator.session.exports.glob("*.zip"))) as bundle:
             texts = {name: bundle.read(name).decode() for name in bundle.namelist() if name.endswith(("json", "txt"))}
     assert not any("s3cret" in text for text in texts.values())

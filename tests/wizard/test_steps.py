@@ -5,13 +5,24 @@ from pathlib import Path
 
 import numpy as np
 
-from slviewer.calibration.next_pose import Coverage
-from slviewer.wizard.snapshot import CalibrationView, Foreseen, PoseView, RigView, SessionView, Space
+from slviewer.calibration.next_pose import Coverage, nominal_lens
+from slviewer.calibration.stereo import StereoModel
+from slviewer.geometry.rig import StereoRig
+from slviewer.target.board import Board
+from slviewer.wizard.pose_plan import PlanInput, PosePlan
+from slviewer.wizard.snapshot import CalibrationView, PoseView, RigView, SessionView, Space
 from slviewer.wizard.steps import Facts, views
 
 OPEN = RigView(state="open", name="bench", camera=(400, 300), projector=(912, 1140))
 EMPTY = SessionView(Path("s"), "", "complementary")
-COVERED = Coverage(np.full((3, 4), 4), np.full(3, 3), np.full(5, 2), (400.0, 700.0))
+LENS = nominal_lens((400, 300))
+
+
+def planned(covered: bool, sigma_mm: float | None = None) -> PosePlan:
+    """Of ten poses, over the whole view or nowhere."""
+    n = 4 if covered else 0
+    coverage = Coverage(np.full((3, 4), n), np.full(3, n), np.full(5, n), (400.0, 700.0))
+    return PosePlan(LENS, {f"pose_{i}": np.eye(4) for i in range(10)}, coverage, None, 0.024, sigma_mm)
 
 
 def poses(n: int, state="good", why: str = "") -> tuple[PoseView, ...]:
@@ -19,11 +30,10 @@ def poses(n: int, state="good", why: str = "") -> tuple[PoseView, ...]:
 
 
 def calibration(stale: str = "") -> CalibrationView:
-    one = np.eye(3)
-    return CalibrationView(
-        ("stereo",), "stereo", stale, "circles:9x7:20", ("pose_0",), {}, {"stereo": 0.1}, {}, (400.0, 600.0), 180.0,
-        one, np.zeros(5), one, np.zeros(5), one, np.array([180.0, 0, 0]), {}, {},
-    )  # fmt: skip
+    rig = StereoRig(LENS, LENS, np.eye(3), np.array([180.0, 0, 0]))
+    poses = {"pose_0": np.eye(4)}
+    stereo = StereoModel(rig, "circles:9x7:20", ("x",), {"stereo": 0.1}, poses, {}, {}, (400.0, 600.0), {})
+    return CalibrationView(stereo, ("stereo",), "stereo", stale)
 
 
 def states(facts: Facts) -> dict[str, str]:
@@ -37,8 +47,8 @@ def test_the_way_through_the_wizard() -> None:
     aimed = replace(EMPTY, target="circles:9x7:20")
     assert states(Facts(aimed, OPEN, None)) == {"rig": "done", "target": "done", "poses": "ready", **blocked}
     few = replace(aimed, poses=poses(2))
-    assert "2 good poses so far" in next(v for v in views(Facts(few, OPEN, None)) if v.key == "calibrate").because
-    enough = replace(aimed, poses=poses(10), coverage=COVERED)
+    assert "2 good poses so far" in next(v for v in views(Facts(few, OPEN, None)) if v.key == "calibrate").blocked_by
+    enough = replace(aimed, poses=poses(10), plan=planned(True))
     reached = states(Facts(enough, OPEN, None))
     assert (reached["poses"], reached["calibrate"], reached["verify"]) == ("done", "ready", "blocked")
     done = states(Facts(replace(enough, calibration=calibration()), OPEN, None))
@@ -46,7 +56,7 @@ def test_the_way_through_the_wizard() -> None:
     assert done["merge"] == done["measure"] == "blocked"
     stale = Facts(replace(enough, calibration=calibration("pose_1 was excluded since: calibrate again")), OPEN, None)
     assert states(stale)["calibrate"] == "ready"
-    assert "pose_1 was excluded" in next(v for v in views(stale) if v.key == "calibrate").wrong[0]
+    assert "pose_1 was excluded" in next(v for v in views(stale) if v.key == "calibrate").problems[0]
 
 
 def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:
@@ -54,9 +64,9 @@ def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:
     facts = Facts(replace(EMPTY, target="circles:9x7:20", poses=poses(10), calibration=rejected), OPEN, None)
     found = {view.key: view for view in views(facts)}
     assert {found[key].state for key in ("verify", "scan", "merge")} == {"blocked"}
-    assert "pose_3 moved by 0.9 px" in found["scan"].because and "insist" in found["verify"].because
-    assert found["calibrate"].state == "ready" and "rejected" in found["calibrate"].now
-    insisted = replace(facts, session=replace(facts.session, calibration=replace(rejected, insisted=True)))  # type: ignore[type-var]
+    assert "pose_3 moved by 0.9 px" in found["scan"].blocked_by and "accept it" in found["verify"].blocked_by
+    assert found["calibrate"].state == "ready" and "rejected" in found["calibrate"].instruction
+    insisted = replace(facts, session=replace(facts.session, calibration=replace(rejected, is_pinned=True)))  # type: ignore[type-var]
     assert states(insisted)["scan"] == "ready" and states(insisted)["calibrate"] == "done"
 
 
@@ -71,16 +81,24 @@ def test_every_step_says_in_one_sentence_what_to_do_and_what_is_wrong() -> None:
     lost = replace(OPEN, state="lost", fault="the camera is gone: plug it in")
     facts = Facts(session, lost, Space(1_000_000, 10_000_000), "saturated")
     for view in views(facts):
-        assert view.now and view.now[0].isupper() and view.now.endswith(".") and "\n" not in view.now
-        assert all(len(sentence) > 20 and "\n" not in sentence for sentence in view.wrong)
-    wrong = " ".join(next(v for v in views(facts) if v.key == "poses").wrong)
+        assert (
+            view.instruction
+            and view.instruction[0].isupper()
+            and view.instruction.endswith(".")
+            and "\n" not in view.instruction
+        )
+        assert all(len(sentence) > 20 and "\n" not in sentence for sentence in view.problems)
+    wrong = " ".join(next(v for v in views(facts) if v.key == "poses").problems)
     assert "plug it in" in wrong and "free some space" in wrong and "saturated" in wrong and "12 of 336" in wrong
 
 
 def test_poses_that_cover_the_view_may_still_lack_accuracy() -> None:
-    covering = replace(EMPTY, target="circles:9x7:20", poses=poses(10), coverage=COVERED)
-    assert "cover the view: calibrate" in views(Facts(covering, OPEN, None))[2].now
-    lacking = replace(covering, foreseen=Foreseen(0.03, 0.02, 0.024, False))
-    assert "0.030 mm is predicted, and 0.024 mm wanted: add more" in views(Facts(lacking, OPEN, None))[2].now
-    few = replace(lacking, poses=poses(3), coverage=None)
-    assert "Choosing where the board tells most" in views(Facts(replace(few, planning=True), OPEN, None))[2].now
+    covering = replace(EMPTY, target="circles:9x7:20", poses=poses(10), plan=planned(True))
+    assert "cover the view: calibrate" in views(Facts(covering, OPEN, None))[2].instruction
+    lacking = replace(covering, plan=planned(True, 0.03), wanted_mm=0.024)
+    assert "sigma 0.030 mm, goal 0.024 mm): add more" in views(Facts(lacking, OPEN, None))[2].instruction
+    enough = replace(lacking, wanted_mm=0.031)
+    assert enough.enough and views(Facts(enough, OPEN, None))[2].instruction.endswith(": calibrate.")
+    pending = PlanInput(Board.parse("circles:9x7:20"), (400, 300), (912, 1140), {})
+    few = replace(lacking, poses=poses(3), plan=planned(False), pending_plan=pending)
+    assert "Computing the best next pose" in views(Facts(few, OPEN, None))[2].instruction

@@ -1,123 +1,112 @@
-"""Calibrate: the models from the good poses, how well each pose agrees, and what every pixel learnt."""
+"""Step 4: calibrate the models from the good poses, and inspect the residuals of poses and pixels."""
 
-import threading
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import viser
 
-from slviewer.gui.calibration_words import (
-    choice_words,
+from slviewer.fringe.sequence import Axis
+from slviewer.gui.calibration_html import (
     comparison_table,
+    exclusions_html,
+    model_choice_html,
     named_poses,
-    set_aside_words,
     splined_table,
-    verdict_words,
+    verdict_html,
 )
-from slviewer.gui.inputs import Choice, Follows, change, titled
-from slviewer.gui.panel import Stage
-from slviewer.gui.pictures import PLOT_PX, Painter, Plot, opened, spread
-from slviewer.gui.widgets import Html, Words, block, cell, colours, table, toned
+from slviewer.gui.inputs import Choice, SessionValue, change, display_name
+from slviewer.gui.panel import PanelContext, StepPanel
+from slviewer.gui.pictures import PLOT_PX, Plot, colour_range
+from slviewer.gui.widgets import Html, Text, coloured, colours, paragraph, table, to_html
 from slviewer.pipeline.report import calibration_view
 from slviewer.report.curves import pixel_curves
-from slviewer.report.data import CalibrationFigures as Details
+from slviewer.report.data import CalibrationFigures, DeviceParameters, PixelCurve
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.report.session import lens_rows, rig_rows
 from slviewer.target.board import Board
 from slviewer.wizard import result_views
-from slviewer.wizard.snapshot import CalibrationView, PreviewView, SessionView, Snapshot
+from slviewer.wizard.snapshot import CalibrationView, SessionView, Snapshot
 
 LAYER, BOARDS = "calibrate", "calibrated boards"
 DEVICES = ("camera", "projector")
-_MOST_NAMED = 6  # poses that a verdict names, as buttons: more do not fit one line or two
+USUAL_WEIGHT = "80 % or more is usual"
+_MOST_NAMED = 6  # poses of a verdict that are offered as buttons: they fit on two lines
 
 
-class Panel:
-    """The fourth step."""
+class Panel(StepPanel):
+    """The calibration."""
 
     key = "calibrate"
+    layers = (LAYER, BOARDS)
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
-        self._painter = Painter(stage.failed)
-        self._lock = threading.RLock()
-        self._snapshot: Snapshot | None = None
-        self._visible = False
+    def __init__(self, context: PanelContext) -> None:
+        super().__init__(context)
         self._pixel_chosen = False
         self._boards: tuple[Any, ...] = ()
         self._cloud: result_views.ScanCloud | None = None
-        self._details: tuple[tuple[Any, ...], Details] | None = None
-        self._chosen = ""  # the operator's model, as the session said last
+        self._details: tuple[tuple[Any, ...], CalibrationFigures] | None = None
+        self._chosen = ""  # the operator's model in the latest snapshot
 
     def build(self) -> None:
-        gui, operator, safely = self._stage.gui, self._stage.operator, self._stage.safely
-        self._calibrate = gui.add_button("Calibrate", icon=viser.Icon.TARGET)
-        self._calibrate.on_click(safely(lambda: operator.calibrate()))
-        self._verdict = Words(gui)
-        self._anyway = gui.add_checkbox(
-            "Use it anyway", False, visible=False, hint="The session remembers it, for this calibration alone"
-        )
-        self._anyway_follows = Follows(self._anyway)
-        self._named = gui.add_button_group("Look at", ("–",), visible=False)
-        self._set_aside = Words(gui)
-        self._summary = Words(gui)
+        gui, context, operator = self._gui, self._context, self._operator
+        self._calibrate = context.button("Calibrate", operator.calibrate, viser.Icon.TARGET, None)
+        self._verdict = Text(gui)
+        hint = "Uses this calibration although it was rejected"
+        self._anyway = gui.add_checkbox("Accept anyway", False, visible=False, hint=hint)
+        self._anyway_value = SessionValue(self._anyway)
+        self._named = gui.add_button_group("Show pose", ("–",), visible=False)
+        self._exclusions = Text(gui)
+        self._summary = Text(gui)
         with gui.add_folder("Models", visible=False) as self._models_folder:
-            self._choice_words = Words(gui)
-            self._use = Choice(gui, "Measure with", "The recommended model, or another one of your choice")
-            self._compare = gui.add_button(
-                "Compare models",
-                icon=viser.Icon.SCALE,
-                color="gray",
-                hint="Measures each pose by calibrations made without it: a minute or more; it can be cancelled",
-            )
-            self._compare.on_click(safely(lambda: operator.compare_models()))
-            self._comparison = Words(gui)
-            self._splined = Words(gui)
+            self._choice_note = Text(gui)
+            self._use = Choice(gui, "Model", "Used for scans and verifications")
+            self._compare = context.button(
+                "Compare models", operator.compare_models, viser.Icon.SCALE,
+                hint="Cross-validation: measures each pose by calibrations without it; takes a minute or more",
+            )  # fmt: skip
+            self._comparison = Text(gui)
+            self._splined = Text(gui)
         with gui.add_folder("Reprojection error", visible=False) as self._poses_folder:
             self._bars = Plot(gui)
             self._pose = Choice(gui, "Pose")
-            self._pose_words = Words(gui)
-            self._exclude = gui.add_button("Exclude this pose", color="orange")
-            self._exclude.on_click(safely(self._toggle_pose))
-            self._device = gui.add_dropdown("Arrows of", DEVICES)
+            self._pose_note = Text(gui)
+            self._exclude = context.button("Exclude this pose", self._toggle_pose, color="orange")
+            self._device = gui.add_dropdown("Residuals", DEVICES)
             self._arrows = Plot(gui)
         with gui.add_folder("Parameters", visible=False, expand_by_default=False) as self._parameters_folder:
-            self._parameters = Words(gui)
+            self._parameters = Text(gui)
         with gui.add_folder("Pixel-wise model", visible=False) as self._pixels_folder:
-            self._fits = Words(gui)
+            self._fits = Text(gui)
             self._axis = Choice(gui, "Axis", "x: along the projector's columns; y: along its rows")
             self._maps = Plot(gui)
-            self._column = gui.add_number("Pixel column u", 0, min=0, step=1)
-            self._row = gui.add_number("Pixel row v", 0, min=0, step=1)
-            self._over = Choice(gui, "Cloud to click", "Shows a cloud in 3D; click on it to choose a pixel")
-            self._stage.bring_button(lambda: self._cloud.points if self._cloud else None)
-            self._curve_words = Words(gui)
+            self._column = gui.add_number("Pixel u", 0, min=0, step=1, hint="Column")
+            self._row = gui.add_number("Pixel v", 0, min=0, step=1, hint="Row")
+            self._over = Choice(gui, "Cloud", "Click a point of it to choose its pixel")
+            context.view_button(lambda: self._cloud.points if self._cloud else None)
+            self._curve_note = Text(gui)
             self._curves = Plot(gui)
-        self._anyway.on_update(safely(self._toggle_anyway))
-        self._named.on_click(safely(self._look_at_named))
-        self._use.on_change(safely(self._choose_model))
+        self._anyway.on_update(context.callback(self._toggle_anyway))
+        self._named.on_click(context.callback(self._show_named))
+        self._use.on_change(context.callback(self._choose_model))
         for choice in (self._pose, self._axis):
-            choice.on_change(safely(self._refresh))
-        for number in (self._device, self._column, self._row):
-            number.on_update(safely(self._refresh))
-        self._over.on_change(safely(self._show_cloud))
+            choice.on_change(context.callback(self._refresh))
+        for handle in (self._device, self._column, self._row):
+            handle.on_update(context.callback(self._refresh))
+        self._over.on_change(context.callback(self._request_cloud))
 
     def draw(self, snapshot: Snapshot) -> None:
         with self._lock:
             self._snapshot = snapshot
-            session = snapshot.session
-            calibration = session.calibration if session else None
-            step = snapshot.step(self.key)
-            busy = snapshot.job is not None and not snapshot.job.background
-            change(self._calibrate, disabled=busy or step.state == "blocked")
-            change(self._calibrate, label="Calibrate again" if calibration else "Calibrate")
+            session, calibration, busy = snapshot.session, snapshot.calibration, snapshot.is_busy
+            label = "Calibrate again" if calibration else "Calibrate"
+            change(self._calibrate, disabled=busy or snapshot.step(self.key).state == "blocked", label=label)
             shown = calibration is not None
             self._draw_verdict(session, calibration)
             self._draw_models(calibration, busy)
             for folder, visible in (
-                (self._poses_folder, shown and bool(calibration and calibration.poses)),
+                (self._poses_folder, shown and bool(calibration and calibration.stereo.poses)),
                 (self._parameters_folder, shown),
                 (self._pixels_folder, shown and bool(calibration and calibration.fit_rms_mm)),
             ):
@@ -125,102 +114,98 @@ class Panel:
             self._summary.set(_summary(calibration) if calibration else "")
             if session is None or calibration is None:
                 return
-            names = [pose.name for pose in session.poses if pose.state in ("used", "excluded", "left out")]
+            names = [pose.name for pose in session.poses if pose.state in ("used", "excluded", "unused")]
             self._pose.offer([(name, name) for name in names], worst(calibration))
             self._axis.offer([(axis, axis) for axis in calibration.fit_rms_mm])
-            clouds = [(scan.name, titled(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"]
-            self._over.offer([("", "no cloud"), *clouds])
+            clouds = [
+                (scan.name, display_name(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"
+            ]
+            self._over.offer([("", "none"), *clouds])
             self._fits.set(_fits(calibration))
             if not self._pixel_chosen:
                 self._pixel_chosen = True
-                u, v = np.round(calibration.K_camera[:2, 2]).astype(int)
+                u, v = np.round(calibration.stereo.rig.camera.K[:2, 2]).astype(int)
                 change(self._column, value=max(int(u), 0))
                 change(self._row, value=max(int(v), 0))
             self._refresh()
 
     def _draw_verdict(self, session: SessionView | None, calibration: CalibrationView | None) -> None:
         verdict = session.verdict if session else None
-        of_calibration = bool(session and session.verdict_of_calibration)
-        if verdict is not None:
-            self._verdict.set(verdict_words(verdict, of_calibration, calibration))
-        elif calibration is not None and calibration.target:
-            self._verdict.say("This calibration was not judged yet: calibrate again for a verdict.", "plain")
+        if session is not None and verdict is not None:
+            self._verdict.set(verdict_html(verdict, session.verdict_of_calibration, calibration))
+        elif calibration is not None and calibration.stereo.board:
+            self._verdict.write("No verdict on this calibration: calibrate again for one.", "plain")
         else:
             self._verdict.set("")
-        refusable = calibration is not None and bool(calibration.rejected)
-        change(self._anyway, visible=refusable)
-        self._anyway_follows.tell(bool(calibration and calibration.insisted))
-        drawn = calibration.pose_rms_px if calibration else {}
-        names = tuple(name for name in named_poses(verdict, calibration) if name in drawn)[:_MOST_NAMED]
+        change(self._anyway, visible=bool(calibration and calibration.rejected))
+        self._anyway_value.update(bool(calibration and calibration.is_pinned))
+        known = calibration.stereo.pose_rms_px if calibration else {}
+        names = tuple(name for name in named_poses(verdict, calibration) if name in known)[:_MOST_NAMED]
         if names and names != self._named.options:
             self._named.options = names
         change(self._named, visible=bool(names))
-        self._set_aside.set(set_aside_words(calibration) if calibration else "")
+        self._exclusions.set(exclusions_html(calibration) if calibration else "")
 
     def _draw_models(self, calibration: CalibrationView | None, busy: bool) -> None:
-        several = calibration is not None and len(calibration.models) > 1 and bool(calibration.poses)
+        several = calibration is not None and len(calibration.models) > 1 and bool(calibration.stereo.poses)
         change(self._models_folder, visible=several)
         if calibration is None or not several:
             return
-        self._choice_words.set(choice_words(calibration))
-        options = [("", f"the recommended one: {calibration.recommended}")]
+        self._choice_note.set(model_choice_html(calibration))
+        options = [("", f"{calibration.recommended} (recommended)")]
         self._use.offer(options + [(model, model) for model in calibration.models], calibration.chosen)
         if calibration.chosen != self._chosen:
             self._chosen = calibration.chosen
             self._use.choose(calibration.chosen)
-        change(self._compare, disabled=busy or bool(calibration.stale))
         compared = calibration.comparison
-        change(self._compare, label="Compare models" if compared is None else "Compare models again")
+        label = "Compare models" if compared is None else "Compare again"
+        change(self._compare, disabled=busy or bool(calibration.stale), label=label)
         self._comparison.set("" if compared is None else comparison_table(compared, calibration.best))
         if calibration.splined is not None:
             self._splined.set(splined_table(calibration.splined))
         else:
-            self._splined.say(f"No splined model: {calibration.lacks}." if calibration.lacks else "", "dim")
+            self._splined.write(f"No splined model: {calibration.missing}." if calibration.missing else "", "dim")
 
-    def draw_preview(self, preview: PreviewView) -> None:
-        """This step needs no camera."""
-
-    def shown(self, visible: bool) -> None:
-        self._visible = visible
-        for layer in (LAYER, BOARDS):
-            self._stage.scene.show(layer, visible)
-        self._stage.scene.on_pick(self._pick if visible else None)
+    def show(self, visible: bool) -> None:
+        super().show(visible)
+        self._scene.on_pick(self._pick if visible else None)
 
     # pictures
 
     def _refresh(self) -> None:
-        """Ask for the pictures of what is chosen."""
+        """Request the pictures of what is chosen."""
         with self._lock:
             session = self._snapshot.session if self._snapshot else None
-            calibration = session.calibration if session else None
-            if session is None or calibration is None:
+            if session is None or session.calibration is None:
                 return
+            calibration, context = session.calibration, self._context
             made = fingerprint(calibration)
-            operator = self._stage.operator
-            if calibration.poses:
-                self._painter.ask(
+            if calibration.stereo.poses:
+                self._painter.request(
                     "bars",
                     made,
-                    lambda: pose_bars(calibration.pose_rms_px, calibration.reprojection_px, width=PLOT_PX),
+                    lambda: pose_bars(
+                        calibration.stereo.pose_rms_px, calibration.stereo.reprojection_rms_px, width=PLOT_PX
+                    ),
                     self._bars.set,
                 )
             self._draw_pose(session, calibration)
             self._draw_boards(session, calibration)
-            self._painter.ask("parameters", made, lambda: _parameters(self._detailed(made)), self._parameters.set)
-            axis: Any = self._axis.value
+            self._painter.request("parameters", made, lambda: _parameters(self._detailed(made)), self._parameters.set)
+            axis = cast(Axis, self._axis.value)
             if axis not in calibration.fit_rms_mm:
                 return
-            self._painter.ask(
+            self._painter.request(
                 "maps",
                 (made, axis),
-                lambda: rms_maps(result_views.pixel_fits(opened(operator))[axis].rms_mm, axis, width=PLOT_PX),
+                lambda: rms_maps(result_views.pixel_fits(context.session)[axis].rms_mm, axis, width=PLOT_PX),
                 self._maps.set,
             )
             pixel = (int(self._column.value), int(self._row.value))
-            self._painter.ask(
+            self._painter.request(
                 "curves",
                 (made, axis, pixel),
-                lambda: (pixel, result_views.pixel_curve(opened(operator), pixel, axis)),
+                lambda: (pixel, result_views.pixel_curve(context.session, pixel, axis)),
                 self._draw_curve,
             )
 
@@ -231,24 +216,22 @@ class Panel:
             return
         excluded = pose.state == "excluded"
         change(self._exclude, label=f"Include {name} again" if excluded else f"Exclude {name}")
-        rms = calibration.pose_rms_px.get(name)
+        rms = calibration.stereo.pose_rms_px.get(name)
         if rms is None:
             why = f": {pose.why}" if pose.why else ""
-            self._pose_words.say(f"{name} is not in this calibration ({pose.state}{why}).", "warning")
-            self._painter.forget("arrows")
+            self._pose_note.write(f"{name} is not in this calibration ({pose.state}{why}).", "warning")
+            self._painter.cancel("arrows")
             self._arrows.hide()
             return
-        said = f"{name}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
-        if calibration.splined is not None and name in calibration.splined.trust:
-            camera, projector = calibration.splined.trust[name]
-            said += (
-                f" The joint adjustment trusts {100 * camera:.0f} % of its features and {100 * projector:.0f} % of its "
-                "phase; 80 % are usual."
-            )
+        text = f"{name}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
+        if calibration.splined is not None and name in calibration.splined.weights:
+            camera, projector = calibration.splined.weights[name]
+            weights = f"features {100 * camera:.0f} %, phase {100 * projector:.0f} %"
+            text += f" Weight in the joint adjustment: {weights}; {USUAL_WEIGHT}."
         if excluded:
-            self._pose_words.say(f"{said} It is excluded now: calibrate again to do without it.", "warning")
+            self._pose_note.write(f"{text} Excluded since: calibrate again.", "warning")
         else:
-            self._pose_words.say(said)
+            self._pose_note.write(text)
         made = fingerprint(calibration)
 
         def arrows() -> Figure | None:
@@ -260,28 +243,28 @@ class Panel:
                 return residual_arrows(title, found.pixels, found.camera, details.stereo.rig.camera.size)
             return residual_arrows(title, found.projector_pixels, found.projector, details.stereo.rig.projector.size)
 
-        self._painter.ask("arrows", (made, name, device), arrows, self._arrows.set)
+        self._painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
     def _draw_boards(self, session: SessionView, calibration: CalibrationView) -> None:
-        """The poses in 3D, from green to red by their reprojection error, the chosen one thick."""
-        scene, chosen = self._stage.scene, self._pose.value
-        shown = (
+        """The poses in 3D, coloured from green to red by their reprojection error, the chosen one thick."""
+        scene, chosen = self._scene, self._pose.value
+        key = (
             fingerprint(calibration),
             chosen,
             bool(self._over.value),
             tuple((p.name, p.state) for p in session.poses),
         )
-        if shown == self._boards:
+        if key == self._boards:
             return
-        self._boards = shown
+        self._boards = key
         scene.clear(BOARDS)
-        if self._over.value or not calibration.target:
+        if self._over.value or not calibration.stereo.board:
             return
-        outline = Board.parse(calibration.target).outline()
-        usual = np.sqrt(np.mean(np.square([max(rms) for rms in calibration.pose_rms_px.values()] or [1.0])))
+        outline = Board.parse(calibration.stereo.board).outline()
+        usual = np.sqrt(np.mean(np.square([max(rms) for rms in calibration.stereo.pose_rms_px.values()] or [1.0])))
         for pose in session.poses:
-            if pose.T_camera_board is not None and pose.name in calibration.pose_rms_px:
-                share = float(np.clip(max(calibration.pose_rms_px[pose.name]) / usual - 0.5, 0, 1))
+            if pose.T_camera_board is not None and pose.name in calibration.stereo.pose_rms_px:
+                share = float(np.clip(max(calibration.stereo.pose_rms_px[pose.name]) / usual - 0.5, 0, 1))
                 colour = (round(60 + 170 * share), round(170 - 110 * share), 70)
                 here = pose.name == chosen
                 label = pose.name if here else ""
@@ -289,35 +272,34 @@ class Panel:
                 scene.board(BOARDS, pose.name, pose.T_camera_board, outline, colour, label=label, width_px=width)
         scene.show(BOARDS, self._visible)
 
-    def _detailed(self, made: tuple[Any, ...]) -> Details:
+    def _detailed(self, made: tuple[Any, ...]) -> CalibrationFigures:
         """The calibration with its residuals, read once; on the painter's thread."""
         if self._details is None or self._details[0] != made:
-            self._details = made, calibration_view(opened(self._stage.operator))
+            self._details = made, calibration_view(self._context.session)
         return self._details[1]
 
-    def _draw_curve(self, made: Any) -> None:
+    def _draw_curve(self, made: tuple[tuple[int, int], PixelCurve | None]) -> None:
         (u, v), curve = made
         if curve is None:
-            self._curve_words.say(f"Pixel ({u}, {v}) saw the board too rarely to be fitted: choose another.", "warning")
+            self._curve_note.write(f"Pixel ({u}, {v}) saw the board in too few poses: choose another.", "warning")
             self._curves.hide()
             return
-        self._curve_words.say("")
+        self._curve_note.write("")
         self._curves.set(pixel_curves(curve, width=PLOT_PX))
 
     # requests
 
     def _toggle_anyway(self) -> None:
-        session = self._snapshot.session if self._snapshot else None
-        calibration = session.calibration if session else None
-        if calibration is not None and calibration.rejected and self._anyway.value != calibration.insisted:
-            self._stage.operator.use_anyway(self._anyway.value)
+        calibration = self._snapshot.calibration if self._snapshot else None
+        if calibration is not None and calibration.rejected and self._anyway.value != calibration.is_pinned:
+            self._operator.accept_rejected_calibration(self._anyway.value)
 
     def _choose_model(self) -> None:
         if self._use.value != self._chosen:
             self._chosen = self._use.value
-            self._stage.operator.choose_model(self._use.value)
+            self._operator.choose_model(self._use.value)
 
-    def _look_at_named(self) -> None:
+    def _show_named(self) -> None:
         self._pose.choose(self._named.value)
         self._refresh()
 
@@ -327,31 +309,31 @@ class Panel:
         if pose is None:
             return
         if pose.state == "excluded":
-            self._stage.operator.include(name)
+            self._operator.include(name)
         else:
-            self._stage.operator.exclude(name)
+            self._operator.exclude(name)
 
-    def _show_cloud(self) -> None:
+    def _request_cloud(self) -> None:
         name = self._over.value
         if not name:
-            self._painter.forget("cloud")
+            self._painter.cancel("cloud")
             self._cloud = None
-            self._stage.scene.clear(LAYER)
-            self._stage.viewpoints.overview()
+            self._scene.clear(LAYER)
+            self._context.viewpoints.overview()
             self._refresh()
             return
         self._refresh()
-        operator = self._stage.operator
-        self._painter.ask("cloud", name, lambda: result_views.scan_cloud(opened(operator), name), self._draw_cloud)
+        context = self._context
+        self._painter.request("cloud", name, lambda: result_views.scan_cloud(context.session, name), self._draw_cloud)
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
         self._cloud = cloud
         rows, columns = cloud.thinned(100_000)
         z = cloud.points[rows, columns, 2]
-        self._stage.scene.cloud(LAYER, "cloud", cloud.points[rows, columns], colours(z, *spread(z)))
-        self._stage.scene.show(LAYER, self._visible)
+        self._scene.cloud(LAYER, "cloud", cloud.points[rows, columns], colours(z, *colour_range(z)))
+        self._scene.show(LAYER, self._visible)
         if self._visible:
-            self._stage.viewpoints.at(f"{LAYER} {cloud.name}", cloud.points)
+            self._context.viewpoints.show(f"{LAYER} {cloud.name}", cloud.points)
 
     def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
         cloud = self._cloud
@@ -361,52 +343,68 @@ class Panel:
         u, v = pixel
         change(self._column, value=u)
         change(self._row, value=v)
-        self._stage.scene.mark(LAYER, "picked", cloud.points[v, u], f"pixel ({u}, {v})")
+        self._scene.mark(LAYER, "picked", cloud.points[v, u], f"pixel ({u}, {v})")
 
 
 def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:
     """What pictures of a calibration depend on."""
-    return (
-        calibration.models,
-        calibration.K_camera.tobytes(),
-        calibration.K_projector.tobytes(),
-        calibration.t.tobytes(),
-    )
+    rig = calibration.stereo.rig
+    return calibration.models, rig.camera.K.tobytes(), rig.projector.K.tobytes(), rig.t.tobytes()
 
 
 def worst(calibration: CalibrationView) -> str:
-    """The pose that agrees least; empty where none is known."""
-    errors = calibration.pose_rms_px
+    """The pose with the largest reprojection error; empty where none is known."""
+    errors = calibration.stereo.pose_rms_px
     return max(errors, key=lambda name: max(errors[name]), default="")
 
 
 def _summary(calibration: CalibrationView) -> Html:
-    rms = calibration.reprojection_px
+    stereo = calibration.stereo
+    rms = stereo.reprojection_rms_px
     rows: list[tuple[object, object]] = []
     if rms:
-        rows.append(("reprojection RMS, camera", toned(f"{rms['camera']:.3f} px", "plain", bold=True)))
-        rows.append(("reprojection RMS, projector", toned(f"{rms['projector']:.3f} px", "plain", bold=True)))
-    rows.append(("poses used", f"{len(calibration.poses)} of {len(calibration.poses) + len(calibration.left_out)}"))
-    if calibration.depth_range_mm:
-        rows.append(("calibrated depths (R2)", "{:.0f} to {:.0f} mm".format(*calibration.depth_range_mm)))
-    rows.append(("baseline", f"{calibration.baseline_mm:.2f} mm"))
-    rows.append(("models", ", ".join(calibration.models)))
-    rows.append(("used for scans", "nothing: it was rejected" if calibration.refused else calibration.best))
+        rows.append(("Reprojection RMS, camera", coloured(f"{rms['camera']:.3f} px", "plain", bold=True)))
+        rows.append(("Reprojection RMS, projector", coloured(f"{rms['projector']:.3f} px", "plain", bold=True)))
+    rows.append(("Poses used", f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.left_out)}"))
+    if stereo.depth_range_mm:
+        rows.append(("Calibrated depths (R2)", "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm)))
+    rows.append(("Baseline", f"{stereo.baseline_mm:.2f} mm"))
+    rows.append(("Models", ", ".join(calibration.models)))
+    rows.append(("Model in use", "none: rejected" if calibration.refused else calibration.best))
     rows += [(model, words) for model, words in calibration.scales.items()]
     return table(("Calibration", ""), rows)
 
 
 def _fits(calibration: CalibrationView) -> Html:
     rows = [
-        (f"axis {axis}", *(f"{medians[name]:.3f} mm" for name in "zxy"))
+        (f"Axis {axis}", *(f"{medians[name]:.3f}" for name in "zxy"))
         for axis, medians in calibration.fit_rms_mm.items()
     ]
-    return table(("Median RMS of the fits", "z", "x", "y"), rows)
+    return table(("Median RMS of the fits", "z, mm", "x, mm", "y, mm"), rows)
 
 
-def _parameters(details: Details) -> Html:
-    stereo = details.stereo
-    lenses = [(f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)]
-    rig = [*rig_rows(stereo), ("target", stereo.board or "made elsewhere")]
-    note = block(toned("± is one standard deviation.", "dim"))
-    return Html(table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig) + cell(note))
+def _parameters(details: CalibrationFigures) -> Html:
+    def lens(device: DeviceParameters) -> list[str]:
+        K, D, sigma = device.K, device.D, device.focal_sigma_px
+        sigma_text = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
+        return [
+            f"{device.size[0]} × {device.size[1]} px",
+            *(f"{K[i, i]:.1f}{sigma_text} px" for i in (0, 1)),
+            *(f"{K[i, 2]:.1f} px" for i in (0, 1)),
+            *(f"{value:.5f}".replace("-", "−") for value in D[:5]),
+        ]
+
+    names = ["Size", "Focal length fx", "Focal length fy", "Centre cx", "Centre cy", "k1", "k2", "p1", "p2", "k3"]
+    lenses = list(zip(names, lens(details.camera), lens(details.projector), strict=True))
+    t = np.asarray(details.t, float).ravel()
+    turned = np.degrees(np.arccos(np.clip((np.trace(details.R) - 1) / 2, -1, 1)))
+    axes = np.degrees(np.arccos(np.clip(details.R[2, 2], -1, 1)))
+    rig = [
+        ("Baseline", f"{np.linalg.norm(t):.2f} mm"),
+        ("Translation, mm", " / ".join(f"{value:.2f}" for value in t).replace("-", "−")),
+        ("Rotation", f"{turned:.2f}°"),
+        ("Angle between the axes", f"{axes:.2f}°"),
+        ("Target", details.target or "imported"),
+    ]
+    note = paragraph(coloured("±: one standard deviation.", "dim"))
+    return Html(table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig) + to_html(note))

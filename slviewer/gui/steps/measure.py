@@ -1,206 +1,203 @@
-"""Measure: distances, fitted shapes, sections, and how far a part lies off its nominal model."""
+"""Step 8: distances, fitted shapes, sections, and deviations from a nominal model."""
 
-import threading
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import viser
 
 from slviewer.gui.inputs import Choice, change
-from slviewer.gui.measure_results import Results
-from slviewer.gui.measure_surface import SurfaceBox
+from slviewer.gui.measure_list import MeasurementList
+from slviewer.gui.measure_surface import SurfaceView
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
-from slviewer.gui.panel import Stage
-from slviewer.gui.pictures import Painter
+from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.scene import GHOST
-from slviewer.gui.widgets import Html, Tone, Words, block, boxed, cell, toned
+from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, paragraph, to_html
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import Place
-from slviewer.report.canvas import round_up
+from slviewer.pipeline.measurements import Shape
+from slviewer.report.canvas import rounded_up
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import MM
 from slviewer.wizard.snapshot import SessionView, Snapshot
 from slviewer.wizard.surfaces import point_at
 
 LAYER = "measure"
-NOT_SAID = "not said"
+UNKNOWN = "unknown"
 _BALL = "ball"
 _PICKED = ("picked 1", "picked 2")
 
 
-class Panel:
-    """The eighth step."""
+class Panel(StepPanel):
+    """Measurements."""
 
     key = "measure"
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
-        self._painter = Painter(stage.failed)
-        self._lock = threading.RLock()
+    def __init__(self, context: PanelContext) -> None:
+        super().__init__(context)
         self._tool = Tool()
-        self._sized = ""
+        self._sized_for = ""
         self._related: list[tuple[str, str]] = []
-        self._visible = False
-        self._surface = SurfaceBox(stage, self._painter, LAYER, self._loaded)
-        self._results = Results(stage, self._painter, LAYER, self._chose)
+        self._surface = SurfaceView(context, self._painter, LAYER, self._handle_loaded)
+        self._results = MeasurementList(context, self._painter, LAYER, self._show_measurement)
 
     def build(self) -> None:
-        gui, safely = self._stage.gui, self._stage.safely
+        gui, context = self._gui, self._context
         with gui.add_folder("Surface", visible=False) as self._surface_folder:
             self._surface.build()
         with gui.add_folder("Tools", visible=False) as self._tools_folder:
             for title, tools in (("Pick", PICK), ("Fit", FIT), ("Compare", COMPARE)):
                 group = gui.add_button_group(title, tools)
-                group.on_click(safely(lambda group=group: self._take(group.value)))  # type: ignore[misc]
-            self._now = Words(gui)
+                group.on_click(context.callback(lambda group=group: self._select_tool(group.value)))  # type: ignore[misc]
+            self._instruction = Text(gui)
             self._build_fit()
-            self._build_between()
-            self._build_nominal()
-            self._away = gui.add_button("Put tool away", icon=viser.Icon.X, color="gray", hint="Key: Esc")
-            self._away.on_click(safely(lambda: self._take("")))
-        self._escape = gui.add_command("Put the measuring tool away", hotkey="escape", disabled=True)
-        self._escape.on_trigger(safely(lambda: self._take("")))
+            self._build_relation()
+            self._build_deviation()
+            self._end = context.button("End tool", lambda: self._select_tool(""), viser.Icon.X, hint="Key: Esc")
+        self._escape = gui.add_command("End the measuring tool", hotkey="escape", disabled=True)
+        self._escape.on_trigger(context.callback(lambda: self._select_tool("")))
         self._results.build()
         self._draw_tool()
 
     def _build_fit(self) -> None:
-        gui, safely = self._stage.gui, self._stage.safely
-        self._radius: Any = gui.add_slider("Radius, mm", 0.5, 100.0, 0.5, 15.0, visible=False, hint="Of the ball in 3D")
-        self._radius.on_update(safely(self._draw_ball))
-        self._inside = Words(gui)
-        self._fit = gui.add_button("Fit", icon=viser.Icon.CHECK, visible=False)
-        self._fit.on_click(safely(self._ask_fit))
+        hint = "Of the ball in 3D"
+        self._radius: Any = self._gui.add_slider("Radius, mm", 0.5, 100.0, 0.5, 15.0, visible=False, hint=hint)
+        self._radius.on_update(self._context.callback(self._draw_ball))
+        self._inside = Text(self._gui)
+        self._fit = self._context.button("Fit", self._request_fit, viser.Icon.CHECK, None, visible=False)
 
-    def _build_between(self) -> None:
-        gui = self._stage.gui
-        self._one, self._other = Choice(gui, "From"), Choice(gui, "To")
-        self._between = gui.add_button("Measure between them", icon=viser.Icon.RULER_2, visible=False)
-        self._between.on_click(
-            self._stage.safely(lambda: self._stage.operator.measure_between(self._one.value, self._other.value))
+    def _build_relation(self) -> None:
+        self._from, self._to = Choice(self._gui, "From"), Choice(self._gui, "To")
+        self._relate = self._context.button(
+            "Measure relation",
+            lambda: self._operator.measure_between(self._from.value, self._to.value),
+            viser.Icon.RULER_2,
+            None,
+            visible=False,
         )
 
-    def _build_nominal(self) -> None:
-        gui, safely = self._stage.gui, self._stage.safely
-        with gui.add_folder(None, visible=False) as self._nominal_folder:  # viser shows upload buttons whatever is said
+    def _build_deviation(self) -> None:
+        gui, context, operator = self._gui, self._context, self._operator
+        with gui.add_folder(None, visible=False) as self._nominal_folder:  # viser cannot hide upload buttons alone
             upload = gui.add_upload_button(
-                "Upload nominal model", icon=viser.Icon.UPLOAD, color="gray", mime_type=".stl,.ply,.obj"
+                "Upload model", icon=viser.Icon.UPLOAD, color="gray", mime_type=".stl,.ply,.obj"
             )
-            upload.on_upload(safely(lambda: self._stage.operator.take_nominal(upload.value.name, upload.value.content)))
-            self._nominal = Choice(gui, "Model")
-            hint = "Not said: mm, and it is asked where the sizes do not fit"
-            self._units = gui.add_dropdown("Its units", (NOT_SAID, *MM), hint=hint)
-            hint = "The tolerance; 0: none, and nothing is judged"
-            self._tolerance = gui.add_number("Limit ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint)
-            self._compare = gui.add_button("Compare", icon=viser.Icon.ARROWS_DIFF)
-            self._compare.on_click(safely(self._ask_compare))
+            upload.on_upload(context.callback(lambda: operator.upload_nominal(upload.value.name, upload.value.content)))
+            self._nominal = Choice(gui, "Nominal")
+            hint = "Of the nominal model; unknown: mm, if the sizes agree"
+            self._units: Any = gui.add_dropdown("Units", (UNKNOWN, *MM), hint=hint)
+            hint = "0: without a verdict"
+            self._tolerance = gui.add_number("Tolerance ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint)
+            self._compare = context.button("Compare", self._request_comparison, viser.Icon.ARROWS_DIFF, None)
 
     def draw(self, snapshot: Snapshot) -> None:
         with self._lock:
             session = snapshot.session
             usable = session is not None and snapshot.step(self.key).state != "blocked"
             self._surface.offer(session if usable else None)
-            there = bool(self._surface.name)
-            change(self._surface_folder, visible=there)
-            change(self._tools_folder, visible=there)
+            has_surface = bool(self._surface.name)
+            change(self._surface_folder, visible=has_surface)
+            change(self._tools_folder, visible=has_surface)
             self._offer_inputs(session)
             new = self._results.draw(session, self._surface.name)
             if self._tool.fits and any(each.kind == self._tool.name.lower() for each in new):
-                self._take(self._tool.name)
-            busy = snapshot.job is not None and not snapshot.job.background
-            change(self._compare, disabled=busy or not self._nominal.value)
-            change(self._fit, disabled=busy)
+                self._select_tool(self._tool.name)
+            change(self._compare, disabled=snapshot.is_busy or not self._nominal.value)
+            change(self._fit, disabled=snapshot.is_busy)
 
-    def shown(self, visible: bool) -> None:
+    def show(self, visible: bool) -> None:
         with self._lock:
-            self._tool.take("")
+            self._tool.select("")
             self._draw_tool()
             self._visible = visible
             self._surface.show(visible)
-            self._stage.scene.on_pick(None)
+            self._scene.on_pick(None)
             change(self._escape, disabled=True)
 
     # tools
 
-    def _take(self, name: str) -> None:
+    def _select_tool(self, name: str) -> None:
         with self._lock:
-            self._tool.take(name)
-            self._listen()  # before it is said: a click made as soon as one reads the sentence would be lost
+            self._tool.select(name)
+            self._listen()  # before the instruction appears, so that no click is lost
             self._draw_tool()
 
     def _listen(self) -> None:
-        """Hear of clicks into the scene while the tool waits for them; another step's clicks are its own."""
+        """React to clicks into the scene while the tool needs them; another step's clicks are its own."""
         if self._visible:
             change(self._escape, disabled=not self._tool.name)
-            self._stage.scene.on_pick(self._click if self._tool.clicks and not self._lacking else None)
+            self._scene.on_pick(self._click if self._tool.clicks and not self._obstacle else None)
 
     @property
-    def _lacking(self) -> str:
-        """What the surface lacks for the tool; empty where it can be used."""
+    def _obstacle(self) -> str:
+        """Why the tool cannot be used on the surface; empty where it can."""
         on = self._surface.on
         if self._tool.name != "Section" or on is None or on.organised or on.faces is not None:
             return ""
         return "This merge has no triangles to cut: measure on one of its scans."
 
     def _click(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        self._stage.safely(lambda: self._surface.clicked(origin, direction, self._picked))(None)
+        self._context.callback(lambda: self._surface.pick(origin, direction, self._add_pick))(None)
 
-    def _picked(self, place: Place) -> None:
+    def _add_pick(self, place: Place) -> None:
         with self._lock:
             if not self._tool.clicks:
                 return
-            done, on, operator = self._tool.pick(place), self._surface.name, self._stage.operator
+            places, on, operator = self._tool.pick(place), self._surface.name, self._operator
             self._draw_tool()
-        if done is None:
+        if places is None:
             return
         match self._tool.name:
             case "Point":
-                operator.measure_point(on, *done)
+                operator.measure_point(on, *places)
             case "Distance":
-                operator.measure_distance(on, *done)
+                operator.measure_distance(on, *places)
             case "Section":
-                operator.measure_section(on, *done)
+                operator.measure_section(on, *places)
 
     def _draw_tool(self) -> None:
-        """What the tool asks for now, and what was picked with it."""
+        """The instruction and the inputs of the tool, and the points picked with it."""
         tool = self._tool
-        title = f"<b>{cell(tool.name)}</b>: " if tool.name else ""
-        said = Html(title + cell(self._lacking or tool.sentence))
-        tone: Tone = "warning" if self._lacking else "info"
-        self._now.set(boxed(said, tone) if tool.name else block(toned(said, "dim")))
-        change(self._away, visible=bool(tool.name))
-        ready = tool.fits and bool(tool.picked)
+        title = f"<b>{to_html(tool.name)}</b>: " if tool.name else ""
+        text = Html(title + to_html(self._obstacle or tool.instruction))
+        tone: Tone = "warning" if self._obstacle else "info"
+        self._instruction.set(alert(text, tone) if tool.name else paragraph(coloured(text, "dim")))
+        change(self._end, visible=bool(tool.name))
         change(self._radius, visible=tool.fits)
-        change(self._fit, visible=ready, label=f"Fit {tool.name.lower()}" if tool.fits else "Fit")
-        for choice in (self._one, self._other):
-            choice.show(tool.name == COMPARE[0])
-        change(self._between, visible=tool.name == COMPARE[0])
-        change(self._nominal_folder, visible=tool.name == COMPARE[1])
-        on, scene = self._surface.on, self._stage.scene
+        label = f"Fit {tool.name.lower()}" if tool.fits else "Fit"
+        change(self._fit, visible=tool.fits and bool(tool.picked), label=label)
+        relation, deviation = (tool.name == name for name in COMPARE)
+        for choice in (self._from, self._to):
+            choice.set_visible(relation)
+        change(self._relate, visible=relation)
+        change(self._nominal_folder, visible=deviation)
+        on = self._surface.on
         marked = [] if on is None or tool.fits else tool.picked
         for i, name in enumerate(_PICKED):
             if on is not None and i < len(marked):
-                scene.mark(LAYER, name, point_at(on, marked[i]), str(i + 1))
+                self._scene.mark(LAYER, name, point_at(on, marked[i]), str(i + 1))
             else:
-                scene.remove(LAYER, name)
+                self._scene.remove(LAYER, name)
         self._draw_ball()
 
     def _draw_ball(self) -> None:
-        """The region that a shape would be fitted to, and how much it holds."""
+        """The region that a shape would be fitted to, and its number of points."""
         with self._lock:
             on, region = self._surface.on, self._region()
             if on is None or region is None or region.centre is None:
-                self._painter.forget("inside")
-                self._stage.scene.remove(LAYER, _BALL)
+                self._painter.cancel("inside")
+                self._scene.remove(LAYER, _BALL)
                 self._inside.set("")
                 return
             radius = float(self._radius.value)
-            self._stage.scene.ball(LAYER, _BALL, region.centre, radius, GHOST)
+            self._scene.ball(LAYER, _BALL, region.centre, radius, GHOST)
             key = (self._surface.name, tuple(region.centre), radius)
-            self._painter.ask("inside", key, lambda: len(on.within(region)), self._say_inside)
-
-    def _say_inside(self, points: int) -> None:
-        self._inside.say(f"{points:,} points in the ball", "dim")
+            self._painter.request(
+                "inside",
+                key,
+                lambda: len(on.within(region)),
+                lambda points: self._inside.write(f"{points:,} points in the ball", "dim"),
+            )
 
     def _region(self) -> Region | None:
         on = self._surface.on
@@ -210,49 +207,47 @@ class Panel:
 
     # the surface and the results
 
-    def _loaded(self) -> None:
-        """Another surface: what was picked on the one before is forgotten, and the ball fits its size."""
+    def _handle_loaded(self) -> None:
+        """Another surface is shown: picked points are dropped, and the ball fits its size."""
         with self._lock:
             on = self._surface.on
             assert on is not None
-            self._take(self._tool.name)
-            self._results.move_to(on.source)
-            if self._sized != on.source:
-                self._sized = on.source
+            self._select_tool(self._tool.name)
+            self._results.change_surface(on.source)
+            if self._sized_for != on.source:
+                self._sized_for = on.source
                 low, high = np.nanpercentile(on.points.reshape(-1, 3), [2, 98], axis=0)
                 most = round_up(0.6 * float(np.linalg.norm(high - low)))
                 self._radius.max, self._radius.step, self._radius.min = most, most / 200, most / 200
                 self._radius.value = most / 5
 
-    def _chose(self, measured: Measurement | None) -> None:
-        """Show a measurement where it was made."""
+    def _show_measurement(self, measured: Measurement | None) -> None:
+        """Show the surface on which a measurement was made."""
         if measured is not None and measured.source != self._surface.name:
             self._surface.choose(measured.source)
-        self._surface.deviate(measured if measured is not None and measured.kind == "deviation" else None)
+        self._surface.show_deviation(measured if measured is not None and measured.kind == "deviation" else None)
 
     # requests
 
     def _offer_inputs(self, session: SessionView | None) -> None:
         measured = session.measurements if session else ()
         related = [(each.id, each.name) for each in measured if each.kind in KINDS and not each.stale]
-        for choice in (self._one, self._other):
+        for choice in (self._from, self._to):
             choice.offer(related)
-        if (
-            related != self._related and len(related) > 1 and self._tool.name != COMPARE[0]
-        ):  # the latest two, most likely
-            self._one.choose(related[-2][0])
-            self._other.choose(related[-1][0])
+        if related != self._related and len(related) > 1 and self._tool.name != COMPARE[0]:  # likely the latest two
+            self._from.choose(related[-2][0])
+            self._to.choose(related[-1][0])
         self._related = related
-        change(self._between, disabled=len(related) < 2)
+        change(self._relate, disabled=len(related) < 2)
         self._nominal.offer([(name, name) for name in (session.nominals if session else ())])
 
-    def _ask_fit(self) -> None:
+    def _request_fit(self) -> None:
         with self._lock:
-            region, shape = self._region(), self._tool.name.lower()
+            region, shape = self._region(), cast(Shape, self._tool.name.lower())
         if region is not None:
-            self._stage.operator.measure_shape(self._surface.name, shape, region)
+            self._operator.measure_shape(self._surface.name, shape, region)
 
-    def _ask_compare(self) -> None:
-        units = None if self._units.value == NOT_SAID else self._units.value
+    def _request_comparison(self) -> None:
+        units = None if self._units.value == UNKNOWN else self._units.value
         tolerance = float(self._tolerance.value) or None
-        self._stage.operator.compare_nominal(self._surface.name, self._nominal.value, units, tolerance)
+        self._operator.compare_nominal(self._surface.name, self._nominal.value, units, tolerance)

@@ -1,4 +1,4 @@
-"""Step 3: hold the board where it is asked for, and capture; see at once whether the pose can be used."""
+"""Step 3: hold the board where it is suggested, and capture; each pose is judged at once."""
 
 import time
 from typing import Any
@@ -8,58 +8,51 @@ import viser
 
 from slviewer.calibration.next_pose import GOAL_POSES, Coverage
 from slviewer.gui.import_inputs import ImportInputs
-from slviewer.gui.inputs import Choice, Follows, change
-from slviewer.gui.panel import Stage
-from slviewer.gui.pose_list import PoseBoards, pose_table
-from slviewer.gui.preview import board_words, drawn, legend, light_words
+from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change
+from slviewer.gui.panel import PanelContext, StepPanel
+from slviewer.gui.pose_list import TONES, PoseBoards, pose_table
+from slviewer.gui.preview import board_html, draw_preview, exposure_html, legend
 from slviewer.gui.scene import GHOST
-from slviewer.gui.undelete import Undelete
-from slviewer.gui.widgets import Html, Picture, Sound, Words, block, boxed, cell, thumbnail, toned
+from slviewer.gui.widgets import Html, Picture, Sound, Text, alert, coloured, paragraph, thumbnail, to_html
 from slviewer.target.board import Board
-from slviewer.wizard.snapshot import Foreseen, PoseView, PreviewView, Snapshot
+from slviewer.wizard.snapshot import PoseView, PreviewView, SessionView, Snapshot
 
 LAYER, WORLD = "poses", "board"
-_DRAG_S = 0.15  # between two places that a dragged board is brought to
+_DRAG_S = 0.15  # between two requests while a board is dragged
 _QUIET_S = 1.0  # after which the gizmo follows the board again
-
-
 _COLOURS = ("var(--mantine-color-gray-light)", "var(--mantine-color-green-3)", "var(--mantine-color-green-6)")
-_ARROWS = {"facing": (1, 1, "●"), "top away": (0, 1, "▲"), "right away": (1, 2, "▶"), "bottom away": (2, 1, "▼"),
-           "left away": (1, 0, "◀")}  # fmt: skip
+_TILTS = {(1, 1): "●", (0, 1): "▲", (1, 2): "▶", (2, 1): "▼", (1, 0): "◀"}
+"""Place (row, column) and arrow of each of the coverage's tilts: facing, then the side that is farther away."""
 
 
 def coverage_chart(coverage: Coverage) -> Html:
-    """Three small charts side by side; a field is full once GOAL poses cover it."""
-    image = _grid(coverage.cells, 17, 17)
+    """Three small charts side by side; a field is full once GOAL_POSES poses cover it."""
     depths = "".join(
         f'<div style="display:flex;align-items:center;gap:0.4em">{_field(n, 44, 15)}<span>{name}</span></div>'
         for name, n in zip(("near", "middle", "far"), coverage.depths, strict=True)
     )
     tilts = np.full((3, 3), -1)
-    for (row, column, _), n in zip(_ARROWS.values(), coverage.tilts, strict=True):
-        tilts[row, column] = n
-    arrows = {(row, column): arrow for row, column, arrow in _ARROWS.values()}
-    tilted = _grid(tilts, 17, 17, arrows)
+    for place, n in zip(_TILTS, coverage.tilts, strict=True):
+        tilts[place] = n
     near, far = coverage.range_mm
     charts = "".join(
-        f'<div><div style="color:var(--mantine-color-dimmed);margin-bottom:0.2em">{cell(title)}</div>{chart}</div>'
+        f'<div><div style="color:var(--mantine-color-dimmed);margin-bottom:0.2em">{to_html(title)}</div>{chart}</div>'
         for title, chart in (
-            ("In the image", image),
-            (f"Depth, {near:.0f} to {far:.0f} mm", depths),
-            ("Tilted away", tilted),
+            ("Image", _grid(coverage.cells)),
+            (f"Depth, {near:.0f}–{far:.0f} mm", depths),
+            ("Tilt", _grid(tilts, _TILTS)),
         )
     )
-    share = 100 * coverage.share
-    title = toned(f"Coverage {share:.0f} %", "good" if share > 90 else "plain", bold=True)
-    return block(
+    title = coloured(f"Coverage {100 * coverage.share:.0f} %", "good" if coverage.share > 0.9 else "plain", bold=True)
+    return paragraph(
         Html(f'<div>{title}</div><div style="display:flex;justify-content:space-between;gap:0.8em">{charts}</div>')
     )
 
 
-def _grid(counts: np.ndarray, width: int, height: int, marks: dict[tuple[int, int], str] | None = None) -> str:
+def _grid(counts: np.ndarray, marks: dict[tuple[int, int], str] | None = None) -> str:
     rows = "".join(
         '<div style="display:flex;gap:2px;margin-bottom:2px">'
-        + "".join(_field(n, width, height, (marks or {}).get((i, j), "")) for j, n in enumerate(row))
+        + "".join(_field(n, 17, 17, (marks or {}).get((i, j), "")) for j, n in enumerate(row))
         + "</div>"
         for i, row in enumerate(counts)
     )
@@ -68,80 +61,76 @@ def _grid(counts: np.ndarray, width: int, height: int, marks: dict[tuple[int, in
 
 def _field(count: int, width: int, height: int, mark: str = "") -> str:
     colour = "transparent" if count < 0 else _COLOURS[min(int(count), GOAL_POSES)]
-    style = (
-        f"width:{width}px;height:{height}px;border-radius:2px;background:{colour};font-size:9px;line-height:{height}px"
-    )
-    return f'<div style="{style};text-align:center">{mark}</div>'
+    style = f"width:{width}px;height:{height}px;border-radius:2px;background:{colour};font-size:9px"
+    return f'<div style="{style};line-height:{height}px;text-align:center">{mark}</div>'
 
 
-class Panel:
+class Panel(StepPanel):
     """Target poses."""
 
     key = "poses"
+    layers = (LAYER, WORLD)
 
-    def __init__(self, stage: Stage) -> None:
-        self._stage = stage
+    def __init__(self, context: PanelContext) -> None:
+        super().__init__(context)
         self._board: Board | None = None
-        self._target = ""
         self._states: dict[str, str] = {}
         self._session: Any = None
-        self._counting = False
-        self._dragged = 0.0
-        self._sent = 0.0
+        self._is_counting = False
+        self._dragged = self._sent = 0.0
         self._ghost_px: np.ndarray | None = None
         self._world: np.ndarray | None = None
-        self._latest = ""
+        self._target = self._latest = ""
 
     def build(self) -> None:
-        """Picture, capture, coverage, the poses."""
-        gui, stage = self._stage.gui, self._stage
-        operator = stage.operator
-        self._boards = PoseBoards(stage.scene, LAYER, self._select)
+        gui, context, operator = self._gui, self._context, self._operator
+        self._boards = PoseBoards(context.scene, LAYER, self._select)
         self._picture = Picture(gui)
-        self._counts = Words(gui)
-        self._stands = Words(gui)
-        self._place = gui.add_button("Place at suggestion", icon=viser.Icon.TARGET_ARROW, color="cyan", visible=False)
-        self._place.on_click(stage.safely(operator.place_at_suggestion))
-        self._capture = gui.add_button("Capture pose", icon=viser.Icon.CAMERA, hint="Key: C")
-        self._capture.on_click(stage.safely(operator.capture_pose))
-        self._key = gui.add_command("Capture pose", hotkey="C", icon=viser.Icon.CAMERA, disabled=True)
-        self._key.on_trigger(stage.safely(operator.capture_pose))
-        self._hands_free = gui.add_checkbox("Hands-free", False, hint="Captures when the board is held still")
-        self._follows = Follows(self._hands_free)
-        self._hands_free.on_update(stage.safely_with(self._switch))
-        how = "Hands-free captures by itself when the board is held still; the key C captures too."
-        Words(gui).say(how, "dim")
-        self._foreseen = Words(gui)
-        self._wanted = gui.add_number(
-            "Sigma wanted, mm", 0.0, min=0.0, max=10.0, step=0.001,
-            hint="Poses are asked for until the calibration is predicted to be this sure of points; 0: what usually "
-            "suffices",
+        self._countdown = Text(gui)
+        self._other_object = Text(gui)
+        self._place = context.button(
+            "Place board", operator.place_at_suggestion, viser.Icon.TARGET_ARROW, "cyan", visible=False,
+            hint="Moves the simulated board to the suggested pose",
         )  # fmt: skip
-        self._wants = Follows(self._wanted)
-        self._wanted.on_update(stage.safely_with(self._want))
-        self._coverage = Words(gui)
+        self._capture = context.button("Capture pose", operator.capture_pose, viser.Icon.CAMERA, None, hint="Key: C")
+        self._hotkey = gui.add_command("Capture pose", hotkey="C", icon=viser.Icon.CAMERA, disabled=True)
+        self._hotkey.on_trigger(context.callback(operator.capture_pose))
+        self._hands_free = gui.add_checkbox("Hands-free", False, hint="Captures whenever the board is held still")
+        self._hands_free_value = SessionValue(self._hands_free)
+        self._hands_free.on_update(
+            context.callback(lambda: operator.set_hands_free(bool(self._hands_free.value)), by_user=True)
+        )
+        self._accuracy = Text(gui)
+        self._wanted = gui.add_number(
+            "Sigma, mm", 0.0, min=0.0, max=10.0, step=0.001,
+            hint="Goal: predicted 3D standard deviation at which no further pose is suggested; 0: the default",
+        )  # fmt: skip
+        self._wanted_value = SessionValue(self._wanted)
+        self._wanted.on_update(
+            context.callback(lambda: operator.set_wanted_sigma(float(self._wanted.value) or None), by_user=True)
+        )
+        self._coverage = Text(gui)
         with gui.add_folder("Captured poses"):
-            self._table = Words(gui)
+            self._table = Text(gui)
             self._chosen = Choice(gui, "Pose")
-            self._chosen.on_change(stage.safely(self._another))
-            self._detail = Words(gui)
-            self._acts = gui.add_button_group("This pose", ("Exclude", "Include", "Retake", "Delete"))
-            self._acts.on_click(stage.safely(lambda: self._act(self._acts.value)))
-            self._undelete = Undelete(stage)
-        self._import = ImportInputs(stage, "calibration")
+            self._chosen.on_change(context.callback(self._draw_choice))
+            self._detail = Text(gui)
+            actions = gui.add_button_group("Action", ("Exclude", "Include", "Retake", "Delete"))
+            actions.on_click(context.callback(lambda: self._act(actions.value)))
+            self._restore = RestoreButton(context)
+        self._import = ImportInputs(context, "calibration")
         self._sound = Sound(gui)
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Poses, coverage and the suggestion."""
         session = snapshot.session
         target = session.target if session else ""
         if target != self._target:
             self._target, self._board = target, Board.parse(target) if target else None
             self._world = None
         change(self._capture, disabled=snapshot.rig.state != "open" or self._board is None)
-        change(self._place, visible=snapshot.world is not None)
-        change(self._place, disabled=session is None or session.suggestion is None or session.planning)
-        self._follows.tell(snapshot.hands_free)
+        can_place = session is not None and session.suggestion is not None and session.pending_plan is None
+        change(self._place, visible=snapshot.world is not None, disabled=not can_place)
+        self._hands_free_value.update(snapshot.hands_free)
         self._draw_world(snapshot)
         self._import.draw(snapshot)
         if session is self._session:
@@ -149,107 +138,111 @@ class Panel:
         self._session = session
         poses = session.poses if session else ()
         self._coverage.set(coverage_chart(session.coverage) if session and session.coverage else "")
-        self._draw_foreseen(session.foreseen if session else None)
-        self._draw_ghost(snapshot)
-        self._sound_for(poses, snapshot.hands_free)
+        self._draw_accuracy(session)
+        self._draw_ghost(session)
+        self._play_sound(poses, snapshot.hands_free)
         latest = poses[-1].name if poses else ""
         self._chosen.offer([(pose.name, pose.name) for pose in reversed(poses)])
         if latest and latest != self._latest:
             self._chosen.choose(latest)
         self._latest = latest
         self._table.set(pose_table(poses))
-        self._undelete.offer(session.deleted_poses if session else ())
-        self._boards.draw(poses, self._board, snapshot.rig.camera, self._chosen.value)
-        self._draw_chosen(snapshot)
+        self._restore.offer(session.deleted_poses if session else ())
+        self._draw_choice(snapshot)
 
     def draw_preview(self, preview: PreviewView) -> None:
-        """The board as it is held, and where it should be."""
-        where = toned("Dashed blue: hold the board here", "info") if self._ghost_px is not None else Html("")
+        hint = coloured("Dashed blue: hold the board here", "info") if self._ghost_px is not None else Html("")
         self._picture.set(
-            drawn(preview, self._board, self._ghost_px),
-            legend(preview, board_words(preview, self._board), light_words(preview), where),
+            draw_preview(preview, self._board, self._ghost_px),
+            legend(preview, board_html(preview, self._board), exposure_html(preview), hint),
         )
         count = preview.countdown_s
         if count is None:
-            self._counts.set("")
+            self._countdown.set("")
         else:
-            if not self._counting:
+            if not self._is_counting:
                 self._sound.play("tick")
-            self._counts.set(boxed(Html(f'<b style="font-size:1.3rem">Hold still: {max(count, 0):.1f} s</b>'), "info"))
-        self._counting = count is not None
+            text = to_html(f"Hold still: {max(count, 0):.1f} s")
+            self._countdown.set(alert(Html(f'<b style="font-size:1.3rem">{text}</b>'), "info"))
+        self._is_counting = count is not None
 
-    def shown(self, visible: bool) -> None:
-        """Its boards stand in the scene while it is shown, and its key works."""
-        for layer in (LAYER, WORLD):
-            self._stage.scene.show(layer, visible)
-        self._key.disabled = not visible
+    def show(self, visible: bool) -> None:
+        super().show(visible)
+        self._hotkey.disabled = not visible
         self._session = None
 
     # drawing
 
-    def _draw_foreseen(self, foreseen: Foreseen | None) -> None:
-        if foreseen is not None:
-            self._wants.tell(round(foreseen.wanted_mm, 3))
-        if foreseen is None or foreseen.sigma_mm is None:
-            self._foreseen.set("")
-            return
-        words = f"Predicted sigma {foreseen.sigma_mm:.3f} mm, wanted {foreseen.wanted_mm:.3f} mm"
-        if foreseen.enough:
-            self._foreseen.say(f"{words}: enough. Calibrate.", "good")
+    def _draw_accuracy(self, session: SessionView | None) -> None:
+        if session is None or session.plan is None or session.plan.sigma_mm is None:
+            self._accuracy.set("")
         else:
-            then = "" if foreseen.next_mm is None else f"; {foreseen.next_mm:.3f} mm with the next pose"
-            self._foreseen.say(words + then, "info")
+            plan = session.plan
+            text = f"Predicted sigma {plan.sigma_mm:.3f} mm, goal {session.wanted_mm:.3f} mm"
+            if session.enough:
+                self._accuracy.write(f"{text}: reached.", "good")
+            else:
+                following = f"; {plan.sigma_next_mm:.3f} mm with the next pose" if plan.sigma_next_mm else ""
+                self._accuracy.write(text + following, "info")
+        if session is not None and session.plan is not None:
+            self._wanted_value.update(round(session.wanted_mm, 3))
 
-    def _draw_ghost(self, snapshot: Snapshot) -> None:
-        session = snapshot.session
+    def _draw_ghost(self, session: SessionView | None) -> None:
         suggestion = session.suggestion if session and not session.enough else None
         self._ghost_px = suggestion.outline_px if suggestion else None
         if suggestion is None or self._board is None:
-            self._stage.scene.remove(LAYER, "suggestion")
+            self._scene.remove(LAYER, "suggestion")
         else:
-            self._stage.scene.board(
-                LAYER, "suggestion", suggestion.T_camera_board, self._board.outline(), GHOST, label="hold it here",
-                width_px=4.0,
-            )  # fmt: skip
+            outline = self._board.outline()
+            self._scene.board(
+                LAYER, "suggestion", suggestion.T_camera_board, outline, GHOST, label="next pose", width_px=4.0
+            )
 
     def _draw_world(self, snapshot: Snapshot) -> None:
         """The simulated board and its handle."""
-        world, scene = snapshot.world, self._stage.scene
+        world, scene = snapshot.world, self._scene
         other = "" if world is None or world.standing == "board" else world.standing
-        self._stands.say(other and f"The {other} stands before the rig: place the board at the suggestion.", "warning")
+        self._other_object.write(other and f"In view: the {other}. Place the board first.", "warning")
         if world is None or world.standing != "board" or self._board is None:
             if self._world is not None:
                 scene.clear(WORLD)
                 self._world = None
             return
-        T, middle = world.T_camera_thing, self._middle(self._board)
+        T, centre = world.T_camera_object, self._board_centre(self._board)
         if self._world is None:
             scene.board(WORLD, "board", T, self._board.outline(), (70, 70, 70), width_px=3.0)
-            scene.gizmo(WORLD, "handle", T @ middle, self._drag, self._drop)
+            scene.gizmo(WORLD, "handle", T @ centre, self._drag, self._drop)
         elif not np.array_equal(T, self._world):
             scene.move(WORLD, "board", T)
             if time.monotonic() - self._dragged > _QUIET_S:
-                scene.move(WORLD, "handle", T @ middle)
+                scene.move(WORLD, "handle", T @ centre)
         self._world = T
 
-    def _draw_chosen(self, snapshot: Snapshot) -> None:
+    def _draw_choice(self, snapshot: Snapshot | None = None) -> None:
+        """The chosen pose in full, and all poses in 3D."""
+        snapshot = snapshot or self._operator.snapshot()
+        poses = snapshot.session.poses if snapshot.session else ()
+        self._boards.draw(poses, self._board, snapshot.rig.camera, self._chosen.value)
         pose = snapshot.pose(self._chosen.value)
         if pose is None:
             self._detail.set("")
             return
-        words = [Html(f"<b>{cell(pose.name)}</b>"), toned(pose.state, _tone(pose), bold=True)]
+        lines = [Html(f"<b>{to_html(pose.name)}</b>"), coloured(pose.state, TONES[pose.state], bold=True)]
         if pose.why:
-            words.append(cell(pose.why))
+            lines.append(to_html(pose.why))
         if pose.rms_px is not None:
-            words.append(cell(f"reprojection RMS: camera {pose.rms_px[0]:.3f} px, projector {pose.rms_px[1]:.3f} px"))
+            lines.append(
+                to_html(f"Reprojection RMS: camera {pose.rms_px[0]:.3f} px, projector {pose.rms_px[1]:.3f} px")
+            )
         if pose.T_camera_board is not None:
-            words.append(toned(f"{'' if pose.calibrated else 'about '}{pose.T_camera_board[2, 3]:.0f} mm away", "dim"))
+            about = "" if pose.calibrated else "about "
+            lines.append(coloured(f"Distance {about}{pose.T_camera_board[2, 3]:.0f} mm", "dim"))
         picture = thumbnail(pose.thumbnail, 150, pose.name)
-        text = "".join(f"<div>{word}</div>" for word in words)
-        self._detail.set(block(Html(f'<div style="display:flex;gap:0.8em">{picture}<div>{text}</div></div>')))
+        text = "".join(f"<div>{line}</div>" for line in lines)
+        self._detail.set(paragraph(Html(f'<div style="display:flex;gap:0.8em">{picture}<div>{text}</div></div>')))
 
-    def _sound_for(self, poses: tuple[PoseView, ...], hands_free: bool) -> None:
-        """Tell the operator, whose eyes are on the board, how the last pose ended."""
+    def _play_sound(self, poses: tuple[PoseView, ...], hands_free: bool) -> None:
+        """Signal the result of the last pose to the operator, who is looking at the board."""
         states: dict[str, str] = {pose.name: pose.state for pose in poses}
         if hands_free and self._states:
             news = [state for name, state in states.items() if self._states.get(name, "") != state]
@@ -258,58 +251,41 @@ class Panel:
             elif "good" in news:
                 self._sound.play("good")
             elif "judging" in news:
-                self._sound.play("taken")
+                self._sound.play("captured")
         self._states = states
 
-    # asking
-
-    def _another(self) -> None:
-        snapshot = self._stage.operator.snapshot()
-        self._draw_chosen(snapshot)
-        if snapshot.session is not None:
-            self._boards.draw(snapshot.session.poses, self._board, snapshot.rig.camera, self._chosen.value)
+    # requests
 
     def _select(self, name: str) -> None:
         self._chosen.choose(name)
-        self._draw_chosen(self._stage.operator.snapshot())
+        self._draw_choice()
 
-    def _act(self, what: str) -> None:
-        name, operator = self._chosen.value, self._stage.operator
+    def _act(self, action: str) -> None:
+        name, operator = self._chosen.value, self._operator
         if not name:
-            self._stage.tell("info", "Capture a pose first.")
-            return
-        {
-            "Exclude": operator.exclude,
-            "Include": operator.include,
-            "Retake": operator.retake_pose,
-            "Delete": operator.delete,
-        }[what](name)
+            self._context.notify("info", "Capture a pose first.")
+        elif action == "Exclude":
+            operator.exclude(name)
+        elif action == "Include":
+            operator.include(name)
+        elif action == "Retake":
+            operator.retake_pose(name)
+        else:
+            operator.delete(name)
 
-    def _want(self, event: Any) -> None:
-        if event.client is not None:
-            self._stage.operator.want_sigma(float(self._wanted.value) or None)
-
-    def _switch(self, event: Any) -> None:
-        if event.client is not None:
-            self._stage.operator.set_hands_free(bool(self._hands_free.value))
-
-    def _drag(self, T_camera_middle: np.ndarray) -> None:
+    def _drag(self, T_camera_centre: np.ndarray) -> None:
         self._dragged = time.monotonic()
         if self._dragged - self._sent > _DRAG_S:
             self._sent = self._dragged
-            self._drop(T_camera_middle)
+            self._drop(T_camera_centre)
 
-    def _drop(self, T_camera_middle: np.ndarray) -> None:
+    def _drop(self, T_camera_centre: np.ndarray) -> None:
         if self._board is not None:
-            self._stage.operator.place("board", T_camera_middle @ np.linalg.inv(self._middle(self._board)))
+            self._operator.place("board", T_camera_centre @ np.linalg.inv(self._board_centre(self._board)))
 
     @staticmethod
-    def _middle(board: Board) -> np.ndarray:
-        """T_board_middle (4, 4): the handle stands where a hand would hold the board's centre."""
+    def _board_centre(board: Board) -> np.ndarray:
+        """T_board_centre (4, 4): the handle is at the board's centre."""
         T = np.eye(4)
         T[:3, 3] = board.outline().mean(axis=0)
         return T
-
-
-def _tone(pose: PoseView) -> Any:
-    return {"good": "good", "used": "good", "refused": "error", "left out": "warning"}.get(pose.state, "dim")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slviewer.gui.merge_views import BY_SCAN, BY_SIGMA, OWN, SCAN_COLOURS, merged_drawn
-from slviewer.gui.merge_words import merge_words, named, refusal_words, turn_words
+from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_html, use_labels
+from slviewer.gui.merge_views import BY_SCAN, BY_SIGMA, OWN, SCAN_COLOURS, colour_merge
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
@@ -31,7 +31,7 @@ def test_pairs_loops_and_what_was_left_out_are_told_by_the_operators_names() -> 
         stray={"edges": 5527, "grazing": 0, "unconfirmed": 8},
         shared=0.99,
     )
-    shown = merge_words(merge, LABELS)
+    shown = merge_html(merge, LABELS)
     said = unescape(shown)
     assert "Lion <b>" not in shown and said.index("on Lion <b>") < said.index(
         "on scan_02"
@@ -45,16 +45,18 @@ def test_pairs_loops_and_what_was_left_out_are_told_by_the_operators_names() -> 
         assert words in said, words
     assert "grazing" not in said
     before = MergedPair("scan_02", "scan_01", 0.117, 0.2, None, None, None, 4.46)
-    bare = unescape(merge_words(MergeView("1", "scan_01", ("scan_01", "scan_02"), 10, {}, False, (before,)), LABELS))
+    bare = unescape(merge_html(MergeView("1", "scan_01", ("scan_01", "scan_02"), 10, {}, False, (before,)), LABELS))
     assert "–</td>" in bare and "4.46°" in bare and "Letter" not in bare and "Loop" not in bare
 
 
 def test_names_inside_sentences_and_angles() -> None:
-    assert named("scan_01, scan_100 and scan_10.", LABELS) == "Lion <b>, scan_100 and Tail."
-    assert "Not merged.</b> Lion <b> hangs on nothing" in unescape(refusal_words("scan_01 hangs on nothing", LABELS))
-    turned = unescape(turn_words(["scan_02", "scan_10", "scan_03"], 22.5, LABELS))
+    assert use_labels("scan_01, scan_100 and scan_10.", LABELS) == "Lion <b>, scan_100 and Tail."
+    assert "Not merged.</b> Lion <b> hangs on nothing" in unescape(
+        merge_failure_html("scan_01 hangs on nothing", LABELS)
+    )
+    turned = unescape(turntable_html(["scan_02", "scan_10", "scan_03"], 22.5, LABELS))
     assert "scan_02 at 0°, Tail at 22.5°, Lion, behind at 45°. " in turned
-    assert "a at 0°, b at 30°, c at 60°, …, e at 120°. " in unescape(turn_words(list("abcde"), 30.0, {}))
+    assert "a at 0°, b at 30°, c at 60°, …, e at 120°. " in unescape(turntable_html(list("abcde"), 30.0, {}))
 
 
 def test_merged_points_by_scan_and_by_uncertainty(tmp_path: Path) -> None:
@@ -66,11 +68,11 @@ def test_merged_points_by_scan_and_by_uncertainty(tmp_path: Path) -> None:
         write_ply(store.exports / "merged_2.ply", points)
         for number in ("1", "2"):
             store.save_result(f"merge/{number}", {"ply": f"merged_{number}.ply"}, {})
-        by_scan = merged_drawn(store, "1", BY_SCAN, ["a", "b", "<c>"])
+        by_scan = colour_merge(store, "1", BY_SCAN, ["a", "b", "<c>"])
         assert by_scan.clouds["merged"][1][3].tolist() == list(SCAN_COLOURS[2]) and "<c>" in unescape(by_scan.legend)
-        by_sigma = merged_drawn(store, "1", BY_SIGMA, [])
+        by_sigma = colour_merge(store, "1", BY_SIGMA, [])
         assert by_sigma.clouds["merged"][1][3].tolist() == [128, 128, 128]
         assert "0.010 mm" in unescape(by_sigma.legend) and "grey where it is not known" in by_sigma.legend
-        assert merged_drawn(store, "1", OWN, []).clouds["merged"][1][1].tolist() == [20, 20, 20]
-        assert "merge again" in merged_drawn(store, "2", BY_SCAN, []).legend
+        assert colour_merge(store, "1", OWN, []).clouds["merged"][1][1].tolist() == [20, 20, 20]
+        assert "merge again" in colour_merge(store, "2", BY_SCAN, []).legend
         assert by_sigma.points.shape == (4, 3) and by_sigma.about == by_scan.about

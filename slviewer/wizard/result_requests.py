@@ -1,0 +1,137 @@
+"""Requests to calibrate, verify, reconstruct and export, and to choose what results are made from."""
+
+from collections.abc import Sequence
+from functools import partial
+
+from slviewer.errors import InputError
+from slviewer.pipeline.calibrate import CalibrationResult
+from slviewer.pipeline.export import FORMATS, What, check_export
+from slviewer.pipeline.models import available, check_accepted, insist, insisted
+from slviewer.pipeline.verify import Shape
+from slviewer.surface.meshing import MeshingPlan
+from slviewer.wizard import diagnostics, tasks
+from slviewer.wizard.export_files import export_file
+from slviewer.wizard.requests import RequestHandler, request
+
+
+class ResultRequests(RequestHandler):
+    """What the worker computes from captures, and decisions about poses, scans and models."""
+
+    @request("Excluding the pose")
+    def exclude(self, name: str, why: str = "by hand") -> None:
+        """Exclude a pose from calibrations."""
+        self._engine.store.exclude(name, why)
+
+    @request("Including the pose")
+    def include(self, name: str) -> None:
+        """Include an excluded pose again."""
+        self._engine.store.include(name)
+
+    @request("Deleting")
+    def delete(self, name: str) -> None:
+        """Move a capture, and its own results, to the session's trash."""
+        store = self._engine.store
+        store.trash_capture(name)
+        store.include(name)
+        for kind in ("poses", "clouds", "verify", "trust"):
+            if store.state_of(f"{kind}/{name}") != "absent":
+                store.trash_result(f"{kind}/{name}")
+
+    @request("Restoring")
+    def undelete(self, name: str) -> None:
+        """Restore a deleted capture from the trash; its results are computed again."""
+        self._engine.reprocess(self._engine.store.restore_capture(name))
+
+    @request("Renaming")
+    def rename(self, name: str, label: str) -> None:
+        """Give a capture a label, any text; its files keep their name."""
+        store = self._engine.store
+        store.load_capture(name)
+        store.decide("names", {**(store.decision("names") or {}), name: label.strip() or name})
+
+    @request("Calibrating")
+    def calibrate(self) -> None:
+        """Calibrate from the poses that are not excluded."""
+        engine, target = self._engine, self._engine.reader.target()
+        if not target:
+            raise InputError("choose the target first")
+        calibrate = partial(tasks.calibrate_session, engine.store, target, warn=self._warn)
+
+        def done(result: CalibrationResult) -> None:
+            engine.notices.add(*tasks.describe_calibration(result))
+            engine.publisher.mark_changed(session=True)
+
+        def failed(error: BaseException) -> None:
+            engine.notices.add_failure("Calibrating", error)
+            engine.publisher.mark_changed(session=True)  # a rejected calibration is saved, to be inspected
+
+        engine.jobs.submit("Calibrating", calibrate, done, failed=failed)
+
+    @request("Comparing the models")
+    def compare_models(self) -> None:
+        """Measure each target pose by calibrations made without it; the best model is then recommended, and used."""
+        compare = partial(tasks.compare_models, self._engine.store, warn=self._warn)
+        self._submit("Comparing the models", compare, tasks.describe_comparison)
+
+    @request("Choosing the model")
+    def choose_model(self, name: str) -> None:
+        """Use this model from now on; empty: the recommended one."""
+        store = self._engine.store
+        if name and name not in (models := available(store)):
+            raise InputError(f"the session has no {name} calibration: choose one of {', '.join(models)}")
+        store.decide("model", name or None)
+
+    @request("Using the rejected calibration")
+    def accept_rejected_calibration(self, on: bool) -> None:
+        """Use the current calibration although it was rejected, or no longer do."""
+        insist(self._engine.store, on)
+
+    @request("Verifying")
+    def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
+        """Compare the models on captures of a plane or a sphere; a rough `radius_mm` helps to detect a sphere."""
+        store = self._engine.store
+        chosen = [store.load_capture(name).name for name in names]
+        verify = partial(tasks.verify_captures, store, chosen, shape, radius_mm, warn=self._warn)
+        self._submit("Verifying", verify, tasks.describe_verifications)
+
+    @request("Reconstructing")
+    def reconstruct(self, name: str, model: str | None = None) -> None:
+        """Reconstruct a capture, by the best model unless one is named."""
+        store = self._engine.store
+        store.load_capture(name)
+        reconstruct = partial(tasks.reconstruct_capture, store, name, model, warn=self._warn)
+        self._submit("Reconstructing", reconstruct, lambda points: f"{name}: {points:,} points")
+
+    @request("Exporting")
+    def export(self, what: What, name: str = "", file_format: str = "", plan: MeshingPlan | None = None) -> None:
+        """Write a file into the session's exports. `export.FORMATS` lists what can be exported and the formats, the
+        first is the default. `name`: the scan of a cloud or a mesh, the model of coefficients; a merge is the current
+        one. `plan`: how to mesh.
+        """
+        store, view = self._engine.store, self._engine.publisher.refresh().session
+        chosen = file_format or FORMATS.get(what, ("",))[0]
+        check_export(what, chosen)
+        if what not in ("report", "table"):
+            check_accepted(store, insisted(store))
+        if what in ("cloud", "mesh"):
+            store.load_capture(name)
+        if what in ("merge", "merged-mesh"):
+            if view is None or view.merge is None:
+                raise InputError("there is no merge yet: merge scans first")
+            name = view.merge.name
+        self._submit("Exporting", partial(export_file, store, what, name, chosen, plan, warn=self._warn), str)
+
+    def report(self) -> bool:
+        """Write the HTML report into the exports."""
+        return self.export("report")
+
+    @request("Collecting diagnostics")
+    def diagnostic_bundle(self) -> None:
+        """Write a zip with versions, settings, logs and small previews, without frames, into the exports."""
+        engine = self._engine
+        store, snapshot = engine.store, engine.publisher.refresh()
+        self._submit(
+            "Collecting diagnostics",
+            lambda report: diagnostics.write_bundle(store, snapshot, engine.preview, engine.log, report),
+            lambda file_name: f"{file_name} is ready to download",
+        )
