@@ -44,16 +44,16 @@ def test_an_uploaded_zip_becomes_poses(opened: Opened, operator: Operator) -> No
     button(page, "3. Poses").click()
     page.get_by_text("Import captures", exact=True).click()
     choose(page, "Layout", "procam-calibration")
-    expect(page.get_by_text("Empty: 1024x768, as this layout has it.")).to_be_visible()
+    expect(page.get_by_text("Default size: 1024x768, of this layout.")).to_be_visible()
     field(page, "Projector").fill("120x90")
     page.wait_for_timeout(1200)  # an input is entered once nobody types
     for name, content in (("broken.zip", b"no zip"), ("set.zip", zip_of_captures())):
         with page.expect_file_chooser() as chooser:
-            button(page, "Upload a zip").click()
+            button(page, "Upload zip").click()
         chooser.value.set_files({"name": name, "mimeType": "application/zip", "buffer": content})
         if name == "broken.zip":
             expect(page.get_by_text(re.compile("the file is no zip")).first).to_be_visible()
-            expect(button(page, "Upload a zip")).to_be_enabled()
+            expect(button(page, "Upload zip")).to_be_enabled()
     expect(page.get_by_text("1 capture imported: capture_0").first).to_be_visible(timeout=PATIENCE_MS)
     expect(page.get_by_text(re.compile("not imported: capture_1: it lacks graycode_04")).first).to_be_visible()
     expect(page.get_by_text(re.compile("notes.txt in the zip")).first).to_be_visible()

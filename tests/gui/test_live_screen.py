@@ -42,8 +42,8 @@ def test_live_clouds_are_seen_kept_and_ended(browser: Browser, app: App) -> None
     button(page, "6. Scan").click()
     button(page, "Live").click()
     expect(page.get_by_text("clouds/s").first).to_be_visible(timeout=COMPILED_MS)
-    expect(page.get_by_text("nothing is saved yet")).to_be_visible()
-    button(page, "Keep this one").click()
+    expect(page.get_by_text("Nothing is saved yet")).to_be_visible()
+    button(page, "Save cloud").click()
     expect(page.get_by_text("scan_01").first).to_be_visible()
     assert app.operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, COMPILED_MS / 1000)
     app.shell.go("merge")  # to leave the step ends it

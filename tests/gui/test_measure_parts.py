@@ -7,7 +7,7 @@ import pytest
 
 from slviewer.gui.measure_drawing import drawn, format_quantity, label, lifted
 from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table, verdict_html
-from slviewer.gui.measure_section import cursor_html, placed, section_figure
+from slviewer.gui.measure_section import cursor_html, cursor_points, section_figure
 from slviewer.gui.measure_surface import painting
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
 from slviewer.inspection.features import Feature
@@ -37,25 +37,25 @@ POINT = made("point", [Quantity("x", -0.00001, "mm")], feature=to_plain(Feature(
 
 
 def text(html: str) -> str:
-    return re.sub(r"&#(\d+);", lambda m: chr(int(m[1])), html).replace("\u2060", "")
+    return re.sub(r"&#(\d+);", lambda m: chr(int(m[1])), html).replace("\u2060", "").replace("\xa0", " ")
 
 
 def test_every_tool_says_what_to_do_and_ends_with_what_it_needs() -> None:
     tool = Tool()
-    assert tool.sentence == "Choose a tool." and not tool.clicks
+    assert tool.instruction == "Choose a tool." and not tool.clicks
     for name in (*PICK, *FIT, *COMPARE):
-        tool.take(name)
-        assert tool.sentence[0].isupper() and tool.sentence.endswith(".")
+        tool.select(name)
+        assert tool.instruction[0].isupper() and tool.instruction.endswith(".")
         assert tool.clicks == (name not in COMPARE)
-    tool.take("Distance")
-    assert tool.pick((1, 2)) is None and "second" in tool.sentence
-    assert tool.pick((3, 4)) == ((1, 2), (3, 4)) and "first" in tool.sentence  # ready for the next distance
-    tool.take("Point")
+    tool.select("Distance")
+    assert tool.pick((1, 2)) is None and "second" in tool.instruction
+    assert tool.pick((3, 4)) == ((1, 2), (3, 4)) and "first" in tool.instruction  # ready for the next distance
+    tool.select("Point")
     assert tool.pick(7) == (7,)
-    tool.take("Sphere")
+    tool.select("Sphere")
     assert tool.pick((1, 2)) is None and tool.pick((5, 6)) is None and tool.picked == [(5, 6)]
-    assert "press Fit sphere" in tool.sentence
-    tool.take("")
+    assert "press Fit sphere" in tool.instruction
+    tool.select("")
     assert tool.picked == []
 
 
@@ -84,15 +84,15 @@ def test_a_section_is_read_off_at_its_cursors() -> None:
     plane = CutPlane.through(np.array([0.0, 0, 500]), np.array([100.0, 0, 500]), np.array([0.0, 0, -1]))
     t = np.linspace(0, np.pi, 721)
     arc = np.stack([50 - 50 * np.cos(t), 50 * np.sin(t)], axis=1)
-    cursors = placed([arc], (10.0, 90.0, 50.0))
+    cursors = cursor_points([arc], (10.0, 90.0, 50.0))
     assert cursors[:, 1] == pytest.approx([30, 30, 50], abs=1e-3)
     assert np.allclose(lifted(plane, cursors), [[10, 0, 470], [90, 0, 470], [50, 0, 450]], atol=1e-3)
     words = text(cursor_html(cursors))
     assert "80.000 mm" in words and "50.000 mm" in words and "0.000 mm" in words
     assert "straight line" in text(cursor_html(np.array([[0.0, 0], [2, 0], [1, 0]])))
-    assert "drawn alike" in section_figure("s", [arc], cursors).caption
+    assert "equal scales" in section_figure("s", [arc], cursors).caption
     flat = arc * [1, 0.01]
-    assert "larger than lengths" in section_figure("s", [flat], placed([flat], (10.0, 90.0, 50.0))).caption
+    assert "heights are enlarged" in section_figure("s", [flat], cursor_points([flat], (10.0, 90.0, 50.0))).caption
     cut = made("section", [], plane=to_plain(plane))
     segments, place = drawn(cut, {}, [arc])  # type: ignore[misc]
     assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(449)  # the highest point, a little off
@@ -104,14 +104,14 @@ def test_words_of_measurements() -> None:
     assert format_quantity(Quantity("angle", 90.0, "deg", 0.01, whole=False)) == "90.000 ± 0.020°*"
     full = text(measurement_html(SPHERE, {"scan_01": "Lion <i>"}))
     assert "25.000 ± 0.020 mm*" in full and "It is rough." in full and "on Lion <i>" in full
-    assert "<b>sphere" not in measurement_html(SPHERE, {}) and "does not know" in full
+    assert "<b>sphere" not in measurement_html(SPHERE, {}) and "unknown part of the calibration" in full
     stale = made("point", [Quantity("x", 1.0, "mm")], stale=True)
     listed = text(measurements_table([SPHERE, stale], "", {}))
     assert listed.index("point on scan_01, stale") < listed.index("sphere on scan_01")
     statistics = {"points": 900, "left_out": 100}
     verdict = {"tolerance_mm": 0.1, "decision": "undecided", "U_mm": 0.02, "inside": 90.0, "close": 9.0, "outside": 1.0}
     told = text(verdict_html({"verdict": verdict, "statistics_mm": statistics, "reach_mm": 2.0}))
-    assert "Tolerance ± 0.1 mm: too close to tell" in told and "10.0 % lie farther than 2 mm" in told
+    assert "Tolerance ± 0.1 mm: too close to tell" in told and "10.0 % excluded: beyond 2 mm" in told
     edges = np.linspace(-0.2, 0.2, 9)
     assert deviation_figure("d", edges, np.arange(8), 0.1, 0.1).png.startswith(b"\x89PNG")
 

@@ -14,9 +14,10 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page, expect
 from playwright.sync_api import TimeoutError as NotShownError
-from wizard_page import SIZE, Opened, button, field
+from wizard_page import SIZE, Opened, button, cut_labels, field
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
+from slviewer.evaluation.crossvalidation import CrossValidation, HeldOut
 from slviewer.gui.app import App
 from slviewer.gui.calibration_html import comparison_table, named_poses, verdict_html
 from slviewer.gui.inputs import display_name
@@ -31,7 +32,7 @@ from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import ScanCloud
-from slviewer.wizard.snapshot import CentreDistance, ComparisonView, ModelFigures, ScanView, VerificationRow
+from slviewer.wizard.snapshot import CentreDistance, ScanView, VerificationRow
 
 REJECTED = Verdict.of(
     [Finding("moved", "rejected", "pose_03 moved by 0.9 px", "hold the <b>board</b> still", ("pose_03",))]
@@ -66,26 +67,26 @@ def choose(page: Page, label: str, option: str) -> None:
 def test_a_calibration_shows_its_poses_and_what_a_pixel_learnt(measured: tuple[Page, Operator, list[str]]) -> None:
     page, _, errors = measured
     button(page, "4. Calibrate").click()
-    expect(page.get_by_text("reprojection RMS, camera")).to_be_visible()
+    expect(page.get_by_text("Reprojection RMS, camera")).to_be_visible()
     expect(page.get_by_text("Reprojection error of each target pose.")).to_be_visible()
     choose(page, "Pose", "pose_02")
     expect(page.get_by_text("pose_02, camera: measured minus predicted features")).to_be_visible()
-    choose(page, "Arrows of", "projector")
+    choose(page, "Residuals", "projector")
     expect(page.get_by_text("pose_02, projector: measured minus predicted features")).to_be_visible()
     expect(page.get_by_text(re.compile(r"What camera pixel \(\d+, \d+\) learnt from"))).to_be_visible()
-    field(page, "Pixel column u").fill("150")
-    field(page, "Pixel row v").fill("120")
+    field(page, "Pixel u").fill("150")
+    field(page, "Pixel v").fill("120")
     expect(page.get_by_text("What camera pixel (150, 120) learnt from")).to_be_visible()
-    field(page, "Pixel row v").fill("0")
-    expect(page.get_by_text("Pixel (150, 0) saw the board too rarely")).to_be_visible()
+    field(page, "Pixel v").fill("0")
+    expect(page.get_by_text("Pixel (150, 0) saw the board in too few poses")).to_be_visible()
 
     button(page, "Exclude pose_02").click()
     expect(button(page, "Include pose_02 again")).to_be_visible()
-    expect(page.get_by_text("It is excluded now").first).to_be_visible()
+    expect(page.get_by_text("Excluded since").first).to_be_visible()
     button(page, "Include pose_02 again").click()
     expect(button(page, "Exclude pose_02")).to_be_visible()
     page.get_by_text("Parameters", exact=True).click()
-    expect(page.get_by_text("angle between the optical axes")).to_be_visible()
+    expect(page.get_by_text("Angle between the axes")).to_be_visible()
     assert errors == []
 
 
@@ -95,21 +96,21 @@ def test_models_are_compared_on_request_and_the_comparison_can_be_cancelled(
     page, engine, errors = measured
     button(page, "4. Calibrate").click()
     button(page, "Compare models").click()
-    again = button(page, "Compare models again")
+    again = button(page, "Compare again")
     expect(again).to_be_enabled(timeout=90_000)
     expect(page.get_by_text("pixelwise is recommended").first).to_be_visible()
     session = engine.snapshot().session
     assert session is not None and session.calibration is not None
     compared = session.calibration.comparison
-    assert compared is not None and compared.poses == 8 and not compared.failed
-    rms = {each.model: each.plane_mm for each in compared.models}
+    assert compared is not None and len(compared.poses["stereo"]) == 8 and not compared.failed
+    rms = {model: compared.rms(model, "plane_mm") for model in compared.models}
     assert 0.01 < rms["pixelwise"] < rms["stereo"] < 1
 
     again.click()
     button(page, "Cancel").click()
     expect(page.get_by_text("Comparing the models: cancelled").first).to_be_visible()
     expect(again).to_be_enabled()
-    assert engine.wait_until_idle().session.calibration.comparison == compared  # type: ignore[union-attr]
+    assert engine.wait_until_idle().calibration.comparison == compared  # type: ignore[union-attr]
     assert errors == []
 
 
@@ -117,13 +118,13 @@ def test_a_plane_is_measured_and_its_table_written(measured: tuple[Page, Operato
     page, _, errors = measured
     button(page, "5. Verify").click()
     choose(page, "Capture", "plane_03")
-    button(page, "Measure as plane").click()
+    button(page, "Measure plane").click()
     expect(page.get_by_text("errors on one colour scale, red is towards the camera")).to_be_visible(timeout=40_000)
     choose(page, "Capture", "sphere_3")
-    button(page, "Measure as sphere").click()
+    button(page, "Measure sphere").click()
     expect(page.get_by_text("errors on one colour scale, red is outwards")).to_be_visible(timeout=40_000)
-    expect(page.get_by_text("error by pixelwise, red is outwards")).to_be_visible()
-    button(page, "Write table as CSV").click()
+    expect(page.get_by_text("error of pixelwise; red is outwards")).to_be_visible()
+    button(page, "Write CSV").click()
     with page.expect_download() as download:
         page.get_by_text("Download verifications.csv").click()
     lines = Path(download.value.path()).read_text().splitlines()
@@ -133,17 +134,17 @@ def test_a_plane_is_measured_and_its_table_written(measured: tuple[Page, Operato
 
 def pick_two_places(page: Page) -> None:
     """A place on the scan, to the left, and one on the reference beside it; then take them back."""
-    choose(page, "Begin", "by points that I pick")
-    none = page.get_by_text(re.compile("^Pair 1: click a place on"))
+    choose(page, "Start from", "picked points")
+    none = page.get_by_text(re.compile("^Pair 1: click a point on"))
     expect(none).to_be_visible()
     expect(button(page, "Merge 2 scans")).to_be_disabled()
     # until the two stand side by side, the reference may be where the scan will be: only the answer tells them apart
-    click_until(page, (385, 400), re.compile(r"now click the same place on .* on the right\.$"))
+    click_until(page, (385, 400), re.compile(r"click the same point on .* on the right\.$"))
     click_until(page, (640, 400), re.compile("^[1-9] of 3 pairs picked"))
     while not none.is_visible():  # a click that was sent twice has begun another pair
         said = page.get_by_text(re.compile(r"^(Pair \d|\d pairs): "))
         before = said.inner_text()
-        button(page, "Undo last pair").click()
+        button(page, "Undo last point").click()
         expect(said).not_to_have_text(before)
     expect(page.get_by_text("0 of 3 pairs picked")).to_be_visible()
 
@@ -157,31 +158,31 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
         choose(page, "Scan", name)
         button(page, "Reconstruct").click()
         assert operator.wait_for(lambda s, name=name: s.scan(name).cloud == "fresh", 40.0)  # type: ignore[misc]
-    expect(page.get_by_text(re.compile("points drawn; the file holds all"))).to_be_visible()
-    button(page, "Bring into view").click()
-    choose(page, "Colour by", "depth")
+    expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
+    button(page, "Zoom to fit").click()
+    choose(page, "Colour", "depth")
     expect(page.get_by_text(re.compile(r"^\d+\.\d mm$")).first).to_be_visible()
-    click_until(page, (590, 420), "absolute phase, axis x")  # right of where notifications stand
+    click_until(page, (590, 420), "Phase, axis x")  # right of where notifications stand
     field(page, "New name").fill("Lion <b>1</b>")
     button(page, "Rename scan").click()
     expect(page.get_by_text("Lion <b>1</b> (object_r2)").first).to_be_visible()
 
     button(page, "7. Merge").click()
-    choose(page, "Begin", "on a turntable")
+    choose(page, "Start from", "turntable")
     expect(page.get_by_text(re.compile(r"object_r1 at 0°, Lion <b>1</b> at 30°"))).to_be_visible()
-    choose(page, "Begin", "as they lie")
+    choose(page, "Start from", "current position")
     button(page, "Merge 2 scans").click()
     expect(page.get_by_text("Not merged.")).to_be_visible(timeout=60_000)
-    expect(page.get_by_text("Or begin by their shapes, or by points that you pick.").first).to_be_visible()
+    expect(page.get_by_text("Or use the initial alignment by features, or by picked points.").first).to_be_visible()
     pick_two_places(page)
-    choose(page, "Begin", "by their shapes")
+    choose(page, "Start from", "features")
     button(page, "Merge 2 scans").click()
-    expect(page.get_by_text(re.compile("in the place of"))).to_be_visible(timeout=60_000)
-    expect(page.get_by_text(re.compile(r"^± 0\.0\d+ mm"))).to_be_visible()
+    expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible(timeout=60_000)
+    expect(page.get_by_text(re.compile(r"^0\.0\d+ mm"))).to_be_visible()
     expect(page.get_by_text("Not merged.")).to_be_hidden()
-    choose(page, "Show in 3D", "merged points by uncertainty")
-    expect(page.get_by_text("expected error along the normal (1 sigma)")).to_be_visible()
-    choose(page, "Show in 3D", "before, coloured by scan")
+    choose(page, "3D view", "merged, uncertainty")
+    expect(page.get_by_text("uncertainty along the normal (1 sigma)")).to_be_visible()
+    choose(page, "3D view", "scans, as captured")
 
     page.get_by_role("button", name=re.compile(r"^\d+\. Export")).click()
     with page.expect_download() as download:
@@ -191,14 +192,14 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     snapshot = operator.snapshot()
     assert snapshot.session is not None and snapshot.session.merge is not None
     assert len(merged.points) == snapshot.session.merge.points and np.isfinite(merged.points).all()
-    choose(page, "Of", "Lion <b>1</b> (object_r2)")
-    choose(page, "As", "mesh")
+    choose(page, "Source", "Lion <b>1</b> (object_r2)")
+    choose(page, "Type", "mesh")
     choose(page, "File type", "GLB")
-    expect(page.get_by_text(re.compile(r"In metres, as glTF demands.*About \d"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"Unit: metres, as glTF demands.*About \d"))).to_be_visible()
     choose(page, "Smoothing", "light")
     field(page, "Triangles").fill("6000")
     field(page, "Triangles").press("Tab")
-    expect(page.get_by_text(re.compile(r"In metres.*About 0\.2 MB"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"Unit: metres.*About 0\.2 MB"))).to_be_visible()
     button(page, "Write file").click()
     with page.expect_download() as download:
         page.get_by_role("link", name="Download object_r2_mesh.glb").click(timeout=40_000)
@@ -210,7 +211,7 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     ).to_be_visible()
     button(page, "Write calibration").click()
     expect(page.get_by_text("calibration.yml").first).to_be_visible()
-    choose(page, "What", "poses")
+    choose(page, "Content", "poses")
     choose(page, "Format", "JSON")
     button(page, "Write poses").click()
     with page.expect_download() as download:
@@ -219,8 +220,8 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     assert len(poses["targets"]) == 8 and len(poses["merges"][0]["scans"]) == 2
 
     button(page, "7. Merge").click()
-    button(page, "Undo this merge").click()
-    expect(button(page, "Undo this merge")).to_be_hidden()
+    button(page, "Undo merge").click()
+    expect(button(page, "Undo merge")).to_be_hidden()
     assert errors == []
 
 
@@ -233,7 +234,7 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
             assert operator.reconstruct(name)
     operator.wait_until_idle(60)
     button(page, "8. Measure").click()
-    choose(page, "Measure on", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
+    choose(page, "Surface", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
     tool(page, "Distance", "Click the first point.")
     click_until(page, (480, 440), "Click the second point.")
     page.keyboard.press("Escape")
@@ -245,16 +246,16 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
     assert width.kind == "distance" and 5 < quantities_of(width)[0].value < 140
     expect(page.get_by_text(re.compile(rf"{quantities_of(width)[0].value:.3f} ± 0\.\d+ mm")).first).to_be_visible()
 
-    tool(page, "Section", "Click where the cut begins.")
+    tool(page, "Section", "Click the start of the section.")
     page.mouse.click(480, 440)
-    page.get_by_text("Click where it ends").wait_for()
+    page.get_by_text("Click the end of the section").wait_for()
     page.mouse.click(590, 420)
     came(operator, 2)
     expect(page.get_by_text("height difference A – B")).to_be_visible()
-    expect(page.get_by_text("radius through A, C, B")).to_be_visible()
+    expect(page.get_by_text("Radius through A, C, B")).to_be_visible()
 
-    choose(page, "Measure on", "sphere_3")
-    tool(page, "Sphere", "Click the middle of the sphere.")
+    choose(page, "Surface", "sphere_3")
+    tool(page, "Sphere", "Click the centre of the sphere.")
     click_until(page, (540, 400), "points in the ball")
     button(page, "Fit sphere").click()
     radius = quantities_of(came(operator, 3))[0]
@@ -263,23 +264,23 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
     page.get_by_role("button", name="Rename", exact=True).click()
     expect(page.get_by_text("Ball <i>").first).to_be_visible()
 
-    tool(page, "Nominal model", "Upload the model")
-    choose(page, "Measure on", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
+    tool(page, "Deviation", "Choose or upload a nominal model")
+    choose(page, "Surface", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
     with page.expect_file_chooser() as chooser:
-        button(page, "Upload nominal model").click()
+        button(page, "Upload model").click()
     chooser.value.set_files(asset("objects/ammonite.ply"))
-    field(page, "Limit ±, mm").fill("1.5")
+    field(page, "Tolerance ±, mm").fill("1.5")
     expect(button(page, "Compare")).to_be_enabled()
     button(page, "Compare").click()
     found = came(operator, 4).data
     assert found["verdict"]["decision"] == "pass" and 0.01 < found["statistics_mm"]["rms"] < 0.5
     expect(page.get_by_text("Tolerance ± 1.5 mm: pass").first).to_be_visible()
-    expect(page.get_by_text("How many of the points lie how far off the nominal.")).to_be_visible()
+    expect(page.get_by_text("Histogram of the deviations.")).to_be_visible()
 
-    button(page, "Delete measurement").click()
-    button(page, "Bring deleted back").click()
+    button(page, "Delete result").click()
+    button(page, "Restore deleted").click()
     came(operator, 4)
-    button(page, "Write table as CSV").click()
+    button(page, "Write CSV").click()
     with page.expect_download() as download:
         page.get_by_text("Download measurements.csv").click(timeout=40_000)
     rows = list(csv.DictReader(Path(download.value.path()).read_text("utf-8-sig").splitlines()))
@@ -325,32 +326,42 @@ def test_a_rejected_calibration_says_why_and_is_used_only_where_one_insists(
     store = operator.session
     assert store is not None
     button(page, "4. Calibrate").click()
-    expect(page.get_by_text("nothing that was seen speaks against this calibration")).to_be_visible()
-    choose(page, "Measure with", "stereo")
-    expect(page.get_by_text("stereo is used, as you have chosen; pixelwise is recommended")).to_be_visible()
+    expect(page.get_by_text("no problems detected")).to_be_visible()
+    choose(page, "Model", "stereo")
+    expect(page.get_by_text("stereo is used (your choice); pixelwise is recommended")).to_be_visible()
     meta, arrays = store.load_result("calibration/stereo")
     meta = {key: value for key, value in meta.items() if key not in ("hash", "arrays")}
     store.save_result("calibration/stereo", {**meta, "verdict": REJECTED.to_json()}, arrays)
     save_verdict(store, REJECTED, ["pose_03"])
     assert operator.choose_model("")
-    expect(page.get_by_text("do not measure with this")).to_be_visible()
+    expect(page.get_by_text("do not measure with it")).to_be_visible()
     expect(page.get_by_text("Hold the <b>board</b> still.")).to_be_visible()
     button(page, "pose_03").click()
     expect(page.get_by_text(re.compile("pose_03, .*: measured minus predicted features"))).to_be_visible()
     button(page, "6. Scan").click()
     expect(page.get_by_text("The calibration was rejected: pose_03 moved by 0.9 px").first).to_be_visible()
     button(page, "4. Calibrate").click()
-    page.get_by_label("Use it anyway").check()
+    page.get_by_label("Accept anyway").check()
     assert operator.wait_for(lambda s: s.step("scan").state != "blocked", 10.0)
     assert errors == []
 
 
+def test_no_label_is_cut_at_1280_by_800(measured: tuple[Page, Operator, list[str]]) -> None:
+    page, operator, _ = measured
+    assert page.viewport_size == SIZE
+    for number, step in enumerate(operator.snapshot().steps, 1):
+        button(page, f"{number}. {step.title}").click()
+        expect(page.get_by_text(step.instruction).first).to_be_visible()
+        page.wait_for_timeout(300)
+        assert cut_labels(page) == [], step.title
+
+
 def test_words_of_a_calibration() -> None:
-    rows = tuple(ModelFigures(m, p, 2 * p, 9.0, p, p) for m, p in (("stereo", 0.2), ("splined", 0.02)))
-    html = comparison_table(ComparisonView(rows, 8, 5, {"pixelwise": "too <few> poses"}), "splined")
+    poses = {m: {"pose_1": HeldOut(p, 2 * p, 9.0, p, p)} for m, p in (("stereo", 0.2), ("splined", 0.02))}
+    html = comparison_table(CrossValidation(poses, (("pose_1",),), {"pixelwise": "too <few> poses"}), "splined")
     assert re.search(r"font-weight:600\">0&#46;020", html) and "<few>" not in html and html.index("stereo") > 0
     assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_html(REJECTED, True, None)
-    assert "Nothing came" in verdict_html(REJECTED, False, None)
+    assert "gave no calibration" in verdict_html(REJECTED, False, None)
 
 
 def test_a_painter_draws_the_last_wish_and_survives_failures() -> None:
@@ -410,7 +421,7 @@ def test_a_cloud_is_painted_by_what_is_asked() -> None:
     noisy = replace(cloud, sigma_z=3 * flat, sigma_calibration=4 * flat)
     np.testing.assert_allclose(uncertainty(noisy)[1:, 1:], 5.0)
     assert "5&#46;000" in painting(noisy, "uncertainty")[1] and "5&#46;000" in point_html(noisy, 4, 2)
-    assert "noise alone" in painting(cloud, "uncertainty")[1].replace("&#32;", " ")
+    assert "noise only" in painting(cloud, "uncertainty")[1].replace("&#32;", " ")
     assert painting(cloud, "texture")[0][0, 0].tolist() == [7, 7, 7]
     assert "measure this capture" in painting(cloud, "error")[1].replace("&#32;", " ")
     assert "600&#46;000" in point_html(cloud, 4, 2)

@@ -54,12 +54,12 @@ def test_a_network_camera_and_a_browser_capture_what_is_projected(browser: Brows
         try:
             page.goto(app.server.url)
             button(page, "1. Rig").click()
-            choose(page, "Rig", "A camera and a projector …")
+            choose(page, "Rig", "Custom …")
             expect(page.get_by_text("Projector page: waiting for the page")).to_be_visible()
             assert app.server.access.token not in page.content()  # whoever only watches reads this too
             projector.goto(app.server.link("/projector"))
             expect(page.get_by_text("Projector page: ready 320 x 240")).to_be_visible()
-            field(page, "Which").fill(camera.url)
+            field(page, "Camera ID").fill(camera.url)
             page.wait_for_timeout(500)
             button(page, "Use these devices").click()
             watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
@@ -109,6 +109,6 @@ def test_a_rig_that_is_refused_leaves_the_one_in_use(opened: Opened, operator: O
     for _ in range(2):  # it can be tried again
         choose(page, "Rig", "gone")
         expect(page.get_by_text("no.avi does not exist").first).to_be_visible()
-        expect(field(page, "Rig")).to_have_value("Simulated, quarter resolution")
+        expect(field(page, "Rig")).to_have_value("Simulated, quarter size")
     assert sum("does not exist" in notice.text for notice in operator.snapshot().notices) == 2
     assert operator.snapshot().rig.state == "open"

@@ -20,10 +20,10 @@ def test_from_the_link_to_a_pose_that_a_reload_keeps(opened: Opened, operator: O
 
     button(page, "2. Target").click()
     button(page, "Use this board").click()
-    expect(page.get_by_text("in use: circles:21x16:9")).to_be_visible()
+    expect(page.get_by_text("In use: circles:21x16:9")).to_be_visible()
     button(page, "Continue to Poses").click()
-    expect(page.get_by_text("Board found: 336 of 336 features")).to_be_visible()
-    button(page, "Place at suggestion").click()
+    expect(page.get_by_text("Board detected: 336 of 336 features")).to_be_visible()
+    button(page, "Place board").click()
     button(page, "Capture pose").click()
     expect(page.get_by_text("pose_01").first).to_be_visible()
     assert operator.wait_for(lambda s: (p := s.pose("pose_01")) is not None and p.state == "good", 30.0)
@@ -39,7 +39,7 @@ def test_from_the_link_to_a_pose_that_a_reload_keeps(opened: Opened, operator: O
 def test_a_guest_sees_the_same_step_and_changes_nothing(opened: Opened, app: App, browser: Browser) -> None:
     guest = browser.new_context(viewport=SIZE).new_page()
     guest.goto(app.server.view_url)
-    expect(guest.get_by_text("You are watching")).to_be_visible()
+    expect(guest.get_by_text("View only")).to_be_visible()
     button(opened.page, "2. Target").click()
     expect(button(guest, "Use this board")).to_be_visible()
     button(guest, "1. Rig").click()
@@ -53,7 +53,7 @@ def test_what_cannot_be_done_is_said_in_words(opened: Opened, tmp_path: Path) ->
     page = opened.page
     field(page, "Folder").fill(str(tmp_path / "a file"))
     button(page, "Open session").click()
-    expect(page.get_by_text("This failed").first).to_be_visible()
+    expect(page.get_by_text("Error", exact=True).first).to_be_visible()
     assert opened.errors == []
 
 

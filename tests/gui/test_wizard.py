@@ -47,9 +47,9 @@ def visit(browser: Browser, url: str) -> Opened:
 
 def stand(page: Page, thing: str) -> None:
     """Let another thing stand before the simulated rig."""
-    choose(page, "Before the rig", thing)
-    expect(field(page, "Before the rig")).to_have_value(thing)
-    expect(page.get_by_text("stands before the rig: choose what to capture instead")).to_be_hidden()
+    choose(page, "Object", thing)
+    expect(field(page, "Object")).to_have_value(thing)
+    expect(page.get_by_text("Choose an object to capture")).to_be_hidden()
 
 
 def complaints(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -79,11 +79,11 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
     opened = visit(browser, app.server.url)
     page = opened.page
     try:
-        choose(page, "Rig", "Simulated, quarter resolution")
+        choose(page, "Rig", "Simulated, quarter size")
         expect(page.get_by_text(re.compile("camera 400 × 300 px"))).to_be_visible()
         button(page, "2. Target").click()
         button(page, "Use this board").click()
-        expect(page.get_by_text(f"in use: {TARGET}")).to_be_visible()
+        expect(page.get_by_text(f"In use: {TARGET}")).to_be_visible()
 
         button(page, "Continue to Poses").click()
         for number in range(1, 7):
@@ -98,7 +98,7 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
 
         button(page, "4. Calibrate").click()
         page.get_by_role("button", name="Calibrate", exact=True).click()
-        expect(page.get_by_text("reprojection RMS, camera")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.get_by_text("Reprojection RMS, camera")).to_be_visible(timeout=PATIENCE_MS)
         calibration = session_of(bare).calibration
         assert calibration is not None and not calibration.stale
 
@@ -130,7 +130,7 @@ def bring(page: Page, operator: Operator, depth: float) -> None:
     """Type a distance until what stands before the rig is there: a busy page may draw an older number over it."""
     for _ in range(4):
         for typed in (depth + 1, depth):
-            field(page, "At, mm").fill(str(typed))
+            field(page, "Distance, mm").fill(str(typed))
         if operator.wait_for(lambda s: s.world is not None and abs(s.world.T_camera_object[2, 3] - depth) < 0.5, 15.0):
             return
     raise AssertionError(f"nothing came to {depth} mm")
@@ -150,14 +150,14 @@ def scan(page: Page, operator: Operator) -> None:
     ask(page, "Clicked point")
 
     button(page, "4. Calibrate").click()  # its curves, at a pixel of this cloud
-    choose(page, "Cloud to click", "scan_01")
-    before = field(page, "Pixel column u").input_value()
+    choose(page, "Cloud", "scan_01")
+    before = field(page, "Pixel u").input_value()
     for _ in range(20):
         page.mouse.click(*ON_THE_CLOUD)
         page.wait_for_timeout(500)
-        if field(page, "Pixel column u").input_value() != before:
+        if field(page, "Pixel u").input_value() != before:
             break
-    expect(field(page, "Pixel column u")).not_to_have_value(before)
+    expect(field(page, "Pixel u")).not_to_have_value(before)
 
 
 def ask(page: Page, answer: str) -> None:
@@ -173,7 +173,7 @@ def ask(page: Page, answer: str) -> None:
 def hands_free(page: Page, name: str) -> None:
     """The next pose by holding still."""
     page.get_by_role("checkbox", name="Hands-free").check()
-    button(page, "Place at suggestion").click()
+    button(page, "Place board").click()
     expect(page.get_by_text("Hold still")).to_be_visible()
     expect(pose_row(page, name, "good")).to_be_visible(timeout=PATIENCE_MS)
     page.get_by_role("checkbox", name="Hands-free").uncheck()
@@ -183,7 +183,7 @@ def merge(page: Page, operator: Operator) -> None:
     """All three in the place of the last, by as much as they were moved."""
     button(page, "7. Merge").click()
     button(page, "Merge 3 scans").click()
-    expect(page.get_by_text(re.compile("in the place of"))).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible(timeout=PATIENCE_MS)
     merged = session_of(operator).merge
     assert merged is not None and merged.reference == "scan_03" and set(merged.pairs) == {"scan_01", "scan_02"}
     for name, depth in zip(("scan_01", "scan_02"), DEPTHS_MM, strict=False):
@@ -224,11 +224,11 @@ def test_whoever_watches_sees_the_pose_and_changes_nothing(
     guest = watching.page
     button(page, "3. Poses").click()
     capture_pose(page, "pose_01")
-    expect(guest.get_by_text("You are watching")).to_be_visible()
+    expect(guest.get_by_text("View only")).to_be_visible()
     expect(pose_row(guest, "pose_01", "good")).to_be_visible()
     before = operator.snapshot()
 
-    button(guest, "Place at suggestion").click()
+    button(guest, "Place board").click()
     button(guest, "Capture pose").click()
     guest.keyboard.press("c")
     guest.get_by_role("checkbox", name="Hands-free").click()
@@ -275,7 +275,7 @@ def test_a_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser
         page = visit(browser, program.url).page
         button(page, "2. Target").click()
         button(page, "Use this board").click()
-        expect(page.get_by_text(f"in use: {TARGET}")).to_be_visible()
+        expect(page.get_by_text(f"In use: {TARGET}")).to_be_visible()
         button(page, "3. Poses").click()
         capture_pose(page, "pose_01")
         button(page, "Capture pose").click()

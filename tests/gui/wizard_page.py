@@ -80,7 +80,25 @@ def pose_row(page: Page, name: str, state: str) -> Locator:
 
 def capture_pose(page: Page, name: str) -> None:
     """Put the simulated board where it is asked for, and capture it as this pose, which must be good."""
-    expect(button(page, "Place at suggestion")).to_be_enabled()
-    button(page, "Place at suggestion").click()
+    expect(button(page, "Place board")).to_be_enabled()
+    button(page, "Place board").click()
     button(page, "Capture pose").click()
     expect(pose_row(page, name, "good")).to_be_visible(timeout=PATIENCE_MS)
+
+
+CUT_LABELS = """() => [...document.querySelectorAll("button, label, th, td, [role=tab], span, p, div")]
+    .filter(e => e.offsetParent && [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim()))
+    .filter(e => e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).overflowX !== "visible")
+    .map(e => e.textContent.trim())"""
+BROKEN_LABELS = """() => [...document.querySelectorAll("label, button, th, [role=tab], span, div")]
+    .filter(e => e.offsetParent && e.childNodes.length === 1 && e.firstChild.nodeType === 3)
+    .filter(e => e.textContent.trim().split(/\\s+/).some(word => {
+        const range = document.createRange(), at = e.textContent.indexOf(word);
+        range.setStart(e.firstChild, at); range.setEnd(e.firstChild, at + word.length);
+        return word.length < 24 && range.getClientRects().length > 1; }))
+    .map(e => e.textContent.trim())"""
+
+
+def cut_labels(page: Page) -> list[str]:
+    """Texts on the page that do not fit: cut off, or with a line break inside a word or between figure and unit."""
+    return [*page.evaluate(CUT_LABELS), *page.evaluate(BROKEN_LABELS)]

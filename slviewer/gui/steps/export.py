@@ -109,7 +109,7 @@ class Panel(StepPanel):
             self._source = Choice(gui, "Source")
             self._as: Any = gui.add_dropdown("Type", (POINTS, MESH))
             self._mesh = MeshInputs(context, self._describe)
-            self._shape_format = Choice(gui, "Format")
+            self._shape_format = Choice(gui, "File type")
             self._shape_note = Text(gui)
             self._shape_link = Text(gui)
             self._shape_result = Text(gui)

@@ -109,7 +109,7 @@ class Panel(StepPanel):
         in_use = str(board) == self._target
         change(self._use, disabled=in_use)
         state = coloured(
-            f"● {board}" if in_use else f"Not in use: {board}", "good" if in_use else "warning", bold=in_use
+            f"● In use: {board}" if in_use else f"Not in use: {board}", "good" if in_use else "warning", bold=in_use
         )
         self._note.set(paragraph(Html(f"{explanation}<br>{state}")))
 

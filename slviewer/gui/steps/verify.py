@@ -58,7 +58,7 @@ class Panel(StepPanel):
             self._label = gui.add_text("Name", "", hint="Optional; numbered by default")
             self._simulated = SimulatedObject(context, LAYER, ("plane", "sphere"))
         with gui.add_folder("Result", visible=False) as self._result_folder:
-            self._result = Choice(gui, "Capture")
+            self._result = Choice(gui, "Result")
             self._figures = Text(gui)
             self._maps = Plot(gui)
             self._model = Choice(gui, "3D colours", "The model whose errors colour the cloud")
