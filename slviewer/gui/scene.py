@@ -1,7 +1,7 @@
 """The 3D view: named layers in the camera's frame, in mm, x to the right and y down as in the image.
 
-A layer is everything under one name ("poses", "scan", …): a panel fills its own, and shows or hides it as a whole. What
-is put under a name that exists replaces it. Every method may be called from any thread.
+A layer ("poses", "scan", …) belongs to a panel, which fills it, and shows or hides it as a whole. An object replaces
+that of the same name. Every method may be called from any thread.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ PROJECTOR: Colour = (235, 140, 30)
 GHOST: Colour = (20, 160, 220)
 
 SHOWN_POINTS = 150_000
-"""Points of one cloud that a browser is sent: software rendering still moves them, and the full cloud stays here."""
+"""Points of one cloud that are sent to a browser: software rendering still moves them smoothly."""
 _FRUSTUM_MM = 60.0
 _FLOOR_MM = 260.0
 
@@ -52,25 +52,25 @@ class ViewerScene:
         self._layer(layer).visible = visible
 
     def remove(self, layer: str, name: str) -> None:
-        """Take one thing out of a layer; nothing happens where there is none."""
+        """Remove an object from a layer, if it is there."""
         for node in reversed(self._nodes.pop((layer, name), [])):  # what hangs below a node first
             node.remove()
 
     def clear(self, layer: str) -> None:
-        """Take everything out of a layer."""
+        """Remove all objects of a layer."""
         for name in self.names(layer):
             self.remove(layer, name)
 
     def names(self, layer: str) -> list[str]:
-        """What stands in a layer."""
+        """The names of a layer's objects."""
         return [name for where, name in list(self._nodes) if where == layer]
 
-    # things
+    # objects
 
     def device(
         self, layer: str, name: str, K: np.ndarray, size: tuple[int, int], T_camera_device: np.ndarray, colour: Colour
     ) -> None:
-        """A camera or a projector: the pyramid that it sees; K (3, 3) px, size (width, height) px, T (4, 4) mm."""
+        """A camera or a projector as a frustum; K (3, 3) px, size (width, height) px, T (4, 4) mm."""
         width, height = size
         wxyz, position = _placed(T_camera_device)
         handle = self._api.add_camera_frustum(
@@ -140,7 +140,7 @@ class ViewerScene:
         scale_mm: float = 90.0,
         turns: bool = True,
     ) -> None:
-        """A handle to drag and turn something with; both callbacks get T (4, 4) in the camera's frame."""
+        """A handle to drag and turn an object; both callbacks get T (4, 4) in the camera's frame."""
         wxyz, position = _placed(T)
         limits = ((-5000.0, 5000.0),) * 3
         handle = self._api.add_transform_controls(
@@ -162,7 +162,7 @@ class ViewerScene:
         self._set(layer, name, [handle])
 
     def move(self, layer: str, name: str, T: np.ndarray) -> None:
-        """Bring something that is there already to T (4, 4), without telling its callbacks."""
+        """Move an existing object to T (4, 4), without calling its callbacks."""
         nodes = self._nodes.get((layer, name))
         if nodes:
             nodes[0].wxyz, nodes[0].position = _placed(T)
@@ -176,9 +176,9 @@ class ViewerScene:
         *,
         size_mm: float = 0.0,
     ) -> int:
-        """A cloud (…, 3) float32 mm with colours (…, 3) uint8 or one; NaN points are left out. Returns how many points
-        are shown: evenly thinned to SHOWN_POINTS, at full precision. `size_mm` of a point is by default what closes the
-        gaps between neighbours.
+        """A cloud (…, 3) float32 mm with colours (…, 3) uint8 or one; NaN points are skipped. Returns the number of
+        points shown: evenly thinned to SHOWN_POINTS, at full precision. The default of `size_mm`, of a point, closes
+        the gaps between neighbours.
         """
         flat = np.asarray(points, np.float32).reshape(-1, 3)
         index = np.flatnonzero(np.isfinite(flat).all(axis=1))
@@ -202,17 +202,6 @@ class ViewerScene:
         self._set(layer, name, [handle])
         return len(shown)
 
-    def lines(self, layer: str, name: str, segments: np.ndarray, colour: Colour, *, width_px: float = 2.0) -> None:
-        """Segments (n, 2, 3) mm."""
-        handle = self._api.add_line_segments(
-            self._path(layer, name),
-            np.asarray(segments, np.float32),
-            colour,
-            thickness=width_px,
-            thickness_units="screen",
-        )
-        self._set(layer, name, [handle])
-
     def mark(
         self,
         layer: str,
@@ -222,13 +211,13 @@ class ViewerScene:
         colour: Colour = (220, 40, 40),
         radius_mm: float = 1.5,
     ) -> None:
-        """A point (3,) mm with words beside it."""
+        """A point (3,) mm with a label."""
         path = self._path(layer, name)
         ball = self._api.add_icosphere(path, radius=radius_mm, color=colour, position=np.asarray(point, float))
         self._set(layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")])
 
     def ball(self, layer: str, name: str, centre: np.ndarray, radius_mm: float, colour: Colour) -> None:
-        """A ball around centre (3,) mm that one sees through."""
+        """A transparent ball around centre (3,) mm."""
         handle = self._api.add_icosphere(
             self._path(layer, name),
             radius=radius_mm,
@@ -243,7 +232,7 @@ class ViewerScene:
     def drawing(
         self, layer: str, name: str, segments: np.ndarray, colour: Colour, place: np.ndarray, text: str
     ) -> None:
-        """Segments (n, 2, 3) mm (n may be 0), and words at place (3,) mm."""
+        """Segments (n, 2, 3) mm (n may be 0), and a label at place (3,) mm."""
         path = self._path(layer, name)
         nodes: list[Any] = [self._api.add_frame(path, show_axes=False)]
         if len(segments):
@@ -257,22 +246,8 @@ class ViewerScene:
         )
         self._set(layer, name, nodes)
 
-    def mesh(self, layer: str, name: str, vertices: np.ndarray, faces: np.ndarray, colour: Colour) -> None:
-        """A surface: vertices (n, 3) mm, faces (m, 3)."""
-        handle = self._api.add_mesh_simple(
-            self._path(layer, name),
-            np.asarray(vertices, np.float32),
-            np.asarray(faces, np.uint32),
-            color=colour,
-            side="double",
-        )
-        self._set(layer, name, [handle])
-
     def on_pick(self, do: Callable[[np.ndarray, np.ndarray], None] | None) -> None:
-        """Call `do(origin, direction)`, (3,) each in the camera's frame, for a click into the scene; None: no longer.
-
-        The nearest point of an organised cloud to that ray is what was clicked on.
-        """
+        """Call `do(origin, direction)`, (3,) each in the camera's frame, for each click into the scene; None: end."""
         if self._pick is not None:
             self._api.remove_click_callback(self._pick)
             self._pick = None
@@ -290,7 +265,7 @@ class ViewerScene:
 
     def _path(self, layer: str, name: str) -> str:
         self._layer(layer)
-        # names are the operator's: a slash would make another layer
+        # names are entered by the operator: a slash would make another layer
         return f"/{layer}/{name.replace('/', '_')}"
 
     def _set(self, layer: str, name: str, nodes: list[Any]) -> None:
@@ -310,7 +285,7 @@ def _matrix(handle: Any) -> np.ndarray:
 
 
 def spacing(points: np.ndarray) -> float:
-    """About the distance between neighbours of a surface that was sampled evenly, in mm."""
+    """Approximate distance, mm, between neighbours of an evenly sampled surface."""
     low, high = np.percentile(points, [1, 99], axis=0)
     sides = np.sort(high - low)
     return float(np.clip(1.3 * np.sqrt(max(sides[1] * sides[2], 1e-6) / len(points)), 0.05, 20.0))

@@ -1,4 +1,4 @@
-"""Who is asking: the right Host and Origin, and a cookie that came from a link which only the operator was given."""
+"""Access rules: the right Host and Origin, and a cookie from a link that only the operator was given."""
 
 import hmac
 import ipaddress
@@ -18,12 +18,23 @@ _TOKEN = re.compile(r"[A-Za-z0-9_-]{16,256}")
 
 
 class Refusal(Exception):
-    """A request that is turned away: the HTTP status, and one plain sentence for whoever sent it."""
+    """A refused request: the HTTP status, and one sentence for the sender."""
 
     def __init__(self, status: HTTPStatus, sentence: str) -> None:
         super().__init__(sentence)
         self.status = status
         self.sentence = sentence
+
+
+class MessageRefused(Exception):
+    """A message that is dropped; `correct`: the client is sent the true value again.
+
+    A number outside its range is not corrected: whoever types 50 into a field that starts at 10 passes through 5.
+    """
+
+    def __init__(self, reason: str, correct: bool = False) -> None:
+        super().__init__(reason)
+        self.correct = correct
 
 
 class Access:

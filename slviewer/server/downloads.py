@@ -33,7 +33,7 @@ class Downloads:
         self._offers: dict[str, Offer] = {}
 
     def offer(self, path: Path, *, within: Path, name: str | None = None) -> str:
-        """The address, on this server, at which this file is fetched until it is withdrawn.
+        """The address, on this server, at which this file is fetched until `clear`.
 
         `within` is the folder that it belongs to (the session's); InputError where the file is missing or, through
         links or "..", lies elsewhere. It is read when it is fetched, so that the newest content arrives.
@@ -43,10 +43,6 @@ class Downloads:
         key = secrets.token_urlsafe(16)
         self._offers[key] = offer
         return PREFIX + key
-
-    def withdraw(self, address: str) -> None:
-        """No longer offer what was offered at this address."""
-        self._offers.pop(address.removeprefix(PREFIX), None)
 
     def clear(self) -> None:
         """No longer offer anything (another session is opened)."""

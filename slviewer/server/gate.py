@@ -1,4 +1,4 @@
-"""What a client's message may change: only what the page offers to that client at this moment."""
+"""Which messages of clients pass: those that the page offers to that client at this moment, with valid values."""
 
 import asyncio
 import logging
@@ -9,15 +9,16 @@ import viser
 from viser import _messages as messages
 
 from slviewer.server import viser_internals as inside
-from slviewer.server.access import Role
+from slviewer.server.access import MessageRefused, Role
 from slviewer.server.connection import Connection
 from slviewer.server.uploads import UploadBudget, Uploads
-from slviewer.server.values import ValueRefused, check_value
 
 logger = logging.getLogger("slviewer.server")
 
 VIEWER_LIMIT = 4096
 """Bytes of a message from someone who only watches: more than the longest that says where they look from."""
+TEXT_LIMIT = 20_000
+"""Characters; no input of the wizard needs a tenth of it."""
 
 
 class ViserGate:
@@ -43,7 +44,7 @@ class ViserGate:
             return None
         try:
             return self._passed(message, raw)
-        except ValueRefused as refused:
+        except MessageRefused as refused:
             logger.debug("client %s: dropped %s: %s", self._client, type(message).__name__, refused)
             self._answer(message, refused)
         except Exception:  # what the check stumbles over, viser would too
@@ -61,64 +62,58 @@ class ViserGate:
         # besides where they look from, those who watch may say that they have drawn something, when they are asked
         watching = messages.ViewerCameraMessage | messages.LocalStorageGetItemResponseMessage
         if self._role != "operator" and not isinstance(message, watching):
-            raise ValueRefused("this link only watches", correct=True)
+            raise MessageRefused("this link only watches", correct=True)
         if not _finite(vars(message)):
-            raise ValueRefused("numbers that are none")
+            raise MessageRefused("numbers that are none")
         match message:
             case messages.ViewerCameraMessage():
                 _camera(message)
             case messages.GuiUpdateMessage():
                 if message.updates.keys() != {"value"}:
-                    raise ValueRefused("only an input's value can be set")
+                    raise MessageRefused("only an input's value can be set")
                 check_value(self._enabled(message.uuid), message.updates["value"])
-            case messages.GuiButtonHoldMessage():
-                _require(inside.holds(self._enabled(message.uuid), message.frequency))
-            case messages.GuiFormSubmitMessage() | messages.GuiFormDirtyMessage():
-                _require(inside.gui_form(server, client, message.uuid) is not None)
             case messages.CommandTriggerMessage():
-                _require(inside.command(server, client, message.uuid) is not None)
+                _check(inside.command(server, client, message.uuid) is not None)
             case messages.FileTransferStartUpload():
                 button = self._enabled(message.source_component_uuid)
-                _require(isinstance(button, viser.GuiUploadButtonHandle))
+                _check(isinstance(button, viser.GuiUploadButtonHandle))
                 return inside.encode(self._uploads.start(message))
             case messages.FileTransferPart():
                 self._uploads.part(message)
             case messages.ScenePointerMessage():
-                _require(inside.pointer_listens(server, client, message.event_type))
+                _check(inside.pointer_listens(server, client, message.event_type))
                 click = message.event_type == "click"
-                _require(len(message.screen_pos) == (1 if click else 2))
-                _require(not click or None not in (message.ray_origin, message.ray_direction))
-            case messages.GetRenderResponseMessage() | messages.LocalStorageGetItemResponseMessage():
-                _require(inside.awaited(server, client, type(message)))
+                _check(len(message.screen_pos) == (1 if click else 2))
+                _check(not click or None not in (message.ray_origin, message.ray_direction))
+            case messages.LocalStorageGetItemResponseMessage():
+                _check(inside.awaited(server, client, type(message)))
             case _:
                 self._scene(message, client)
         return raw
 
     def _scene(self, message: Any, client: int) -> None:
         scene = inside.scene_api(self._server, client, message.owner)
-        _require(scene is not None)
+        _check(scene is not None)
         match message:
             case messages.TransformControlsUpdateMessage():
-                _require(inside.gizmo(scene, client, message.name) and math.hypot(*message.wxyz) > 1e-6)
+                _check(inside.gizmo(scene, client, message.name) and math.hypot(*message.wxyz) > 1e-6)
             case messages.TransformControlsDragStartMessage() | messages.TransformControlsDragEndMessage():
-                _require(inside.gizmo(scene, client, message.name))
+                _check(inside.gizmo(scene, client, message.name))
             case messages.SceneNodeClickMessage():
-                _require(inside.node_clicks(scene, message.name))
-            case messages.SceneNodeDragMessage():
-                _require(inside.node_drags(scene, client, message.name))
+                _check(inside.node_clicks(scene, message.name))
             case _:
-                raise ValueRefused("no message of clients")
+                raise MessageRefused("no message of clients")
 
     def _enabled(self, uuid: str) -> Any:
         assert self._client is not None
         handle = inside.gui_input(self._server, self._client, uuid)
         if handle is None:
-            raise ValueRefused("nothing to be seen there")
+            raise MessageRefused("nothing to be seen there")
         if getattr(handle, "disabled", False):
-            raise ValueRefused("disabled", correct=True)
+            raise MessageRefused("disabled", correct=True)
         return handle
 
-    def _answer(self, message: Any, refused: ValueRefused) -> None:
+    def _answer(self, message: Any, refused: MessageRefused) -> None:
         assert self._client is not None
         if isinstance(message, messages.FileTransferStartUpload):
             inside.refuse_upload(
@@ -135,15 +130,10 @@ class ViserGate:
         asyncio.get_running_loop().call_soon(inside.forget_upload, self._server, self._client, transfer)
 
 
-def _require(condition: bool) -> None:
-    if not condition:
-        raise ValueRefused("nothing listens to that")
-
-
 def _camera(message: messages.ViewerCameraMessage) -> None:
     usable = 0 < message.image_height < 2**15 and 0 < message.image_width < 2**15 and math.hypot(*message.wxyz) > 1e-6
     if not usable:
-        raise ValueRefused("no camera")
+        raise MessageRefused("no camera")
 
 
 def _finite(value: Any) -> bool:
@@ -155,3 +145,38 @@ def _finite(value: Any) -> bool:
     if isinstance(value, list | tuple):
         return all(map(_finite, value))
     return True
+
+
+def check_value(handle: Any, value: Any) -> None:
+    """Raise MessageRefused unless the input takes this value, as it is in the message."""
+    match handle:
+        case viser.GuiButtonHandle():
+            _check(value is True, "a button is pressed, nothing else")
+        case viser.GuiCheckboxHandle():
+            _check(isinstance(value, bool), "not yes or no")
+        case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
+            _check(isinstance(value, str) and value in handle.options, "not an option", correct=True)
+        case viser.GuiTextHandle():
+            _check(isinstance(value, str) and _plain(value, handle.multiline), "not plain text")
+        case viser.GuiNumberHandle() | viser.GuiSliderHandle():
+            _number(value, handle.value, handle.min, handle.max)
+        case _:  # uploads have messages of their own, and the wizard has no other inputs
+            raise MessageRefused("this input takes no value")
+
+
+def _check(condition: bool, reason: str = "nothing listens to that", correct: bool = False) -> None:
+    if not condition:
+        raise MessageRefused(reason, correct)
+
+
+def _number(value: Any, current: float, low: float | None, high: float | None) -> None:
+    _check(isinstance(value, int | float) and not isinstance(value, bool), "not a number", correct=True)
+    _check(abs(value) < 2**53 and math.isfinite(value), "not a finite number", correct=True)
+    # viser would cut the fraction off in silence.
+    _check(isinstance(current, float) or value == int(value), "not a whole number", correct=True)
+    _check((low is None or value >= low) and (high is None or value <= high), "outside its range")
+
+
+def _plain(text: str, multiline: bool) -> bool:
+    allowed = "\n\r\t" if multiline else "\t"
+    return len(text) <= TEXT_LIMIT and all(c.isprintable() or c in allowed or ord(c) > 159 for c in text)

@@ -10,11 +10,11 @@ import viser
 from websockets.asyncio.server import ServerConnection
 from websockets.asyncio.server import serve as serve_websockets
 
-from slviewer.server import pins, viser_internals
+from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
+from slviewer.server.auth_middleware import AuthMiddleware
 from slviewer.server.binding import listen
 from slviewer.server.connection import Connection, quiet_logger
-from slviewer.server.door import Door
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
 from slviewer.server.responses import script_hash
@@ -92,14 +92,14 @@ def serve(
 
     Raises SlviewerError within two seconds where the address can't be served, and where viser is not the pinned one.
     """
-    pins.check_version()
+    viser_internals.check_version()
     sock = listen(host, port)
     address, port = sock.getsockname()[:2]
     try:
         access = Access(port, token, view_token, names)
         routes, downloads = Routes(), Downloads()
-        scripts = (*pins.VISER_SCRIPTS, script_hash(viser_internals.ONE_DRAW))
-        door = Door(access, routes, downloads, viser_internals.client_page(), scripts)
+        scripts = (*viser_internals.VISER_SCRIPTS, script_hash(viser_internals.ONE_DRAW))
+        middleware = AuthMiddleware(access, routes, downloads, viser_internals.client_page(), scripts)
         budget = UploadBudget(upload_limit)
         started: list[viser.ViserServer] = []
 
@@ -119,7 +119,7 @@ def serve(
 
             options.update(
                 sock=sock,
-                process_request=door.answer,
+                process_request=middleware.answer,
                 create_connection=Connection,
                 max_size=MESSAGE_LIMIT,
                 server_header=None,

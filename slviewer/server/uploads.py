@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from slviewer.server.access import MessageRefused
 from slviewer.server.text import safe_name
-from slviewer.server.values import ValueRefused
 
 SMALLEST_PART = 4096
 """Bytes; viser's page sends half a megabyte at a time. Smaller parts would cost more memory than they carry."""
@@ -42,11 +42,13 @@ class Uploads:
         """The announcement (a FileTransferStartUpload) with a safe file name; Refused where it asks for too much."""
         size, parts = message.size_bytes, message.part_count
         if size < 0 or not (parts == 0 if size == 0 else 1 <= parts <= size // SMALLEST_PART + 1):
-            raise ValueRefused("an upload whose parts cannot make up its size")
+            raise MessageRefused("an upload whose parts cannot make up its size")
         if size > self._budget.limit - self._budget.used:
-            raise ValueRefused(f"an upload of {size / 1e6:.0f} MB where {self._budget.limit / 1e6:.0f} MB are allowed")
+            raise MessageRefused(
+                f"an upload of {size / 1e6:.0f} MB where {self._budget.limit / 1e6:.0f} MB are allowed"
+            )
         if message.transfer_uuid in self._budget.names:
-            raise ValueRefused("an upload that is under way")
+            raise MessageRefused("an upload that is under way")
         if size:  # an empty file is complete with its announcement
             self._budget.used += size
             self._budget.names.add(message.transfer_uuid)
@@ -57,7 +59,7 @@ class Uploads:
         """Count one part (a FileTransferPart) in; Refused, and the upload forgotten, where it was not announced."""
         transfer = self._transfers.get(message.transfer_uuid)
         if transfer is None:
-            raise ValueRefused("a part of no upload")
+            raise MessageRefused("a part of no upload")
         transfer.received += len(message.content)
         fits = (
             message.source_component_uuid == transfer.source
@@ -70,7 +72,7 @@ class Uploads:
         if not fits or (complete and transfer.received != transfer.size):
             self._end(message.transfer_uuid)
             self._forget(message.transfer_uuid)
-            raise ValueRefused("a part that was not announced")
+            raise MessageRefused("a part that was not announced")
         if complete:
             self._end(message.transfer_uuid)
 

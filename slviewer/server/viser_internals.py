@@ -1,7 +1,7 @@
-"""Everything that this room knows about the inside of viser, for exactly the version that it was read from.
+"""All uses of viser's private interface, written for exactly one version of it.
 
 viser 1.1.1 has no hook for access, so its WebSocket server is created by ours, and its messages are read on their way
-in. `pins.py` names the version; a test compares what is used here with what it was when this was written.
+in. A test compares what is used here with what it was when this was written.
 """
 
 import contextlib
@@ -24,20 +24,25 @@ from viser.infra import _infra
 
 from slviewer.errors import SlviewerError
 
+VISER = "1.1.1"
+
+VISER_SCRIPTS = (
+    "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='",
+    "'sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE='",
+)
+"""The scripts that viser's page runs: the loader that stands in it, and the application that the loader unpacks."""
+
 Message = _messages.Message
 
 CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
 ONE_DRAW = resources.files("slviewer.server").joinpath("one_draw.js").read_bytes()
-"""A script of ours that runs in viser's page before its own."""
+"""Our script, which runs in viser's page before its own."""
 
 FROM_CLIENTS: dict[str, type[Any]] = {
     kind.__name__: kind
     for kind in (
         _messages.ViewerCameraMessage,
         _messages.GuiUpdateMessage,
-        _messages.GuiButtonHoldMessage,
-        _messages.GuiFormSubmitMessage,
-        _messages.GuiFormDirtyMessage,
         _messages.CommandTriggerMessage,
         _messages.FileTransferStartUpload,
         _messages.FileTransferPart,
@@ -45,9 +50,7 @@ FROM_CLIENTS: dict[str, type[Any]] = {
         _messages.TransformControlsDragStartMessage,
         _messages.TransformControlsDragEndMessage,
         _messages.SceneNodeClickMessage,
-        _messages.SceneNodeDragMessage,
         _messages.ScenePointerMessage,
-        _messages.GetRenderResponseMessage,
         _messages.LocalStorageGetItemResponseMessage,
     )
 }
@@ -85,6 +88,15 @@ def start(serve: Callable[..., Any], host: str, port: int, label: str | None) ->
         setattr(owner, name, value)
     themed()
     return server
+
+
+def check_version() -> None:
+    """Raise SlviewerError where another version of viser is installed: its access control was not tested."""
+    if viser.__version__ != VISER:
+        raise SlviewerError(
+            f"viser {viser.__version__} is installed, but this slviewer serves safely only with viser {VISER}: "
+            f"install it with pip install viser=={VISER}."
+        )
 
 
 def client_page() -> bytes:
@@ -156,12 +168,6 @@ def gui_input(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
     return next((handle for handle in found if handle is not None and shown(handle)), None)
 
 
-def gui_form(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
-    """The form with this id that the client can see, or None."""
-    found = (api._container_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
-    return next((box for box in found if isinstance(box, _gui_handles.GuiFormHandle) and shown(box)), None)
-
-
 def command(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
     """The command with this id that is not disabled, or None."""
     found = (api._command_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
@@ -191,11 +197,6 @@ def shown(handle: Any) -> bool:
         handle = box
 
 
-def holds(handle: Any, frequency: float) -> bool:
-    """Whether this is a button that calls back at this frequency, in Hz, while it is held."""
-    return isinstance(handle, _gui_handles.GuiButtonHandle) and frequency in handle._button_impl.hold_cbs_from_freq
-
-
 def scene_api(server: viser.ViserServer, client_id: int, owner: str) -> Any:
     """The scene that a message names by its owner: the shared one, or the client's own; None for anyone else's."""
     if owner == "":
@@ -216,14 +217,6 @@ def node_clicks(scene: Any, name: str) -> bool:
     """Whether someone listens to clicks on this node."""
     handle = scene._handle_from_node_name.get(name)
     return handle is not None and bool(handle._impl.click_cb) and _visible(scene, name)
-
-
-def node_drags(scene: Any, client_id: int, name: str) -> bool:
-    """Whether someone listens to this node being dragged; also while one removed is still held."""
-    if (client_id, name) in scene._active_drag_handles:
-        return True
-    handle = scene._handle_from_node_name.get(name)
-    return handle is not None and bool(handle._impl.drag_cb) and _visible(scene, name)
 
 
 def _visible(scene: Any, name: str) -> bool:

@@ -38,7 +38,7 @@ def until(condition: Callable[[], Any], seconds: float = 5.0) -> bool:
 
 
 class Client:
-    """A WebSocket to viser, past the door."""
+    """A WebSocket to viser, past the authentication."""
 
     def __init__(self, server: SafeServer, connection: ClientConnection) -> None:
         self.server = server

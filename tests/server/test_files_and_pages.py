@@ -34,7 +34,7 @@ def test_an_offered_file_arrives_whole(operator, watcher, stranger, tmp_path):
         assert disposition.startswith("attachment; ") and "filename*=UTF-8''scan%20_%C3%A9_.ply" in disposition
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
     assert stranger.get(address).status == 403
-    downloads.withdraw(address)
+    downloads.clear()
     assert operator.get(address).status == 404
 
 

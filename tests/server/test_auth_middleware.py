@@ -1,4 +1,4 @@
-"""Who is let in: every way past the door that viser leaves open is tried."""
+"""Who is let in: every access that viser leaves open is tried."""
 
 import contextlib
 import logging

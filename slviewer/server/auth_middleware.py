@@ -1,4 +1,4 @@
-"""Every request passes here: who asks, what for, and what they get."""
+"""Authentication and routing of every HTTP request."""
 
 import logging
 import re
@@ -17,11 +17,11 @@ logger = logging.getLogger("slviewer.server")
 
 _PATH = re.compile(r"/|(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+")
 
-_ONWARD = """<!doctype html><meta charset="utf-8"><title>slviewer</title><script>location.replace(location.pathname)\
+_REDIRECT = """<!doctype html><meta charset="utf-8"><title>slviewer</title><script>location.replace(location.pathname)\
 </script><noscript><a href="{path}">Open slviewer</a></noscript>"""
 
 
-class Door:
+class AuthMiddleware:
     """Answers a server's requests: viser's page, our own pages and files, and who may open a WebSocket."""
 
     def __init__(
@@ -42,7 +42,7 @@ class Door:
             response = respond(refusal.status, refusal.sentence + "\n")
         except Exception:
             logger.exception("a request failed")
-            response = respond(HTTPStatus.INTERNAL_SERVER_ERROR, "slviewer failed here: its log says why.\n")
+            response = respond(HTTPStatus.INTERNAL_SERVER_ERROR, "slviewer failed: see its log.\n")
         harden(response.headers)
         return response
 
@@ -52,15 +52,15 @@ class Door:
         websocket = any(value.lower() == "websocket" for value in headers.get_all("Upgrade"))
         access.check_origin(headers, host, websocket)
         path, _, query = request.path.partition("?")
-        if not _PATH.fullmatch(path):  # "//elsewhere" as a place to go on to would lead there
+        if not _PATH.fullmatch(path):  # "//elsewhere" in a redirect would lead to another site
             raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
         if "?" in request.path:
             if websocket:
                 raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
-            return self._let_in(path, query, host, "cross-site" in headers.get_all("Sec-Fetch-Site"))
+            return self._accept_token(path, query, host, "cross-site" in headers.get_all("Sec-Fetch-Site"))
         role = access.role(headers)
         if websocket:
-            self._may_connect(path, role)
+            self._check_websocket(path, role)
             connection.role = role
             return None
         if path == "/":
@@ -75,7 +75,7 @@ class Door:
             return await self._download(connection, path)
         return self._page(path, role, host)
 
-    def _let_in(self, path: str, query: str, host: str, from_another_site: bool) -> Response:
+    def _accept_token(self, path: str, query: str, host: str, from_another_site: bool) -> Response:
         """Answer to the link with the token: a cookie, and the same address without it.
 
         Any other parameter is refused: some make viser's page load messages, and so code, from elsewhere.
@@ -88,7 +88,7 @@ class Door:
             raise Refusal(HTTPStatus.FORBIDDEN, "This link is not, or no longer, valid: open the one last printed.")
         if from_another_site:
             # A browser that was sent here by another site's link would send on no strict cookie: our own page must.
-            html = _ONWARD.format(path=path).encode()
+            html = _REDIRECT.format(path=path).encode()
             response = respond(HTTPStatus.OK, html, "text/html; charset=utf-8")
             harden(response.headers, page_policy(html, host))
         else:
@@ -98,7 +98,7 @@ class Door:
         response.headers["Set-Cookie"] = self._access.set_cookie(role)
         return response
 
-    def _may_connect(self, path: str, role: Role) -> None:
+    def _check_websocket(self, path: str, role: Role) -> None:
         if path != "/":
             endpoint = self._routes.endpoint_at(path)
             if endpoint is None:
@@ -127,4 +127,4 @@ class Door:
 
 def _operator_only(viewers: bool, role: Role) -> None:
     if role != "operator" and not viewers:
-        raise Refusal(HTTPStatus.FORBIDDEN, "This link only watches: the page is for the operator.")
+        raise Refusal(HTTPStatus.FORBIDDEN, "This link is view-only: the page is for the operator.")
