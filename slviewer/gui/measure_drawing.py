@@ -61,7 +61,7 @@ def drawn(
         ends = [feature for feature in related if feature is not None]
         if len(ends) != 2:
             return None
-        # from outside of both; a point lies on the surface already
+        # outside of both; a point is on the surface already
         clear = 0.0 if any(end.kind == "point" for end in ends) else 1.2 * max(end.radius or 0.0 for end in ends)
         return _dimension(ends[0].place, ends[1].place, clear)
     feature = feature_of(measured)
@@ -70,8 +70,8 @@ def drawn(
 
 def feature_of(measured: Measurement) -> Feature | None:
     """The point, plane, sphere or cylinder of a measurement; None of other kinds."""
-    found = measured.data.get("feature") or measured.data.get("fit", {}).get("feature")
-    return None if found is None else from_plain(found, Feature)
+    feature = measured.data.get("feature") or measured.data.get("fit", {}).get("feature")
+    return None if feature is None else from_plain(feature, Feature)
 
 
 def lifted(plane: CutPlane, points: np.ndarray) -> np.ndarray:

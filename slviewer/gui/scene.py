@@ -114,7 +114,7 @@ class ViewerScene:
         )
         middle = outline.mean(axis=0)
         if picture is not None:
-            # viser's image stands with its rows going up; the board's y goes down its rows
+            # rows of viser's images go up; the board's y goes down
             turned = tf.SO3.from_x_radians(np.pi).wxyz
             size = np.ptp(outline, axis=0)
             image = self._api.add_image(

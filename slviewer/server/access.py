@@ -91,7 +91,7 @@ class Access:
         own = {f"http://{host}", f"https://{host}"}
         if any(origin.lower() not in own for origin in origins) or (websocket and len(origins) != 1):
             raise Refusal(HTTPStatus.FORBIDDEN, "Another page may not use this one.")
-        # SameSite ignores ports, so a page of another port of this machine is told apart only here. Following a link is
+        # SameSite ignores ports, so a page of another port of this machine is detected only here. Following a link is
         # no harm: it shows the page to the person who clicked it.
         site, mode = headers.get_all("Sec-Fetch-Site"), headers.get_all("Sec-Fetch-Mode")
         destination = headers.get_all("Sec-Fetch-Dest")

@@ -19,7 +19,7 @@ PREFIX = "/download/"
 
 @dataclass(frozen=True)
 class Offer:
-    """One file: where it lies, the folder that it must not leave, and the name under which it is saved."""
+    """One file: its path, the folder that it must not leave, and the name under which it is saved."""
 
     path: Path
     within: Path
@@ -36,7 +36,7 @@ class Downloads:
         """The address, on this server, at which this file is fetched until `clear`.
 
         `within` is the folder that it belongs to (the session's); InputError where the file is missing or, through
-        links or "..", lies elsewhere. It is read when it is fetched, so that the newest content arrives.
+        links or "..", is elsewhere. It is read when it is fetched, so that the newest content arrives.
         """
         offer = Offer(Path(path), Path(within).resolve(), safe_name(name or Path(path).name, "download"))
         _opened(offer).close()
@@ -70,7 +70,7 @@ class Downloads:
 
 
 def _opened(offer: Offer) -> BinaryIO:
-    """The file, found to be a regular one inside its folder after it was opened, so that no link can change it."""
+    """The opened file, checked after opening to be a regular one inside its folder, so that no link can change it."""
     with contextlib.suppress(OSError, ValueError):
         real = offer.path.resolve(strict=True)
         if real.is_relative_to(offer.within):

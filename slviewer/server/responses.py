@@ -12,14 +12,14 @@ _CLOSED = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-act
 
 
 def respond(status: HTTPStatus, body: bytes | str = b"", content_type: str = "text/plain; charset=utf-8") -> Response:
-    """A whole answer, its length told."""
+    """A complete answer with its length."""
     data = body.encode() if isinstance(body, str) else body
     headers = Headers({"Content-Type": content_type, "Content-Length": str(len(data))})
     return Response(status.value, status.phrase, headers, data)
 
 
 def harden(headers: Headers, policy: str = _CLOSED) -> None:
-    """Add what keeps an answer out of other sites' pages, of caches, and of histories (in place)."""
+    """Add the headers that keep an answer out of other sites' pages, caches and histories (in place)."""
     for name, value in {
         "Content-Security-Policy": policy,
         "X-Content-Type-Options": "nosniff",
@@ -33,7 +33,7 @@ def harden(headers: Headers, policy: str = _CLOSED) -> None:
 
 
 def page_policy(html: bytes, host: str) -> str:
-    """What a page of ours may do: run the scripts that stand in it, show pictures, talk to this server; no more."""
+    """The policy of our own pages: run the scripts in them, show pictures, connect to this server; nothing else."""
     scripts = " ".join(script_hash(m) for m in re.findall(rb"<script[^>]*>(.*?)</script>", html, re.S)) or "'none'"
     return (
         f"{_CLOSED}; script-src {scripts}; style-src 'unsafe-inline'; img-src 'self' data: blob:; "

@@ -56,7 +56,7 @@ class Stream:
             settle(rig)
             rig.camera.grab(frames[k])
         else:
-            rig.projector.show(count - 1)  # one that changed during this exposure says so only when it is asked again
+            rig.projector.show(count - 1)  # a change during this exposure is reported at the next call
             last = frames[-1].copy()
             self._offer(LiveCapture(frames, begun, settings))
             return last
@@ -93,10 +93,10 @@ class Stream:
 
     def _allocate(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
         with self._condition:
-            found = self._free.pop() if self._free else None
-        if found is None or found.shape != shape or found.dtype != dtype:
+            buffer = self._free.pop() if self._free else None
+        if buffer is None or buffer.shape != shape or buffer.dtype != dtype:
             return allocate_frames(shape, dtype)
-        return found
+        return buffer
 
     def _offer(self, shot: LiveCapture) -> None:
         with self._condition:

@@ -35,7 +35,7 @@ class Planner:
     def look_up(self, given: PlanInput) -> tuple[PosePlan, bool]:
         """(the best plan now, whether it is final). One that is not final is improved by `request`.
 
-        Until then its poses stand where the last final plan for the same board and devices had them, and its
+        Until then its poses are those of the last final plan for the same board and devices, and its
         suggestion and sigma are that plan's as long as poses were only added.
         """
         with self._lock:
@@ -76,16 +76,16 @@ class Planner:
         if given.key != self._requested:
             return
         try:
-            found = self._compute(given)
+            computed = self._compute(given)
         except Exception:  # the operator can go on without a suggestion
             log.exception("the next pose could not be computed")
-            found = self.look_up(given)[0]
-        self._add(given, found)
+            computed = self.look_up(given)[0]
+        self._add(given, computed)
         self._changed()
 
-    def _add(self, given: PlanInput, found: PosePlan) -> PosePlan:
+    def _add(self, given: PlanInput, computed: PosePlan) -> PosePlan:
         with self._lock:
             while len(self._plans) >= MOST_PLANS:
                 self._plans.pop(next(iter(self._plans)))
-            self._plans[given.key] = found
-        return found
+            self._plans[given.key] = computed
+        return computed

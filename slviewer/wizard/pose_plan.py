@@ -116,7 +116,7 @@ class PosePlan:
 
 
 def plan(given: PlanInput) -> PosePlan:
-    """The plan after the poses of `given`. The rig is the calibrated one, else what the poses tell."""
+    """The plan after the poses of `given`. The rig is the calibrated one, else one estimated from the poses."""
     seen = list(given.features.values())
     if given.calibrated is not None:
         rig, known = given.calibrated.rig, given.calibrated.poses

@@ -124,12 +124,12 @@ class Watcher:
     def _detect(self, item: tuple[np.ndarray, float, float]) -> None:
         image, scale, time_s = item
         watch, board = self._watch, None
-        found, missing = detect_board(watch.board, image)
-        if found is not None and watch.board is not None:
+        detection, missing = detect_board(watch.board, image)
+        if detection is not None and watch.board is not None:
             # centres of reduced pixels to those of the camera's
-            found = replace(found, pixels=(found.pixels + 0.5) / scale - 0.5)
-            still = self._stillness.update(found.pixels, STILL_PX * image.shape[1] / scale, time_s)
-            board = board_seen(watch.board, found, still, watch.lens, time_s)
+            detection = replace(detection, pixels=(detection.pixels + 0.5) / scale - 0.5)
+            still = self._stillness.update(detection.pixels, STILL_PX * image.shape[1] / scale, time_s)
+            board = board_seen(watch.board, detection, still, watch.lens, time_s)
         else:
             self._stillness.reset()
         self._result = (watch, board, missing)
@@ -181,14 +181,16 @@ def detect_board(board: Board | None, image: np.ndarray) -> tuple[Detection | No
         return None, str(error)
 
 
-def board_seen(board: Board, found: Detection, still_s: float, lens: Lens | None, time_s: float) -> BoardSeen | None:
+def board_seen(
+    board: Board, detection: Detection, still_s: float, lens: Lens | None, time_s: float
+) -> BoardSeen | None:
     """The detected board as a panel draws it."""
-    points = board.points[found.ids]
+    points = board.points[detection.ids]
     if len(points) < 4:
         return None
-    H = fit_homography(points[:, :2], found.pixels)
-    T = None if lens is None else approximate_pose(points, found.pixels, lens)
-    return BoardSeen(found.pixels, to_image(H, board.outline()[:, :2]), still_s, T, time_s)
+    H = fit_homography(points[:, :2], detection.pixels)
+    T = None if lens is None else approximate_pose(points, detection.pixels, lens)
+    return BoardSeen(detection.pixels, to_image(H, board.outline()[:, :2]), still_s, T, time_s)
 
 
 def _top(frame: np.ndarray) -> int:

@@ -175,7 +175,7 @@ class CentreDistance:
 
 @dataclass(frozen=True, eq=False)
 class ScanView:
-    """One capture that is no target pose. `cloud` says whether it is reconstructed: no, yes, or by an older
+    """One capture that is no target pose. `cloud`: whether it is reconstructed: no, yes, or by an older
     calibration; `label` is the operator's name for it.
     """
 
@@ -227,7 +227,7 @@ class MergeView:
 
     `registered`: the pairs that it was made from; `loops` that these close, the worst first; `dropped`: pairs that the
     others contradict, and `refused` ones that did not register, in sentences. `stray`: {kind: number of pixels that lie
-    on no surface}; `shared`: the share of the points that more than one scan measured.
+    on no surface}; `shared`: the share of the points measured by several scans.
     """
 
     name: str

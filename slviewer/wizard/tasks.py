@@ -133,21 +133,21 @@ def verify_captures(
             progress=span.within(0, 0.5),
             warn=warn,
         )
-        found = measured.captures[name]
+        result = measured.captures[name]
         models = available(session)
         meta = {
-            **found.to_json(),
-            "centres_mm": {m: r.sphere.centre for m, r in found.results.items() if isinstance(r, SphereResult)},
+            **result.to_json(),
+            "centres_mm": {m: r.sphere.centre for m, r in result.results.items() if isinstance(r, SphereResult)},
             "masked": dict(measured.masked[name]),
             "scales": {model: scale_factor(session, model) for model in models},
-            "normals": {m: r.plane.normal for m, r in found.results.items() if isinstance(r, PlaneResult)},
+            "normals": {m: r.plane.normal for m, r in result.results.items() if isinstance(r, PlaneResult)},
             "inputs": session.input_hashes(name, *(f"calibration/{model}" for model in models)),
         }
-        arrays = {f"error_{model}": result.error_map for model, result in found.results.items()}
+        arrays = {f"error_{model}": result.error_map for model, result in result.results.items()}
         span(0.5, "saving")
         session.guarded(report.saving).save_result(f"verify/{name}", meta, arrays)
         reconstruct_capture(session, name, None, span.within(0.5, 1), warn)
-        rms[name] = {model: result.rms_mm for model, result in found.results.items()}
+        rms[name] = {model: result.rms_mm for model, result in result.results.items()}
     report(1.0, "measured")
     return rms
 
@@ -174,16 +174,16 @@ def merge_scans(
     insist = insisted(session)
     model = best(session, insist)
     with staged_export(session, f"merged_{number}.ply", report) as ply:
-        found = merge(
+        result = merge(
             session, names, reference, ply, model=model, start=start, angle=angle, picked=picked,
             accept_rejected=insist, progress=report.within(0, 0.97), warn=warn,
         )  # fmt: skip
-        session.guarded(report.saving).save_result(f"merge/{number}", merge_record(session, found, model), {})
+        session.guarded(report.saving).save_result(f"merge/{number}", merge_record(session, result, model), {})
     report(1.0, "merged")
-    return found
+    return result
 
 
-def describe_merge(reference: str, found: Merge) -> str:
+def describe_merge(reference: str, result: Merge) -> str:
     """The result in one sentence."""
-    pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in found.pairs.items())
+    pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in result.pairs.items())
     return f"merged on {reference}: {'; '.join(pairs)}"

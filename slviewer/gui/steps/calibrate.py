@@ -236,12 +236,12 @@ class Panel(StepPanel):
 
         def arrows() -> Figure | None:
             details = self._detailed(made)
-            found, title = details.residuals.get(name), f"{name}, {device}"
-            if found is None:
+            residuals, title = details.residuals.get(name), f"{name}, {device}"
+            if residuals is None:
                 return None
             if device == "camera":
-                return residual_arrows(title, found.pixels, found.camera, details.stereo.rig.camera.size)
-            return residual_arrows(title, found.projector_pixels, found.projector, details.stereo.rig.projector.size)
+                return residual_arrows(title, residuals.pixels, residuals.camera, details.camera.size)
+            return residual_arrows(title, residuals.projector_pixels, residuals.projector, details.projector.size)
 
         self._painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
