@@ -357,7 +357,7 @@ def test_no_label_is_cut_at_1280_by_800(measured: tuple[Page, Operator, list[str
 
 
 def test_words_of_a_calibration() -> None:
-    poses = {m: {"pose_1": HeldOut(p, 2 * p, 9.0, p, p)} for m, p in (("stereo", 0.2), ("splined", 0.02))}
+    poses = {m: {"pose_1": HeldOut(p, 2 * p, 9.0, p, p, 100, 600.0)} for m, p in (("stereo", 0.2), ("splined", 0.02))}
     html = comparison_table(CrossValidation(poses, (("pose_1",),), {"pixelwise": "too <few> poses"}), "splined")
     assert re.search(r"font-weight:600\">0&#46;020", html) and "<few>" not in html and html.index("stereo") > 0
     assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_html(REJECTED, True, None)

@@ -43,7 +43,7 @@ def test_a_task_has_the_open_rig_and_everything_is_restored_after_it(bench: Benc
     bench.acquisition.run_task("Checking the rig", task, results.append)
     bench.until(lambda: bool(results) and bench.acquisition.idle)
     assert 1 < results[0] < bright
-    assert (views[0].name, views[0].doing, views[0].frame, views[0].frames) == (
+    assert (views[0].name, views[0].stage, views[0].frame, views[0].frames) == (
         "Checking the rig",
         "measuring the light",
         50,

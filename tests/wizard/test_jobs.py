@@ -53,7 +53,7 @@ def test_progress_is_seen(jobs: Jobs) -> None:
     assert half.wait(5)
     view = jobs.view()
     assert view is not None
-    assert (view.name, view.share, view.doing, view.can_cancel, view.waiting) == ("Working", 0.5, "halfway", True, 1)
+    assert (view.name, view.share, view.stage, view.can_cancel, view.waiting) == ("Working", 0.5, "halfway", True, 1)
     go_on.set()
     assert jobs.wait_until_idle(5)
 
@@ -122,8 +122,8 @@ def test_a_save_that_has_begun_is_awaited_and_counts(jobs: Jobs, notices: Notice
     ("error", "says"),
     [
         (CalibrationRejected("2 usable poses, and at least 3 are needed"), "2 usable poses, and at least 3 are needed"),
-        (KeyError("x"), "Failing failed because of an error in the program (KeyError); the log holds its details"),
-        (MemoryError(), "memory is full"),
+        (KeyError("x"), "Failing failed because of an error in the program (KeyError); see the log for details"),
+        (MemoryError(), "out of memory"),
         (OSError(28, "No space left on device", "/x"), "Failing failed: No space left on device (/x)"),
     ],
 )

@@ -92,7 +92,7 @@ def test_stillness_starts_anew_with_every_movement() -> None:
     assert still.update(pixels + 0.5, 1.0, 11.0) == 1
     assert still.update(pixels + 2, 1.0, 12.0) == 0
     assert still.update(pixels + 2, 1.0, 12.7) == pytest.approx(0.7)
-    still.lose()
+    still.reset()
     assert still.update(pixels + 2, 1.0, 13.0) == 0
     # a slow drift is movement too
     drift = Stillness()

@@ -100,7 +100,7 @@ def test_a_session_opens_without_the_rig_that_it_remembers(operator: Operator, t
     assert operator.open_session(tmp_path / "other") and operator.session is not None
     view = operator.wait_until_idle()
     assert view.rig.state == "lost" and "no.avi does not exist" in view.rig.fault and view.rig.choice == missing
-    assert "Try it again" in view.step("rig").problems[0]
+    assert "Try again" in view.step("rig").problems[0]
     assert not operator.choose_rig(missing)  # as the button "Try this rig again" asks
     assert operator.session.decision("rig") == missing and operator.session.decision("exposure")["exposure_ms"] == 3.0
     assert operator.choose_rig(RIG) and operator.wait_for(lambda s: s.rig.state == "open", 10.0)
