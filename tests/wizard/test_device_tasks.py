@@ -181,7 +181,7 @@ def test_another_rig_ends_what_the_one_before_was_doing(bench: Bench) -> None:
     bench.until(lambda: bench.acquisition.idle and bench.acquisition.view().state == "open")
     assert (bench.acquisition.view().name, bench.acquisition.view().light) == ("another", "white")
     assert not done and not bench.saved
-    assert sorted(bench.texts) == ["Checking the rig: cancelled", "waits: not taken, another rig was chosen"]
+    assert sorted(bench.texts) == ["Checking the rig: cancelled", "waits: not captured, another rig was chosen"]
 
 
 def test_a_camera_that_opens_and_gives_no_picture_is_told_of_once(

@@ -184,7 +184,7 @@ def test_hands_free_captures_a_board_that_is_held_still(operator: Operator, monk
 def test_a_session_is_opened_for_one_operator_and_changed_for_another(operator: Operator, tmp_path: Path) -> None:
     with Operator() as other:
         assert not other.open_session(tmp_path / "session")
-        assert "open for writing in" in last(other.settle())
+        assert "open for writing in" in last(other.wait_until_idle())
     assert operator.open_session(tmp_path / "second") and operator.session is not None
     assert operator.session.folder == tmp_path / "second"
     Session.open(tmp_path / "session", write=True).close()
