@@ -178,7 +178,7 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     choose(page, "Start from", "features")
     button(page, "Merge 2 scans").click()
     expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible(timeout=60_000)
-    expect(page.get_by_text(re.compile(r"^0\.0\d+ mm"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^0\.0\d+ mm")).first).to_be_visible()
     expect(page.get_by_text("Not merged.")).to_be_hidden()
     choose(page, "3D view", "merged, uncertainty")
     expect(page.get_by_text("uncertainty along the normal (1 sigma)")).to_be_visible()
