@@ -11,7 +11,7 @@ from slviewer.gui.widgets import Html, Tone, alert, coloured, paragraph, table, 
 from slviewer.inspection.colours import deviation_colours
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline.measurements import quantities_of
-from slviewer.report.canvas import finish, new_figure, tidy
+from slviewer.report.canvas import finish_figure, new_figure, style_axes
 from slviewer.report.measurements import draw_deviations
 from slviewer.report.page import Figure
 from slviewer.session.measurements import Measurement
@@ -94,12 +94,12 @@ def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: fl
     """Histogram of the deviations: edges (n + 1,) mm and counts (n,)."""
     drawing = new_figure(PLOT_PX, _HIGH)
     axes = drawing.subplots()
-    tidy(axes, "", "deviation, mm", "points, %")
+    style_axes(axes, "", "deviation, mm", "points, %")
     draw_deviations(axes, edges, counts, limit, tolerance)
     if tolerance is not None:
         far = max(float(edges[-1]), 1.15 * tolerance)
         axes.set_xlim(-far, far)
-    return finish(drawing, "Histogram of the deviations.", name)
+    return finish_figure(drawing, "Histogram of the deviations.", name)
 
 
 def _notes(measured: Sequence[Measurement]) -> str:

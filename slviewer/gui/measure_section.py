@@ -10,8 +10,8 @@ from slviewer.gui.inputs import change
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.widgets import Html, Text, table
-from slviewer.inspection.section import between, nearest_on, radius_through
-from slviewer.report.canvas import finish, new_figure, tidy
+from slviewer.inspection.section import measure_cursors, nearest_on_section, radius_through
+from slviewer.report.canvas import finish_figure, new_figure, style_axes
 from slviewer.report.page import Figure
 
 CURSORS = ("A", "B", "C")
@@ -81,7 +81,7 @@ def _range(along: np.ndarray) -> tuple[float, float, float]:
 
 def cursor_points(lines: list[np.ndarray], at: tuple[float, ...]) -> np.ndarray:
     """(3, 2) mm: the section's points at the cursors."""
-    return np.array([nearest_on(lines, x) for x in at])
+    return np.array([nearest_on_section(lines, x) for x in at])
 
 
 def cursor_html(cursors: np.ndarray) -> Html:
@@ -114,4 +114,4 @@ def section_figure(name: str, lines: list[np.ndarray], cursors: np.ndarray) -> F
     axes.set_aspect("auto" if raised else "equal", adjustable="datalim")
     axes.margins(y=0.15)
     scale = "heights are enlarged" if raised else "equal scales"
-    return finish(drawing, f"Section through both points and the camera; up: towards the camera; {scale}.", name)
+    return finish_figure(drawing, f"Section through both points and the camera; up: towards the camera; {scale}.", name)

@@ -18,7 +18,7 @@ from slviewer.gui.pictures import Painter
 from slviewer.gui.viewpoints import TO_THE_RIGHT
 from slviewer.gui.widgets import Html, Text, alert, coloured, paragraph, table, to_html
 from slviewer.registration.multiway import Pair
-from slviewer.registration.picked import LEAST_PICKS, picked_start
+from slviewer.registration.picked import LEAST_PICKS, fit_picked_start
 from slviewer.session.store import Session
 from slviewer.wizard.result_views import ScanCloud, nearest, scan_cloud
 
@@ -285,7 +285,7 @@ def _residuals_html(picks: _Picks) -> Html:
     if n < LEAST_PICKS:
         return paragraph(coloured(f"{n} of {LEAST_PICKS} pairs picked", "dim"))
     try:
-        _, residuals_mm = picked_start(*picks.points)
+        _, residuals_mm = fit_picked_start(*picks.points)
     except SlviewerError as error:
         return alert(str(error), "warning")
     rows = [(f"Pair {k}", f"{mm:.2f}") for k, mm in enumerate(residuals_mm, 1)]

@@ -30,7 +30,7 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.session.capture import Capture
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
-from slviewer.session.measurements import NAMES, Measurement, as_saved
+from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -385,7 +385,7 @@ class SessionReader:
                     scales = {meta["model"]: used} if (used := meta["data"].get("scale")) is not None else {}
                 stale = _differs(meta.get("inputs", {}), known) or _differs(scales, inputs.factors)
                 if kind == f"{MEASUREMENTS}/":
-                    read.append(as_saved(result.removeprefix(kind), meta, names, stale))
+                    read.append(measurement_from_meta(result.removeprefix(kind), meta, names, stale))
                 if not stale:
                     known[result] = meta["hash"]
         return tuple(read)

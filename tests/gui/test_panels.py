@@ -86,7 +86,7 @@ def test_a_calibration_shows_its_poses_and_what_a_pixel_learnt(measured: tuple[P
     button(page, "Include pose_02 again").click()
     expect(button(page, "Exclude pose_02")).to_be_visible()
     page.get_by_text("Parameters", exact=True).click()
-    expect(page.get_by_text("Angle between the axes")).to_be_visible()
+    expect(page.get_by_text("angle between the optical axes")).to_be_visible()
     assert errors == []
 
 

@@ -20,7 +20,7 @@ from slviewer.gui.pictures import PLOT_PX, Plot, colour_range
 from slviewer.gui.widgets import Html, Text, coloured, colours, paragraph, table, to_html
 from slviewer.pipeline.report import calibration_view
 from slviewer.report.curves import pixel_curves
-from slviewer.report.data import CalibrationFigures, DeviceParameters, PixelCurve
+from slviewer.report.data import CalibrationFigures, PixelCurve
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
@@ -240,8 +240,10 @@ class Panel(StepPanel):
             if residuals is None:
                 return None
             if device == "camera":
-                return residual_arrows(title, residuals.pixels, residuals.camera, details.camera.size)
-            return residual_arrows(title, residuals.projector_pixels, residuals.projector, details.projector.size)
+                return residual_arrows(title, residuals.pixels, residuals.camera, details.stereo.rig.camera.size)
+            return residual_arrows(
+                title, residuals.projector_pixels, residuals.projector, details.stereo.rig.projector.size
+            )
 
         self._painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
@@ -384,27 +386,8 @@ def _fits(calibration: CalibrationView) -> Html:
 
 
 def _parameters(details: CalibrationFigures) -> Html:
-    def lens(device: DeviceParameters) -> list[str]:
-        K, D, sigma = device.K, device.D, device.focal_sigma_px
-        sigma_text = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
-        return [
-            f"{device.size[0]} × {device.size[1]} px",
-            *(f"{K[i, i]:.1f}{sigma_text} px" for i in (0, 1)),
-            *(f"{K[i, 2]:.1f} px" for i in (0, 1)),
-            *(f"{value:.5f}".replace("-", "−") for value in D[:5]),
-        ]
-
-    names = ["Size", "Focal length fx", "Focal length fy", "Centre cx", "Centre cy", "k1", "k2", "p1", "p2", "k3"]
-    lenses = list(zip(names, lens(details.camera), lens(details.projector), strict=True))
-    t = np.asarray(details.t, float).ravel()
-    turned = np.degrees(np.arccos(np.clip((np.trace(details.R) - 1) / 2, -1, 1)))
-    axes = np.degrees(np.arccos(np.clip(details.R[2, 2], -1, 1)))
-    rig = [
-        ("Baseline", f"{np.linalg.norm(t):.2f} mm"),
-        ("Translation, mm", " / ".join(f"{value:.2f}" for value in t).replace("-", "−")),
-        ("Rotation", f"{turned:.2f}°"),
-        ("Angle between the axes", f"{axes:.2f}°"),
-        ("Target", details.target or "imported"),
-    ]
+    stereo = details.stereo
+    lenses = [(f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)]
+    rig = [*rig_rows(stereo), ("Target", stereo.board or "imported")]
     note = paragraph(coloured("±: one standard deviation.", "dim"))
     return Html(table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig) + to_html(note))

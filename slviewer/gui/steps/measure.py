@@ -16,7 +16,7 @@ from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import Place
 from slviewer.pipeline.measurements import Shape
-from slviewer.report.canvas import rounded_up
+from slviewer.report.canvas import round_up
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import MM
 from slviewer.wizard.snapshot import SessionView, Snapshot
