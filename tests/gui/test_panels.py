@@ -17,7 +17,7 @@ from playwright.sync_api import TimeoutError as NotShownError
 from wizard_page import SIZE, Opened, button, cut_labels, field
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
-from slviewer.evaluation.crossvalidation import CrossValidation, HeldOut
+from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
 from slviewer.gui.app import App
 from slviewer.gui.calibration_html import comparison_table, named_poses, verdict_html
 from slviewer.gui.inputs import display_name
@@ -357,7 +357,9 @@ def test_no_label_is_cut_at_1280_by_800(measured: tuple[Page, Operator, list[str
 
 
 def test_words_of_a_calibration() -> None:
-    poses = {m: {"pose_1": HeldOut(p, 2 * p, 9.0, p, p, 100, 600.0)} for m, p in (("stereo", 0.2), ("splined", 0.02))}
+    poses = {
+        m: {"pose_1": HeldOutPose(p, 2 * p, 9.0, p, p, 100, 600.0)} for m, p in (("stereo", 0.2), ("splined", 0.02))
+    }
     html = comparison_table(CrossValidation(poses, (("pose_1",),), {"pixelwise": "too <few> poses"}), "splined")
     assert re.search(r"font-weight:600\">0&#46;020", html) and "<few>" not in html and html.index("stereo") > 0
     assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_html(REJECTED, True, None)
