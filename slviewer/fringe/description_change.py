@@ -101,7 +101,7 @@ def _with_values(
     a = agreement(reader, frames)
     failed = failed_tests(frames, a)
     out = list(changes)
-    if failed & {"bits", "rule", "rising"} or not a.rule > SURE or a.edges < FEWEST_EDGES:
+    if failed & {"inverse", "bits", "rule", "rising"} or not a.rule > SURE or a.edges < FEWEST_EDGES:
         return None
     if frames.fringe is not None:
         period = frames.fringe[0]

@@ -13,7 +13,17 @@ import numpy as np
 
 from slviewer.fringe.kernels_light import equalize, mark_clipped
 from slviewer.fringe.layout import check_stack, white_level
-from slviewer.fringe.light_fit import Fit, Light, LightModel, Remainder, Term, equalized_sample, fit_light, room_changes
+from slviewer.fringe.light_fit import (
+    SHARE_PRIOR,
+    Fit,
+    Light,
+    LightModel,
+    Remainder,
+    Term,
+    equalized_sample,
+    fit_light,
+    room_changes,
+)
 from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.suspect import Fault, Suspect
@@ -35,11 +45,19 @@ AS_GOOD = 1.02
 LEFT, LEFT_CONTRAST = 4.0, 0.02
 """Light explains the frames if the mean squared residual is below so many times the square of the grey levels by which
 neighbouring pixels differ, plus the square of this share of the contrast for what blur and the camera's curve add."""
+EXPLAINED = 0.6
+"""Of a Gray code alone it explains them if that is below this share of what equal light leaves: blur, scattered light
+and compression add to it. Of sound frames, and of those that show another's pattern, light explains up to a third."""
 LEFT_OF_ROOM = 1.5
 """... so many times where gains and room light together explain them: they have so many values that they can pretend to
 explain a frame out of its place."""
 ONE_FRAME = 6.0
 """... and no frame has so many times the residual of the median frame: frames that show another's pattern have more."""
+LEFT_OF_FRAME = 0.3
+"""... unless, in a Gray code alone, light explains all but this share of what it leaves otherwise."""
+CLEARLY_BETTER = 1.5
+"""Both factors where a Gray code alone leaves more than noise: some percent of it are blur and scattered light
+that a wave along the rows, or room light, happens to fit."""
 CYCLES = np.arange(0.5, 8.25, 0.25)
 """Waves along the image's height that are tried."""
 FINE = 0.05
@@ -314,9 +332,10 @@ def _simplest(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
     own = fit_light(coarse, ("gain",), first.light, weight, 2)
     fits = [own, *(fit_light(coarse, terms, start, weight, 3) for terms, start in _candidates(coarse, own))]
     best = min(fit.variance for fit in fits)
-    if own.variance < BETTER * best:
+    is_noise = bool(coarse.shifts) or own.variance < LEFT * coarse.roughness**2
+    if own.variance < (BETTER if is_noise else CLEARLY_BETTER) * best:
         return first
-    chosen = next(fit for fit in fits if fit.variance <= AS_GOOD * best)
+    chosen = next(fit for fit in fits if fit.variance <= (AS_GOOD if is_noise else CLEARLY_BETTER) * best)
     if any("wave" in term for term in chosen.terms):
         chosen = _refined(coarse, chosen)
     return fit_light(sample, chosen.terms, chosen.light, most_steps=3)
@@ -355,10 +374,16 @@ def _explains(sample: LightSample, fit: Fit) -> bool:
     entries[len(model.phased) :] = (fit.weight * sample.interior).sum(axis=1)
     judged = np.isin(model.used, fit.informed)
     each = energy[judged] / np.maximum(entries[judged], 1)
-    most = LEFT if len(fit.terms) < 3 else LEFT_OF_ROOM
-    return fit.variance < most * sample.roughness**2 + LEFT_CONTRAST**2 * float(
-        np.mean(sample.amplitudes) ** 2
-    ) and each.max() < ONE_FRAME * max(float(np.median(each)), sample.roughness**2 / 2)
+    limit = ONE_FRAME * max(float(np.median(each)), sample.roughness**2 / 2)
+    if sample.shifts:
+        most = LEFT if len(fit.terms) < 3 else LEFT_OF_ROOM
+        small = most * sample.roughness**2 + LEFT_CONTRAST**2 * float(np.mean(sample.amplitudes) ** 2)
+        return fit.variance < small and bool(each.max() < limit)
+    one = np.ones_like(fit.weight)
+    equal = model.eliminate(Light.constant(len(sample.frames)), SHARE_PRIOR[0], one)
+    explained = model.eliminate(fit.light, fit.share, one).variance < EXPLAINED * equal.variance
+    unequal = (fit.weight * equal.left**2).sum(axis=1)[judged] / np.maximum(entries[judged], 1)
+    return explained and bool((each < np.maximum(limit, LEFT_OF_FRAME * unequal)).all())
 
 
 def _with_nearest(sample: LightSample, fit: Fit) -> Fit:
@@ -381,8 +406,8 @@ def _with_nearest(sample: LightSample, fit: Fit) -> Fit:
 def _with_fine_stripes(sample: LightSample, fit: Fit) -> Light:
     """The light, with gains of coded frames whose stripes are too fine to have an interior.
 
-    Over many fine stripes the mean of a bit and that of its inverse are the same share of white, and that is half of
-    dark and bright together.
+    Over many fine stripes the mean of each bit and of each inverse is the same share of white: about half, more or less
+    by what the camera's curve makes of blurred stripes, which all of them have in common.
     """
     model, light = LightModel(sample), fit.light
     left = model.eliminate(light, fit.share, fit.weight)
@@ -390,12 +415,12 @@ def _with_fine_stripes(sample: LightSample, fit: Fit) -> Light:
     fine = [i for i, share in zip(sample.coded, inside, strict=True) if share < FINE and i not in fit.informed]
     dark, bright = left.levels
     both = (left.counts[0] > 0) & (left.counts[1] > 0)
-    if not fine or np.count_nonzero(both) < MIN_PIXELS:
+    if "gain" not in fit.terms or not fine or np.count_nonzero(both) < MIN_PIXELS:
         return light
     middle = float(np.mean(0.5 * (dark + bright)[both]))
     frames, _ = equalized_sample(sample, light, fine)
-    gain, excess = light.gain.copy(), frames[:, both].mean(axis=1) / middle
-    gain[fine] *= np.where(
-        np.abs(np.log(np.maximum(excess, 1e-3))) < FARTHEST, excess, 1
-    )  # else something else was shown
+    gain, excess = light.gain.copy(), np.maximum(frames[:, both].mean(axis=1) / middle, 1e-3)
+    shows_stripes = np.abs(np.log(excess)) < FARTHEST
+    if shows_stripes.any():
+        gain[fine] *= np.where(shows_stripes, excess / np.median(excess[shows_stripes]), 1)
     return replace(light, gain=gain)

@@ -299,8 +299,10 @@ class Remainder:
 
     def robust_weight(self) -> np.ndarray:
         entries = sum(np.maximum(count - 1, 0) for count in self.counts)
-        ratio = (self.left**2).sum(axis=0) / np.maximum(self.model.phase_freedom + entries, 1)
-        return (1 / (1 + (ratio / max(OUTLIER * float(np.median(ratio)), 1e-6)) ** 2)).astype(np.float32)
+        freedom = self.model.phase_freedom + entries
+        ratio = (self.left**2).sum(axis=0) / np.maximum(freedom, 1)
+        usual = float(np.median(ratio[freedom > 0])) if (freedom > 0).any() else 0.0
+        return (1 / (1 + (ratio / max(OUTLIER * usual, 1e-6)) ** 2)).astype(np.float32)
 
     def solve(
         self, light: Light, terms: Sequence[Term], variance: float, share: float

@@ -4,7 +4,7 @@ Phase-shifted frames are one cosine per pixel, so that more than three of them s
 when one was late, lost or repeated. Frames of unequal light are compared as they would be under equal light. What the
 projector's gamma adds is common to all frames, and is not held against one of them; where it shifts the phase of three
 or four steps, it is reported. Frames of a Gray code contradict
-each other too: see `residual_gray`.
+each other too: see `description_check`.
 """
 
 from dataclasses import dataclass, replace
@@ -12,17 +12,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slviewer.fringe.aliased_harmonics import estimate_aliased_harmonics, harmonics_suspects
+from slviewer.fringe.description_check import find_contradictions
 from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_frames, estimate_frame_light, light_suspects
 from slviewer.fringe.layout import Layout, check_stack, layout, white_level
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.residual_gray import code_suspects
 from slviewer.fringe.residual_order import order_suspects, strange_suspects
 from slviewer.fringe.residual_sample import Fringe, fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.fringe.suspect import LIGHT_FAULTS, ORDER_FAULTS, Suspect
+from slviewer.fringe.suspect import LIGHT_FAULTS, ORDER_FAULTS, Fault, Suspect
 
 SMALL_DRIFT = 0.05
 """rms variation of the light up to which a misplaced frame is recognised without correcting the light first."""
+_CODE_FAULTS: dict[str, Fault] = {
+    "frame-lag": "lag", "frame-order": "swapped", "missing-frame": "dropped", "duplicate-frame": "late"
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -98,9 +101,21 @@ def _compare(
         suspects += order_suspects(sampled) or strange_suspects(sampled)
         residuals += _residuals(sampled, _light(sampled) * light.light.gain[list(shift.indices)], factor)
     suspects += harmonics_suspects(estimate_aliased_harmonics(found, stack, white, noise), found)
-    if found.gray:
-        suspects += code_suspects(sequence, found, stack, white)
+    if found.gray and not suspects:
+        suspects += _code_suspects(sequence, stack, axis)
     return FrameResiduals(axis, tuple(residuals), tuple(_once(suspects)), "; ".join(said))
+
+
+def _code_suspects(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> list[Suspect]:
+    """What contradicts the order of the frames that are no phase steps; of all frames, if they are late by as many."""
+    out = []
+    for c in find_contradictions(sequence, stack):
+        if c.cause in _CODE_FAULTS and c.axis in (axis, None) and c.value is not None:
+            is_common = c.cause == "frame-lag" and c.axis is None
+            frame = 0 if is_common else int(c.value)
+            if is_common or sequence.frames[frame].kind != "phase":
+                out.append(Suspect(frame, _CODE_FAULTS[c.cause], c.message))
+    return out
 
 
 def _residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list[FrameResidual]:

@@ -164,8 +164,8 @@ def test_bits_and_inverses_must_add_up():
     for k in (1, 2, 3, 5):
         assert told(sequence, late(stack, k)) == {k: "late"}
     assert told(sequence, swapped(stack, 2)) == {2: "swapped"}
-    assert set(told(sequence, swapped(stack, 1))) == {0, 2}
-    assert told(sequence, dropped(stack, 2))[2] == "lag"
+    assert told(sequence, swapped(stack, 1)) == {1: "swapped"}
+    assert told(sequence, dropped(stack, 2)) == {2: "dropped"}
     assert told(sequence, brighter(stack, 0)) == {0: "exposure-drift"}
 
 
