@@ -40,7 +40,7 @@ class Answer:
     is_certain: bool = False
 
 
-def score_of(a: Agreement) -> float:
+def sum_shares(a: Agreement) -> float:
     """The sum of the shares that tell how well the frames agree; a half for what is not known."""
     return float(sum(0.5 if np.isnan(share) else share for share in _shares(a)))
 
@@ -83,7 +83,7 @@ def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
     return failed
 
 
-def is_sure(frames: AxisFrames, a: Agreement) -> bool:
+def is_supported(frames: AxisFrames, a: Agreement) -> bool:
     """Whether a hypothesis has something to show for itself."""
     if frames.bits and not (a.edges >= FEWEST_EDGES and a.rule > SURE):
         return False

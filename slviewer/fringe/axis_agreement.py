@@ -210,7 +210,7 @@ class AxisReader:
         return (cosine - 1j * frames.sign * sine) * turned
 
 
-def agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
+def measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
     """How well the frames agree under this hypothesis."""
     if frames not in reader.known:
         reader.known[frames] = _agreement(reader, frames)

@@ -9,19 +9,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from slviewer.fringe.agreement_tests import failed_tests, is_sure, score_of
+from slviewer.fringe.agreement_tests import failed_tests, is_supported, sum_shares
 from slviewer.fringe.axis_agreement import (
     Agreement,
     AxisReader,
-    agreement,
     coordinates,
     described_frames,
+    measure_agreement,
 )
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
 from slviewer.fringe.frame_light import describe_disturbance, equalize_frames, estimate_frame_light
 from slviewer.fringe.frame_likeness import FrameLikeness
-from slviewer.fringe.frame_order import fitting_order, misplaced_steps, repeated_frames, unexplained_steps
+from slviewer.fringe.frame_order import detect_copies, detect_misplaced_steps, detect_unexplained_steps, search_order
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.line_sample import LineSample, coded_frames, grid_sample, sample_lines
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -113,12 +113,12 @@ def find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[C
     if dark := _without_pattern(sequence, sample):
         return dark
     likeness = FrameLikeness(sequence, sample)
-    if repeated := repeated_frames(sequence, readers, likeness):
+    if repeated := detect_copies(sequence, readers, likeness):
         return repeated
-    stated = {axis: agreement(readers[axis], described_frames(sequence, axis)) for axis in sequence.axes}
+    stated = {axis: measure_agreement(readers[axis], described_frames(sequence, axis)) for axis in sequence.axes}
     failed = {axis: failed_tests(described_frames(sequence, axis), stated[axis]) for axis in sequence.axes}
-    disordered = [c for axis in sequence.axes for c in misplaced_steps(sequence, axis, sample)]
-    strange = set() if disordered else unexplained_steps(sequence, sample)
+    disordered = [c for axis in sequence.axes for c in detect_misplaced_steps(sequence, axis, sample)]
+    strange = set() if disordered else detect_unexplained_steps(sequence, sample)
     uneven = [i for i in range(len(stack)) if not likeness.is_even(i, i)]
     if not any(failed.values()) and not disordered and not strange and not uneven:
         return _mirrored(sequence, sample)
@@ -127,10 +127,10 @@ def find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[C
     if exchanged := _axes_exchanged(sequence, sample, failed):
         return exchanged
     answers = {axis: explain_axis(readers[axis], sequence, axis) for axis in sequence.axes if failed[axis]}
-    explained = [answers[axis][0].score if answers.get(axis) else score_of(stated[axis]) for axis in sequence.axes]
+    explained = [answers[axis][0].score if answers.get(axis) else sum_shares(stated[axis]) for axis in sequence.axes]
     complete = all(answers.values()) and not disordered and not strange and not uneven
     if not (complete and all(answers[axis][0].is_certain for axis in answers)):
-        order = fitting_order(sequence, sample, readers, likeness, disordered, strange)
+        order = search_order(sequence, sample, readers, likeness, disordered, strange)
         if order is not None and not (complete and sum(explained) > order.score - CLEARLY):
             return order.contradictions
     out = list(disordered)
@@ -197,9 +197,10 @@ def _axes_exchanged(
                 variants.append(replace(frames, shifts=other.shifts))
             else:
                 variants.append(replace(frames, bits=other.bits, inverse=other.inverse))
-        agreements = [agreement(reader, variant) for variant in variants]
+        agreements = [measure_agreement(reader, variant) for variant in variants]
         if any(
-            failed_tests(variant, a) or not is_sure(variant, a) for variant, a in zip(variants, agreements, strict=True)
+            failed_tests(variant, a) or not is_supported(variant, a)
+            for variant, a in zip(variants, agreements, strict=True)
         ):
             continue
         if with_steps and with_bits:

@@ -110,7 +110,7 @@ def fit_light(
     return Fit(light, tuple(terms), left.variance, share, weight, model.informed)
 
 
-def room_changes(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
+def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
     """The frame from which on a change of the room's light, beside gains or alone, explains the most; empty if none."""
     model = LightModel(sample)
     left = model.eliminate(light, SHARE_PRIOR[0], weight)
@@ -142,7 +142,7 @@ def room_changes(sample: LightSample, light: Light, with_gain: bool, weight: np.
     return at
 
 
-def equalized_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def equalize_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """(u, p) samples under equal light, and the gains that they were divided by."""
     cosine, sine = _wave(sample, light.cycles)
     wave = light.wave[used].astype(np.float32)
@@ -215,7 +215,7 @@ class LightModel:
 
     def eliminate(self, light: Light, share: float, weight: np.ndarray) -> "Remainder":
         sample, n = self.sample, len(self.phased)
-        frames, gain = equalized_sample(sample, light, self.used)
+        frames, gain = equalize_sample(sample, light, self.used)
         shown, left = np.zeros_like(frames), np.zeros_like(frames)
         harmonics: list[tuple[slice, np.ndarray]] = []
         if n:

@@ -56,7 +56,7 @@ class LightSample:
         """(p,) grey levels, in proportion to what the scene reflects, of frames between which no light ``changes``."""
         if not self.shifts:
             return _half_range(self.frames, self.coded, self.partner, changes)
-        return self.amplitudes[undisturbed(self.shifts, changes)]
+        return self.amplitudes[steady_shift(self.shifts, changes)]
 
 
 def sample_light(
@@ -131,7 +131,7 @@ def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequ
     """
     shifts = _shifts(sequence)
     if shifts:
-        chosen = np.stack([frames[i] for i in shifts[undisturbed(shifts, changes)]]).astype(np.float32)
+        chosen = np.stack([frames[i] for i in shifts[steady_shift(shifts, changes)]]).astype(np.float32)
         return np.abs(fit_cosine(chosen.reshape(len(chosen), -1))[1]).reshape(frames.shape[1:])
     coded = tuple(i for i, f in enumerate(sequence.frames) if f.kind != "texture")
     return _half_range(frames, coded, _partners(sequence, coded), changes)
@@ -152,7 +152,7 @@ def _half_range(
     return np.float32(0.5) * (high - low)
 
 
-def undisturbed(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int:
+def steady_shift(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int:
     """The place of the last shift between whose frames no light ``changes``; -1, the last, where there is none."""
     return next(
         (s for s in reversed(range(len(shifts))) if not any(min(shifts[s]) < k <= max(shifts[s]) for k in changes)), -1

@@ -14,7 +14,7 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.fringe.decode import decode
 from slviewer.fringe.description_check import check_description
-from slviewer.fringe.frame_light import estimate_frame_light, light_suspects
+from slviewer.fringe.frame_light import detect_light_faults, estimate_frame_light
 from slviewer.fringe.presets import AXES, bits_for, complementary, gray, gray_bits, multifrequency, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 from slviewer.simulation.rig import letter
@@ -133,7 +133,7 @@ def test_room_light_among_gray_frames_is_corrected(frame: int) -> None:
     sequence, frames = taken("complementary")
     brighter = np.minimum(0.7 * frames + 60 * (np.arange(len(frames)) >= frame)[:, None, None], 255).astype(np.uint8)
     assert check_description(sequence, brighter) == ()
-    suspects = light_suspects(sequence, estimate_frame_light(sequence, brighter))
+    suspects = detect_light_faults(sequence, estimate_frame_light(sequence, brighter))
     assert [(s.fault, s.frame) for s in suspects] == [("room-light", frame)]
     for axis in AXES:
         truth, seen = (decode(sequence, stack, axis).coordinate for stack in (frames, brighter))

@@ -13,7 +13,7 @@ import pytest
 
 from slviewer.fringe.decode import decode
 from slviewer.fringe.description_check import check_description
-from slviewer.fringe.frame_light import estimate_frame_light, light_suspects
+from slviewer.fringe.frame_light import detect_light_faults, estimate_frame_light
 from slviewer.fringe.presets import gray, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 
@@ -75,7 +75,7 @@ def with_fault(script: ModuleType, fault: str, frames: np.ndarray, severity: flo
 def test_sound_captures_are_not_accused(real_data: Path, name: str) -> None:
     sequence, frames = photographed(real_data, name)
     assert check_description(sequence, frames) == ()
-    assert light_suspects(sequence, estimate_frame_light(sequence, frames)) == []
+    assert detect_light_faults(sequence, estimate_frame_light(sequence, frames)) == []
     for coordinate in coordinates(real_data, name).values():
         assert 0.1 < np.isfinite(coordinate).mean() <= 1
 
@@ -133,7 +133,7 @@ def test_light_that_varies_is_corrected_and_named(
     sequence, frames = photographed(real_data, name)
     faulty = with_fault(make_faulty, fault, frames, severity)
     assert check_description(sequence, faulty) == ()
-    suspects = {s.fault for s in light_suspects(sequence, estimate_frame_light(sequence, faulty))}
+    suspects = {s.fault for s in detect_light_faults(sequence, estimate_frame_light(sequence, faulty))}
     assert suspects & causes and suspects <= causes
     for axis, truth in coordinates(real_data, name).items():
         coordinate = decode(sequence, faulty, axis).coordinate
@@ -148,4 +148,4 @@ def test_dim_captures_are_not_accused(real_data: Path, name: str, make_faulty: M
     sequence, frames = photographed(real_data, name)
     faulty = with_fault(make_faulty, "dark", frames)
     assert {c.cause for c in check_description(sequence, faulty)} <= {"dark"}
-    assert light_suspects(sequence, estimate_frame_light(sequence, faulty)) == []
+    assert detect_light_faults(sequence, estimate_frame_light(sequence, faulty)) == []
