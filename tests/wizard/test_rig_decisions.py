@@ -52,7 +52,7 @@ def test_a_rig_is_kept_under_a_name_with_its_exposure(operator: Operator) -> Non
     assert operator.save_rig("mine", "With a longer exposure.")
     assert operator.session is not None
     assert load_rig("mine", operator.session) == {**RIG, "exposure_ms": 2.5, "gain": 1.0}
-    assert operator.save_rig("../mine") is False and "cannot be a name" in last(operator.settle())
+    assert operator.save_rig("../mine") is False and "../mine" in last(operator.settle())
     assert operator.choose_rig({**RIG, "exposure_ms": 1.5})
     now = operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, 5.0)
     assert now is not None and now.session is not None and now.session.exposures_ms == ()
@@ -97,7 +97,7 @@ def test_a_session_opens_without_the_rig_that_it_remembers(operator: Operator, t
         store.decide("exposure", {"exposure_ms": 3.0, "gain": None})
     assert operator.open_session(tmp_path / "other") and operator.session is not None
     view = operator.settle()
-    assert view.rig.state == "lost" and "no.avi does not exist" in view.rig.fault and view.rig.choice == missing
+    assert view.rig.state == "lost" and "no.avi" in view.rig.fault and view.rig.choice == missing
     assert "Try it again" in view.step("rig").wrong[0]
     assert not operator.choose_rig(missing)  # as the button "Try this rig again" asks
     assert operator.session.decision("rig") == missing and operator.session.decision("exposure")["exposure_ms"] == 3.0

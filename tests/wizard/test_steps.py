@@ -37,7 +37,7 @@ def test_the_way_through_the_wizard() -> None:
     aimed = replace(EMPTY, target="circles:9x7:20")
     assert states(Facts(aimed, OPEN, None)) == {"rig": "done", "target": "done", "poses": "ready", **blocked}
     few = replace(aimed, poses=poses(2))
-    assert "2 good poses so far" in next(v for v in views(Facts(few, OPEN, None)) if v.key == "calibrate").because
+    assert "2 good poses" in next(v for v in views(Facts(few, OPEN, None)) if v.key == "calibrate").because
     enough = replace(aimed, poses=poses(10), coverage=COVERED)
     reached = states(Facts(enough, OPEN, None))
     assert (reached["poses"], reached["calibrate"], reached["verify"]) == ("done", "ready", "blocked")
@@ -81,6 +81,6 @@ def test_poses_that_cover_the_view_may_still_lack_accuracy() -> None:
     covering = replace(EMPTY, target="circles:9x7:20", poses=poses(10), coverage=COVERED)
     assert "cover the view: calibrate" in views(Facts(covering, OPEN, None))[2].now
     lacking = replace(covering, foreseen=Foreseen(0.03, 0.02, 0.024, False))
-    assert "0.030 mm is predicted, and 0.024 mm wanted: add more" in views(Facts(lacking, OPEN, None))[2].now
+    assert all(sigma in views(Facts(lacking, OPEN, None))[2].now for sigma in ("0.030 mm", "0.024 mm"))
     few = replace(lacking, poses=poses(3), coverage=None)
     assert "Choosing where the board tells most" in views(Facts(replace(few, planning=True), OPEN, None))[2].now
