@@ -148,6 +148,7 @@ def test_a_covered_circle_among_clutter_is_counted_not_replaced() -> None:
             detect(SYMMETRIC, scene.render(SYMMETRIC))
 
 
-def test_a_board_that_reaches_beyond_the_image_says_at_which_side() -> None:
+@pytest.mark.parametrize("shift", [80, 110, 140])
+def test_a_board_that_reaches_beyond_the_image_says_at_which_side(shift: int) -> None:
     with pytest.raises(DetectionError, match=r"of 63 .*right"):
-        detect(SYMMETRIC, replace(SCENE, shift=(110, 0)).render(SYMMETRIC))
+        detect(SYMMETRIC, replace(SCENE, shift=(shift, 0)).render(SYMMETRIC))
