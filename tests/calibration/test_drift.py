@@ -16,6 +16,8 @@ from slviewer.errors import InputError
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.slow
+
 RIG = letter(0.5, seed=3)
 FEW = 6  # later poses where a movement is looked for: it is seen in every one
 

@@ -13,6 +13,8 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.session.exporters import write_calibration
 from slviewer.session.store import Session
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 CAMERA, PROJECTOR = (160, 120), (456, 570)
 R = cv2.Rodrigues(np.array([0.01, 0.3, -0.02]))[0]

@@ -30,6 +30,8 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import rig_record
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 CENTRES = np.array([[-38.0, 0.0, 560.0], [42.0, 6.0, 570.0]])
 RADIUS = 25.0

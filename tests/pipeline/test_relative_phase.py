@@ -17,6 +17,8 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.truth import rig_record
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 RIG = letter(0.25, 3, local_distortion_px=0.0)
 RECORD = rig_record(RIG)

@@ -29,6 +29,8 @@ from slviewer.reconstruction.onepass import OnePass
 from slviewer.reconstruction.onepass_cuda import CudaPass, has_pass, one_pass
 from slviewer.validation import bench_gpu
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 PROJECTOR = (912, 1140)
 HEIGHT, WIDTH = 14, 20  # the simulator runs each pixel as a Python thread

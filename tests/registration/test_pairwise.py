@@ -9,6 +9,8 @@ from slviewer.registration.pairwise import register
 from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(("deg", "mm"), [(1.0, 2.0), (60.0, 150.0)])
 def test_a_known_motion_is_found(deg: float, mm: float) -> None:

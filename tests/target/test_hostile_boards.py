@@ -12,6 +12,8 @@ from slviewer.errors import DetectionError
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 
+pytestmark = pytest.mark.slow
+
 SYMMETRIC, ASYMMETRIC = Board.parse("circles:9x7:20"), Board.parse("acircles:4x11:20")
 SIZE = (400, 300)
 SCENE = Scene(size=SIZE, supersample=3, fill=0.6, sheet=0.6)
