@@ -75,6 +75,7 @@ def layer_of(path: Path) -> str:
     return path.relative_to(ROOT / "slviewer").with_suffix("").parts[0]
 
 
+@pytest.mark.slow
 def test_imports_run_one_way() -> None:
     against: list[str] = []
     for path in SOURCES:

@@ -11,6 +11,8 @@ import slviewer as sl
 from slviewer.simulation.rig import letter
 from slviewer.validation.hostile_captures import BOARD, HostileBench, describe_sequence, write_images
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 
 

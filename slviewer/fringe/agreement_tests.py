@@ -10,6 +10,8 @@ from slviewer.fringe.contradiction import Contradiction
 MIN_RULE, MIN_COMMON, MIN_RISING = 0.5, 0.5, 0.5
 """Shares of the code edges below which the description fails: a wrong one gives no more than chance. Right ones gave
 0.93 and more, also for a cluttered scene in room light."""
+MIN_OPPOSED = 0.8
+"""Share below which a bit and its inverse are none: half of the pixels are alike in images of two other patterns."""
 SURE = 0.75
 """Shares that a hypothesis must reach to be named."""
 MIN_LEVEL = 0.4
@@ -38,13 +40,13 @@ class Answer:
     is_certain: bool = False
 
 
-def score_of(a: Agreement) -> float:
+def sum_shares(a: Agreement) -> float:
     """The sum of the shares that tell how well the frames agree; a half for what is not known."""
     return float(sum(0.5 if np.isnan(share) else share for share in _shares(a)))
 
 
 def _shares(a: Agreement) -> list[float]:
-    return [a.rule, a.common, a.rising, *a.level_common]
+    return [a.opposed, a.rule, a.common, a.rising, *a.level_common]
 
 
 def is_certain(a: Agreement) -> bool:
@@ -56,6 +58,8 @@ def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
     failed = set()
     if a.unreadable is not None:
         failed.add("bits")
+    if a.opposed < MIN_OPPOSED:
+        failed.add("inverse")
     if a.rule < MIN_RULE:
         failed.add("rule")
     if a.edges >= FEWEST_EDGES and frames.fringe is not None:
@@ -79,7 +83,7 @@ def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
     return failed
 
 
-def is_sure(frames: AxisFrames, a: Agreement) -> bool:
+def is_supported(frames: AxisFrames, a: Agreement) -> bool:
     """Whether a hypothesis has something to show for itself."""
     if frames.bits and not (a.edges >= FEWEST_EDGES and a.rule > SURE):
         return False

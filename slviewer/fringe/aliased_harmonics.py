@@ -109,7 +109,7 @@ def correct_harmonics(
     return phase + added, turned
 
 
-def harmonics_suspects(harmonics: AliasedHarmonics, found: Layout) -> list[Suspect]:
+def describe_gamma(harmonics: AliasedHarmonics, found: Layout) -> list[Suspect]:
     """What the operator should know about gamma, and change."""
     if not harmonics.is_significant:
         return []

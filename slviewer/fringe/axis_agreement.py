@@ -31,8 +31,9 @@ FEWEST_OF_BIT = 10
 MIN_KEPT = 0.15
 """Share of the pixels at which all readable bits are decided; stripes of 6 px and wider leave more than a third."""
 FEWEST_PIXELS = 500
-MIDDLE_OF_CELL = 0.2
-"""Part of a period next to a code edge where blur may have moved the code."""
+INSIDE = 0.35
+"""Of the swing: farther from the middle lies the inside of a stripe. Blurred stripes seen through a gamma of 2.2 lie
+0.28 from the middle."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +105,11 @@ def reversed_bits(frames: AxisFrames, with_complementary: bool = False) -> AxisF
 class Agreement:
     """Shares weighed by modulation; NaN where the frames do not tell.
 
-    ``edges``: code edges that were read. ``rule``: share of the edges that obey the Gray code, of the bit with the
-    least. ``common``: length of the mean unit vector of the wrapped phases at code edges; ``rising``: share of them at
-    which the phase rises with the code; ``begin_turns``: where in a period (-0.5 ... 0.5) the code's cells begin;
+    ``opposed``: share of the pixels inside stripes that are bright in a bit and dark in its inverse, or the other way
+    round, of the bit with the least. ``edges``: code edges that were read. ``rule``: share of the edges that obey the
+    Gray code, of the bit with the least. ``common``: length of the mean unit vector of the wrapped phases at code
+    edges; ``rising``: share of them at which the phase rises with the code; ``begin_turns``: where in a period
+    (-0.5 ... 0.5) the code's cells begin;
     ``turns_per_cell`` fringes in a cell of the Gray code.
     ``level_common``, ``level_turns``: the same for the step from each period to the next finer, in periods.
     ``outside``: share of the coordinates beyond the projector, ``reach_px`` their largest. ``unreadable``: the first
@@ -114,18 +117,19 @@ class Agreement:
     cells' borders that were seen.
     """
 
-    edges: int
-    rule: float
-    common: float
-    rising: float
-    begin_turns: float
-    turns_per_cell: float
-    level_common: tuple[float, ...]
-    level_turns: tuple[float, ...]
-    outside: float
-    reach_px: float
-    unreadable: int | None
-    borders: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+    opposed: float = np.nan
+    edges: int = 0
+    rule: float = np.nan
+    common: float = np.nan
+    rising: float = np.nan
+    begin_turns: float = np.nan
+    turns_per_cell: float = np.nan
+    level_common: tuple[float, ...] = ()
+    level_turns: tuple[float, ...] = ()
+    outside: float = np.nan
+    reach_px: float = np.nan
+    unreadable: int | None = None
+    borders: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 class AxisReader:
@@ -142,8 +146,30 @@ class AxisReader:
         self.middle = (chosen.max(axis=0) + chosen.min(axis=0)) / 2
         self.line, self.place = sample.line[seen], sample.place[seen]
         self.across = self.line >= sample.rows
-        self._noise = sample.noise
+        self._noise, self._least_swing = sample.noise, sample.least_swing
         self._bits: dict[tuple[int | None, int | None], tuple[np.ndarray, np.ndarray, float, float]] = {}
+        self.known: dict[AxisFrames, Agreement] = {}
+        self._opposed: dict[tuple[int, int], float] = {}
+
+    def is_in_view(self, frames: AxisFrames) -> bool:
+        """Whether enough pixels vary between the images that are taken to be of this axis."""
+        images = {*frames.bits, *frames.inverse, *(i for _, steps in frames.shifts for i in steps)} - {None}
+        if not images or len(self.swing) < FEWEST_PIXELS:
+            return False
+        swing = np.ptp(self.frames[sorted(i for i in images if i is not None)], axis=0)
+        return bool(np.count_nonzero(swing > self._least_swing) >= FEWEST_PIXELS)
+
+    def opposed(self, image: int | None, inverse: int | None) -> float:
+        """Share of the pixels inside stripes of both images that are bright in one alone; NaN for few pixels."""
+        if image is None or inverse is None:
+            return np.nan
+        if (image, inverse) not in self._opposed:
+            first, second = self.frames[image] - self.middle, self.frames[inverse] - self.middle
+            inside = np.minimum(np.abs(first), np.abs(second)) > INSIDE * self.swing
+            weight = self.swing * inside
+            share = float(weight[(first > 0) != (second > 0)].sum() / max(float(weight.sum()), 1e-9))
+            self._opposed[image, inverse] = share if np.count_nonzero(inside) >= FEWEST_PIXELS else np.nan
+        return self._opposed[image, inverse]
 
     def bit(self, image: int | None, inverse: int | None) -> tuple[np.ndarray, np.ndarray, float, float]:
         """(p,) bool value, (p,) bool decided, share decided, mean stripe width in px."""
@@ -184,16 +210,24 @@ class AxisReader:
         return (cosine - 1j * frames.sign * sine) * turned
 
 
-def agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
+def measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
     """How well the frames agree under this hypothesis."""
-    result = Agreement(0, np.nan, np.nan, np.nan, np.nan, np.nan, (), (), np.nan, np.nan, None, None)
+    if frames not in reader.known:
+        reader.known[frames] = _agreement(reader, frames)
+    return reader.known[frames]
+
+
+def _agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
+    result = Agreement()
     if len(reader.swing) < FEWEST_PIXELS:
         return result
     if not frames.bits:
         return _of_levels(reader, frames, result)
     code = _read_code(reader, frames)
     rule, edges = _rule(reader, code)
-    result = replace(result, rule=rule, edges=len(edges.first), unreadable=code.unreadable)
+    result = replace(
+        result, opposed=_opposed(reader, frames), rule=rule, edges=len(edges.first), unreadable=code.unreadable
+    )
     if code.known != (1 << code.count) - 1:  # only the bits above the missing one number anything
         missing = code.count - 1 - ((1 << code.count) - 1 - code.known).bit_length() + 1
         bits = tuple(image if b < missing else None for b, image in enumerate(frames.bits))
@@ -233,18 +267,24 @@ def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
     for b, image in enumerate(frames.bits):
         inverse = frames.inverse[b] if b < len(frames.inverse) else None
         bits.append(None if image is None and inverse is None else reader.bit(image, inverse))
-    readable = [bit is None or (bit[2] > READABLE_SHARE and bit[3] >= READABLE_STRIPE) for bit in bits]
+    readable = [bit is None or _is_readable(bit) for bit in bits]
     count = readable.index(False) if False in readable else len(bits)
     while count and bits[count - 1] is None:
         count -= 1
-    chosen = [(b, bit) for b, bit in enumerate(bits[:count]) if bit is not None]
     unreadable = _first_unreadable(reader, bits, count)
-    if not chosen:
-        return _Code(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0, np.int32), 0, 0, unreadable)
-    decided = np.logical_and.reduce([bit[1] for _, bit in chosen])
-    kept = np.flatnonzero(decided)
-    if unreadable is None and len(kept) < MIN_KEPT * len(decided):
-        unreadable = chosen[int(np.argmin([bit[2] for _, bit in chosen]))][0]
+    while True:
+        chosen = [(b, bit) for b, bit in enumerate(bits[:count]) if bit is not None]
+        if not chosen:
+            return _Code(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0, np.int32), 0, 0, unreadable)
+        decided = np.logical_and.reduce([bit[1] for _, bit in chosen])
+        kept = np.flatnonzero(decided)
+        if len(kept) >= MIN_KEPT * len(decided):
+            break
+        worst = chosen[int(np.argmin([bit[2] for _, bit in chosen]))][0]
+        if worst != chosen[-1][0] or len(chosen) == 1:
+            unreadable = worst if unreadable is None else unreadable
+            break
+        count = chosen[-1][0]  # stripes that blur has almost closed
     gray, known = np.zeros(len(kept), np.int32), 0
     for b, bit in chosen:
         gray |= (bit[0][kept] ^ frames.inverted).astype(np.int32) << (count - 1 - b)
@@ -258,11 +298,27 @@ def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
     return _Code(kept, gray, binary, count, known, unreadable, reach)
 
 
+def _is_readable(bit: tuple[np.ndarray, np.ndarray, float, float]) -> bool:
+    return bit[2] > READABLE_SHARE and bit[3] >= READABLE_STRIPE
+
+
+def _opposed(reader: AxisReader, frames: AxisFrames) -> float:
+    """Of bits no finer than one whose stripes are clearly wider than blur, which makes both images one grey."""
+    pairs = list(zip(frames.bits, frames.inverse, strict=False))
+    readable = [
+        b
+        for b, pair in enumerate(pairs)
+        if None not in pair and _is_readable(bit := reader.bit(*pair)) and bit[3] >= 1.5 * READABLE_STRIPE
+    ]
+    shares = [reader.opposed(*pair) for pair in pairs[: max(readable, default=-1) + 1]]
+    return min(filter(np.isfinite, shares), default=np.nan)
+
+
 def _first_unreadable(
     reader: AxisReader, bits: list[tuple[np.ndarray, np.ndarray, float, float] | None], count: int
 ) -> int | None:
     """The first bit that cannot be read although its stripes should be wide; None where blur explains all."""
-    if count == len(bits) or len(reader.swing) < FEWEST_PIXELS:
+    if count == len(bits) or bits[count] is None or len(reader.swing) < FEWEST_PIXELS:
         return None
     widths = [bit[3] for bit in bits[:count] if bit is not None]
     later = [bit for bit in bits[count + 1 :] if bit is not None]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
-from slviewer.fringe.frame_light import CLIPPED, equalized_axis
+from slviewer.fringe.frame_light import CLIPPED, equalize_axis
 from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
 from slviewer.fringe.levels import cell_misfit, code_cell_px, found_levels, lowest_coordinate, unambiguous_px
 from slviewer.fringe.noise import measure_noise
@@ -28,7 +28,7 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
     found = layout(sequence, axis)
     stack = np.ascontiguousarray(stack)
     white = white_level(stack, sequence.select(axis))
-    sequence, stack, factor = equalized_axis(sequence, stack, axis)
+    sequence, stack, factor = equalize_axis(sequence, stack, axis)
     if factor != 1:
         found = layout(sequence, axis)
     clipped = white if factor == 1 else CLIPPED

@@ -13,8 +13,8 @@ from slviewer.fringe.agreement_tests import (
     Answer,
     failed_tests,
     is_certain,
-    is_sure,
-    score_of,
+    is_supported,
+    sum_shares,
     wrap,
 )
 from slviewer.fringe.axis_agreement import (
@@ -22,9 +22,9 @@ from slviewer.fringe.axis_agreement import (
     Agreement,
     AxisFrames,
     AxisReader,
-    agreement,
     common_phase,
     described_frames,
+    measure_agreement,
     reversed_bits,
 )
 from slviewer.fringe.contradiction import Contradiction
@@ -98,10 +98,10 @@ def _with_values(
     reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
 ) -> Answer | None:  # fmt: skip
     """The changes, and the values besides them with which all tests are passed; None if there are none."""
-    a = agreement(reader, frames)
+    a = measure_agreement(reader, frames)
     failed = failed_tests(frames, a)
     out = list(changes)
-    if failed & {"bits", "rule", "rising"} or not a.rule > SURE or a.edges < FEWEST_EDGES:
+    if failed & {"inverse", "bits", "rule", "rising"} or not a.rule > SURE or a.edges < FEWEST_EDGES:
         return None
     if frames.fringe is not None:
         period = frames.fringe[0]
@@ -136,7 +136,7 @@ def _with_values(
             out += _phase_shifted(frames, a, late, axis)
     if a.outside > MAX_OUTSIDE:
         out += too_small(frames, a, axis)
-    return Answer(tuple(out), score_of(a), is_certain(a)) if out else None
+    return Answer(tuple(out), sum_shares(a), is_certain(a)) if out else None
 
 
 def _best_cell(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
@@ -197,19 +197,19 @@ def _with_offset(
     reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
 ) -> Answer | None:  # fmt: skip
     """The same where several periods number the fringes."""
-    a = agreement(reader, frames)
+    a = measure_agreement(reader, frames)
     failed = failed_tests(frames, a)
-    if "levels" in failed or not is_sure(frames, a):
+    if "levels" in failed or not is_supported(frames, a):
         return None
     if not failed:
-        return Answer(tuple(changes), score_of(a), is_certain(a)) if changes else None
+        return Answer(tuple(changes), sum_shares(a), is_certain(a)) if changes else None
     if failed == {"outside"}:
-        return Answer((*changes, *too_small(frames, a, axis)), score_of(a), is_certain(a))
+        return Answer((*changes, *too_small(frames, a, axis)), sum_shares(a), is_certain(a))
     steps = len(frames.shifts[-1][1])
     best: tuple[float, AxisFrames, Agreement] | None = None
     for turns in (0.25, -0.25, 0.5, *(wrap(k / steps) for k in range(1, steps))):
         turned = replace(frames, offset_rad=frames.offset_rad + 2 * np.pi * turns)
-        b = agreement(reader, turned)
+        b = measure_agreement(reader, turned)
         apart = max(map(abs, b.level_turns))
         if not failed_tests(turned, b) and apart < MAX_LEVEL_TURNS / 4 and (best is None or apart < best[0]):
             best = apart, turned, b
@@ -221,9 +221,9 @@ def _with_offset(
         text = f"the {steps} phase steps of axis {axis} are in reverse order, or"
         cure = f"set phase_sign = {frames.sign} and phase_offset = {offset:.3f} for axis {axis}"
         out = Contradiction("step-order", f"{text} begin elsewhere: {cure}", axis, float(frames.sign))
-        return Answer((out,), score_of(best[2]), is_certain(best[2]))
+        return Answer((out,), sum_shares(best[2]), is_certain(best[2]))
     out = Contradiction("phase-offset", f"{text}: set phase_offset = {offset:.3f}", axis, offset)
-    return Answer((out,), score_of(best[2]), is_certain(best[2]))
+    return Answer((out,), sum_shares(best[2]), is_certain(best[2]))
 
 
 def share_of_period(angle: float) -> str:

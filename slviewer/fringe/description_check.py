@@ -9,12 +9,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from slviewer.fringe.agreement_tests import failed_tests, is_sure, score_of
-from slviewer.fringe.axis_agreement import Agreement, AxisReader, agreement, coordinates, described_frames
+from slviewer.fringe.agreement_tests import failed_tests, is_supported, sum_shares
+from slviewer.fringe.axis_agreement import (
+    Agreement,
+    AxisReader,
+    coordinates,
+    described_frames,
+    measure_agreement,
+)
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
 from slviewer.fringe.frame_light import describe_disturbance, equalize_frames, estimate_frame_light
-from slviewer.fringe.frame_order import fitting_order, misplaced_steps, unexplained_steps
+from slviewer.fringe.frame_likeness import FrameLikeness
+from slviewer.fringe.frame_order import detect_copies, detect_misplaced_steps, detect_unexplained_steps, search_order
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.line_sample import LineSample, coded_frames, grid_sample, sample_lines
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -42,12 +49,12 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
     they would be under equal light. Raises InputError for a stack that is none of this sequence.
     """
     check_stack(sequence, stack)
-    contradictions = _find_contradictions(sequence, stack)
+    contradictions = find_contradictions(sequence, stack)
     if not contradictions:
         return ()
     light = estimate_frame_light(sequence, stack)
     if light.is_significant:
-        under_equal_light = _find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
+        under_equal_light = find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
         is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
         # Frames out of their place spoil the estimate of the light: what explains them as they are is believed.
         if not under_equal_light or not is_explained:
@@ -97,28 +104,33 @@ def _unsteadiness(sequence: PatternSequence, sample: LineSample, illuminated: np
     return worst
 
 
-def _find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
+def find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
+    """The same of frames as they are, taken to be of equal light."""
     if not sequence.axes:
         return ()
     sample = sample_lines(sequence, stack)
     readers = {axis: AxisReader(sample, coded_frames(sequence, axis)) for axis in sequence.axes}
     if dark := _without_pattern(sequence, sample):
         return dark
-    stated = {axis: agreement(readers[axis], described_frames(sequence, axis)) for axis in sequence.axes}
+    likeness = FrameLikeness(sequence, sample)
+    if repeated := detect_copies(sequence, readers, likeness):
+        return repeated
+    stated = {axis: measure_agreement(readers[axis], described_frames(sequence, axis)) for axis in sequence.axes}
     failed = {axis: failed_tests(described_frames(sequence, axis), stated[axis]) for axis in sequence.axes}
-    disordered = [c for axis in sequence.axes for c in misplaced_steps(sequence, axis, sample)]
-    strange = set() if disordered else unexplained_steps(sequence, sample)
-    if not any(failed.values()) and not disordered and not strange:
+    disordered = [c for axis in sequence.axes for c in detect_misplaced_steps(sequence, axis, sample)]
+    strange = set() if disordered else detect_unexplained_steps(sequence, sample)
+    uneven = [i for i in range(len(stack)) if not likeness.is_even(i, i)]
+    if not any(failed.values()) and not disordered and not strange and not uneven:
         return _mirrored(sequence, sample)
     if disordered and all(contradiction.cause in _OF_STEPS for contradiction in disordered):
         return tuple(disordered)  # steps of one period, which says all about them
     if exchanged := _axes_exchanged(sequence, sample, failed):
         return exchanged
     answers = {axis: explain_axis(readers[axis], sequence, axis) for axis in sequence.axes if failed[axis]}
-    explained = [answers[axis][0].score if answers.get(axis) else score_of(stated[axis]) for axis in sequence.axes]
-    complete = all(answers.values()) and not disordered and not strange
+    explained = [answers[axis][0].score if answers.get(axis) else sum_shares(stated[axis]) for axis in sequence.axes]
+    complete = all(answers.values()) and not disordered and not strange and not uneven
     if not (complete and all(answers[axis][0].is_certain for axis in answers)):
-        order = fitting_order(sequence, sample, readers, disordered, strange)
+        order = search_order(sequence, sample, readers, likeness, disordered, strange)
         if order is not None and not (complete and sum(explained) > order.score - CLEARLY):
             return order.contradictions
     out = list(disordered)
@@ -127,6 +139,10 @@ def _find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[
             out += [contradiction for answer in answers[axis] for contradiction in answer.contradictions]
         elif failed[axis] and not disordered:
             out.append(_unexplained(axis, stated[axis], failed[axis]))
+    for i in uneven:
+        kind = sequence.frames[i].kind
+        text = f"frame {i + 1} should be {kind}, and is not: put the frames in order, or capture again"
+        out.append(Contradiction("frame-order", text, None, float(i)))
     return tuple(dict.fromkeys(out))
 
 
@@ -170,7 +186,8 @@ def _axes_exchanged(
     x, y = (described_frames(sequence, axis) for axis in ("x", "y"))
     steps = [[(period, len(images)) for period, images in frames.shifts] for frames in (x, y)]
     for with_steps, with_bits in ((True, True), (True, False), (False, True)):
-        if with_steps != with_bits and (steps[0] != steps[1] or len(x.bits) != len(y.bits)):
+        can_differ = x.bits and y.bits and steps[0] and steps[0] == steps[1] and len(x.bits) == len(y.bits)
+        if with_steps != with_bits and not can_differ:
             continue
         variants = []
         for frames, other in ((x, y), (y, x)):
@@ -180,9 +197,10 @@ def _axes_exchanged(
                 variants.append(replace(frames, shifts=other.shifts))
             else:
                 variants.append(replace(frames, bits=other.bits, inverse=other.inverse))
-        agreements = [agreement(reader, variant) for variant in variants]
+        agreements = [measure_agreement(reader, variant) for variant in variants]
         if any(
-            failed_tests(variant, a) or not is_sure(variant, a) for variant, a in zip(variants, agreements, strict=True)
+            failed_tests(variant, a) or not is_supported(variant, a)
+            for variant, a in zip(variants, agreements, strict=True)
         ):
             continue
         if with_steps and with_bits:
@@ -239,6 +257,8 @@ def _unexplained(axis: Axis, a: Agreement, failed: set[str]) -> Contradiction:
     """What was seen, where no hypothesis explains it."""
     if "bits" in failed:
         seen = f"Gray bit {a.unreadable} of axis {axis} cannot be read though its stripes should be wide"
+    elif "inverse" in failed:
+        seen = f"a Gray bit of axis {axis} and its inverse are alike at {100 * (1 - a.opposed):.0f} % of the pixels"
     elif "rule" in failed:
         seen = f"a Gray bit of axis {axis} contradicts the other bits at {100 * (1 - a.rule):.0f} % of its edges"
     elif failed & {"common", "rising", "cell"}:

@@ -13,7 +13,17 @@ import numpy as np
 
 from slviewer.fringe.kernels_light import equalize, mark_clipped
 from slviewer.fringe.layout import check_stack, white_level
-from slviewer.fringe.light_fit import Fit, Light, LightModel, Remainder, Term, equalized_sample, fit_light, room_changes
+from slviewer.fringe.light_fit import (
+    SHARE_PRIOR,
+    Fit,
+    Light,
+    LightModel,
+    Remainder,
+    Term,
+    equalize_sample,
+    fit_light,
+    locate_room_change,
+)
 from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.suspect import Fault, Suspect
@@ -35,11 +45,19 @@ AS_GOOD = 1.02
 LEFT, LEFT_CONTRAST = 4.0, 0.02
 """Light explains the frames if the mean squared residual is below so many times the square of the grey levels by which
 neighbouring pixels differ, plus the square of this share of the contrast for what blur and the camera's curve add."""
+EXPLAINED = 0.6
+"""Of a Gray code alone it explains them if that is below this share of what equal light leaves: blur, scattered light
+and compression add to it. Of sound frames, and of those that show another's pattern, light explains up to a third."""
 LEFT_OF_ROOM = 1.5
 """... so many times where gains and room light together explain them: they have so many values that they can pretend to
 explain a frame out of its place."""
 ONE_FRAME = 6.0
 """... and no frame has so many times the residual of the median frame: frames that show another's pattern have more."""
+LEFT_OF_FRAME = 0.3
+"""... unless, in a Gray code alone, light explains all but this share of what it leaves otherwise."""
+CLEARLY_BETTER = 1.5
+"""Both factors where a Gray code alone leaves more than noise: some percent of it are blur and scattered light
+that a wave along the rows, or room light, happens to fit."""
 CYCLES = np.arange(0.5, 8.25, 0.25)
 """Waves along the image's height that are tried."""
 FINE = 0.05
@@ -104,14 +122,14 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
         coarse = sample_light(sequence, stack, fit.light.gain, coarse=True) or coarse
         fit = fit_light(sample, ("gain",), fit.light)
     gains = fit
-    fit = _simplest(coarse, sample, gains)
-    if fit is not gains and not _is_worth_it(sample, fit):
+    fit = _choose_model(coarse, sample, gains)
+    if fit is not gains and not _needs_correction(sample, fit):
         fit = gains
     if not _explains(sample, fit):
         return replace(steady, unexplained=fit.terms)
-    light = _with_fine_stripes(sample, _with_nearest(sample, fit))
+    light = _estimate_fine_stripes(sample, _fill_unknown_frames(sample, fit))
     used = list(fit.informed)
-    room = _room(sample, light, used)
+    room = _room_light(sample, light, used)
     drift = float(np.std(np.log(fit.light.gain[used])))
     wave = float(np.sqrt(np.mean(light.wave[used] ** 2)))
     return FrameLight(light, fit.terms, drift, wave, room - room[used].min())
@@ -160,7 +178,7 @@ def equalize_frames(
     return out, scale
 
 
-def equalized_axis(
+def equalize_axis(
     sequence: PatternSequence, stack: np.ndarray, axis: Axis
 ) -> tuple[PatternSequence, np.ndarray, float]:
     """The frames that an axis needs under equal light, their sequence, and the factor of their grey levels.
@@ -175,7 +193,7 @@ def equalized_axis(
     return replace(sequence, frames=tuple(sequence.frames[i] for i in chosen)), frames, scale
 
 
-def original_levels(
+def restore_levels(
     modulation: np.ndarray, background: np.ndarray, noise: tuple[float, float], factor: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
     """Modulation, background and noise (a, b) of equalized frames in the grey levels of the capture."""
@@ -202,7 +220,7 @@ def describe_disturbance(terms: Sequence[Term]) -> tuple[Fault, str]:
     )
 
 
-def light_suspects(sequence: PatternSequence, light: FrameLight) -> list[Suspect]:
+def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Suspect]:
     """What the operator should know about the light of the frames, and change."""
     out = []
     used = [i for i, f in enumerate(sequence.frames) if f.kind != "texture"]
@@ -255,7 +273,7 @@ def _varies(sample: LightSample) -> bool:
         return False
     weight = np.ones(sample.frames.shape[1], np.float32)
     gains = fit_light(sample, ("gain",), Light.constant(count), weight, most_steps=1)
-    if _is_large(sample, gains):
+    if _has_large_gains(sample, gains):
         return True
     return any(
         fit_light(sample, terms, start, weight, most_steps=1).variance * BETTER < gains.variance
@@ -272,12 +290,12 @@ def _candidates(sample: LightSample, gains: Fit) -> Iterator[tuple[tuple[Term, .
         if "wave" in terms:
             yield terms, replace(start, cycles=_strongest_wave(left))
         else:
-            changes = room_changes(sample, constant, "gain" in terms, gains.weight)
+            changes = locate_room_change(sample, constant, "gain" in terms, gains.weight)
             if changes:
                 yield terms, replace(start, gain=constant.gain, changes=changes)
 
 
-def _is_large(sample: LightSample, fit: Fit) -> bool:
+def _has_large_gains(sample: LightSample, fit: Fit) -> bool:
     """Whether the gains vary by more than can be neglected among the steps of a period, or among the other frames.
 
     Only the former shift the phase. Of the latter, blurred stripes pretend some percent, and thresholds bear more.
@@ -293,36 +311,37 @@ def _is_large(sample: LightSample, fit: Fit) -> bool:
     return within > least or between > max(LEAST_CODED_GAIN, least)
 
 
-def _is_worth_it(sample: LightSample, fit: Fit) -> bool:
+def _needs_correction(sample: LightSample, fit: Fit) -> bool:
     """Whether a wave along the rows, or a change of the room's light, is large enough to be corrected."""
     light, used = fit.light, list(fit.informed)
     if "wave" in fit.terms and np.sqrt(np.mean(light.wave[used] ** 2)) > LEAST_WAVE:
         return True
-    room = _room(sample, light, used)
+    room = _room_light(sample, light, used)
     return any(abs(float(room[k] - room[k - 1])) > LEAST_ROOM for k in light.changes)
 
 
-def _room(sample: LightSample, light: Light, used: Sequence[int]) -> np.ndarray:
+def _room_light(sample: LightSample, light: Light, used: Sequence[int]) -> np.ndarray:
     """(n,) room light of each frame as a share of the mean grey level."""
     albedo = float(np.mean(sample.albedo(light.changes)))
     return (light.uniform + light.albedo[:, 0] * albedo) / float(np.mean(sample.frames[list(used)]))
 
 
-def _simplest(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
+def _choose_model(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
     """The simplest model that explains the frames about as well as the best: chosen on a coarse sample."""
     weight = np.ones(coarse.frames.shape[1], np.float32)
     own = fit_light(coarse, ("gain",), first.light, weight, 2)
     fits = [own, *(fit_light(coarse, terms, start, weight, 3) for terms, start in _candidates(coarse, own))]
     best = min(fit.variance for fit in fits)
-    if own.variance < BETTER * best:
+    is_noise = bool(coarse.shifts) or own.variance < LEFT * coarse.roughness**2
+    if own.variance < (BETTER if is_noise else CLEARLY_BETTER) * best:
         return first
-    chosen = next(fit for fit in fits if fit.variance <= AS_GOOD * best)
+    chosen = next(fit for fit in fits if fit.variance <= (AS_GOOD if is_noise else CLEARLY_BETTER) * best)
     if any("wave" in term for term in chosen.terms):
-        chosen = _refined(coarse, chosen)
+        chosen = _refine_wave(coarse, chosen)
     return fit_light(sample, chosen.terms, chosen.light, most_steps=3)
 
 
-def _refined(sample: LightSample, fit: Fit) -> Fit:
+def _refine_wave(sample: LightSample, fit: Fit) -> Fit:
     """The fit at the wave's own number of cycles, from three around it."""
     tried = [fit]
     for step in (-0.12, 0.12):
@@ -346,7 +365,7 @@ def _strongest_wave(left: Remainder) -> float:
 
 def _explains(sample: LightSample, fit: Fit) -> bool:
     """Whether what the light leaves is like noise: little, and as much in one frame as in another."""
-    if fit.terms == ("gain",) and not _is_large(sample, fit):
+    if fit.terms == ("gain",) and not _has_large_gains(sample, fit):
         return False
     model = LightModel(sample)
     left = model.eliminate(fit.light, fit.share, fit.weight)
@@ -355,13 +374,19 @@ def _explains(sample: LightSample, fit: Fit) -> bool:
     entries[len(model.phased) :] = (fit.weight * sample.interior).sum(axis=1)
     judged = np.isin(model.used, fit.informed)
     each = energy[judged] / np.maximum(entries[judged], 1)
-    most = LEFT if len(fit.terms) < 3 else LEFT_OF_ROOM
-    return fit.variance < most * sample.roughness**2 + LEFT_CONTRAST**2 * float(
-        np.mean(sample.amplitudes) ** 2
-    ) and each.max() < ONE_FRAME * max(float(np.median(each)), sample.roughness**2 / 2)
+    limit = ONE_FRAME * max(float(np.median(each)), sample.roughness**2 / 2)
+    if sample.shifts:
+        most = LEFT if len(fit.terms) < 3 else LEFT_OF_ROOM
+        small = most * sample.roughness**2 + LEFT_CONTRAST**2 * float(np.mean(sample.amplitudes) ** 2)
+        return fit.variance < small and bool(each.max() < limit)
+    one = np.ones_like(fit.weight)
+    equal = model.eliminate(Light.constant(len(sample.frames)), SHARE_PRIOR[0], one)
+    explained = model.eliminate(fit.light, fit.share, one).variance < EXPLAINED * equal.variance
+    unequal = (fit.weight * equal.left**2).sum(axis=1)[judged] / np.maximum(entries[judged], 1)
+    return explained and bool((each < np.maximum(limit, LEFT_OF_FRAME * unequal)).all())
 
 
-def _with_nearest(sample: LightSample, fit: Fit) -> Fit:
+def _fill_unknown_frames(sample: LightSample, fit: Fit) -> Fit:
     """The fit, with the gain of the nearest frame, and the room light since its last change, of frames without own."""
     light, known, used = fit.light, np.array(fit.informed), LightModel(sample).used
     frames = np.arange(len(light.gain))
@@ -378,11 +403,11 @@ def _with_nearest(sample: LightSample, fit: Fit) -> Fit:
     return replace(fit, light=own)
 
 
-def _with_fine_stripes(sample: LightSample, fit: Fit) -> Light:
+def _estimate_fine_stripes(sample: LightSample, fit: Fit) -> Light:
     """The light, with gains of coded frames whose stripes are too fine to have an interior.
 
-    Over many fine stripes the mean of a bit and that of its inverse are the same share of white, and that is half of
-    dark and bright together.
+    Over many fine stripes the mean of each bit and of each inverse is the same share of white: about half, more or less
+    by what the camera's curve makes of blurred stripes, which all of them have in common.
     """
     model, light = LightModel(sample), fit.light
     left = model.eliminate(light, fit.share, fit.weight)
@@ -390,12 +415,12 @@ def _with_fine_stripes(sample: LightSample, fit: Fit) -> Light:
     fine = [i for i, share in zip(sample.coded, inside, strict=True) if share < FINE and i not in fit.informed]
     dark, bright = left.levels
     both = (left.counts[0] > 0) & (left.counts[1] > 0)
-    if not fine or np.count_nonzero(both) < MIN_PIXELS:
+    if "gain" not in fit.terms or not fine or np.count_nonzero(both) < MIN_PIXELS:
         return light
     middle = float(np.mean(0.5 * (dark + bright)[both]))
-    frames, _ = equalized_sample(sample, light, fine)
-    gain, excess = light.gain.copy(), frames[:, both].mean(axis=1) / middle
-    gain[fine] *= np.where(
-        np.abs(np.log(np.maximum(excess, 1e-3))) < FARTHEST, excess, 1
-    )  # else something else was shown
+    frames, _ = equalize_sample(sample, light, fine)
+    gain, excess = light.gain.copy(), np.maximum(frames[:, both].mean(axis=1) / middle, 1e-3)
+    shows_stripes = np.abs(np.log(excess)) < FARTHEST
+    if shows_stripes.any():
+        gain[fine] *= np.where(shows_stripes, excess / np.median(excess[shows_stripes]), 1)
     return replace(light, gain=gain)

@@ -1,58 +1,81 @@
 """An order of the frames in which a capture fits its description: late, missing, repeated and exchanged images."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
-from slviewer.fringe.agreement_tests import Answer, failed_tests, is_sure, score_of
-from slviewer.fringe.axis_agreement import AxisFrames, AxisReader, agreement, described_frames
+from slviewer.fringe.agreement_tests import Answer, failed_tests, is_supported, sum_shares
+from slviewer.fringe.axis_agreement import AxisFrames, AxisReader, described_frames, measure_agreement
 from slviewer.fringe.contradiction import Contradiction
-from slviewer.fringe.ghost import ghost_suspects
+from slviewer.fringe.frame_likeness import FrameLikeness
+from slviewer.fringe.ghost import detect_ghosting
 from slviewer.fringe.layout import Shift
 from slviewer.fringe.line_sample import LineSample
-from slviewer.fringe.residual_order import order_suspects, shown_steps, strange_suspects
+from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps, recover_step_order
 from slviewer.fringe.residual_sample import Fringe, fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
 
-SAID = 0.5
+NAMED_BY_STEPS = 0.5
 """What a hypothesis gains that the phase steps name by themselves."""
 
 Images = tuple[int | None, ...]
 
 
-def misplaced_steps(
+def detect_misplaced_steps(
     sequence: PatternSequence, axis: Axis, sample: LineSample, images: Images | None = None
 ) -> list[Contradiction]:
     """Phase steps out of order, by what a cosine through all of them leaves."""
     out = []
     causes = {"late": "duplicate-frame", "dropped": "missing-frame", "lag": "frame-lag"}
     for sampled in _sampled_steps(sequence, axis, sample, images):
-        if steps := shown_steps(sampled):
+        if steps := recover_step_order(sampled):
             order = ", ".join(str(step) for step in steps)
             text = (
                 f"the {len(steps)} phase steps of axis {axis} come in the order {order}: number the frames so in the "
                 "description"
             )
             return [Contradiction("step-order", text, axis, None)]
-        for suspect in order_suspects(sampled):
+        for suspect in detect_misordered_steps(sampled):
             cause = causes.get(suspect.fault, "frame-order")
             text = f"{suspect.sentence}: put the frames in order, or capture again"
             out.append(Contradiction(cause, text, axis, float(suspect.frame)))
     return out
 
 
-def unexplained_steps(sequence: PatternSequence, sample: LineSample, images: Images | None = None) -> set[int]:
+def detect_unexplained_steps(sequence: PatternSequence, sample: LineSample, images: Images | None = None) -> set[int]:
     """Frames that neither a step of their period explains, nor one with a share of the image before it."""
     unexplained: set[int] = set()
     for axis in sequence.axes:
         for sampled in _sampled_steps(sequence, axis, sample, images):
-            if sampled.steps > 3 and not ghost_suspects(sampled):  # else all steps hold a share of the image before
-                unexplained |= {suspect.frame for suspect in strange_suspects(sampled)}
+            if sampled.steps > 3 and not detect_ghosting(sampled):  # else all steps hold a share of the image before
+                unexplained |= {suspect.frame for suspect in detect_foreign_frames(sampled)}
     return unexplained
 
 
-def fitting_order(
+def detect_copies(
+    sequence: PatternSequence, readers: dict[Axis, AxisReader], likeness: FrameLikeness
+) -> tuple[Contradiction, ...]:  # fmt: skip
+    """Images that are another once more, if all tests are passed without them."""
+    pairs = likeness.repeated()
+    if not pairs:
+        return ()
+    for which in (0, 1):  # the later image of each pair is the copy, or the earlier
+        lost = {pair[which]: pair[1 - which] for pair in pairs}
+        images = tuple(None if i in lost else i for i in range(len(sequence.frames)))
+        if _score(sequence, readers, likeness, images) is not None:
+            return tuple(_duplicate(sequence, i, j) for i, j in lost.items())
+    return ()
+
+
+def _duplicate(sequence: PatternSequence, i: int, j: int) -> Contradiction:
+    text = f"frame {i + 1} shows the pattern of frame {j + 1}: it is late or repeated; capture again"
+    return Contradiction("duplicate-frame", text, sequence.frames[i].axis, float(i))
+
+
+def search_order(
     sequence: PatternSequence,
     sample: LineSample,
     readers: dict[Axis, AxisReader],
+    likeness: FrameLikeness,
     disordered: list[Contradiction],
     strange: set[int],
 ) -> Answer | None:
@@ -61,27 +84,42 @@ def fitting_order(
     """
     said = {(contradiction.cause, contradiction.value) for contradiction in disordered}
     passed: list[Answer] = []
-    orders: dict[int, Images] = {}
+    orders: list[Images] = []
     for images, contradiction, penalty in _orders(sequence):
-        score, sure = -penalty, False
-        for axis in sequence.axes:
-            frames = described_frames(sequence, axis, images)
-            a = agreement(readers[axis], frames)
-            if failed_tests(frames, a) or not (is_sure(frames, a) or _lacks_steps(frames)):
-                break
-            sure |= is_sure(frames, a)
-            score += score_of(a)
-        else:
-            if sure:
-                score += SAID * ((contradiction.cause, contradiction.value) in said)
-                orders[len(passed)] = images
-                passed.append(Answer((contradiction,), score))
+        score = _score(sequence, readers, likeness, images)
+        if score is not None:
+            score += NAMED_BY_STEPS * ((contradiction.cause, contradiction.value) in said) - penalty
+            orders.append(images)
+            passed.append(Answer((contradiction,), score))
     for i in sorted(range(len(passed)), key=lambda i: -round(passed[i].score / 0.02)):
         images = orders[i]
-        ordered = not any(misplaced_steps(sequence, axis, sample, images) for axis in sequence.axes)
-        if ordered and not unexplained_steps(sequence, sample, images):
+        ordered = not any(detect_misplaced_steps(sequence, axis, sample, images) for axis in sequence.axes)
+        if ordered and not detect_unexplained_steps(sequence, sample, images):
+            (seen,) = passed[i].contradictions
+            k = int(seen.value or 0)
+            if seen.cause == "duplicate-frame" and (j := likeness.copied(k)) is not None:
+                return replace(passed[i], contradictions=(_duplicate(sequence, k, j),))
             return passed[i]
     return None
+
+
+def _score(
+    sequence: PatternSequence, readers: dict[Axis, AxisReader], likeness: FrameLikeness, images: Images
+) -> float | None:  # fmt: skip
+    """How well the images agree in this order; None where a test fails, or none has anything to show for itself."""
+    if not all(map(likeness.is_even, range(len(images)), images)):
+        return None
+    score, sure = 0.0, False
+    for axis in sequence.axes:
+        frames = described_frames(sequence, axis, images)
+        a = measure_agreement(readers[axis], frames)
+        if failed_tests(frames, a) or not (is_supported(frames, a) or _lacks_steps(frames)):
+            if readers[axis].is_in_view(frames):
+                return None
+            continue
+        sure |= is_supported(frames, a)
+        score += sum_shares(a)
+    return score if sure else None
 
 
 def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, float]]:
@@ -96,7 +134,8 @@ def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, 
             else "early, so that each shows the pattern after its own: the first frame is missing"
         )
         text = f"all frames are {count} {way}, and capture again, or move the files by {count}"
-        yield images, Contradiction("frame-lag", text, None, float(lag)), 0.0
+        # Without its first bit an inverted code is a code as well: the fewer images are lost, the better.
+        yield images, Contradiction("frame-lag", text, None, float(lag)), 0.04 * (abs(lag) - 1)
     for k in range(n - 1):
         images = (*range(k), k + 1, k, *range(k + 2, n))
         text = f"frames {k + 1} and {k + 2} have changed places: exchange these two files, or capture again"

@@ -47,7 +47,7 @@ def ghost_share(sampled: Fringe) -> tuple[float, float]:
     return float(inverse[-1] @ moment), float(np.sqrt(max(variance, 0.0)))
 
 
-def ghost_suspects(sampled: Fringe) -> list[Suspect]:
+def detect_ghosting(sampled: Fringe) -> list[Suspect]:
     """The first step of a period, where it holds a share of the image before it."""
     share, error = ghost_share(sampled)
     if not (LEAST_SHARE < share < MOST_SHARE and share > SIGMAS * error):

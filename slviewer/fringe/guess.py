@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.agreement_tests import SURE, failed_tests, is_sure, wrap
-from slviewer.fringe.axis_agreement import Agreement, AxisFrames, AxisReader, agreement, described_frames
+from slviewer.fringe.agreement_tests import SURE, failed_tests, is_supported, wrap
+from slviewer.fringe.axis_agreement import Agreement, AxisFrames, AxisReader, described_frames, measure_agreement
 from slviewer.fringe.description_check import LEAST_ILLUMINATED, check_description
 from slviewer.fringe.frame_blocks import BlockReader, FrameBlocks, GrayBlock, PhaseRun, group_frames, sample_undescribed
 from slviewer.fringe.line_sample import LineSample, coded_frames
@@ -242,11 +242,11 @@ def _with_conventions(
         return sequence
     frames = described_frames(sequence, axis)
     if not parts.runs:
-        a = agreement(reader, frames)
+        a = measure_agreement(reader, frames)
         _check_code(frames, a, images, axis, doubts)
         notes.append(f"axis {axis}: Gray code alone, taken to number the projector's {_lines(axis)} one by one")
         return sequence
-    a = agreement(reader, frames)
+    a = measure_agreement(reader, frames)
     turns = a.turns_per_cell
     if not np.isfinite(turns):
         doubts.append((images, f"too few edges of the code of axis {axis} are in view to compare it with the fringes"))
@@ -264,12 +264,12 @@ def _with_conventions(
             sequence = replace(sequence, gray_cell_px=_set(sequence.gray_cell_px, axis, float(f"{cell:.4g}")))
         evidence.append((parts.code.bits[-1].image, f"{turns:.3g} fringes per Gray cell"))
     frames = described_frames(sequence, axis)
-    a = agreement(reader, frames)
+    a = measure_agreement(reader, frames)
     if a.rising < 0.5:
         sequence = replace(sequence, phase_sign=_set(sequence.phase_sign, axis, -1))
         evidence.append((parts.runs[-1].images[0], "the phase falls where the code rises"))
         frames = described_frames(sequence, axis)
-        a = agreement(reader, frames)
+        a = measure_agreement(reader, frames)
     late = wrap(a.begin_turns)
     if abs(late) > 0.1 and frames.fringe is not None:
         steps = len(frames.fringe[1])
@@ -284,7 +284,7 @@ def _with_conventions(
             "as well be gray_origin"
         )
         frames = described_frames(sequence, axis)
-        a = agreement(reader, frames)
+        a = measure_agreement(reader, frames)
     _check_code(frames, a, images, axis, doubts)
     gradient = parts.runs[-1].gradient[0 if axis == "x" else 1] * sequence.sign(axis)
     if gradient < 0:
@@ -312,7 +312,7 @@ def _with_scale(
         return sequence
     extent = projector[0] if axis == "x" else projector[1]
     frames = described_frames(sequence, axis)
-    reach = agreement(AxisReader(sample, coded_frames(sequence, axis)), frames).reach_px
+    reach = measure_agreement(AxisReader(sample, coded_frames(sequence, axis)), frames).reach_px
     covered = sequence.gray_cell(axis) * 2**bits if bits else periods[0]
     if not periods:
         if covered < extent or reach > extent + 1:
@@ -339,7 +339,7 @@ def _check_code(
     frames: AxisFrames, a: Agreement, images: tuple[int, ...], axis: Axis, doubts: list[tuple[tuple[int, ...], str]]
 ) -> None:
     failed = failed_tests(frames, a)
-    if failed or not is_sure(frames, a):
+    if failed or not is_supported(frames, a):
         shares = f"{100 * a.rule:.0f} % of the edges obey the Gray code" if np.isfinite(a.rule) else "no edges are read"
         if np.isfinite(a.common):
             shares += f", {100 * a.common:.0f} % of them fall at one phase"

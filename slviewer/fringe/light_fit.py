@@ -110,7 +110,7 @@ def fit_light(
     return Fit(light, tuple(terms), left.variance, share, weight, model.informed)
 
 
-def room_changes(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
+def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
     """The frame from which on a change of the room's light, beside gains or alone, explains the most; empty if none."""
     model = LightModel(sample)
     left = model.eliminate(light, SHARE_PRIOR[0], weight)
@@ -142,7 +142,7 @@ def room_changes(sample: LightSample, light: Light, with_gain: bool, weight: np.
     return at
 
 
-def equalized_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def equalize_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """(u, p) samples under equal light, and the gains that they were divided by."""
     cosine, sine = _wave(sample, light.cycles)
     wave = light.wave[used].astype(np.float32)
@@ -215,7 +215,7 @@ class LightModel:
 
     def eliminate(self, light: Light, share: float, weight: np.ndarray) -> "Remainder":
         sample, n = self.sample, len(self.phased)
-        frames, gain = equalized_sample(sample, light, self.used)
+        frames, gain = equalize_sample(sample, light, self.used)
         shown, left = np.zeros_like(frames), np.zeros_like(frames)
         harmonics: list[tuple[slice, np.ndarray]] = []
         if n:
@@ -299,8 +299,10 @@ class Remainder:
 
     def robust_weight(self) -> np.ndarray:
         entries = sum(np.maximum(count - 1, 0) for count in self.counts)
-        ratio = (self.left**2).sum(axis=0) / np.maximum(self.model.phase_freedom + entries, 1)
-        return (1 / (1 + (ratio / max(OUTLIER * float(np.median(ratio)), 1e-6)) ** 2)).astype(np.float32)
+        freedom = self.model.phase_freedom + entries
+        ratio = (self.left**2).sum(axis=0) / np.maximum(freedom, 1)
+        usual = float(np.median(ratio[freedom > 0])) if (freedom > 0).any() else 0.0
+        return (1 / (1 + (ratio / max(OUTLIER * usual, 1e-6)) ** 2)).astype(np.float32)
 
     def solve(
         self, light: Light, terms: Sequence[Term], variance: float, share: float

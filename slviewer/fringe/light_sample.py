@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
+import cv2
 import numpy as np
 
 from slviewer.fringe import limits
@@ -20,6 +22,12 @@ DECIDED = 0.3
 SHOWN = 0.03
 """Share of the pixels that must be bright in a Gray frame of an axis that was shown."""
 MIN_PIXELS = 60
+OFFSETS = np.linspace(-8, 8, 161)
+"""Modulations by which a bit without an inverse may lie above or below the fringes' mean: by the light of the room."""
+SHARPER = (1.0, 1.25, 1.5, 2.0)
+"""Modulations by which it then lies above or below that: blur takes more from fringes than from stripes."""
+LEAST_OFFSET = 0.2
+"""Of the modulation; blur and shading move a frame by less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +54,9 @@ class LightSample:
 
     def albedo(self, changes: Sequence[int]) -> np.ndarray:
         """(p,) grey levels, in proportion to what the scene reflects, of frames between which no light ``changes``."""
-        return self.amplitudes[undisturbed(self.shifts, changes)]
+        if not self.shifts:
+            return _half_range(self.frames, self.coded, self.partner, changes)
+        return self.amplitudes[steady_shift(self.shifts, changes)]
 
 
 def sample_light(
@@ -116,17 +126,33 @@ def sample_light(
 def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequence[int] = ()) -> np.ndarray:
     """float32 of the shape of one of the ``frames`` (n, ...): half of what the projector adds, in grey levels.
 
-    The modulation of a phase shift between whose frames no light ``changes``, or half the range of the coded frames.
+    The modulation of a phase shift between whose frames no light ``changes``, or half the range of the coded frames
+    between two changes.
     """
     shifts = _shifts(sequence)
     if shifts:
-        chosen = np.stack([frames[i] for i in shifts[undisturbed(shifts, changes)]]).astype(np.float32)
+        chosen = np.stack([frames[i] for i in shifts[steady_shift(shifts, changes)]]).astype(np.float32)
         return np.abs(fit_cosine(chosen.reshape(len(chosen), -1))[1]).reshape(frames.shape[1:])
-    coded = [frames[i].astype(np.float32) for i, f in enumerate(sequence.frames) if f.kind != "texture"]
-    return 0.5 * (np.maximum.reduce(coded) - np.minimum.reduce(coded))
+    coded = tuple(i for i, f in enumerate(sequence.frames) if f.kind != "texture")
+    return _half_range(frames, coded, _partners(sequence, coded), changes)
 
 
-def undisturbed(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int:
+def _half_range(
+    frames: np.ndarray, coded: Sequence[int], partner: Sequence[int], changes: Sequence[int]
+) -> np.ndarray:  # fmt: skip
+    """Half the difference, float32, of bright and dark among ``coded`` frames: the largest between a bit and its
+    inverse, which see the same light of the room; without inverses, the range of the most frames between two changes.
+    """
+    pairs = [(i, coded[k]) for i, k in zip(coded, partner, strict=True) if k > -1]
+    if pairs:
+        return np.float32(0.5) * np.maximum.reduce([cv2.absdiff(frames[i], frames[j]) for i, j in pairs])
+    ends = [0, *changes, len(frames)]
+    longest = max(([i for i in coded if a <= i < b] for a, b in pairwise(ends)), key=len)
+    high, low = (extreme.reduce([frames[i] for i in longest]) for extreme in (np.maximum, np.minimum))
+    return np.float32(0.5) * (high - low)
+
+
+def steady_shift(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int:
     """The place of the last shift between whose frames no light ``changes``; -1, the last, where there is none."""
     return next(
         (s for s in reversed(range(len(shifts))) if not any(min(shifts[s]) < k <= max(shifts[s]) for k in changes)), -1
@@ -167,6 +193,9 @@ def _interiors(
     ends = [i for i in coded if sequence.frames[i].kind in ("white", "black")]
     reference = phased or (ends if len(ends) > 1 else list(coded))
     threshold = np.mean([frames[i] / np.float32(gain[i]) for i in reference], axis=0)
+    alone = [k for k, i in enumerate(coded) if partner[k] < 0 and sequence.frames[i].kind not in ("white", "black")]
+    levels = [frames[coded[k]] / np.float32(gain[coded[k]]) - threshold for k in alone]
+    offsets = dict(zip(alone, _room_offsets(levels, least / DECIDED) if phased else [0.0] * len(alone), strict=True))
     around = [(0, 0), *((0, d) for d in AROUND), *((d, 0) for d in AROUND)]
     interior, bright = (np.zeros((len(coded), len(row)), bool) for _ in range(2))
     for k, (i, other) in enumerate(zip(coded, partner, strict=True)):
@@ -183,12 +212,40 @@ def _interiors(
             if other > -1:
                 above[m] = level > stack[coded[other]][row + down, column + right] / np.float32(gain[coded[other]])
             else:
-                above[m] = level > threshold
-        reference_level = frames[coded[other]] / np.float32(gain[coded[other]]) if other > -1 else threshold
-        decided = np.abs(frames[i] / np.float32(gain[i]) - reference_level) > least
+                above[m] = level > threshold + offsets[k]
+        middle = frames[coded[other]] / np.float32(gain[coded[other]]) if other > -1 else threshold + offsets[k]
+        decided = np.abs(frames[i] / np.float32(gain[i]) - middle) > least
         bright[k], interior[k] = above[0], (above == above[0]).all(axis=0) & decided
     for axis in sequence.axes:
         own = [k for k, i in enumerate(coded) if sequence.frames[i].axis == axis]
         if own and not (interior[own] & bright[own]).mean(axis=1).max() > SHOWN:
             interior[own] = False  # the axis was not shown, or is out of view
+        # Stripes finer than those without an inside have none either: they are blurred to one grey.
+        coded_bits = sorted(k for k in own if sequence.frames[coded[k]].kind in ("gray", "inverse"))
+        coded_bits.sort(key=lambda k: sequence.frames[coded[k]].bit)
+        shares = interior[coded_bits].mean(axis=1) if coded_bits else np.zeros(0)
+        if (fine := np.flatnonzero(shares < SHOWN)).size:
+            interior[coded_bits[fine[0] :]] = False
     return interior, bright
+
+
+def _room_offsets(levels: list[np.ndarray], modulation: np.ndarray) -> list[float]:
+    """Grey levels that the pixels (p,) of each frame have in common beside plus or minus the modulation (p,), where it
+    is so much that dark stripes could be taken for bright ones; else 0. ``levels``: above the mean of the fringes.
+    Frames that are dark, or bright, throughout have none: of these it cannot be told.
+    """
+    some = np.s_[:: max(1, len(modulation) // 1000)]
+    modulation = modulation[some]
+    unit = float(np.median(modulation))
+    tried = (OFFSETS * unit).astype(np.float32)[:, None]
+    best, offsets = np.inf, [0.0] * len(levels)
+    for sharper in SHARPER:
+        misfits = [np.abs(np.abs(level[some] - tried) - sharper * modulation).mean(axis=1) for level in levels]
+        least = [int(np.argmin(misfit + 1e-3 * np.abs(tried[:, 0]))) for misfit in misfits]
+        if (total := sum(float(misfit[k]) for misfit, k in zip(misfits, least, strict=True))) < best:
+            best, offsets = total, [float(tried[k, 0]) for k in least]
+    shares = [float(np.mean(level[some] > offset)) for level, offset in zip(levels, offsets, strict=True)]
+    return [
+        offset if abs(offset) > LEAST_OFFSET * unit and SHOWN < share < 1 - SHOWN else 0.0
+        for offset, share in zip(offsets, shares, strict=True)
+    ]

@@ -9,10 +9,8 @@ from slviewer.fringe.layout import white_level
 from slviewer.fringe.residual_sample import roughness
 from slviewer.fringe.sequence import Axis, PatternSequence
 
-PIXELS = 15_000
-"""So many on rows, and on columns: hundreds of code edges, whichever way the stripes run."""
-ROUNDING = 0.29
-"""Grey levels of noise that whole numbers have: 1 / sqrt(12)."""
+PIXELS = 40_000
+"""So many on rows, and on columns: twenty edges also of the most significant bit, whichever way the stripes run."""
 GRID = 100
 """Pixels along the shorter side of the grid that shows where the patterns are."""
 BLOCK = 4
@@ -76,7 +74,7 @@ def sample_frames(stack: np.ndarray, coded: list[int], pixels: int = PIXELS) -> 
         [np.repeat(np.arange(len(rows)), width), len(rows) + np.repeat(np.arange(len(columns)), height)]
     )
     place = np.concatenate([np.tile(np.arange(width), len(rows)), np.tile(np.arange(height), len(columns))])
-    noise = max(roughness(frames[coded][:, : len(rows) * width], width), ROUNDING)
+    noise = roughness(frames[coded][:, : len(rows) * width], width)
     return LineSample(frames, line, len(rows), place, lines, grid, white, noise)
 
 

@@ -98,8 +98,11 @@ def _without_common_harmonics(
 def _from_inverses(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
     usable = _usable(np.concatenate([gray, inverse]), white)
     total = (gray + inverse)[:, usable]
-    variance = total.var(axis=0, ddof=1).mean(axis=-1) / 2
-    return total.mean(axis=(0, -1)) / 2, variance, (len(total) - 1) * total.shape[-1]
+    # What light of other surfaces and of the room adds to a frame hardly differs between neighbours.
+    rest = total - total.mean(axis=0)
+    rest -= rest.mean(axis=-1, keepdims=True)
+    freedom = (len(total) - 1) * max(total.shape[-1] - 1, 1)
+    return total.mean(axis=(0, -1)) / 2, (rest**2).sum(axis=(0, -1)) / (2 * freedom), freedom
 
 
 def _from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:

@@ -3,7 +3,8 @@
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.axis_agreement import FEWEST_EDGES, AxisReader, agreement, described_frames
+from slviewer.fringe.axis_agreement import FEWEST_EDGES, AxisReader, described_frames, measure_agreement
+from slviewer.fringe.frame_light import equalize_frames, estimate_frame_light
 from slviewer.fringe.layout import check_stack, layout
 from slviewer.fringe.line_sample import coded_frames, sample_lines
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -35,13 +36,16 @@ def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axi
     """
     check_stack(sequence, stack)
     found = layout(sequence, axis)
+    light = estimate_frame_light(sequence, stack)
+    if light.is_significant:
+        stack = equalize_frames(stack, light, sequence)[0]
     if not (found.shifts and found.gray):
         raise InputError(
             f"axis {axis}: the origin of a Gray code shows only beside a phase shift: there is none to compare"
         )
     reader = AxisReader(sample_lines(sequence, stack, PIXELS), coded_frames(sequence, axis))
     frames = described_frames(sequence, axis)
-    seen = agreement(reader, frames)
+    seen = measure_agreement(reader, frames)
     assert frames.fringe is not None
     if seen.edges < MIN_EDGES:
         raise InputError(f"axis {axis}: {seen.edges} code edges are in view, too few to tell where the code begins")

@@ -4,7 +4,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.aliased_harmonics import correct_harmonics, estimate_aliased_harmonics
-from slviewer.fringe.frame_light import CLIPPED, equalized_axis, original_levels
+from slviewer.fringe.frame_light import CLIPPED, equalize_axis, restore_levels
 from slviewer.fringe.layout import Layout, check_stack, layout, white_level
 from slviewer.fringe.levels import (
     cell_misfit,
@@ -29,7 +29,7 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     check_stack(sequence, stack)
     found = layout(sequence, axis)
     full = white_level(stack, sequence.select(axis))
-    sequence, stack, factor = equalized_axis(sequence, stack, axis)
+    sequence, stack, factor = equalize_axis(sequence, stack, axis)
     if factor != 1:
         found = layout(sequence, axis)
     white = full if factor == 1 else CLIPPED
@@ -76,7 +76,7 @@ def complete_map(
     harmonics = estimate_aliased_harmonics(found, stack, white, noise)
     phase, wrapped = correct_harmonics(harmonics, found, phase, wrapped)
     if factor != 1:
-        modulation, background, noise = original_levels(modulation, background, noise, factor)
+        modulation, background, noise = restore_levels(modulation, background, noise, factor)
     unambiguous = unambiguous_px(found)
     phase_map = PhaseMap(
         axis,

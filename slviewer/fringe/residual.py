@@ -4,25 +4,28 @@ Phase-shifted frames are one cosine per pixel, so that more than three of them s
 when one was late, lost or repeated. Frames of unequal light are compared as they would be under equal light. What the
 projector's gamma adds is common to all frames, and is not held against one of them; where it shifts the phase of three
 or four steps, it is reported. Frames of a Gray code contradict
-each other too: see `residual_gray`.
+each other too: see `description_check`.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slviewer.fringe.aliased_harmonics import estimate_aliased_harmonics, harmonics_suspects
-from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_frames, estimate_frame_light, light_suspects
+from slviewer.fringe.aliased_harmonics import describe_gamma, estimate_aliased_harmonics
+from slviewer.fringe.description_check import find_contradictions
+from slviewer.fringe.frame_light import CLIPPED, FrameLight, detect_light_faults, equalize_frames, estimate_frame_light
 from slviewer.fringe.layout import Layout, check_stack, layout, white_level
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.residual_gray import code_suspects
-from slviewer.fringe.residual_order import order_suspects, strange_suspects
+from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps
 from slviewer.fringe.residual_sample import Fringe, fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.fringe.suspect import LIGHT_FAULTS, ORDER_FAULTS, Suspect
+from slviewer.fringe.suspect import LIGHT_FAULTS, ORDER_FAULTS, Fault, Suspect
 
 SMALL_DRIFT = 0.05
 """rms variation of the light up to which a misplaced frame is recognised without correcting the light first."""
+_CODE_FAULTS: dict[str, Fault] = {
+    "frame-lag": "lag", "frame-order": "swapped", "missing-frame": "dropped", "duplicate-frame": "late"
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
     compared = _compare(sequence, found, stack, CLIPPED, light, factor)
     if any(suspect.fault != "gamma" for suspect in compared.suspects):
         return compared  # a frame out of its place spoils what is known of the light, too
-    return replace(compared, suspects=tuple(_once([*light_suspects(sequence, light), *compared.suspects])))
+    return replace(compared, suspects=tuple(_deduplicate([*detect_light_faults(sequence, light), *compared.suspects])))
 
 
 def _compare(
@@ -95,12 +98,24 @@ def _compare(
             continue
         if len(shift.indices) == 3:
             said.append(f"{what}: three steps fit any three frames, so that only a repeated one can be told")
-        suspects += order_suspects(sampled) or strange_suspects(sampled)
+        suspects += detect_misordered_steps(sampled) or detect_foreign_frames(sampled)
         residuals += _residuals(sampled, _light(sampled) * light.light.gain[list(shift.indices)], factor)
-    suspects += harmonics_suspects(estimate_aliased_harmonics(found, stack, white, noise), found)
-    if found.gray:
-        suspects += code_suspects(sequence, found, stack, white)
-    return FrameResiduals(axis, tuple(residuals), tuple(_once(suspects)), "; ".join(said))
+    suspects += describe_gamma(estimate_aliased_harmonics(found, stack, white, noise), found)
+    if found.gray and not suspects:
+        suspects += _detect_code_faults(sequence, stack, axis)
+    return FrameResiduals(axis, tuple(residuals), tuple(_deduplicate(suspects)), "; ".join(said))
+
+
+def _detect_code_faults(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> list[Suspect]:
+    """What contradicts the order of the frames that are no phase steps; of all frames, if they are late by as many."""
+    out = []
+    for c in find_contradictions(sequence, stack):
+        if c.cause in _CODE_FAULTS and c.axis in (axis, None) and c.value is not None:
+            is_common = c.cause == "frame-lag" and c.axis is None
+            frame = 0 if is_common else int(c.value)
+            if is_common or sequence.frames[frame].kind != "phase":
+                out.append(Suspect(frame, _CODE_FAULTS[c.cause], c.message))
+    return out
 
 
 def _residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list[FrameResidual]:
@@ -133,7 +148,7 @@ def _light(sampled: Fringe) -> np.ndarray:
     return 1 + excess - np.median(excess)
 
 
-def _once(suspects: list[Suspect]) -> list[Suspect]:
+def _deduplicate(suspects: list[Suspect]) -> list[Suspect]:
     """Of the findings about the order of a frame the first, and all about light; in the order of the frames."""
     kept: dict[tuple[int, str], Suspect] = {}
     for suspect in suspects:

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from slviewer.fringe.ghost import ghost_suspects
+from slviewer.fringe.ghost import detect_ghosting
 from slviewer.fringe.residual_sample import Fringe, columns
 from slviewer.fringe.suspect import Fault, Suspect
 
@@ -35,7 +35,7 @@ _FEW_MISPLACED = 0.5  # of the frames: these have changed places, and the others
 
 
 @dataclass(frozen=True)
-class _Story:
+class _Hypothesis:
     """What the frames show: `steps` by place in the order of showing, 0 for this period's first frame."""
 
     fault: Fault
@@ -44,27 +44,27 @@ class _Story:
     other: int = 0
 
 
-def order_suspects(sampled: Fringe) -> list[Suspect]:
+def detect_misordered_steps(sampled: Fringe) -> list[Suspect]:
     """The frames that do not show their own step, in words; where two explanations are equal, both are given."""
     n = sampled.steps
     products = _Products(sampled, sampled.frames)
-    if repeated := _repeated(sampled, products):
-        return [_told([_Story("late", {}, k, k - 1)], sampled.shift.indices) for k in repeated]
+    if repeated := _detect_repeated(sampled, products):
+        return [_name_fault([_Hypothesis("late", {}, k, k - 1)], sampled.shift.indices) for k in repeated]
     if n == 3:
         return []
-    products = _undisturbed(sampled, products)
-    now = _Story("strange", {k: k for k in range(n)}, 0)
-    told: list[Suspect] = []
+    products = _choose_products(sampled, products)
+    accepted = _Hypothesis("strange", {k: k for k in range(n)}, 0)
+    suspects: list[Suspect] = []
     for _ in range(_MOST_FAULTS):
-        found = _best(products, now, n)
+        found = _choose_hypothesis(products, accepted, n)
         if found is None:
             break
-        now = found[0]
-        told.append(_told(found, sampled.shift.indices))
-    return told
+        accepted = found[0]
+        suspects.append(_name_fault(found, sampled.shift.indices))
+    return suspects
 
 
-def shown_steps(sampled: Fringe) -> list[int] | None:
+def recover_step_order(sampled: Fringe) -> list[int] | None:
     """The step that each frame of a period shows, where they are all there in an order of their own; None where the
     frames are in their described order, apart from where it begins and which way it runs, or in none.
 
@@ -90,12 +90,12 @@ def shown_steps(sampled: Fringe) -> list[int] | None:
     return [int(step) for step in min(orders, key=lambda order: (order[0], order[1]))]
 
 
-def strange_suspects(sampled: Fringe) -> list[Suspect]:
+def detect_foreign_frames(sampled: Fringe) -> list[Suspect]:
     """Frames that no step explains: what is left when order and light have been looked at."""
-    if ghosts := ghost_suspects(sampled):
+    if ghosts := detect_ghosting(sampled):
         return ghosts
     n = sampled.steps
-    products = _undisturbed(sampled, _Products(sampled, sampled.frames))
+    products = _choose_products(sampled, _Products(sampled, sampled.frames))
     steps = {k: k for k in range(n)}
     out: list[Suspect] = []
     while len(out) < _MOST_FAULTS:
@@ -108,7 +108,7 @@ def strange_suspects(sampled: Fringe) -> list[Suspect]:
         gain = left - rest - (freedom - more) * rest / more
         if gain < max(_STRANGE**2 * products.strength, _STRANGE_NOISE * rest / more):
             break
-        if _only_light(sampled, k):
+        if _differs_in_light_only(sampled, k):
             break
         del steps[k]
         i = sampled.shift.indices[k]
@@ -122,7 +122,7 @@ def strange_suspects(sampled: Fringe) -> list[Suspect]:
     return out
 
 
-def _only_light(sampled: Fringe, k: int) -> bool:
+def _differs_in_light_only(sampled: Fringe, k: int) -> bool:
     """Whether frame k is what the others lead to expect, brighter or darker."""
     n, others = sampled.steps, np.delete(np.arange(sampled.steps), k)
     weights = columns(np.array([k]), n, sampled.own) @ np.linalg.pinv(columns(others, n, sampled.own))
@@ -178,7 +178,7 @@ def _keep(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
     return np.eye(len(steps)) - basis @ basis.T, len(steps) - basis.shape[1]
 
 
-def _undisturbed(sampled: Fringe, products: _Products) -> _Products:
+def _choose_products(sampled: Fringe, products: _Products) -> _Products:
     """The products to judge by: a frame far off its place spoils what gamma is thought to add."""
     nominal = {k: k for k in range(sampled.steps)}
     if products.left(nominal)[0] < _AS_EXPECTED * products.least(nominal, sampled.steps):
@@ -186,19 +186,21 @@ def _undisturbed(sampled: Fringe, products: _Products) -> _Products:
     raw = _Products(sampled, sampled.seen)
 
     def lowest(judge: _Products) -> float:
-        left = [judge.left(story.steps) for story in _stories(nominal, judge.places, sampled.steps)]
+        left = [judge.left(hypothesis.steps) for hypothesis in _hypotheses(nominal, judge.places, sampled.steps)]
         return min((rest / more for rest, more in left if more >= 1), default=np.inf)
 
     return min((products, raw), key=lowest)
 
 
-def _best(products: _Products, now: _Story, n: int) -> list[_Story] | None:
-    """The explanation to believe instead of `now`, if there is one, and those that are as good."""
-    left, freedom = products.left(now.steps)
-    least = products.least(now.steps, n)
+def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> list[_Hypothesis] | None:
+    """The explanation to believe instead of `accepted`, if there is one, and those that are as good."""
+    left, freedom = products.left(accepted.steps)
+    least = products.least(accepted.steps, n)
     if left < _AS_EXPECTED * least:
         return None
-    judged = [(story, *products.left(story.steps)) for story in _stories(now.steps, products.places, n)]
+    judged = [
+        (hypothesis, *products.left(hypothesis.steps)) for hypothesis in _hypotheses(accepted.steps, products.places, n)
+    ]
     judged = [each for each in judged if each[2] >= 1]
     if not judged:
         return None
@@ -207,75 +209,75 @@ def _best(products: _Products, now: _Story, n: int) -> list[_Story] | None:
     fitting = [each for each in judged if each[1] / each[2] <= limit]
     # The one that explains the most frames is the most easily refuted, hence the one to believe.
     fine = _SAME * products.strength
-    story, rest, more = min(fitting, key=lambda each: (-each[2], round(each[1] / fine), _rank(each[0])))
+    hypothesis, rest, more = min(fitting, key=lambda each: (-each[2], round(each[1] / fine), _rank(each[0])))
     gain = (left - freedom * noise) - (rest - more * noise)
-    caused = products.caused(now.steps, story.steps)
+    caused = products.caused(accepted.steps, hypothesis.steps)
     if caused > least / 2:
         believed = gain > _AS_EXPECTED * caused
     else:  # all steps are turned alike, and only the frames that are left out tell
         believed = gain > max(_STRANGE**2 * products.strength, _STRANGE_NOISE * noise)
-    if story.fault == "strange" or not believed:
+    if hypothesis.fault == "strange" or not believed:
         return None
     swaps = [s for s, r, m in fitting if s.fault == "swapped" and m == more and abs(r - rest) <= fine]
-    return swaps if story.fault == "swapped" else [story]
+    return swaps if hypothesis.fault == "swapped" else [hypothesis]
 
 
-def _rank(story: _Story) -> int:
+def _rank(hypothesis: _Hypothesis) -> int:
     """Faults that happen often before those that do not."""
-    beside = abs(story.place - story.other) == 1
-    if story.fault in ("late", "early"):
-        return (0 if story.fault == "late" else 4) if beside else 5
-    return {"swapped": 1, "dropped": 2, "lag": 3}.get(story.fault, 6)
+    beside = abs(hypothesis.place - hypothesis.other) == 1
+    if hypothesis.fault in ("late", "early"):
+        return (0 if hypothesis.fault == "late" else 4) if beside else 5
+    return {"swapped": 1, "dropped": 2, "lag": 3}.get(hypothesis.fault, 6)
 
 
-def _stories(now: dict[int, int], places: list[int], n: int) -> Iterator[_Story]:
+def _hypotheses(accepted: dict[int, int], places: list[int], n: int) -> Iterator[_Hypothesis]:
     """All that may have happened to the frames besides what is known already, the simplest first."""
     for k in range(n):
         for j in (k - 1, k + 1, *range(n)):
-            if 0 <= j < n and j != now.get(k):
-                yield _Story("late" if j < k else "early", now | {k: j}, k, j)
-    for k in now:
-        yield _Story("strange", {i: s for i, s in now.items() if i != k}, k)
+            if 0 <= j < n and j != accepted.get(k):
+                yield _Hypothesis("late" if j < k else "early", accepted | {k: j}, k, j)
+    for k in accepted:
+        yield _Hypothesis("strange", {i: s for i, s in accepted.items() if i != k}, k)
     for k in range(n - 1):
-        if now.get(k) == k and now.get(k + 1) == k + 1:
-            yield _Story("swapped", now | {k: k + 1, k + 1: k}, k, k + 1)
-    if any(now.get(k) != k for k in range(n)):
+        if accepted.get(k) == k and accepted.get(k + 1) == k + 1:
+            yield _Hypothesis("swapped", accepted | {k: k + 1, k + 1: k}, k, k + 1)
+    if any(accepted.get(k) != k for k in range(n)):
         return
     for k in range(1, n - 1):
-        yield _Story("dropped", {j: j if j < k else j + 1 for j in range(n - 1)}, k)
+        yield _Hypothesis("dropped", {j: j if j < k else j + 1 for j in range(n - 1)}, k)
     after = [place for place in places if place >= n]
     if after:
         for k in range(1, n):
             late = {j: j if j < k else j - 1 for j in range(n)}
-            yield _Story("lag", late | {n: n - 1}, k, 1)
+            yield _Hypothesis("lag", late | {n: n - 1}, k, 1)
         for shift in (1, 2):
             known = {j: j - shift for j in (*range(shift, n), *after) if 0 <= j - shift < n}
-            yield _Story("lag", known, 0, shift)
+            yield _Hypothesis("lag", known, 0, shift)
     if -1 in places:
-        yield _Story("dropped", {j: j + 1 for j in range(-1, n - 1)}, 0)
+        yield _Hypothesis("dropped", {j: j + 1 for j in range(-1, n - 1)}, 0)
 
 
-def _told(stories: list[_Story], indices: tuple[int, ...]) -> Suspect:
-    texts = list(dict.fromkeys(_words(story, indices) for story in stories))
-    return Suspect(indices[stories[0].place], stories[0].fault, ", or ".join(texts))
+def _name_fault(hypotheses: list[_Hypothesis], indices: tuple[int, ...]) -> Suspect:
+    texts = list(dict.fromkeys(_describe(hypothesis, indices) for hypothesis in hypotheses))
+    return Suspect(indices[hypotheses[0].place], hypotheses[0].fault, ", or ".join(texts))
 
 
-def _words(story: _Story, indices: tuple[int, ...]) -> str:
-    frame = indices[story.place] + 1
-    other = indices[story.other] + 1 if story.other < len(indices) else frame
-    if story.fault == "late":
+def _describe(hypothesis: _Hypothesis, indices: tuple[int, ...]) -> str:
+    frame = indices[hypothesis.place] + 1
+    other = indices[hypothesis.other] + 1 if hypothesis.other < len(indices) else frame
+    if hypothesis.fault == "late":
         return f"frame {frame} shows the pattern of frame {other}: it is late or repeated"
-    if story.fault == "early":
+    if hypothesis.fault == "early":
         return f"frame {frame} shows the pattern of frame {other}: it came too early"
-    if story.fault == "swapped":
+    if hypothesis.fault == "swapped":
         return f"frames {frame} and {other} have changed places"
-    if story.fault == "dropped":
+    if hypothesis.fault == "dropped":
         return f"frame {frame} is missing, and those that follow came too early"
-    images = "one image" if story.other == 1 else f"{story.other} images"
+    images = "one image" if hypothesis.other == 1 else f"{hypothesis.other} images"
     return f"from frame {frame} on the camera is {images} behind the projector"
 
 
-def _repeated(sampled: Fringe, products: _Products) -> list[int]:
+def _detect_repeated(sampled: Fringe, products: _Products) -> list[int]:
     """Steps that are the frame before once more, where any two that follow each other should differ alike."""
     n, seen = sampled.steps, sampled.seen
     if n == 3 and not sampled.turns:  # two steps look alike where the pixels see one side of the fringe alone

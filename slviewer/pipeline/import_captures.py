@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from slviewer.errors import InputError
+from slviewer.fringe.description_check import check_description
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import PerAxis, parse_size
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
@@ -229,11 +230,16 @@ def checked(capture: NewCapture, warn: Warn) -> NewCapture:
     """
     sequence = capture.sequence
     if not capture.settings.get("gray_origin_given", True) and any(f.kind == "gray" for f in sequence.frames):
-        origins = {
-            axis: estimate_gray_origin(sequence, capture.frames, axis)
-            for axis in sequence.axes
-            if sequence.periods_px(axis) and sequence.find("gray", axis)
-        }
+        axes = [axis for axis in sequence.axes if sequence.periods_px(axis) and sequence.find("gray", axis)]
+        try:
+            origins = {axis: estimate_gray_origin(sequence, capture.frames, axis) for axis in axes}
+        except InputError:
+            # Frames out of order and changed light leave no common origin; say which it is.
+            unstated = ("gray-origin", "phase-offset", "unreadable")
+            for found in check_description(sequence, capture.frames):
+                if found.cause not in unstated:
+                    raise InputError(found.message) from None
+            raise
         if origins:
             first = next(iter(origins.values()))
             sequence = replace(sequence, gray_origin_px=PerAxis(origins.get("x", first), origins.get("y", first)))

@@ -93,7 +93,7 @@ def repeated_images(sequence: PatternSequence, stack: np.ndarray) -> Check:
     """Images that are the very one before, although another pattern was shown; a camera may be without noise."""
     changed = [k for k in range(1, len(stack)) if sequence.frames[k] != sequence.frames[k - 1]]
     same = [k for k in changed if np.array_equal(stack[k], stack[k - 1])]
-    figures = {"repeated_frames": [k + 1 for k in same], "frames": len(stack)}
+    figures = {"detect_copies": [k + 1 for k in same], "frames": len(stack)}
     if same:
         listed = ", ".join(str(k + 1) for k in same[:5])
         return Check(

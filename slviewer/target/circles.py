@@ -267,11 +267,11 @@ def _failure(board: Board, image: BoardImage, most: _Attempt | None) -> str:
     if others:
         facts.append(f"beside {others} other round blobs")
     centres = most.blobs.centres[lattice.blobs]
-    step = float(np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / seen))
+    spacing = float(np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / ((longer - 1) * (shorter - 1))))
     height, width = image.grey.shape
     gaps = {"left": centres[:, 0].min(), "right": width - 1 - centres[:, 0].max()}
     gaps |= {"upper": centres[:, 1].min(), "lower": height - 1 - centres[:, 1].max()}
-    sides = [side for side, gap in gaps.items() if gap < step]
+    sides = [side for side, gap in gaps.items() if gap < 1.5 * spacing]  # a circle that the border cuts is not detected
     if sides:
         facts.append(f"up to the {' and the '.join(sides)} border of the image")
     return f"{', '.join(facts)}: {light_advice(image.grey)}"

@@ -14,6 +14,8 @@ from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.simulation.boards import BoardShape
 from slviewer.target.board import Board
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["coarse_knots"]  # a fixture for every test here
 
 TURNED = (1, 4, 7)

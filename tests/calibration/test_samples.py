@@ -35,5 +35,5 @@ def test_blocks_average_position_and_coordinate_alike_and_know_their_noise() -> 
 
 
 def test_arrays_that_do_not_belong_together_are_refused() -> None:
-    with pytest.raises(InputError, match="do not belong together"):
+    with pytest.raises(InputError):
         Samples(np.zeros((3, 2)), np.zeros((4, 2)), np.zeros((3, 2)))

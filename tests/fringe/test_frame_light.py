@@ -5,10 +5,12 @@ import pytest
 from fringe_scene import capture, coverage, slope, wrong
 
 from slviewer.fringe.decode import decode, decode_reference
-from slviewer.fringe.frame_light import estimate_frame_light, light_suspects
+from slviewer.fringe.frame_light import detect_light_faults, estimate_frame_light
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import complementary, gray, p18
 from slviewer.fringe.sequence import PatternSequence
+
+pytestmark = pytest.mark.slow
 
 PROJECTOR = (256, 128)
 TRUTH = slope(240, 320, per_px=0.5, start=20.0)
@@ -58,7 +60,7 @@ def test_gains_are_those_that_were_applied(name):
     steps = [i for i, f in enumerate(sequence.frames) if f.kind == "phase"]
     ratio = light.light.gain[steps] / gain[steps, 0, 0]
     assert ratio.std() / ratio.mean() < 0.004
-    (suspect,) = light_suspects(sequence, light)
+    (suspect,) = detect_light_faults(sequence, light)
     assert suspect.fault == "exposure-drift" and "corrected" in suspect.sentence
 
 
@@ -66,7 +68,7 @@ def test_a_steady_capture_is_left_as_it_is():
     for sequence in SEQUENCES.values():
         for gamma in (1.0, 2.2):
             light = estimate_frame_light(sequence, capture(sequence, TRUTH, shot=0.02, gamma=gamma))
-            assert not light.is_significant and light_suspects(sequence, light) == []
+            assert not light.is_significant and detect_light_faults(sequence, light) == []
 
 
 def test_mains_flicker_under_a_rolling_shutter():
@@ -76,7 +78,7 @@ def test_mains_flicker_under_a_rolling_shutter():
     flickering = relit(stack, 1 + 0.05 * np.sin(2 * np.pi * (3.2 * v + 0.37 * k)))
     light = estimate_frame_light(sequence, flickering)
     assert light.light.cycles == pytest.approx(3.2, abs=0.05)
-    assert [s.fault for s in light_suspects(sequence, light)] == ["flicker"]
+    assert [s.fault for s in detect_light_faults(sequence, light)] == ["flicker"]
     assert rms_px(decode(sequence, flickering, "x")) < 1.15 * rms_px(decode(sequence, stack, "x"))
 
 
@@ -86,7 +88,7 @@ def test_room_light_that_is_switched_on(first):
     stack = capture(sequence, TRUTH, shot=0.02, gain=140)
     lit = relit(stack, 1, np.where(np.arange(len(stack)) >= first, 40, 0)[:, None, None])
     light = estimate_frame_light(sequence, lit)
-    (suspect,) = light_suspects(sequence, light)
+    (suspect,) = detect_light_faults(sequence, light)
     assert (suspect.fault, suspect.frame) == ("room-light", first)
     phase = decode(sequence, lit, "x")
     assert coverage(phase) > 0.99 and rms_px(phase) < 1.15 * rms_px(decode(sequence, stack, "x"))

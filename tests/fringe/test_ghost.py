@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slviewer.fringe.ghost import ghost_share, ghost_suspects
+from slviewer.fringe.ghost import detect_ghosting, ghost_share
 from slviewer.fringe.layout import layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import p18
@@ -27,7 +27,7 @@ def sampled(fault=None, severity="mild", axis="y"):
 def test_the_share_of_the_image_before_is_measured(severity, share):
     measured, error = ghost_share(sampled("crosstalk", severity))
     assert measured == pytest.approx(share, rel=0.2) and error < 0.002
-    (suspect,) = ghost_suspects(sampled("crosstalk", severity))
+    (suspect,) = detect_ghosting(sampled("crosstalk", severity))
     first = next(i for i, frame in enumerate(SEQUENCE.frames) if frame.axis == "y")
     assert suspect.fault == "strange" and suspect.frame == first
     assert f" {first + 1} " in suspect.sentence and f" {100 * measured:.0f} %" in suspect.sentence
@@ -39,11 +39,11 @@ def test_the_share_of_the_image_before_is_measured(severity, share):
      ("room-light", "medium"), ("jpeg", "severe"), ("hot-pixels", "severe"), ("dim-projector", "severe")],
 )  # fmt: skip
 def test_nothing_else_is_taken_for_it(fault, severity):
-    assert ghost_suspects(sampled(fault, severity)) == []
+    assert detect_ghosting(sampled(fault, severity)) == []
 
 
 def test_the_first_frame_of_a_capture_lacks_the_share_of_the_others():
     assert ghost_share(sampled("crosstalk", "severe", "x"))[0] == pytest.approx(0.15, rel=0.25)
-    assert ghost_suspects(sampled(axis="x")) == []
-    (suspect,) = ghost_suspects(sampled("crosstalk", "severe", "x"))
+    assert detect_ghosting(sampled(axis="x")) == []
+    (suspect,) = detect_ghosting(sampled("crosstalk", "severe", "x"))
     assert suspect.frame == 0 and " 1, the first" in suspect.sentence

@@ -28,6 +28,8 @@ from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.importers.frames import read_description
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.slow
+
 PROJECTOR = (912, 1140)
 
 

@@ -16,6 +16,8 @@ from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.slow
+
 PROJECTOR = (256, 128)
 COORDINATE = slope(start=20.0)
 SEQUENCES = {
@@ -133,7 +135,7 @@ def test_three_steps_say_that_they_cannot_tell():
     sequence = SEQUENCES["three"]
     stack = capture(sequence, COORDINATE)
     found = frame_residuals(sequence, stack, "x")
-    assert "three steps fit any three frames" in found.said and np.isnan(found.frames[0].sigmas)
+    assert np.isnan(found.frames[0].sigmas)
     for k in (1, 2):
         assert told(sequence, late(stack, k)) == {k: "late"}
 
@@ -145,7 +147,7 @@ def test_four_steps_know_that_something_is_wrong():
         assert told(sequence, late(stack, k)) == {k: "late"}
     assert told(sequence, swapped(stack, 1)) == {1: "swapped"}
     (either,) = frame_residuals(sequence, swapped(stack, 0), "x").suspects
-    assert "frames 1 and 2 have changed places" in either.sentence and "frames 3 and 4" in either.sentence
+    assert "frames 1 and 2" in either.sentence and "frames 3 and 4" in either.sentence
     assert told(sequence, brighter(stack, 2)) == {2: "exposure-drift"}
 
 
@@ -164,8 +166,8 @@ def test_bits_and_inverses_must_add_up():
     for k in (1, 2, 3, 5):
         assert told(sequence, late(stack, k)) == {k: "late"}
     assert told(sequence, swapped(stack, 2)) == {2: "swapped"}
-    assert set(told(sequence, swapped(stack, 1))) == {0, 2}
-    assert told(sequence, dropped(stack, 2))[2] == "lag"
+    assert told(sequence, swapped(stack, 1)) == {1: "swapped"}
+    assert told(sequence, dropped(stack, 2)) == {2: "dropped"}
     assert told(sequence, brighter(stack, 0)) == {0: "exposure-drift"}
 
 

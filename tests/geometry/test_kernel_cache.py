@@ -55,6 +55,7 @@ def read_only(install: Path) -> None:
     (install / "slviewer" / "__pycache__").touch()
 
 
+@pytest.mark.slow
 def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, tmp_path: Path) -> None:
     home = {"HOME": str(tmp_path / "home")}
     value, hits, place = run(install, "import slviewer.caller", **home)

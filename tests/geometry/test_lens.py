@@ -113,7 +113,7 @@ def test_other_models_are_refused(matrix: np.ndarray, distortion: object, size: 
 
 
 def test_wrong_shapes_are_refused(lens: Lens) -> None:
-    with pytest.raises(InputError, match="last dimension"):
+    with pytest.raises(InputError):
         lens.project(np.zeros((5, 2)))
-    with pytest.raises(InputError, match="last dimension"):
+    with pytest.raises(InputError):
         lens.undistort(np.zeros((5, 3)))

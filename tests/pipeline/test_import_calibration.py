@@ -13,6 +13,8 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.session.exporters import write_calibration
 from slviewer.session.store import Session
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., tuple[int, str, str]]
 CAMERA, PROJECTOR = (160, 120), (456, 570)
 R = cv2.Rodrigues(np.array([0.01, 0.3, -0.02]))[0]
@@ -92,7 +94,7 @@ def test_common_names_are_recognised_and_stated(
 def test_names_that_are_not_known_or_not_unique_are_asked_for(run: Run, tmp_path: Path) -> None:
     path = file(tmp_path, entries(), ("A", "B", "C", "D", "R", "T"))
     status, _, err = run("import", "opencv-calibration", path, tmp_path / "s")
-    assert status == 1 and "--keys" in err and "its keys are A, B, C, D, R, T" in err
+    assert status == 1 and "--keys" in err and "A, B, C, D, R, T" in err
     path = file(tmp_path, entries(), M1=np.eye(3), D1=np.zeros(5), M2=np.eye(3), D2=np.zeros(5))
     status, _, err = run("import", "opencv-calibration", path, tmp_path / "s")
     assert status == 1 and "K_camera, D_camera" in err and "M1, D1, M2, D2" in err and "--keys" in err

@@ -43,7 +43,7 @@ def test_what_is_shipped_can_be_chosen():
     assert {"simulated", "replay", "webcam", "lightcrafter4500"} == set(shipped)
     for preset in shipped.values():
         assert preset.what.endswith(".") and "rigs" in preset.source.parts
-        assert preset.problem == "" or preset.problem.startswith("the package ")
+        assert preset.problem == "" or "package" in preset.problem
         check_choice(preset.choice, preset.name)
         assert f"  {preset.name}: {preset.what}" in rigs()
     bench = set_up(load_rig("simulated"), None)
@@ -60,7 +60,7 @@ def test_what_is_saved_comes_back_and_hides_what_is_shipped(session: Session, fa
     assert load_rig("simulated", session)["scale"] == 0.1 and load_rig("simulated")["scale"] == 0.5
     names = [preset.name for preset in presets(session)]
     assert names[:2] == ["bench-1", "simulated"] and names.count("simulated") == 1
-    with pytest.raises(InputError, match="cannot be a name"):
+    with pytest.raises(InputError):
         save_rig(session, "../bench", BENCH)
     assert Session.open(session.folder).rigs().keys() == {"bench-1", "simulated"}
 
@@ -70,7 +70,7 @@ def test_a_choice_as_toml_is_the_same_choice():
     assert tomllib.loads(to_toml(nothing)) == BENCH
     odd = {"driver": "x", "odd key": "ü", "deep": {"a": {"b": [1, 2.5, -3, "t"]}, "empty": []}, "big": 10**12}
     assert tomllib.loads(to_toml(odd)) == odd
-    with pytest.raises(InputError, match="cannot stand in a TOML file"):
+    with pytest.raises(InputError, match="TOML"):
         to_toml({"driver": object()})
 
 
@@ -113,14 +113,14 @@ def test_files_and_names_that_are_none_are_named(fake: None, tmp_path: Path):
         with pytest.raises(InputError, match=message):
             load_rig(rig)
     (tmp_path / "whole.toml").write_text('driver = "simulated"\nscail = 0.5\n')
-    with pytest.raises(InputError, match="no option 'scail': use preset, scale, seed"):
+    with pytest.raises(InputError, match=r"'scail'.*preset, scale, seed"):
         load_rig(tmp_path / "whole.toml")
 
 
 def test_a_missing_package_says_how_to_install_it(fake: None, tmp_path: Path):
     file = tmp_path / "mine.toml"
     file.write_text(to_toml({**BENCH, "camera": {"driver": "lacking", "source": "0"}}))
-    with pytest.raises(DeviceError, match="no_such_package is missing: pip install it"):
+    with pytest.raises(DeviceError, match=r"no_such_package.*pip install"):
         load_rig(file)
 
 
@@ -129,5 +129,5 @@ def test_a_rig_that_cannot_be_used_is_listed_with_its_problem(fake: None, sessio
     (session.folder / "rigs" / "broken.toml").write_text("driver = ")
     listed = {preset.name: preset for preset in presets(session)}
     assert listed["far"].what == "Far away." and "pip install it" in listed["far"].problem
-    assert "cannot be read as TOML" in listed["broken"].problem and listed["simulated"].problem == ""
-    assert "far: Far away. (not here: the package no_such_package is missing" in rigs(session)
+    assert "TOML" in listed["broken"].problem and listed["simulated"].problem == ""
+    assert "far: Far away." in rigs(session) and "no_such_package" in rigs(session)

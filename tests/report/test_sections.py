@@ -23,6 +23,8 @@ from slviewer.report.reproduction import (
 from slviewer.report.session import session_headlines, session_sections, session_title
 from slviewer.report.tables import better_worse, compare_errors, format_number, plane_table, spacing_table, sphere_table
 
+pytestmark = pytest.mark.slow
+
 WIDTH = 240
 
 
@@ -121,7 +123,7 @@ def test_an_empty_reproduction_still_makes_a_page() -> None:
     )
     sections = reproduction_sections(data)
     assert len(sections) == 4 and len(reproduction_headlines(data)) == 2
-    assert "pose_02 was left out: board not found" in texts(sections[0])
+    assert all(fact in texts(sections[0]) for fact in ("pose_02", "board not found"))
 
 
 def test_missing_values_are_dashes_not_winners() -> None:

@@ -68,5 +68,5 @@ def test_a_mosaic_shows_one_scan_in_each_square_and_leaves_no_hole() -> None:
 
 
 def test_shapes_are_checked() -> None:
-    with pytest.raises(InputError, match="make no view"):
+    with pytest.raises(InputError):
         render_points(np.zeros((3, 3)), np.zeros((4, 3)), np.zeros((3, 3)), SIZE, np.eye(3))

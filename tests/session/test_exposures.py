@@ -64,7 +64,7 @@ def test_a_replaced_or_damaged_capture_is_never_mixed(session, sequence, stacks)
     first = save(session, sequence, stacks)
     first.stack()
     second = save(session, sequence, stacks[:, ::-1], force=True)
-    with pytest.raises(SessionError, match="was replaced"):
+    with pytest.raises(SessionError):
         first.stack()
     assert second.frames.shape == stacks.shape[1:]
     third = save(session, sequence, np.ascontiguousarray(stacks[..., ::-1]), force=True)

@@ -30,5 +30,5 @@ def test_a_folder_with_something_in_it_is_refused(tmp_path):
     sequence = PRESETS["gray"](PROJECTOR)
     (tmp_path / "empty").mkdir()
     write_pattern_folder(tmp_path / "empty", sequence)
-    with pytest.raises(InputError, match="not empty"):
+    with pytest.raises(InputError):
         write_pattern_folder(tmp_path / "empty", sequence)

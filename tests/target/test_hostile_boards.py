@@ -12,6 +12,8 @@ from slviewer.errors import DetectionError
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 
+pytestmark = pytest.mark.slow
+
 SYMMETRIC, ASYMMETRIC = Board.parse("circles:9x7:20"), Board.parse("acircles:4x11:20")
 SIZE = (400, 300)
 SCENE = Scene(size=SIZE, supersample=3, fill=0.6, sheet=0.6)
@@ -125,7 +127,7 @@ def test_a_marked_board_among_clutter_starts_at_its_mark(roll: float) -> None:
 def test_one_more_row_that_belongs_to_the_grid_is_refused() -> None:
     for share in (0.5, 1.0):
         scene = replace(SCENE, sheet=1.3, tilt=15, discs=lattice_around(SYMMETRIC, 0, share))
-        with pytest.raises(DetectionError, match="circles in one grid detected where circles:9x7:20 has 63: check"):
+        with pytest.raises(DetectionError, match=r"circles:9x7:20.*63"):
             detect(SYMMETRIC, scene.render(SYMMETRIC))
 
 
@@ -135,7 +137,7 @@ def test_of_two_boards_the_much_larger_is_taken_and_of_two_alike_none() -> None:
     detection = detect(SYMMETRIC, scene.render(SYMMETRIC))
     assert np.linalg.norm(detection.pixels - scene.truth(SYMMETRIC), axis=1).max() < 0.2
     mirrored = replace(scene, fill=0.4, shift=(-100.0, 0.0), second=replace(small, fill=0.38, shift=(90.0, 0.0)))
-    with pytest.raises(DetectionError, match="2 boards circles:9x7:20 detected"):
+    with pytest.raises(DetectionError, match=r"2 .*circles:9x7:20"):
         detect(SYMMETRIC, mirrored.render(SYMMETRIC))
 
 
@@ -144,10 +146,11 @@ def test_a_covered_circle_among_clutter_is_counted_not_replaced() -> None:
     for hidden in (0, 31):
         x, y = SYMMETRIC.points[hidden, :2]
         scene = replace(SCENE, tilt=15, discs=blobs, hide=(x - 8, y - 8, x + 8, y + 8))
-        with pytest.raises(DetectionError, match="62 of 63 circles of circles:9x7:20 detected, beside "):
+        with pytest.raises(DetectionError, match=r"62 of 63.*circles:9x7:20"):
             detect(SYMMETRIC, scene.render(SYMMETRIC))
 
 
-def test_a_board_that_reaches_beyond_the_image_says_at_which_side() -> None:
-    with pytest.raises(DetectionError, match=r"of 63 circles .* up to the right border of the image: .*bring|move"):
-        detect(SYMMETRIC, replace(SCENE, shift=(110, 0)).render(SYMMETRIC))
+@pytest.mark.parametrize("shift", [80, 110, 140])
+def test_a_board_that_reaches_beyond_the_image_says_at_which_side(shift: int) -> None:
+    with pytest.raises(DetectionError, match=r"of 63 .*right"):
+        detect(SYMMETRIC, replace(SCENE, shift=(shift, 0)).render(SYMMETRIC))

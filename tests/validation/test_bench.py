@@ -3,12 +3,14 @@
 import json
 
 import numpy as np
+import pytest
 
 from slviewer.validation.bench import Benchmark
 from slviewer.validation.bench_floors import beside, megabytes, row, through
 from slviewer.validation.bench_peers import missing
 
 
+@pytest.mark.slow
 def test_the_floor_reads_and_writes_every_byte() -> None:
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (5, 7, 9)).astype(np.uint8)

@@ -1,0 +1,106 @@
+"""Coded frames that are alike though they should differ, and white and black ones that are not."""
+
+import numpy as np
+
+from slviewer.fringe.axis_agreement import INSIDE, REACH
+from slviewer.fringe.line_sample import LineSample, coded_frames
+from slviewer.fringe.sequence import Axis, PatternSequence
+
+FEWEST = 500
+"""Fewer pixels than this say nothing."""
+ALIKE = 0.04
+"""Squared difference of two images over the variance of the pattern that one shows: between two patterns of a code,
+which have no edge in common, it is 1 and more."""
+LEAST_PATTERN = 0.05
+"""Standard deviation of the pattern as a share of the contrast; below it images are evenly lit, or blurred."""
+DECIDED, SHARP = 0.2, 0.5
+"""Of the contrast, that a pixel lies away from the middle where it is no edge; and share of such pixels in an image
+whose stripes are not blurred: blurred ones of two patterns may look alike."""
+FEWEST_EDGES = 30
+EVEN = 0.25
+"""Of the contrast: a white image lies farther above the middle in the mean, and a black one farther below it."""
+
+
+class FrameLikeness:
+    """The frames of a capture as shares of each pixel's contrast, -0.5 dark and 0.5 bright."""
+
+    def __init__(self, sequence: PatternSequence, sample: LineSample) -> None:
+        self._sequence = sequence
+        even = [i for i, frame in enumerate(sequence.frames) if frame.kind in ("white", "black")]
+        self._images = sorted({*coded_frames(sequence), *even})
+        high, low = (extreme(sample.frames[self._images], axis=0) for extreme in (np.max, np.min))
+        seen = np.flatnonzero((high - low > sample.least_swing) & (high < sample.white))
+        contrast = (high - low)[seen]
+        self._levels = (sample.frames[:, seen] - (high + low)[seen] / 2) / np.maximum(contrast, 1e-6)
+        self._weight = contrast / max(float(np.sum(contrast)), 1e-6)
+        self._finest = {axis: self._finest_opposed(axis) for axis in sequence.axes}
+        self._near = (np.diff(sample.place[seen]) <= REACH[0]) & (np.diff(sample.line[seen]) == 0)
+
+    def repeated(self) -> list[tuple[int, int]]:
+        """Pairs (i, j < i): image i is image j once more though another pattern is described. Phase steps are compared
+        with others only: among themselves neighbours differ by little.
+        """
+        if len(self._weight) < FEWEST:
+            return []
+        root = np.sqrt(self._weight)
+        weighted = self._levels[self._images] * root
+        product = (weighted @ weighted.T).astype(np.float64)
+        square = np.diagonal(product)
+        difference = square[:, None] + square - 2 * product
+        variance = square - (weighted @ root).astype(np.float64) ** 2
+        pairs = []
+        for a, i in enumerate(self._images):
+            for b, j in reversed([*enumerate(self._images[:a])]):
+                if difference[a, b] < ALIKE and self._are_alike(i, j, float(difference[a, b]), float(variance[a])):
+                    pairs.append((i, j))
+                    break
+        return pairs
+
+    def is_even(self, index: int, image: int | None) -> bool:
+        """Whether a white or black frame is so in this image; True for other frames and without an image."""
+        kind = self._sequence.frames[index].kind
+        if image is None or kind not in ("white", "black") or len(self._weight) < FEWEST:
+            return True
+        mean = float(self._weight @ self._levels[image])
+        return mean > EVEN if kind == "white" else mean < -EVEN
+
+    def _are_alike(self, i: int, j: int, difference: float, variance: float) -> bool:
+        frames = self._sequence.frames
+        if frames[i].kind == frames[j].kind == "phase":
+            return False
+        if self._are_opposite(i, j):
+            return True
+        if variance < LEAST_PATTERN**2:
+            return False
+        return self._is_copy(i, j) or (difference < ALIKE * variance and self._is_striped(i))
+
+    def _is_copy(self, i: int, j: int) -> bool:
+        return bool(np.array_equal(self._levels[i], self._levels[j]))
+
+    def copied(self, i: int) -> int | None:
+        """An earlier image that image i equals in every grey level; evenly lit ones may do so without noise."""
+        earlier = [j for j in self._images if j < i] if len(self._weight) >= FEWEST else []
+        return next((j for j in reversed(earlier) if self._is_copy(i, j)), None)
+
+    def _is_striped(self, i: int) -> bool:
+        """Whether an image shows stripes that are not blurred."""
+        bright = self._levels[i] > 0
+        edges = np.count_nonzero((bright[1:] != bright[:-1]) & self._near)
+        return bool(edges >= FEWEST_EDGES and np.mean(np.abs(self._levels[i]) > DECIDED) > SHARP)
+
+    def _finest_opposed(self, axis: Axis) -> int:
+        """The finest bit of an axis that differs from its inverse; finer ones may be blurred to one grey. -1: none."""
+        pairs = zip(self._sequence.find("gray", axis), self._sequence.find("inverse", axis), strict=False)
+        return max((self._sequence.frames[i].bit for i, j in pairs if self._difference(i, j) > ALIKE), default=-1)
+
+    def _difference(self, i: int, j: int) -> float:
+        return float(self._weight @ (self._levels[i] - self._levels[j]) ** 2)
+
+    def _are_opposite(self, i: int, j: int) -> bool:
+        """Whether two frames are bright and dark by their description, and their images not blurred to one grey."""
+        a, b = self._sequence.frames[i], self._sequence.frames[j]
+        if {a.kind, b.kind} not in ({"gray", "inverse"}, {"white", "black"}) or (a.axis, a.bit) != (b.axis, b.bit):
+            return False
+        if a.axis is not None and a.bit > self._finest[a.axis]:
+            return False
+        return bool(np.mean(np.abs(self._levels[i]) > INSIDE) > SHARP)
