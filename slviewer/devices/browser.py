@@ -88,13 +88,6 @@ class BrowserProjector(Openable):
         self._channel.keep(level)
         page.ask("level", grey=level)
 
-    def show_marker(self) -> None:
-        """A picture by which a person, and a camera, knows this screen: four corner squares of different sizes, large
-        first at the top left, smallest at the bottom left, white on black, and the projector's size in words.
-        """
-        self.check_open()
-        self._channel.page().ask("marker")
-
     def _forget(self) -> None:
         self._sequence = self._sent = self._page = None
 

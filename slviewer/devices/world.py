@@ -101,10 +101,6 @@ class SimulatedWorld:
         pose = Pose(np.eye(3), np.array([0, 0, _FIRST_PLACES_MM["board"]]) - middle)
         self._put("board", printed_board(board, pose, shape, self.rig.seed))
 
-    def place_board(self, pose: Pose) -> None:
-        """Let the board stand at T_camera_board, in place of whatever stood there."""
-        self.place("board", pose)
-
     def place(self, thing: Thing, pose: Pose | None = None) -> None:
         """Let `thing` stand at T_camera_thing, in place of whatever stood there; None: where it stood before."""
         if thing not in get_args(Thing):

@@ -66,8 +66,9 @@ def reconstruct(
 ) -> Cloud:
     """The organised cloud of a capture: points, predicted sigmas and texture on the camera's grid.
 
-    ``phases``: the capture's absolute phase maps by axis. ``axis``: the one that depth is taken from; None chooses as
-    ``choose_axis`` does. ``texture``: (h, w) or (h, w, 3), uint8 or uint16.
+    ``phases``: the capture's absolute phase maps by axis. ``axis``: the one that depth is taken from; None selects the
+    one with the smaller median predicted sigma_z over the pixels that both measure, or, where there are none, the one
+    that measures more pixels. ``texture``: (h, w) or (h, w, 3), uint8 or uint16.
 
     Raises InputError where the capture or the model lacks the axis.
     """
@@ -86,15 +87,6 @@ def reconstruct(
         points, sigma_z, edges = measured[axis]
     left = model.sigma_calibration(axis, points) if isinstance(model, Sure) else None
     return Cloud(points, axis, model.name, sigma_z, texture, left, edges)
-
-
-def choose_axis(model: Model, phases: Mapping[Axis, PhaseMap]) -> Axis:
-    """The axis with the smaller median predicted sigma_z over the pixels that both axes measure.
-
-    Where no pixel is measured through both, the one that measures more of them. Raises InputError where the capture and
-    the model share no axis.
-    """
-    return _best_axis(_measure_all(model, phases))
 
 
 def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:

@@ -80,15 +80,3 @@ class Spheres:
 def sphere(centre: tuple[float, float, float], diameter_mm: float = 196.0) -> Spheres:
     """The Letter's sphere, of 196 mm diameter."""
     return Spheres(np.array([centre], float), diameter_mm / 2)
-
-
-def sphere_pair(
-    middle: tuple[float, float, float],
-    direction: tuple[float, float, float] = (1.0, 0.0, 0.0),
-    diameter_mm: float = 50.0,
-    spacing_mm: float = 150.0,
-) -> Spheres:
-    """Two spheres whose centres lie `spacing_mm` apart along `direction`, as on a ball bar."""
-    half = np.array(direction, float)
-    half *= spacing_mm / 2 / np.linalg.norm(half)
-    return Spheres(np.array([middle - half, middle + half]), diameter_mm / 2)

@@ -48,23 +48,6 @@ def scene_record(scene: Scene) -> dict[str, Any]:
     raise InputError(f"a scene of type {type(scene).__name__} has no record: use a board, spheres or a mesh")
 
 
-def truth_record(rig: SimulatedRig, scene: Scene) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """`scene_record`, and for printed boards the arrays that no record should hold.
-
-    features (n, 3) mm in the board's frame, where they really are; camera (n, 2) and projector (n, 2) px, where they
-    appear.
-    """
-    arrays = {}
-    if isinstance(scene, BoardScene) and scene.board is not None:
-        points = scene.pose.to_camera(scene.features)
-        arrays = {
-            "features": scene.features,
-            "camera": rig.camera.project(points),
-            "projector": rig.project(points),
-        }
-    return scene_record(scene), arrays
-
-
 def _lens_record(lens: SimulatedLens) -> dict[str, Any]:
     """The lens at its own scale as K and D in OpenCV's order; the waves stay in px of the full resolution."""
     (fx, fy), (cx, cy), s = lens.focal_px, lens.centre_px, lens.scale

@@ -8,7 +8,7 @@ from slviewer.calibration.guidance import pose_selection
 from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceBench
 from slviewer.calibration.guidance.information import Information, Sensitivity
 from slviewer.calibration.guidance.initial_rig import estimate_rig
-from slviewer.calibration.guidance.pose_selection import predicted_sigma, suggest_poses
+from slviewer.calibration.guidance.pose_selection import suggest_poses
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
 from slviewer.wizard.pose_plan import MIN_POSES, PlanInput, PoseFeatures, plan
@@ -81,9 +81,12 @@ def test_guided_poses_are_seen_and_know_more_than_others(true, bench, known) -> 
         X = BOARD.points @ had[-1][:3, :3].T + had[-1][:3, 3]
         for pixels, device in ((true.camera.project(X), true.camera), (true.project(X), true.projector)):
             assert ((pixels > -1) & (pixels < np.array(device.size))).all()
-    reached = predicted_sigma(bench, had)
+    sight = Sensitivity.from_bench(bench, depth_range(BOARD, bench.stereo.camera))
+    reached, by_design = (
+        Information.from_rows(bench, bench.rows(np.array(poses)), sight).sigma_mm for poses in (had, known[1])
+    )
     assert sigmas[0] > sigmas[1] > sigmas[2] > reached
-    assert reached < 0.8 * predicted_sigma(bench, known[1])  # as many that reach the corners by design
+    assert reached < 0.8 * by_design  # as many that reach the corners by design
     assert found.sigma_next_mm == pytest.approx(reached, rel=1e-3)
 
 

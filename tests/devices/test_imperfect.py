@@ -4,9 +4,9 @@ import time
 
 import numpy as np
 import pytest
+from imperfect_rig import Imperfections, imperfect, resampled_rig
 
 from slviewer.devices.capture import capture
-from slviewer.devices.imperfect import Imperfections, imperfect, resampled_rig
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.replay import replay
 from slviewer.devices.simulated import preset_rig

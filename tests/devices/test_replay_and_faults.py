@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from faulty_rig import breakable
 
 from slviewer.devices import drivers as drivers_module
 from slviewer.devices.capture import capture
 from slviewer.devices.drivers import Driver, available, driver, drivers
-from slviewer.devices.faults import breakable
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.replay import Recording, replay, replayed
 from slviewer.errors import DeviceError, InputError

@@ -142,7 +142,7 @@ def test_moving_the_board_changes_the_next_frame(world, rig):
     rig.projector.show_level(255)
     poses = target_poses(world.rig, world.board, 3)
     for pose in poses:
-        world.place_board(pose)
+        world.place("board", pose)
         found = detect(world.board, seen(rig))
         expected = world.rig.camera.project(pose.to_camera(world.scene.features))[found.ids]
         assert np.abs(found.pixels - expected).max() < 0.15
@@ -154,7 +154,7 @@ def test_a_draft_shows_the_board_where_it_is_and_captures_are_never_drafts(monke
     monkeypatch.setattr(world_module, "_SETTLED_S", 1e9)
     world = SimulatedWorld(letter(0.5))
     with simulated_rig(world).opened() as rig:
-        world.place_board(target_poses(world.rig, world.board, 2)[1])
+        world.place("board", target_poses(world.rig, world.board, 2)[1])
         rig.projector.show_level(255)
         draft = seen(rig)
         found = detect(world.board, draft)
@@ -182,7 +182,7 @@ def test_each_thing_keeps_its_place(world, rig):
     with pytest.raises(InputError, match="cube"):
         world.place("cube")
     with pytest.raises(InputError, match="finite"):
-        world.place_board(Pose(np.eye(3), np.array([0, 0, np.nan])))
+        world.place("board", Pose(np.eye(3), np.array([0, 0, np.nan])))
 
 
 def test_another_board_can_be_printed(world, rig):
@@ -208,7 +208,7 @@ def test_the_board_may_move_in_another_thread_during_a_capture(world, rig):
 
     def move():
         while not stop.wait(0.002):
-            world.place_board(poses[np.random.default_rng().integers(5)])
+            world.place("board", poses[np.random.default_rng().integers(5)])
 
     mover = threading.Thread(target=move)
     mover.start()

@@ -4,11 +4,11 @@ import msgspec
 import numpy as np
 import pytest
 from colour_camera import ColouredCamera, coloured
+from faulty_rig import breakable
 
 from slviewer.devices.browser import BrowserProjector
 from slviewer.devices.capture import capture, colour_texture, take
 from slviewer.devices.channel import Channel
-from slviewer.devices.faults import breakable
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.devices.replay import replay
 from slviewer.devices.screen import Screen

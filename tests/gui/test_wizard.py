@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from faulty_rig import Faults, breakable
 from playwright.sync_api import Browser, Page, expect
 from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose, field, pose_row, press
 
-from slviewer.devices.faults import Faults, breakable
 from slviewer.gui.app import App
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.session.store import Session

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from imperfect_rig import Imperfections, imperfect
 
 from slviewer.devices.capture import capture
-from slviewer.devices.imperfect import Imperfections, imperfect
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.phase import Reason

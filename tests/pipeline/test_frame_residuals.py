@@ -3,9 +3,9 @@
 import json
 
 import pytest
+from imperfect_rig import Imperfections, imperfect
 
 from slviewer.devices.capture import capture
-from slviewer.devices.imperfect import Imperfections, imperfect
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.description_check import check_description

@@ -6,8 +6,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from imperfect_rig import Imperfections, imperfect, resampled_rig
 
-from slviewer.devices.imperfect import Imperfections, imperfect, resampled_rig
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imperfect_rig import Imperfections, imperfect
 
 from slviewer.cli import main
 from slviewer.devices.capture import capture
-from slviewer.devices.imperfect import Imperfections, imperfect
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, p18

@@ -7,7 +7,7 @@ import pytest
 
 from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import choose_axis, normals, reconstruct
+from slviewer.reconstruction.reconstruct import normals, reconstruct
 
 SHAPE = (30, 40)
 
@@ -53,9 +53,8 @@ def phases(*axes: str) -> dict:
 
 
 def test_the_axis_with_the_smaller_sigma_is_taken() -> None:
-    assert choose_axis(FakeModel({"x": 0.02, "y": 0.5}), phases("x", "y")) == "x"
+    assert reconstruct(FakeModel({"x": 0.02, "y": 0.5}), phases("x", "y")).axis == "x"
     model = FakeModel({"x": 0.5, "y": 0.02})
-    assert choose_axis(model, phases("x", "y")) == "y"
     cloud = reconstruct(model, phases("x", "y"))
     assert (cloud.axis, cloud.model) == ("y", "fake")
     assert np.nanmedian(cloud.sigma_z) == np.float32(0.02)
@@ -75,9 +74,9 @@ def test_sigma_is_compared_on_the_same_pixels() -> None:
 
     both = phases("x", "y")
     both["y"].offset[:20] = np.nan
-    assert choose_axis(Uneven({"x": 1, "y": 1}), both) == "x"
+    assert reconstruct(Uneven({"x": 1, "y": 1}), both).axis == "x"
     both["x"].offset[5:] = np.nan
-    assert choose_axis(Uneven({"x": 1, "y": 1}), both) == "y"  # nothing in common, and y measures more
+    assert reconstruct(Uneven({"x": 1, "y": 1}), both).axis == "y"  # nothing in common, and y measures more
 
 
 def test_what_the_calibrations_own_phases_scatter_by_is_part_of_sigma() -> None:

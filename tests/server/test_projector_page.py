@@ -219,7 +219,7 @@ def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel
 def test_the_marker_tells_the_screen_and_its_sides(opens, channel, projector):
     page = opens()
     ready(channel, projector)
-    projector.show_marker()
+    channel.page().ask("marker")
     side = SIZE[1] / 16
 
     def square(turned: np.ndarray) -> float:

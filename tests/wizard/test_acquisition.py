@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from faulty_rig import Faults, breakable
 
 from slviewer.devices.capture import Taken
-from slviewer.devices.faults import Faults, breakable
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_rig import Faults, breakable
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
-from slviewer.devices.faults import Faults, breakable
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_rig import Faults, breakable
 
-from slviewer.devices.faults import Faults, breakable
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.session.store import Session
 from slviewer.target.board import Board

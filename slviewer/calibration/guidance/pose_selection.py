@@ -33,12 +33,6 @@ class Guidance:
     sigma_next_mm: float
 
 
-def predicted_sigma(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> float:
-    """mm: the calibration's 3D sigma after ``poses`` T_camera_board (4, 4), root mean square over the volume."""
-    sight = Sensitivity.from_bench(bench, depth_range(bench.board, bench.stereo.camera))
-    return Information.from_rows(bench, bench.rows(np.reshape(poses, (-1, 4, 4))), sight).sigma_mm
-
-
 def suggest_poses(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> Guidance | None:
     """What to capture after ``poses`` T_camera_board (4, 4); None where no pose is in view of both devices."""
     candidates = candidate_poses(bench)

@@ -41,7 +41,7 @@ class Faults:
         if device in self._gone:
             raise DeviceError(f"the {device} does not answer: plug it in again and reconnect")
 
-    def mend(self, device: str) -> None:
+    def restore(self, device: str) -> None:
         """What opening a device again does."""
         self._gone.discard(device)
 
@@ -54,9 +54,9 @@ class FaultyCamera:
         self.name, self.size, self.dtype = camera.name, camera.size, camera.dtype
 
     def open(self) -> None:
-        """Open the wrapped camera, mended."""
+        """Open the wrapped camera, working again."""
         self._camera.open()
-        self._faults.mend("camera")
+        self._faults.restore("camera")
 
     def close(self) -> None:
         """Close the wrapped camera."""
@@ -86,9 +86,9 @@ class FaultyProjector:
         self.name, self.size = projector.name, projector.size
 
     def open(self) -> None:
-        """Open the wrapped projector, mended."""
+        """Open the wrapped projector, working again."""
         self._projector.open()
-        self._faults.mend("projector")
+        self._faults.restore("projector")
 
     def close(self) -> None:
         """Close the wrapped projector."""
