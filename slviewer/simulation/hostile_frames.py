@@ -36,6 +36,16 @@ def drifting_gains(n: int, rms: float, rng: np.random.Generator) -> np.ndarray:
     return 1 + rms * np.clip(gains, -2.5, 2.5) / np.clip(gains, -2.5, 2.5).std()
 
 
+def vary_exposure(light: np.ndarray, rms: float, shot: Shot) -> np.ndarray:
+    """Automatic exposure: each frame has a gain of its own, of this relative rms."""
+    return scale_frames(light, drifting_gains(len(light), rms, shot.rng))
+
+
+def follow_exposure(light: np.ndarray, off: float, shot: Shot) -> np.ndarray:
+    """An exposure control that starts too bright by ``off``; see `exposure_loop_gains`."""
+    return scale_frames(light, exposure_loop_gains(light, off))
+
+
 def exposure_loop_gains(light: np.ndarray, off: float, speed: float = 0.15) -> np.ndarray:
     """(n,) gains of an exposure control that starts too bright by ``off`` and follows the mean level of the last frame.
 
@@ -161,9 +171,9 @@ def add_hot_pixels(frames: np.ndarray, share: float, shot: Shot) -> np.ndarray:
 # Frames in another order than described
 
 
-def delay_frames(frames: np.ndarray, by: int = 1) -> np.ndarray:
+def delay_frames(frames: np.ndarray, by: float = 1, shot: Shot | None = None) -> np.ndarray:
     """Every frame shows what was projected so many frames before."""
-    return np.roll(frames, by, axis=0)
+    return np.roll(frames, int(by), axis=0)
 
 
 def drop_frame(frames: np.ndarray, index: int) -> np.ndarray:

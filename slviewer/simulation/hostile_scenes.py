@@ -126,7 +126,7 @@ class MirrorTable:
         return replace(rig, R=rig.R @ M, t=rig.R @ shift + rig.t, light=light)
 
 
-def with_hand(scene: Scene, reach_mm: float) -> Scene:
+def with_hand(scene: Scene, reach_mm: float, number: int = 0) -> Scene:
     """The scene with a hand that reaches `reach_mm` over it: over a board's right edge, or over a sphere's front."""
     lengths = np.arange(0.0, reach_mm + 20.0, 12.0)
     offsets = np.array([(x, y, -_FINGER_RADIUS_MM - 3.0) for x in lengths for y in _FINGERS_MM])
