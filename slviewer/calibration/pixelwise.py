@@ -297,9 +297,9 @@ def _project_onto_plane(  # type: ignore[no-untyped-def]
             if not (region[i, j] and low <= measured <= high):
                 continue
             uc, vc = rays[v0 + i, u0 + j, 0], rays[v0 + i, u0 + j, 1]
-            depth, new = ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent)
+            depth, new, _ = ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent)
             if np.isnan(depth) and shift != 0.0:
-                depth, new = ray_depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
+                depth, new, _ = ray_depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
             shift = new
             if np.isnan(depth):
                 continue

@@ -4,12 +4,12 @@ import numpy as np
 
 from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
 from slviewer.fringe.frame_light import CLIPPED, equalize_axis
+from slviewer.fringe.kernels_spikes import spike_rules
 from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
 from slviewer.fringe.levels import cell_misfit, code_cell_px, found_levels, lowest_coordinate, unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.reference import code_bits, complete_map, dark_sigmas, decode_reference, phase_shift
-from slviewer.fringe.reference_spikes import border_rad, cell_rad, is_plain, repeat_cells
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
 
@@ -43,7 +43,7 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
     else:
         maps = _levels(found, stack, scale)
     phase, *others = maps
-    phase = _settled(found, phase, others[-1])
+    _repair_spikes(found, phase, others[-1])
     return complete_map(axis, found, stack, clipped, (phase, *others), noise, factor)
 
 
@@ -69,7 +69,7 @@ def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
 def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
     phase, wrapped, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(4))
     reason = np.empty(stack.shape[1:], np.uint8)
-    rules = code_rules(found, fringe_mean(found, stack) if is_plain(found) else MIDDLE)
+    rules = code_rules(found, fringe_mean(found, stack) if found.is_plain else MIDDLE)
     kernels_coded.decode_coded(
         stack,
         steps_of(found.shifts[0], found.sign, found.offset_rad),
@@ -147,15 +147,14 @@ def _gray_alone(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple
     return phase, np.full_like(phase, np.nan), modulation, background, reason
 
 
-def _settled(found: Layout, phase: np.ndarray, reason: np.ndarray) -> np.ndarray:
-    """The phase that stands after a look at each neighbourhood; ``reason`` learns why the rest does not."""
-    rules = spike_rules(found)
-    other = np.empty_like(phase)
-    if rules.plain:
-        kernels_spikes.repair(phase, rules, other)
-        phase, other = other, phase
-    kernels_spikes.settle(phase, reason, rules, other)
-    return other
+def _repair_spikes(found: Layout, phase: np.ndarray, reason: np.ndarray) -> None:
+    """Move phases that were read from the wrong side of a code edge, and mask those without support."""
+    rules, lists = spike_rules(found), kernels_spikes.allocate_lists(phase.shape)
+    if rules.is_plain:
+        kernels_spikes.list_changes(phase, rules, False, *lists)
+        kernels_spikes.move_phases(*lists, phase)
+    kernels_spikes.list_changes(phase, rules, True, *lists)
+    kernels_spikes.mask_phases(*lists, phase, reason)
 
 
 def grey_scale(found: Layout, noise: tuple[float, float], white: float) -> kernels.Scale:
@@ -172,24 +171,6 @@ def code_rules(found: Layout, mean: float) -> kernels_coded.CodeRules:
         limits.WEAKER,
         mean,
         limits.UNDECIDED_BIT,
-    )
-
-
-def spike_rules(found: Layout) -> kernels_spikes.SpikeRules:
-    """How a neighbourhood decides about a pixel of a layout."""
-    return kernels_spikes.SpikeRules(
-        cell_rad(found),
-        is_plain(found),
-        found.origin_rad,
-        limits.EDGE,
-        limits.WINDOW,
-        limits.SPIKE_MAJORITY,
-        limits.SPIKE_NEIGHBOURS,
-        limits.WHOLE_PERIOD,
-        limits.LONELY,
-        limits.LONELY_NEIGHBOURS,
-        *border_rad(found),
-        repeat_cells(found),
     )
 
 

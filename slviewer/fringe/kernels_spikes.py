@@ -1,128 +1,206 @@
-"""Spikes and lonely pixels, compiled; `reference_spikes` is what this must agree with.
+"""Spikes of one period and pixels without support, compiled: the rule of a pixel, and kernels that apply it to a map.
 
-Nearly every pixel agrees with its four neighbours, and is passed over at the speed of memory.
+The rule is also compiled for CUDA devices (`geometry.cuda_device.device_function`); `reference_spikes` is what it must
+agree with. All changes are listed before the first is made, because a pixel's neighbours vote with the phase that they
+had. Nearly every pixel agrees with its four neighbours, and is passed over at the speed of memory.
 """
 
+import math
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from slviewer.fringe import limits
+from slviewer.fringe.layout import Layout
+from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.phase import Reason
 from slviewer.geometry.jit import kernel
 
-INCONSISTENT, OUTSIDE = np.uint8(Reason.INCONSISTENT), np.uint8(Reason.OUTSIDE)
-TWO_PI = 2 * np.pi
-PER_TURN = np.float32(1 / TWO_PI)
+INCONSISTENT, OUTSIDE, UNCHANGED = np.uint8(Reason.INCONSISTENT), np.uint8(Reason.OUTSIDE), np.uint8(0)
+UP, DOWN = np.uint8(1), np.uint8(2)
+TURN, PER_TURN = np.float32(2 * math.pi), np.float32(0.5 / math.pi)
+HALF, INVALID = np.float32(0.5), np.float32(math.nan)
+RUN = 32
+"""Pixels that are passed over together where none is suspect."""
 
 
 class SpikeRules(NamedTuple):
-    """How a neighbourhood decides; see `limits`."""
+    """How a neighbourhood decides about a pixel; see `limits`.
+
+    ``cell_rad``: the phase by which neighbours differ that count as a cell apart; ``is_plain``: the order comes from a
+    plain Gray code, whose edges lie at ``origin_rad``; ``low_rad`` and ``high_rad``: phases of the projector's borders,
+    a tolerance outside, infinite for a relative phase, which repeats after ``repeat`` cells.
+    """
 
     cell_rad: float
-    plain: bool
+    is_plain: bool
     origin_rad: float
-    edge: float
-    window: int
-    majority: float
-    neighbours: int
-    whole: float
-    lonely: float
-    lonely_neighbours: int
     low_rad: float
     high_rad: float
     repeat: float
+    edge: float = limits.EDGE
+    window: int = limits.WINDOW
+    majority: float = limits.SPIKE_MAJORITY
+    neighbours: int = limits.SPIKE_NEIGHBOURS
+    whole: float = limits.WHOLE_PERIOD
+    lonely: float = limits.LONELY
+    lonely_neighbours: int = limits.LONELY_NEIGHBOURS
+
+
+def spike_rules(found: Layout) -> SpikeRules:
+    """The rules for the phases of a layout."""
+    period = 2 * np.pi
+    # Gray code alone has no period: neighbouring cells agree
+    cell = period if found.shifts else period * max(limits.GRAY_CELL_PX / found.gray_cell_px, limits.GRAY_CELLS)
+    unambiguous, low, high = unambiguous_px(found), -np.inf, np.inf
+    if not np.isfinite(unambiguous):
+        low, high = -0.5 - limits.OUTSIDE_PX, found.extent - 0.5 + limits.OUTSIDE_PX
+    per_px = period / found.period_px
+    return SpikeRules(
+        cell, found.is_plain, found.origin_rad, low * per_px, high * per_px, unambiguous / found.period_px
+    )
+
+
+@numba.njit
+def do_agree(own, other, per_cell):
+    """Whether two phases differ by half a cell at most; False for NaN."""
+    return abs((other - own) * per_cell) <= HALF
+
+
+@numba.njit
+def is_suspect(phase, row, x, per_cell):
+    """Whether one of a pixel's four neighbours is missing, or does not agree with it."""
+    if row == 0 or row == phase.shape[0] - 1 or x == 0 or x == phase.shape[1] - 1:
+        return True
+    own = phase[row, x]
+    vertical = do_agree(own, phase[row - 1, x], per_cell) and do_agree(own, phase[row + 1, x], per_cell)
+    return not (vertical and do_agree(own, phase[row, x - 1], per_cell) and do_agree(own, phase[row, x + 1], per_cell))
+
+
+@numba.njit
+def count_votes(phase, row, x, rules):
+    """(valid, agreeing, a cell above, a cell below): numbers of the neighbours in the window."""
+    height, width = phase.shape
+    per_cell, nearly = np.float32(1 / rules.cell_rad), np.float32(rules.whole)
+    valid, agreeing, above, below = 0, 0, 0, 0
+    for v in range(max(0, row - rules.window), min(height, row + rules.window + 1)):
+        for u in range(max(0, x - rules.window), min(width, x + rules.window + 1)):
+            cells = (phase[v, u] - phase[row, x]) * per_cell
+            if (v == row and u == x) or math.isnan(cells):
+                continue
+            if rules.repeat < math.inf:
+                turns = np.float32(round(cells * np.float32(1 / rules.repeat)))
+                cells = cells - np.float32(rules.repeat) * turns
+            nearest = np.float32(round(cells))
+            valid += 1
+            if nearest == 0:
+                agreeing += 1
+            elif abs(cells - nearest) < nearly:
+                if nearest == 1:
+                    above += 1
+                elif nearest == -1:
+                    below += 1
+    return valid, agreeing, above, below
+
+
+@numba.njit
+def period_change(phase, row, x, rules):
+    """UP or DOWN where a clear majority of the neighbours is one period above or below a pixel at a code edge."""
+    part = (phase[row, x] - np.float32(rules.origin_rad)) * PER_TURN
+    part = part - np.float32(math.floor(part))
+    if part >= np.float32(rules.edge) and part < np.float32(1 - rules.edge):
+        return UNCHANGED
+    valid, _, above, below = count_votes(phase, row, x, rules)
+    if valid < rules.neighbours:
+        return UNCHANGED
+    if above >= rules.majority * valid:
+        return UP
+    return DOWN if below >= rules.majority * valid else UNCHANGED
+
+
+@numba.njit
+def masking_reason(phase, row, x, suspect, rules):
+    """The reason to mask a pixel, or UNCHANGED; neighbours vote only where one is ``suspect``."""
+    if suspect:
+        valid, agreeing, _, _ = count_votes(phase, row, x, rules)
+        if valid < rules.lonely_neighbours or agreeing < rules.lonely * valid:
+            return INCONSISTENT
+    is_outside = phase[row, x] < np.float32(rules.low_rad) or phase[row, x] > np.float32(rules.high_rad)
+    return OUTSIDE if is_outside else UNCHANGED
+
+
+def allocate_lists(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``columns``, ``words`` and ``counts`` for `list_changes` of a map (h, w)."""
+    return np.empty(shape, np.uint16), np.empty(shape, np.uint8), np.empty(shape[0], np.int64)
+
+
+@kernel(parallel=True)
+def list_changes(phase, rules, masking, columns, words, counts):
+    """List what changes in ``phase`` (h, w): of row v, ``counts[v]`` pixels, at ``columns[v]``.
+
+    ``masking``: pixels to mask, ``words[v]`` being their reasons; else those to be moved by a period, UP or DOWN.
+    """
+    for row in numba.prange(phase.shape[0]):
+        counts[row] = _list_row(phase, row, rules, masking, columns[row], words[row])
+
+
+@kernel()
+def _list_row(phase, row, rules, masking, columns, words):
+    width = phase.shape[1]
+    low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
+    suspect, examined = np.empty(width, np.bool_), np.empty(width, np.bool_)
+    _mark_suspects(phase, row, np.float32(1 / rules.cell_rad), suspect)
+    own = phase[row]
+    for x in range(width):
+        suspect[x] &= own[x] == own[x]  # not NaN
+        examined[x] = suspect[x] | (masking & ((own[x] < low) | (own[x] > high)))
+    count = 0
+    for first in range(0, width, RUN):
+        last = min(first + RUN, width)
+        some = False
+        for x in range(first, last):
+            some |= examined[x]
+        if not some:
+            continue
+        for x in range(first, last):
+            if examined[x]:
+                word = (
+                    masking_reason(phase, row, x, suspect[x], rules) if masking else period_change(phase, row, x, rules)
+                )
+                if word != UNCHANGED:
+                    columns[count], words[count] = x, word
+                    count += 1
+    return count
 
 
 @numba.njit(inline="always")
-def suspects(phase, row, per_cell, suspect):
-    """Fill ``suspect`` (w,): one of the four neighbours is missing, invalid, or half a cell or more away."""
+def _mark_suspects(phase, row, per_cell, suspect):
+    """`is_suspect` of a row, without branches, for vector instructions."""
     height, width = phase.shape
     if row == 0 or row == height - 1:
         for x in range(width):
             suspect[x] = True
         return
     over, own, under = phase[row - 1], phase[row], phase[row + 1]
-    half = np.float32(0.5)
     for x in range(width):
-        vertical = (abs((over[x] - own[x]) * per_cell) <= half) & (abs((under[x] - own[x]) * per_cell) <= half)
-        suspect[x] = not vertical
+        suspect[x] = not (do_agree(own[x], over[x], per_cell) & do_agree(own[x], under[x], per_cell))
     for x in range(1, width - 1):
-        level = (abs((own[x - 1] - own[x]) * per_cell) <= half) & (abs((own[x + 1] - own[x]) * per_cell) <= half)
-        suspect[x] |= not level
+        suspect[x] |= not (do_agree(own[x], own[x - 1], per_cell) & do_agree(own[x], own[x + 1], per_cell))
     suspect[0] = suspect[width - 1] = True
 
 
-@numba.njit
-def votes(phase, row, x, rules):
-    """(valid, agree, above, below) neighbours in the window; see `reference_spikes`."""
-    height, width = phase.shape
-    per_cell, nearly = np.float32(1 / rules.cell_rad), np.float32(rules.whole)
-    valid, agree, above, below = 0, 0, 0, 0
-    for v in range(max(0, row - rules.window), min(height, row + rules.window + 1)):
-        for u in range(max(0, x - rules.window), min(width, x + rules.window + 1)):
-            cells = (phase[v, u] - phase[row, x]) * per_cell
-            if (v == row and u == x) or np.isnan(cells):
-                continue
-            if rules.repeat < np.inf:
-                cells -= np.float32(rules.repeat) * np.rint(cells * np.float32(1 / rules.repeat))
-            nearest = np.rint(cells)
-            valid += 1
-            if nearest == 0:
-                agree += 1
-            elif abs(cells - nearest) < nearly:
-                above += nearest == 1
-                below += nearest == -1
-    return valid, agree, above, below
+@kernel()
+def move_phases(columns, words, counts, phase):
+    """Move the listed phases by a period."""
+    for row in range(len(counts)):
+        for i in range(counts[row]):
+            phase[row, columns[row, i]] += TURN if words[row, i] == UP else -TURN
 
 
-@numba.njit
-def at_edge(phase, rules):
-    """Whether an absolute phase lies beside a code edge."""
-    part = (phase - np.float32(rules.origin_rad)) * PER_TURN
-    part -= np.floor(part)
-    return part < np.float32(rules.edge) or part >= np.float32(1 - rules.edge)
-
-
-@kernel(parallel=True)
-def repair(phase, rules, out):
-    """Fill ``out`` (h, w) with the phase, moved by a period where a clear majority at a code edge says so."""
-    height, width = phase.shape
-    per_cell = np.float32(1 / rules.cell_rad)
-    for row in numba.prange(height):
-        suspect = np.empty(width, np.bool_)
-        suspects(phase, row, per_cell, suspect)
-        for x in range(width):  # a slice would compile half as long again, for its shape check's message
-            out[row, x] = phase[row, x]
-        for x in range(width):
-            if not suspect[x] or np.isnan(phase[row, x]) or not at_edge(phase[row, x], rules):
-                continue
-            valid, _, above, below = votes(phase, row, x, rules)
-            if valid >= rules.neighbours:
-                if above >= rules.majority * valid:
-                    out[row, x] = phase[row, x] + np.float32(TWO_PI)
-                elif below >= rules.majority * valid:
-                    out[row, x] = phase[row, x] - np.float32(TWO_PI)
-
-
-@kernel(parallel=True)
-def settle(phase, reason, rules, out):
-    """Fill ``out`` with the phase that stands, and mark the others in ``reason``; ``phase`` is only read."""
-    height, width = phase.shape
-    per_cell = np.float32(1 / rules.cell_rad)
-    low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
-    for row in numba.prange(height):
-        suspect = np.empty(width, np.bool_)
-        suspects(phase, row, per_cell, suspect)
-        own = phase[row]
-        for x in range(width):
-            outside = (own[x] < low) | (own[x] > high)
-            out[row, x] = np.float32(np.nan) if outside else own[x]
-            reason[row, x] = OUTSIDE if outside else reason[row, x]
-        for x in range(width):
-            if not suspect[x] or np.isnan(own[x]):
-                continue
-            valid, agree, _, _ = votes(phase, row, x, rules)
-            if valid < rules.lonely_neighbours or agree < rules.lonely * valid:
-                out[row, x] = np.nan
-                reason[row, x] = INCONSISTENT
+@kernel()
+def mask_phases(columns, words, counts, phase, reason):
+    """Mask the listed phases, for the reasons listed."""
+    for row in range(len(counts)):
+        for i in range(counts[row]):
+            phase[row, columns[row, i]], reason[row, columns[row, i]] = INVALID, words[row, i]

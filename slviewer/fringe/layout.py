@@ -59,6 +59,11 @@ class Layout:
         return abs(self.gray_cell_px - self.period_px) <= SAME_WIDTH * self.period_px
 
     @property
+    def is_plain(self) -> bool:
+        """Whether the order comes from a plain Gray code, whose edges coincide with the wraps of the phase."""
+        return self.numbers_periods and self.complementary is None
+
+    @property
     def numbers_cells(self) -> bool:
         """Whether Gray bits beside phase shifts number cells that are no single shift's periods."""
         return bool(self.shifts and self.gray) and not self.numbers_periods

@@ -1,19 +1,12 @@
-"""Spikes of one period, and pixels that nothing vouches for, in NumPy: the definition of `kernels_spikes`."""
+"""Spikes of one period and pixels without support, in NumPy: the definition of `kernels_spikes`."""
 
 import numpy as np
 
-from slviewer.fringe import limits
+from slviewer.fringe.kernels_spikes import SpikeRules, spike_rules
 from slviewer.fringe.layout import Layout
-from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.phase import Reason
 
 TWO_PI = 2 * np.pi
-OFFSETS = [
-    (dv, du)
-    for dv in range(-limits.WINDOW, limits.WINDOW + 1)
-    for du in range(-limits.WINDOW, limits.WINDOW + 1)
-    if (dv, du) != (0, 0)
-]
 
 
 def settle(found: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -23,70 +16,34 @@ def settle(found: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.nda
     such a pixel is moved by the one period. What then still stands alone is INCONSISTENT. A depth step has enough
     neighbours on its own side, and is left as it is.
     """
-    cell = cell_rad(found)
-    if is_plain(found):
-        phase = _repaired(found, phase, cell)
-    reason = reason.copy()
-    v, u, votes = _votes(phase, cell, repeat_cells(found))
-    few = votes["valid"] < limits.LONELY_NEIGHBOURS
-    lonely = votes["agree"] < limits.LONELY * votes["valid"]
-    wrong = few | lonely
-    reason[v[wrong], u[wrong]] = Reason.INCONSISTENT
-    low, high = border_rad(found)
+    rules = spike_rules(found)
+    phase, reason = phase.copy(), reason.copy()
+    if rules.is_plain:
+        v, u, votes = _count_votes(phase, rules)
+        part = (phase[v, u] - np.float32(rules.origin_rad)) * np.float32(1 / TWO_PI)
+        part -= np.floor(part)
+        at_edge = (part < np.float32(rules.edge)) | (part >= np.float32(1 - rules.edge))
+        enough = at_edge & (votes["valid"] >= rules.neighbours)
+        for word, shift in (("above", 1), ("below", -1)):
+            move = enough & (votes[word] >= rules.majority * votes["valid"])
+            phase[v[move], u[move]] += np.float32(shift * TWO_PI)
+    v, u, votes = _count_votes(phase, rules)
+    lonely = (votes["valid"] < rules.lonely_neighbours) | (votes["agree"] < rules.lonely * votes["valid"])
+    reason[v[lonely], u[lonely]] = Reason.INCONSISTENT
     with np.errstate(invalid="ignore"):
-        reason[(reason == Reason.VALID) & ((phase < low) | (phase > high))] = Reason.OUTSIDE
+        reason[(reason == Reason.VALID) & ((phase < rules.low_rad) | (phase > rules.high_rad))] = Reason.OUTSIDE
     return np.where(reason == Reason.VALID, phase, np.float32(np.nan)), reason
 
 
-def is_plain(found: Layout) -> bool:
-    """Whether the order comes from a plain Gray code, whose edges coincide with the wraps of the phase."""
-    return found.numbers_periods and found.complementary is None
-
-
-def cell_rad(found: Layout) -> float:
-    """Phase by which neighbours must differ to count as a cell apart: a period, or for Gray code alone so much that
-    neighbouring cells agree."""
-    return TWO_PI if found.shifts else TWO_PI * max(limits.GRAY_CELL_PX / found.gray_cell_px, limits.GRAY_CELLS)
-
-
-def repeat_cells(found: Layout) -> float:
-    """Cells after which a relative phase repeats; infinite for an absolute one."""
-    return unambiguous_px(found) / found.period_px
-
-
-def border_rad(found: Layout) -> tuple[float, float]:
-    """The phases of the projector's two borders, a tolerance outside; infinite for a relative phase."""
-    if np.isfinite(unambiguous_px(found)):
-        return -np.inf, np.inf
-    scale = TWO_PI / found.period_px
-    return (-0.5 - limits.OUTSIDE_PX) * scale, (found.extent - 0.5 + limits.OUTSIDE_PX) * scale
-
-
-def _repaired(found: Layout, phase: np.ndarray, cell: float) -> np.ndarray:
-    v, u, votes = _votes(phase, cell, np.inf)
-    enough = (votes["valid"] >= limits.SPIKE_NEIGHBOURS) & _at_edge(found, phase[v, u])
-    phase = phase.copy()
-    for word, shift in (("above", 1), ("below", -1)):
-        move = enough & (votes[word] >= limits.SPIKE_MAJORITY * votes["valid"])
-        phase[v[move], u[move]] += np.float32(shift * TWO_PI)
-    return phase
-
-
-def _at_edge(found: Layout, phase: np.ndarray) -> np.ndarray:
-    part = (phase - np.float32(found.origin_rad)) * np.float32(1 / TWO_PI)
-    part -= np.floor(part)
-    return (part < np.float32(limits.EDGE)) | (part >= np.float32(1 - limits.EDGE))
-
-
-def _votes(phase: np.ndarray, cell: float, repeat: float) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def _count_votes(phase: np.ndarray, rules: SpikeRules) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Pixels that differ from one of their four neighbours, and how their window votes.
 
     ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``. The phase is
-    known modulo ``repeat`` cells.
+    known modulo ``rules.repeat`` cells.
     """
-    margin = limits.WINDOW
+    margin, repeat = rules.window, rules.repeat
     padded = np.pad(phase, margin, constant_values=np.nan)
-    per_cell = np.float32(1 / cell)
+    per_cell = np.float32(1 / rules.cell_rad)
     centre = padded[margin:-margin, margin:-margin]
     suspect = np.zeros(phase.shape, bool)
     with np.errstate(invalid="ignore"):
@@ -95,12 +52,14 @@ def _votes(phase: np.ndarray, cell: float, repeat: float) -> tuple[np.ndarray, n
             suspect |= ~(np.abs(np.rint((near - centre) * per_cell)) < 0.5)
         v, u = np.nonzero(suspect & np.isfinite(phase))
         votes = {word: np.zeros(len(v), np.int32) for word in ("valid", "agree", "above", "below")}
-        for dv, du in OFFSETS:
-            cells = (padded[v + margin + dv, u + margin + du] - phase[v, u]) * per_cell
+        for dv, du in np.ndindex(2 * margin + 1, 2 * margin + 1):
+            if dv == du == margin:
+                continue
+            cells = (padded[v + dv, u + du] - phase[v, u]) * per_cell
             if np.isfinite(repeat):
                 cells -= np.float32(repeat) * np.rint(cells * np.float32(1 / repeat))
             nearest = np.rint(cells)
-            whole = np.abs(cells - nearest) < np.float32(limits.WHOLE_PERIOD)
+            whole = np.abs(cells - nearest) < np.float32(rules.whole)
             votes["valid"] += np.isfinite(cells)
             votes["agree"] += nearest == 0
             votes["above"] += whole & (nearest == 1)

@@ -9,6 +9,7 @@ import logging
 import os
 import sys
 import threading
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -89,3 +90,20 @@ def _count_devices() -> tuple[int, str, int]:
 
 def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def device_function(function: Any) -> Any:
+    """A function compiled by numba for the processor, and those that it calls, for use in CUDA kernels.
+
+    A rule for one pixel is written once: what such a function calls must exist on both sides (``math``, not ``numpy``).
+    """
+    from numba import cuda
+
+    python = function.py_func
+    names = dict(python.__globals__)
+    for name in python.__code__.co_names:
+        if hasattr(names.get(name), "py_func"):
+            names[name] = device_function(names[name])
+    twin = FunctionType(python.__code__, names, python.__name__, python.__defaults__, python.__closure__)
+    twin.__module__ = python.__module__
+    return cuda.jit(device=True)(twin)

@@ -1,5 +1,6 @@
 """Depth from one projector coordinate per camera pixel, exact under both lenses' distortion."""
 
+import math
 from typing import Literal
 
 import numba
@@ -126,11 +127,11 @@ def _projection(z, a0, a1, a2, t, parameters, row):
     """
     depth = z * a2 + t[2]
     if not (z > 0.0 and depth > 0.0):
-        return np.nan, np.nan, np.nan, np.nan, np.nan
+        return math.nan, math.nan, math.nan, math.nan, math.nan
     inverse = 1.0 / depth
     x, y = (z * a0 + t[0]) * inverse, (z * a1 + t[1]) * inverse
     if not x * x + y * y < parameters[9]:
-        return np.nan, np.nan, np.nan, np.nan, np.nan
+        return math.nan, math.nan, math.nan, math.nan, math.nan
     dx = (a0 * t[2] - t[0] * a2) * inverse * inverse
     dy = (a1 * t[2] - t[1] * a2) * inverse * inverse
     xd, yd, dxx, dxy, dyy = distort_point(x, y, parameters)
@@ -142,9 +143,10 @@ def _projection(z, a0, a1, a2, t, parameters, row):
 
 @kernel()
 def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
-    """(depth of one ray, undistorted minus distorted normalised coordinate there); NaN as ``triangulate`` says.
+    """(depth of one ray, undistorted minus distorted normalised coordinate there, px a mm of depth); NaN as
+    ``triangulate`` says.
 
-    ``shift``: initial value of the latter.
+    ``shift``: initial value of the second.
     """
     a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
     a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
@@ -154,7 +156,7 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
     up = reading + shift
     denominator = a - a2 * up
     if denominator == 0.0:
-        return np.nan, 0.0
+        return math.nan, 0.0, math.nan
     z = -(t[row] - t[2] * up) / denominator  # Letter eq. 6; rows 2 and 3 of M for axis y
     u, other, slope, straight, undistorted = _projection(z, a0, a1, a2, t, parameters, row)
     error = measured - u
@@ -162,11 +164,11 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
         if abs(error) <= TOLERANCE_PX:
             size = extent[1 - row]
             if not -0.5 - MARGIN * size <= other <= (1.0 + MARGIN) * size - 0.5:
-                return np.nan, 0.0
+                return math.nan, 0.0, math.nan
             # where distortion turns the coordinate back along the ray, two depths share it: ambiguous, so invalid
-            return (z if slope * straight > 0.0 else np.nan), undistorted - reading
-        if not np.isfinite(error) or slope == 0.0:
-            return np.nan, 0.0
+            return (z if slope * straight > 0.0 else math.nan), undistorted - reading, slope
+        if not abs(error) < math.inf or slope == 0.0:
+            return math.nan, 0.0, math.nan
         step = error / slope
         damping = 1.0
         while True:  # shorten the step until it stays in view and comes nearer
@@ -176,9 +178,9 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
                 break
             damping *= 0.5
             if damping < 1e-3:
-                return np.nan, 0.0
+                return math.nan, 0.0, math.nan
         z, error = nz, measured - nu
-    return np.nan, 0.0
+    return math.nan, 0.0, math.nan
 
 
 @kernel(parallel=True)
@@ -191,9 +193,9 @@ def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
             uc, vc, measured = rays[i, 0], rays[i, 1], coordinate[i]
             z[i] = np.nan
             if low <= measured <= high:  # False for NaN
-                z[i], new = ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent)
+                z[i], new, _ = ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent)
                 if np.isnan(z[i]) and shift != 0.0:
-                    z[i], new = ray_depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
+                    z[i], new, _ = ray_depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
                 shift = new
 
 

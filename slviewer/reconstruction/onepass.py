@@ -7,18 +7,17 @@ import numpy as np
 from slviewer.calibration.pixelwise import MAX_EXTRAPOLATION, PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
-from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of, spike_rules, waves
+from slviewer.fringe import kernels_spikes as spikes
+from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of, waves
 from slviewer.fringe.kernels import Shifts
 from slviewer.fringe.kernels_levels import Ladder
 from slviewer.fringe.layout import Layout, check_stack, clip_level, layout, white_level
 from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.reference_spikes import is_plain
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction import onepass_kernels as kernels
-from slviewer.reconstruction import onepass_spikes as spikes
 from slviewer.reconstruction.cloud import Cloud
 
 
@@ -102,8 +101,7 @@ class OnePass:
         self._order = _order(self.sequence, self._layout)
         self._shifts = shifts_of(self._layout)
         self._ladder = ladder_of(self._layout)
-        height, width = self.shape
-        self._lists = np.empty((height, width), np.uint16), np.empty((height, width), np.uint8), np.empty(height, int)
+        self._lists = spikes.allocate_lists(self.shape)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -116,7 +114,7 @@ class OnePass:
         largest grey level is sought in all of them."""
         self._check(frames)
         white = white_level(frames, self.sequence.select(self.axis))
-        mean = fringe_mean(self._layout, frames) if is_plain(self._layout) else MIDDLE
+        mean = fringe_mean(self._layout, frames) if self._layout.is_plain else MIDDLE
         return LightLevels(measure_noise(self._layout, frames, white), mean, white)
 
     def run(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
@@ -152,12 +150,15 @@ class OnePass:
 
     def mend(self, scan: PassResult) -> None:
         """The second pass, over few pixels: spikes of one period are moved, lonely and outside pixels masked."""
-        rules, maps = spike_rules(self._layout), _maps(scan)
-        if rules.plain:
-            spikes.find(scan.phase, rules, False, *self._lists)
-            spikes.move(*self._lists, self._depths, maps)
-        spikes.find(scan.phase, rules, True, *self._lists)
-        spikes.refuse(*self._lists, maps)
+        rules, maps = spikes.spike_rules(self._layout), _maps(scan)
+        columns, words, counts = self._lists
+        if rules.is_plain:
+            spikes.list_changes(scan.phase, rules, False, columns, words, counts)
+            spikes.move_phases(columns, words, counts, scan.phase)
+            kernels.measure_moved(columns, words, counts, self._depths, maps)
+        spikes.list_changes(scan.phase, rules, True, columns, words, counts)
+        spikes.mask_phases(columns, words, counts, scan.phase, scan.reason)
+        kernels.mask_points(columns, counts, maps)
 
     def _check(self, frames: np.ndarray) -> None:
         check_stack(self.sequence, frames)
@@ -244,5 +245,5 @@ def _splined(model: SplinedModel, axis: Axis, period_px: float) -> kernels.Depth
     fast = model.fast_axis(axis)
     c = np.concatenate([fast.coefficients, model.rays.astype(np.float32)])
     per_mm = (fast.held.shape[2] - 1) / (fast.far - fast.near)
-    bounds = np.empty((0, 0, 0), np.float32)
+    bounds = np.empty((2, 0, 0), np.float32)
     return kernels.Depths(c, period_px / (2 * np.pi), fast.centre, bounds, fast.held, fast.step, fast.near, per_mm)

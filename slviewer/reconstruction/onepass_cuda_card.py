@@ -7,13 +7,15 @@ import numpy as np
 from numba import cuda
 
 from slviewer.fringe import limits
-from slviewer.fringe.decode import spike_rules
+from slviewer.fringe.kernels_spikes import spike_rules
 from slviewer.fringe.reference import dark_sigmas
+from slviewer.geometry.cuda_device import device_function
 from slviewer.geometry.rig import StereoRig
-from slviewer.reconstruction import onepass_cuda_depths as depths
+from slviewer.geometry.triangulation import MARGIN, ray_depth
 from slviewer.reconstruction.onepass import Job, LightLevels, PassResult
 from slviewer.reconstruction.onepass_cuda_spikes import spike_kernels
 from slviewer.reconstruction.onepass_cuda_sweep import SweepPlan, sweep_kernel
+from slviewer.reconstruction.pixel_depths import INVALID, pixelwise_point, splined_point
 
 THREADS = 256
 """Of a block: eight warps, which leave every scheduler of a multiprocessor with work, whatever registers they need."""
@@ -34,20 +36,21 @@ class Card:
         slots += order.others.tolist() if deep else []
         measure, c, extra = _depths(job)
         rules = spike_rules(found)
-        self._plain, self._shaded = rules.plain, order.texture < 0
+        self._is_plain, self._shaded = rules.is_plain, order.texture < 0
         others = len(order.others) if deep else 0
         self._sweep = sweep_kernel(_plan(job, others), pixels, measure, deep, self._shaded)
-        self._mend = spike_kernels(rules, job.shape, measure)
+        self._spikes = spike_kernels(rules, job.shape, measure)
 
         self.stream = cuda.stream()
         self._grid = -(-pixels // THREADS), THREADS, self.stream
         self._c = cuda.to_device(np.ascontiguousarray(c.reshape(len(c), pixels)))
-        self._extra = cuda.to_device(np.ascontiguousarray(extra.ravel()))
+        self._extra = cuda.to_device(np.ascontiguousarray(extra))
         self._frames = cuda.device_array(len(slots) * pixels, dtype)
         self._runs = [
             (first, last, self._frames[at * pixels : (at + last - first) * pixels]) for at, first, last in _runs(slots)
         ]
         self._phase, self._modulation, self._sigma_z = (cuda.device_array(pixels, np.float32) for _ in range(3))
+        self._phase_map = self._phase.reshape(job.shape)
         self._points = cuda.device_array((pixels, 3), np.float32)
         self._reason, self._words = (cuda.device_array(pixels, np.uint8) for _ in range(2))
         self._texture = cuda.device_array(pixels if self._shaded else 1, dtype)
@@ -78,12 +81,12 @@ class Card:
 
     def mend(self) -> None:
         """The second: what `OnePass.mend` does."""
-        find_moved, move, find_refused, refuse = self._mend
-        if self._plain:
-            find_moved[self._grid](self._phase, self._words)
+        list_moves, move, list_masked, mask = self._spikes
+        if self._is_plain:
+            list_moves[self._grid](self._phase_map, self._words)
             move[self._grid](self._words, self._c, self._extra, self._phase, self._points, self._sigma_z)
-        find_refused[self._grid](self._phase, self._words)
-        refuse[self._grid](self._words, self._phase, self._reason, self._points, self._sigma_z)
+        list_masked[self._grid](self._phase_map, self._words)
+        mask[self._grid](self._words, self._phase, self._reason, self._points, self._sigma_z)
 
     def fetch(self, scan: PassResult) -> int:
         """Fill a scan's arrays, texture only where it is made of fringes; the largest grey level, 0 of uint8 frames."""
@@ -126,16 +129,50 @@ def _plan(job: Job, others: int) -> SweepPlan:
 
 
 def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
-    """How a pixel is measured, and the two arrays that it needs; see `onepass_cuda_depths`."""
-    (height, width), d = job.shape, job.depths
+    """How a pixel is measured, as a device function of (pixel, phase, c, extra) that returns what `pixel_depths` does,
+    and these two arrays: ``c`` (m, h, w) of the camera's pixels, and what else it needs. The pixel is a uint64, as
+    unsigned indices are taken as they are."""
+    width, d = job.shape[1], job.depths
     if isinstance(d, StereoRig):
-        extra = np.concatenate([d.R.ravel(), d.t, d.projector.parameters, np.array(d.projector.size, float)])
-        px_per_rad = job.layout.period_px / (2 * np.pi)
-        return depths.stereo(0 if job.axis == "x" else 1, px_per_rad), np.moveaxis(d.camera.rays(), 2, 0), extra
+        extra = np.zeros((6, 10))
+        for row, numbers in zip(extra, (*d.R, d.t, d.projector.parameters, d.projector.size), strict=True):
+            row[: len(numbers)] = numbers
+        return _stereo(0 if job.axis == "x" else 1, job.layout.period_px), np.moveaxis(d.camera.rays(), 2, 0), extra
+    gain, centre, near, per_mm = (np.float32(number) for number in (d.gain, d.centre, d.near, d.per_mm))
     if d.grid.size:
-        measure = depths.splined(width, d.grid.shape, d.step, d.gain, d.centre, d.near, d.per_mm)
-        return measure, d.c, d.grid
-    return depths.pixelwise(width * height, d.gain, d.centre), d.c, d.bounds
+        splined, step = device_function(splined_point), d.step
+
+        @cuda.jit(device=True)
+        def measure_splined(i, phase, c, grid):
+            return splined(i, phase, c, grid, gain, centre, width, step, near, per_mm)
+
+        return measure_splined, d.c, d.grid
+    pixelwise = device_function(pixelwise_point)
+
+    @cuda.jit(device=True)
+    def measure_pixelwise(i, phase, c, bounds):
+        return pixelwise(i, phase, c, bounds, gain, centre)
+
+    return measure_pixelwise, d.c, d.bounds.reshape(2, -1)
+
+
+def _stereo(row: int, period_px: float) -> Callable[..., Any]:
+    """By `geometry.triangulation` in float64; ``c`` (2, n): the camera's rays; ``extra`` (6, 10): the rows of R, t, the
+    projector's parameters, and its size."""
+    px_per_rad, depth_of = np.float32(period_px / (2 * np.pi)), device_function(ray_depth)
+
+    @cuda.jit(device=True)
+    def measure(i, phase, c, extra):
+        measured, extent = np.float64(phase * px_per_rad), extra[5, row]
+        if not (-0.5 - MARGIN * extent <= measured <= (1.0 + MARGIN) * extent - 0.5):
+            return INVALID, INVALID, INVALID, INVALID
+        u, v = c[0, i], c[1, i]
+        z, _, slope = depth_of(u, v, measured, 0.0, extra[:3], extra[3], extra[4], row, extra[5])
+        if z != z:
+            return INVALID, INVALID, INVALID, INVALID
+        return np.float32(u * z), np.float32(v * z), np.float32(z), px_per_rad * np.float32(abs(1.0 / slope))
+
+    return measure
 
 
 def _runs(slots: list[int]) -> Iterator[tuple[int, int, int]]:

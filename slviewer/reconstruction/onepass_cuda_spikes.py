@@ -1,141 +1,74 @@
-"""Spikes of one period and lonely pixels on a CUDA device: a twin of `onepass_spikes` and `fringe.kernels_spikes`.
+"""The second pass of `OnePass` on a CUDA device, by the rules of `fringe.kernels_spikes`.
 
-What changes is found before the first pixel is changed, because each one's neighbours vote with the phase that they
+What changes is listed before the first pixel is changed, because each one's neighbours vote with the phase that they
 had. Imported only where there is a device.
 """
 
-import math
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from slviewer.fringe.kernels_spikes import SpikeRules
-from slviewer.fringe.phase import Reason
+from slviewer.fringe import kernels_spikes
+from slviewer.fringe.kernels_spikes import INVALID, TURN, UNCHANGED, UP, SpikeRules
+from slviewer.geometry.cuda_device import device_function
 
 cuda: Any = import_module("numba.cuda")  # its own annotations are not those of what a kernel may call
 
-INCONSISTENT, OUTSIDE = np.uint8(Reason.INCONSISTENT), np.uint8(Reason.OUTSIDE)
-NOTHING, UP, DOWN = np.uint8(0), np.uint8(1), np.uint8(2)
-ONE_TURN, PER_TURN = np.float32(2 * math.pi), np.float32(0.5 / math.pi)
-HALF, NONE = np.float32(0.5), np.float32(math.nan)
-
 
 def spike_kernels(rules: SpikeRules, shape: tuple[int, int], measure: Callable[..., Any]) -> tuple[Any, ...]:
-    """Kernels (find what is to move, move it, find what does not stand, mask it) for maps of ``shape``, flattened.
+    """Kernels (list what is to be moved by a period, move it, list what is to be masked, mask it).
 
-    Those that find fill ``words`` (n,) uint8; ``measure`` is one of `onepass_cuda_depths`.
+    Those that list take the phase (h, w) and fill ``words`` (n,) uint8; the others take maps flattened. ``measure`` is
+    one of `onepass_cuda_card`.
     """
     height, width = shape
-    window, neighbours, lonely_neighbours = int(rules.window), int(rules.neighbours), int(rules.lonely_neighbours)
-    per_cell, nearly, edge, far_edge = (
-        np.float32(number) for number in (1 / rules.cell_rad, rules.whole, rules.edge, 1 - rules.edge)
+    per_cell = np.float32(1 / rules.cell_rad)
+    is_suspect, period_change, masking_reason = (
+        device_function(rule)
+        for rule in (kernels_spikes.is_suspect, kernels_spikes.period_change, kernels_spikes.masking_reason)
     )
-    origin, low, high = (np.float32(number) for number in (rules.origin_rad, rules.low_rad, rules.high_rad))
-    majority, lonely = float(rules.majority), float(rules.lonely)
-
-    @cuda.jit(device=True)
-    def is_suspect(phase, i, row, x):
-        """One of the four neighbours is missing, invalid, or half a cell or more away."""
-        if row == 0 or row == height - 1 or x == 0 or x == width - 1:
-            return True
-        own = phase[i]
-        agrees = (
-            abs((phase[i - width] - own) * per_cell) <= HALF
-            and abs((phase[i + width] - own) * per_cell) <= HALF
-            and abs((phase[i - 1] - own) * per_cell) <= HALF
-            and abs((phase[i + 1] - own) * per_cell) <= HALF
-        )
-        return not agrees
-
-    @cuda.jit(device=True)
-    def votes(phase, i, row, x):
-        own = phase[i]
-        valid, agree, above, below = 0, 0, 0, 0
-        for v in range(max(0, row - window), min(height, row + window + 1)):
-            for u in range(max(0, x - window), min(width, x + window + 1)):
-                cells = (phase[v * width + u] - own) * per_cell
-                if (v == row and u == x) or cells != cells:
-                    continue
-                nearest = np.float32(round(cells))
-                valid += 1
-                if nearest == 0:
-                    agree += 1
-                elif abs(cells - nearest) < nearly:
-                    if nearest == 1:
-                        above += 1
-                    elif nearest == -1:
-                        below += 1
-        return valid, agree, above, below
 
     @cuda.jit
-    def find_moved(phase, words):
+    def list_moves(phase, words):
         i = cuda.grid(1)
-        if i >= phase.shape[0]:
-            return
-        words[i] = NOTHING
-        own = phase[i]
-        row = i // width
-        x = i - row * width
-        if own != own or not is_suspect(phase, i, row, x):
-            return
-        part = (own - origin) * PER_TURN
-        part = part - np.float32(math.floor(part))
-        if part >= edge and part < far_edge:
-            return
-        valid, _, above, below = votes(phase, i, row, x)
-        if valid < neighbours:
-            return
-        if above >= majority * valid:
-            words[i] = UP
-        elif below >= majority * valid:
-            words[i] = DOWN
+        if i < height * width:
+            row = i // width
+            x = i - row * width
+            words[i] = UNCHANGED
+            if phase[row, x] == phase[row, x] and is_suspect(phase, row, x, per_cell):  # False for NaN
+                words[i] = period_change(phase, row, x, rules)
 
     @cuda.jit
     def move(words, c, extra, phase, points, sigma_z):
         i = cuda.grid(1)
-        if i >= phase.shape[0] or words[i] == NOTHING:
+        if i >= height * width or words[i] == UNCHANGED:
             return
         before, at = phase[i], np.uint64(i)
-        after = before + (ONE_TURN if words[i] == UP else -ONE_TURN)
+        after = before + (TURN if words[i] == UP else -TURN)
         _, _, _, old_slope = measure(at, before, c, extra)
         x, y, z, slope = measure(at, after, c, extra)
         phase[i] = after
-        points[i, 0] = x
-        points[i, 1] = y
-        points[i, 2] = z
+        points[i, 0], points[i, 1], points[i, 2] = x, y, z
         sigma_z[i] = sigma_z[i] * (slope / old_slope)
 
     @cuda.jit
-    def find_refused(phase, words):
+    def list_masked(phase, words):
         i = cuda.grid(1)
-        if i >= phase.shape[0]:
-            return
-        words[i] = NOTHING
-        own = phase[i]
-        if own != own:
-            return
-        row = i // width
-        x = i - row * width
-        if is_suspect(phase, i, row, x):
-            valid, agree, _, _ = votes(phase, i, row, x)
-            if valid < lonely_neighbours or agree < lonely * valid:
-                words[i] = INCONSISTENT
-                return
-        if own < low or own > high:
-            words[i] = OUTSIDE
+        if i < height * width:
+            row = i // width
+            x = i - row * width
+            words[i] = UNCHANGED
+            if phase[row, x] == phase[row, x]:
+                words[i] = masking_reason(phase, row, x, is_suspect(phase, row, x, per_cell), rules)
 
     @cuda.jit
-    def refuse(words, phase, reason, points, sigma_z):
+    def mask(words, phase, reason, points, sigma_z):
         i = cuda.grid(1)
-        if i >= phase.shape[0] or words[i] == NOTHING:
+        if i >= height * width or words[i] == UNCHANGED:
             return
-        phase[i] = NONE
-        reason[i] = words[i]
-        points[i, 0] = NONE
-        points[i, 1] = NONE
-        points[i, 2] = NONE
-        sigma_z[i] = NONE
+        phase[i], reason[i] = INVALID, words[i]
+        points[i, 0] = points[i, 1] = points[i, 2] = sigma_z[i] = INVALID
 
-    return find_moved, move, find_refused, refuse
+    return list_moves, move, list_masked, mask

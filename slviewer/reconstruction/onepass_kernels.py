@@ -13,8 +13,10 @@ from slviewer.calibration.splined.correction_grid import add_corrections, locate
 from slviewer.fringe.kernels import ROWS, period
 from slviewer.fringe.kernels_coded import coded_rows
 from slviewer.fringe.kernels_levels import levels_rows
+from slviewer.fringe.kernels_spikes import INVALID, TURN, UP
 from slviewer.geometry.jit import fma, kernel
 from slviewer.geometry.rays import fill_points
+from slviewer.reconstruction.pixel_depths import pixelwise_point, splined_point
 
 
 class Order(NamedTuple):
@@ -171,3 +173,34 @@ def _brightest(stack, order, first, last):
                 for x in range(len(levels)):
                     highest = max(highest, np.int32(levels[x]))
     return highest
+
+
+@kernel()
+def measure_moved(columns, words, counts, depths, maps):
+    """Measure the pixels anew whose phases `kernels_spikes.move_phases` has moved."""
+    width, gain, centre = maps.phase.shape[1], np.float32(depths.gain), np.float32(depths.centre)
+    near, per_mm, c = np.float32(depths.near), np.float32(depths.per_mm), depths.c.reshape(5, -1)
+    bounds = depths.bounds.reshape(2, -1)
+    for row in range(len(counts)):
+        for k in range(counts[row]):
+            x = columns[row, k]
+            i, phase = row * width + x, maps.phase[row, x]
+            before = phase - (TURN if words[row, k] == UP else -TURN)
+            if depths.grid.size:
+                _, _, _, old = splined_point(i, before, c, depths.grid, gain, centre, width, depths.step, near, per_mm)
+                a, b, z, new = splined_point(i, phase, c, depths.grid, gain, centre, width, depths.step, near, per_mm)
+            else:
+                _, _, _, old = pixelwise_point(i, before, c, bounds, gain, centre)
+                a, b, z, new = pixelwise_point(i, phase, c, bounds, gain, centre)
+            maps.points[row, x, 0], maps.points[row, x, 1], maps.points[row, x, 2] = a, b, z
+            maps.sigma_z[row, x] *= new / old
+
+
+@kernel()
+def mask_points(columns, counts, maps):
+    """Mask the points whose phases `kernels_spikes.mask_phases` has masked."""
+    for row in range(len(counts)):
+        for k in range(counts[row]):
+            x = columns[row, k]
+            maps.points[row, x, 0] = maps.points[row, x, 1] = maps.points[row, x, 2] = INVALID
+            maps.sigma_z[row, x] = INVALID

@@ -241,27 +241,36 @@ def test_a_stereo_pass_refuses_what_it_cannot_do():
 
 
 @pytest.mark.parametrize("cc", [(7, 5), (9, 0)])
-def test_kernels_compile_for_real_devices(monkeypatch, cc):
+@pytest.mark.parametrize("model", MODELS)
+def test_kernels_compile_for_real_devices(monkeypatch, model, cc):
     """As far as PTX, which needs no device."""
     pytest.importorskip("numba_cuda", reason="kernels are compiled by numba-cuda: pip install 'slviewer[cuda]'")
     from numba import cuda
     from numba.core import types
 
+    from slviewer.fringe.kernels_spikes import spike_rules
     from slviewer.reconstruction import onepass_cuda_card as card
     from slviewer.reconstruction import onepass_cuda_sweep as sweep
+    from slviewer.reconstruction.onepass_cuda_spikes import spike_kernels
 
     there = sys.modules[type(sweep._verdict).__module__]
     monkeypatch.setattr(there, "get_current_device", lambda: SimpleNamespace(compute_capability=cc))
-    one = CudaPass(SEQUENCES["short"], splined(), "x")
-    measure, _, _ = card._depths(one._job())
-    kernel = sweep.sweep_kernel(card._plan(one._job(), 0), HEIGHT * WIDTH, measure, True, False)
-    single, whole = types.float32, types.uint16
-    ptx, _ = cuda.compile_ptx(
-        kernel.py_func,
-        (
-            whole[::1], types.UniTuple(single, 6), single[:, ::1], single[::1], single[::1], types.uint8[::1],
-            single[::1], single[:, ::1], single[::1], whole[::1], types.int32[::1],
-        ),
-        cc=cc,
-    )  # fmt: skip
-    assert ".visible .entry" in ptx and "ld.local" not in ptx
+    job = CudaPass(SEQUENCES["short"], MODELS[model](), "x")._job()
+    measure, c, extra = card._depths(job)
+    single, whole, words = types.float32[::1], types.uint16[::1], types.uint8[::1]
+    maps, points = types.float32[:, ::1], types.float32[:, ::1]
+    number = types.float64 if model == "stereo" else types.float32
+    tables = number[:, ::1], (number[::1], number[:, ::1], number[:, :, ::1])[extra.ndim - 1]
+    assert c.dtype == extra.dtype == number.name
+
+    def compiled(kernel, *arguments):
+        ptx, _ = cuda.compile_ptx(kernel.py_func, arguments, cc=cc)
+        return ".visible .entry" in ptx and "ld.local" not in ptx
+
+    kernel = sweep.sweep_kernel(card._plan(job, 0), HEIGHT * WIDTH, measure, True, False)
+    light = types.UniTuple(types.float32, 6)
+    assert compiled(kernel, whole, light, *tables, single, words, single, points, single, whole, types.int32[::1])
+    list_moves, move, list_masked, mask = spike_kernels(spike_rules(job.layout), (HEIGHT, WIDTH), measure)
+    assert compiled(list_moves, maps, words) and compiled(list_masked, maps, words)
+    assert compiled(move, words, *tables, single, points, single)
+    assert compiled(mask, words, single, words, points, single)
