@@ -1,7 +1,7 @@
 """The traditional stereo calibration of camera and projector (the Letter, eq. 1-8 and step 1)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -15,6 +15,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
+from slviewer.records import to_plain
 
 MIN_FEATURES = 12
 MAX_FOCAL_SIGMA = 0.05
@@ -83,40 +84,15 @@ class StereoModel:
         return (per_rad * phase.sigma_phase).astype(np.float32)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; residual arrows included as lists."""
-        return {
-            "rig": self.rig.to_dict(),
-            "board": self.board,
-            "axes": list(self.axes),
-            "reprojection_rms_px": dict(self.reprojection_rms_px),
-            "poses": {name: T.tolist() for name, T in self.poses.items()},
-            "pose_rms_px": {name: list(rms) for name, rms in self.pose_rms_px.items()},
-            "left_out": dict(self.left_out),
-            "depth_range_mm": self.depth_range_mm,
-            "focal_sigma_px": dict(self.focal_sigma_px),
-            "features_set_aside": self.features_set_aside,
-        }
+        """Plain values for JSON, without the residuals; the inverse of `records.from_plain`."""
+        data: dict[str, Any] = to_plain(replace(self, residuals_px={}))
+        del data["residuals_px"]
+        return data
 
     @classmethod
     def from_rig(cls, rig: StereoRig) -> "StereoModel":
         """A calibration of which only the rig is known: no poses, no residuals, no calibrated depths."""
         return cls(rig, "", ("x", "y"), {}, {}, {}, {}, None, {})
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "StereoModel":
-        """The inverse of ``to_dict``."""
-        return cls(
-            rig=StereoRig.from_dict(data["rig"]),
-            board=data["board"],
-            axes=tuple(data["axes"]),
-            reprojection_rms_px=data["reprojection_rms_px"],
-            poses={name: np.array(T) for name, T in data["poses"].items()},
-            pose_rms_px={name: (rms[0], rms[1]) for name, rms in data["pose_rms_px"].items()},
-            left_out=data["left_out"],
-            depth_range_mm=(data["depth_range_mm"][0], data["depth_range_mm"][1]),
-            focal_sigma_px=data["focal_sigma_px"],
-            features_set_aside=data["features_set_aside"],
-        )
 
 
 def calibrate_stereo(

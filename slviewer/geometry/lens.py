@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -107,16 +106,6 @@ class Lens:
         K[:2, 2] = (K[:2, 2] + 0.5) * factor - 0.5
         width, height = self.size
         return Lens(K, self.D, (round(width * factor), round(height * factor)))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, for JSON."""
-        return {"K": self.K.tolist(), "D": self.D.tolist(), "size": list(self.size)}
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "Lens":
-        """The lens that ``to_dict`` described."""
-        width, height = values["size"]
-        return cls(np.array(values["K"]), np.array(values["D"]), (width, height))
 
 
 def _flatten(values: np.ndarray, last: int, what: str) -> np.ndarray:

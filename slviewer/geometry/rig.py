@@ -1,7 +1,6 @@
 """The stereo rig: one camera, one projector, and the transform between them."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -50,18 +49,3 @@ class StereoRig:
     def project(self, points: np.ndarray) -> np.ndarray:
         """Camera-frame points (..., 3) mm to projector pixels (..., 2); NaN behind the projector and past its fold."""
         return self.projector.project(self.to_projector(points))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, for JSON."""
-        return {
-            "camera": self.camera.to_dict(),
-            "projector": self.projector.to_dict(),
-            "R": self.R.tolist(),
-            "t": self.t.tolist(),
-        }
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "StereoRig":
-        """The rig that ``to_dict`` described."""
-        lenses = Lens.from_dict(values["camera"]), Lens.from_dict(values["projector"])
-        return cls(*lenses, np.array(values["R"]), np.array(values["t"]))

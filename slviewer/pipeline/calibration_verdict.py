@@ -16,6 +16,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.models import VERDICT, available, save_stereo
 from slviewer.pipeline.poses import Judged, judge_all
+from slviewer.records import from_plain
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
@@ -92,7 +93,7 @@ def last_verdict(store: Session) -> Verdict | None:
     """What was said of the last calibration that was tried, also if none came of it; None where nothing was."""
     if not store.has_result(VERDICT):
         return None
-    return Verdict.from_json(store.load_result(VERDICT, only=())[0]["verdict"])
+    return from_plain(store.load_result(VERDICT, only=())[0]["verdict"], Verdict)
 
 
 def rejected(verdict: Verdict, kept: bool) -> CalibrationRejected:

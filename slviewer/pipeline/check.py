@@ -16,6 +16,7 @@ from slviewer.pipeline.models import load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.reconstruction.axis_agreement import check_sizes
+from slviewer.records import from_plain, to_plain
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
@@ -33,7 +34,7 @@ class Checked:
 
     def to_json(self) -> dict[str, Any]:
         """JSON-able."""
-        return {"time": self.time, "calibration": self.calibration} | self.drift.to_dict()
+        return {"time": self.time, "calibration": self.calibration} | to_plain(self.drift)
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,8 @@ def history(store: Session) -> tuple[Checked, ...]:
     """Every drift check that the session remembers, the oldest first."""
     found = []
     for name in _names(store):
-        values = dict(store.load_result(name, only=())[0]["checked"])
-        found.append(Checked(values.pop("time"), values.pop("calibration"), Drift.from_dict(values)))
+        values = store.load_result(name, only=())[0]["checked"]
+        found.append(Checked(values["time"], values["calibration"], from_plain(values, Drift)))
     return tuple(found)
 
 

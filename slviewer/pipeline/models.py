@@ -81,7 +81,7 @@ def load_stereo(store: Session) -> StereoModel:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
     meta = store.load_result("calibration/stereo", only=())[0]
     if "model" in meta:
-        return StereoModel.from_dict(meta["model"])
+        return from_plain(meta["model"], StereoModel)
     captures = store.captures()
     if not captures and not (meta["camera"] and meta["projector"]):
         raise InputError(f"{store.folder} holds no capture that tells the camera's size: import the scans first")
@@ -182,7 +182,7 @@ def rejection(store: Session) -> str:
     if "stereo" not in available(store):
         return ""
     judged = store.load_result("calibration/stereo", only=())[0].get("verdict")
-    verdict = Verdict.from_json(judged) if judged else Verdict()
+    verdict = from_plain(judged, Verdict) if judged else Verdict()
     return verdict.reason if verdict.level == "rejected" else ""
 
 

@@ -12,6 +12,7 @@ from slviewer.fringe.description_check import check_description
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.frame_residuals import residuals
+from slviewer.records import to_plain
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -57,7 +58,7 @@ def keep_evidence(store: Session, capture: Capture, board: Board, evidence: Pose
     meta = {
         "target": str(board),
         "look": LOOK,
-        "evidence": evidence.to_json(),
+        "evidence": to_plain(evidence),
         "inputs": {capture.name: capture.hash},
     }
     store.save_result(f"evidence/{capture.name}", meta, {})

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel, pixel_samples
 from slviewer.calibration.splined.model import SplinedModel
@@ -30,6 +31,7 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import scale_factor, told_scale
+from slviewer.records import from_plain
 from slviewer.report.data import (
     AcceptanceView,
     CalibrationFigures,
@@ -98,7 +100,7 @@ def _data(store: Session) -> SessionData:
         spacings=spacings,
         warnings=stale,
         verdict=verdict,
-        verdict_of_calibration=verdict is not None and judged == verdict.to_json(),
+        verdict_of_calibration=verdict is not None and judged is not None and from_plain(judged, Verdict) == verdict,
         models=_models(store),
         acceptances=_acceptances(store),
         drifts=_drifts(store),

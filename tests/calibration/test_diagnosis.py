@@ -18,6 +18,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.suspect import Suspect
 from slviewer.geometry.triangulation import triangulate_pixels
+from slviewer.records import from_plain, to_plain
 
 TRUE = rig()
 UPRIGHT = ((1.5, 0.1), (-0.1, 3.0))
@@ -173,13 +174,13 @@ def test_features_numbered_otherwise_are_seen_through_any_lens() -> None:
 def test_evidence_and_verdicts_survive_saving() -> None:
     suspect = Suspect(3, "late", "frame 4 shows the pattern of frame 3")
     kept = pose(1, suspects=(suspect,), grid=(21, 16), moved_px=np.nan)
-    again = PoseEvidence.from_json(json.loads(json.dumps(kept.to_json())))
+    again = PoseEvidence.from_json(json.loads(json.dumps(to_plain(kept))))
     assert np.isnan(again.moved_px)
     assert dataclasses.replace(again, moved_px=0.0) == dataclasses.replace(kept, moved_px=0.0)
     verdict = Verdict.of(
         [Finding("gamma", "doubtful", "curved", "mend it"), Finding("moved", "rejected", "it", "hold it")]
     )
     assert verdict.causes == ("moved", "gamma") and verdict.level == "rejected"
-    assert Verdict.from_json(json.loads(json.dumps(verdict.to_json()))) == verdict
+    assert from_plain(json.loads(json.dumps(verdict.to_json())), Verdict) == verdict
     assert "rejected: it: hold it" in verdict.text()
     assert len(set(CAUSES)) == len(CAUSES)

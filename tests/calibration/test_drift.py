@@ -13,6 +13,7 @@ from slviewer.calibration.drift.reference import MIN_POSES, DriftReference, buil
 from slviewer.calibration.drift.view import DriftView
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
+from slviewer.records import from_plain, to_plain
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
@@ -95,7 +96,7 @@ def test_a_refocused_lens_is_no_movement(reference):
 
 def test_an_answer_survives_json(reference):
     found = checked(reference, moved(RIG, (0.05, 0.05, 0)), 4)
-    assert Drift.from_dict(json.loads(json.dumps(found.to_dict()))) == found
+    assert from_plain(json.loads(json.dumps(to_plain(found))), Drift) == found
     assert "recalibrate, because" in found.text()
 
 

@@ -9,6 +9,7 @@ from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
 
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected
+from slviewer.records import from_plain
 
 TRUE = rig()
 
@@ -43,7 +44,7 @@ def test_depths_are_those_of_the_boards(model: StereoModel) -> None:
 
 
 def test_it_survives_saving(model: StereoModel) -> None:
-    again = StereoModel.from_dict(model.to_dict())
+    again = from_plain(model.to_dict(), StereoModel)
     assert np.array_equal(again.rig.R, model.rig.R) and again.pose_rms_px == model.pose_rms_px
 
 

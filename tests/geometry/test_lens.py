@@ -8,6 +8,7 @@ import pytest
 
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
+from slviewer.records import from_plain, to_plain
 
 K = np.array([[880.0, 0, 199.3], [0, 884.0, 151.7], [0, 0, 1]])
 D = np.array([-0.08, 0.11, 0.0009, -0.0007, 0.02])
@@ -87,7 +88,7 @@ def test_scaled_keeps_what_a_pixel_sees(lens: Lens) -> None:
 
 
 def test_dict_round_trip(lens: Lens) -> None:
-    again = Lens.from_dict(json.loads(json.dumps(lens.to_dict())))
+    again = from_plain(json.loads(json.dumps(to_plain(lens))), Lens)
     assert np.array_equal(again.K, lens.K) and np.array_equal(again.D, lens.D) and again.size == lens.size
 
 

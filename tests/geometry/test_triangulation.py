@@ -10,6 +10,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate, triangulate_pixels
+from slviewer.records import from_plain, to_plain
 
 
 def make_rig(k1: float = -0.08, vertical: bool = False) -> StereoRig:
@@ -141,7 +142,7 @@ def test_depth_per_px_is_the_derivative(axis: str) -> None:
 
 def test_dict_round_trip() -> None:
     rig = make_rig()
-    again = StereoRig.from_dict(json.loads(json.dumps(rig.to_dict())))
+    again = from_plain(json.loads(json.dumps(to_plain(rig))), StereoRig)
     assert np.array_equal(again.R, rig.R) and np.array_equal(again.t, rig.t)
     assert np.array_equal(again.camera.rays(), rig.camera.rays())
 

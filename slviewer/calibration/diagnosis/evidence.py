@@ -1,7 +1,7 @@
 """Evidence of each pose and of the calibration made from them, before it is judged."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from slviewer.calibration.soundness import MIN_TILT_SPREAD_DEG
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis
 from slviewer.fringe.suspect import Suspect
+from slviewer.records import from_plain
 
 
 @dataclass(frozen=True)
@@ -53,31 +54,12 @@ class PoseEvidence:
     turn: tuple[tuple[float, float], tuple[float, float]] | None = None
     contradictions: tuple[Contradiction, ...] = ()
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values; NaN as None."""
-        data = asdict(self)
-        data["moved_px"] = _to_plain(self.moved_px)
-        data["axes"] = {name: {k: _to_plain(v) for k, v in axis.items()} for name, axis in data["axes"].items()}
-        return data
-
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "PoseEvidence":
-        """The inverse of ``to_json``."""
-        return cls(
-            name=data["name"],
-            refused=data["refused"],
-            grid=None if data["grid"] is None else (data["grid"][0], data["grid"][1]),
-            axes={
-                name: AxisEvidence(**{k: np.nan if v is None else v for k, v in axis.items()})  # type: ignore[arg-type]
-                for name, axis in data["axes"].items()
-            },
-            suspects=tuple(Suspect(**suspect) for suspect in data["suspects"]),
-            displaced=data["displaced"],
-            moved_px=np.nan if data["moved_px"] is None else data["moved_px"],
-            numbering=data["numbering"],
-            turn=None if data["turn"] is None else (tuple(data["turn"][0]), tuple(data["turn"][1])),
-            contradictions=tuple(Contradiction(**contradiction) for contradiction in data["contradictions"]),
-        )
+        """The inverse of `records.to_plain`; what was not measured may be None instead of NaN."""
+        axes = {name: {k: np.nan if v is None else v for k, v in axis.items()} for name, axis in data["axes"].items()}
+        moved = np.nan if data["moved_px"] is None else data["moved_px"]
+        return from_plain({**data, "axes": axes, "moved_px": moved}, cls)
 
 
 @dataclass(frozen=True)
@@ -137,7 +119,3 @@ class Evidence:
     def usable(self) -> tuple[PoseEvidence, ...]:
         """Poses whose board and phase were read."""
         return tuple(pose for pose in self.poses if not pose.refused)
-
-
-def _to_plain(value: float) -> float | None:
-    return None if isinstance(value, float) and not np.isfinite(value) else value

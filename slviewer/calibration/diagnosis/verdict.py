@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from slviewer.calibration.splined.residual_noise import Noise
+from slviewer.records import to_plain
 
 Level = Literal["good", "doubtful", "rejected"]
 Severity = Literal["note", "doubtful", "rejected"]
@@ -56,21 +57,6 @@ class Finding:
         """Both sentences in one."""
         return f"{self.sentence}: {self.remedy}"
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "cause": self.cause,
-            "severity": self.severity,
-            "sentence": self.sentence,
-            "remedy": self.remedy,
-            "poses": list(self.poses),
-        }
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> "Finding":
-        """The inverse of ``to_json``."""
-        return cls(data["cause"], data["severity"], data["sentence"], data["remedy"], tuple(data["poses"]))
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -108,13 +94,8 @@ class Verdict:
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return {"level": self.level, "findings": [finding.to_json() for finding in self.findings]}
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> "Verdict":
-        """The inverse of ``to_json``."""
-        return cls(tuple(Finding.from_json(finding) for finding in data["findings"]))
+        """Plain values; the inverse of `records.from_plain`."""
+        return {"level": self.level, **to_plain(self)}
 
 
 DOUBTFUL_RATIO = 4.0

@@ -6,9 +6,9 @@ space by 700 ppm. A turn or shift along the epipolar lines makes the board seem 
 them moves the pattern off its epipolar lines.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.stats import f as fisher
@@ -89,16 +89,6 @@ class Drift:
             + " um",
         ]
         return "\n".join(lines + [f"  not seen: {what}" for what in self.unseen])
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "Drift":
-        """The inverse of ``to_dict``."""
-        plain: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in values.items()}
-        return cls(**plain)
 
 
 def check_drift(reference: DriftReference, view: DriftView) -> Drift:

@@ -14,6 +14,7 @@ from slviewer.calibration.splined.posterior import point_rows
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.splined.unknowns import Arrangement, State
 from slviewer.fringe.sequence import Axis
+from slviewer.records import from_plain, to_plain
 
 
 @dataclass(frozen=True)
@@ -78,16 +79,9 @@ class Bundle:
 
     def to_dict(self) -> dict[str, Any]:
         """What is not an array, JSON-able."""
-        return {
-            "poses": list(self.poses),
-            "noise": vars(self.noise),
-            "strengths": list(self.strengths),
-            "fits": {name: vars(fit) for name, fit in self.fits.items()},
-            "left_out": dict(self.left_out),
-            "depth_range_mm": list(self.depth_range_mm),
-            "steps": self.steps,
-            "turned": list(self.turned),
-        }
+        keys = ("poses", "noise", "strengths", "fits", "left_out", "depth_range_mm", "steps", "turned")
+        data: dict[str, Any] = to_plain({key: getattr(self, key) for key in keys})
+        return data
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Flat named arrays, for saving; the factor packed, in float32."""
@@ -120,13 +114,12 @@ class Bundle:
         a = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
         rig = Arrangement(devices[0], devices[1], a["R"], a["t"])
         state = State(rig, a["R_board"], a["t_board"], a["heights"], a["offsets"])
-        strengths, depths, noise = data["strengths"], data["depth_range_mm"], data["noise"]
-        pairs = {key: (noise[key][0], noise[key][1]) for key in ("excess_px", "sample_px")}
+        strengths, depths = data["strengths"], data["depth_range_mm"]
         return cls(
             state=state,
             poses=tuple(data["poses"]),
             points=a["points"],
-            noise=Noise(noise["camera_px"], **pairs),
+            noise=from_plain(data["noise"], Noise),
             strengths=(strengths[0], strengths[1]),
             fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
             left_out=data["left_out"],
