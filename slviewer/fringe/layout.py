@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis, Kind, PatternSequence
@@ -135,6 +136,17 @@ def clip_level(dtype: np.dtype, largest: int) -> float:
     if largest in LEFT_ALIGNED_WHITE:
         return float(largest)
     return float(next(level for level in WHITE_LEVELS if level >= largest))
+
+
+def to_eight_bits(image: np.ndarray, largest: int | None = None) -> NDArray[np.uint8]:
+    """An image (h, w) or (h, w, 3), uint8 or uint16, as uint8: the upper eight of the camera's bits.
+
+    ``largest``: the largest grey level of the frame that it is a part of; None: its own.
+    """
+    if image.dtype == np.uint8:
+        return image
+    white = clip_level(image.dtype, int(image.max(initial=0)) if largest is None else largest)
+    return (image >> (int(white).bit_length() - 8)).astype(np.uint8)
 
 
 def _shift(sequence: PatternSequence, axis: Axis, period: float) -> Shift:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError, InputError
+from slviewer.fringe.layout import to_eight_bits
 from slviewer.session.importers.images import read_image
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
@@ -124,8 +125,7 @@ def detect_board(
 def draw_detection(board: Board, image: np.ndarray, detection: Detection | None) -> np.ndarray:
     """(h, w, 3) uint8 BGR: the photograph with each feature marked and numbered, and the board's axes (x red, y green);
     enlarged or reduced to a width at which the numbers can be read."""
-    if image.dtype == np.uint16:
-        image = cv2.convertScaleAbs(image, alpha=255.0 / max(float(image.max()), 1.0))
+    image = to_eight_bits(image)
     picture = np.ascontiguousarray(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     scale = _LARGEST_OVERLAY_PX / max(picture.shape[:2])
     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else 1)

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.layout import to_eight_bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ class Cloud:
                     raise InputError(f"{name} of shape {lasting.shape} does not belong to {sigma_z.shape} pixels.")
                 object.__setattr__(self, name, lasting)
         if self.texture is not None:
-            object.__setattr__(self, "texture", _eight_bits(self.texture, points.shape[:2]))
+            object.__setattr__(self, "texture", _convert_texture(self.texture, points.shape[:2]))
 
     @property
     def mask(self) -> np.ndarray:
@@ -85,16 +86,12 @@ class Cloud:
         return None if self.texture is None else self.texture[self.mask]
 
 
-def _eight_bits(texture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _convert_texture(texture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if texture.shape not in (shape, (*shape, 3)):
         raise InputError(
             f"A texture of shape {texture.shape} does not belong to a cloud of {shape[1]}x{shape[0]} pixels: "
             "use the one of the same capture."
         )
-    if texture.dtype == np.uint8:
-        return texture
-    if texture.dtype != np.uint16:
+    if texture.dtype not in (np.uint8, np.uint16):
         raise InputError(f"A texture of {texture.dtype} was given: it must be uint8 or uint16.")
-    brightest = int(texture.max(initial=0))
-    bits = next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits)
-    return (texture >> (bits - 8)).astype(np.uint8)
+    return to_eight_bits(texture)

@@ -15,6 +15,7 @@ import numpy as np
 
 from slviewer.calibration.next_pose import approximate_pose
 from slviewer.errors import DetectionError
+from slviewer.fringe.layout import clip_level, to_eight_bits
 from slviewer.geometry.lens import Lens
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
@@ -158,14 +159,12 @@ def reduced(frame: np.ndarray) -> tuple[np.ndarray, float]:
     """(the frame (h, w) as uint8, SEARCH_PX long at most; its scale)."""
     scale = min(1.0, SEARCH_PX / max(frame.shape))
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
-    if small.dtype != np.uint8:
-        small = cv2.convertScaleAbs(small, alpha=255 / _top(frame))
-    return small, scale
+    return to_eight_bits(small, int(frame.max(initial=0))), scale
 
 
 def brightness(frame: np.ndarray) -> tuple[float, float, np.ndarray]:
     """(share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,) of shares)."""
-    top = _top(frame)
+    top = clip_level(frame.dtype, int(frame.max(initial=0)))
     some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
     counts = np.histogram(some, BINS, (0, top + 1))[0]
     return float((some >= top).mean()), float(np.percentile(some, 99.5)) / top, counts / some.size
@@ -191,14 +190,6 @@ def board_seen(
     H = fit_homography(points[:, :2], detection.pixels)
     T = None if lens is None else approximate_pose(points, detection.pixels, lens)
     return BoardSeen(detection.pixels, to_image(H, board.outline()[:, :2]), still_s, T, time_s)
-
-
-def _top(frame: np.ndarray) -> int:
-    """The camera's white: cameras of 10, 12 or 14 bits fill part of 16."""
-    if frame.dtype == np.uint8:
-        return 255
-    brightest = int(frame.max(initial=0))
-    return next((1 << bits) - 1 for bits in (10, 12, 14, 16) if brightest < 1 << bits)
 
 
 class HandsFree:

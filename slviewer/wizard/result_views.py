@@ -11,6 +11,7 @@ import numpy as np
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.errors import InputError
 from slviewer.fringe.hdr import radiance, toned
+from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.poses import load_observations
@@ -163,7 +164,5 @@ def thumbnail(capture: Capture) -> bytes:
     if choice is not None:
         image = toned(radiance(image, choice, capture.exposures_ms))
     scale = THUMBNAIL_PX / max(image.shape)
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    if small.dtype != np.uint8:
-        small = cv2.convertScaleAbs(small, alpha=255 / max(int(small.max()), 1))
+    small = to_eight_bits(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), int(image.max()))
     return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1])
