@@ -20,7 +20,7 @@ from slviewer.geometry.jit import kernel
 INCONSISTENT, OUTSIDE, UNCHANGED = np.uint8(Reason.INCONSISTENT), np.uint8(Reason.OUTSIDE), np.uint8(0)
 UP, DOWN = np.uint8(1), np.uint8(2)
 TURN, PER_TURN = np.float32(2 * math.pi), np.float32(0.5 / math.pi)
-HALF, INVALID = np.float32(0.5), np.float32(math.nan)
+HALF, ONE, INVALID = np.float32(0.5), np.float32(1), np.float32(math.nan)
 RUN = 32
 """Pixels that are passed over together where none is suspect."""
 
@@ -78,29 +78,21 @@ def is_suspect(phase, row, x, per_cell):
     return not (vertical and do_agree(own, phase[row, x - 1], per_cell) and do_agree(own, phase[row, x + 1], per_cell))
 
 
-@numba.njit
+@numba.njit(inline="always")
 def count_votes(phase, row, x, rules):
     """(valid, agreeing, a cell above, a cell below): numbers of the neighbours in the window."""
     height, width = phase.shape
-    per_cell, nearly = np.float32(1 / rules.cell_rad), np.float32(rules.whole)
-    valid, agreeing, above, below = 0, 0, 0, 0
+    per_cell, nearly, own = np.float32(1 / rules.cell_rad), np.float32(rules.whole), phase[row, x]
+    valid, agreeing, above, below = -1, -1, 0, 0  # the pixel itself is valid, and agrees
     for v in range(max(0, row - rules.window), min(height, row + rules.window + 1)):
         for u in range(max(0, x - rules.window), min(width, x + rules.window + 1)):
-            cells = (phase[v, u] - phase[row, x]) * per_cell
-            if (v == row and u == x) or math.isnan(cells):
-                continue
+            cells = (phase[v, u] - own) * per_cell
             if rules.repeat < math.inf:
-                turns = np.float32(round(cells * np.float32(1 / rules.repeat)))
-                cells = cells - np.float32(rules.repeat) * turns
-            nearest = np.float32(round(cells))
-            valid += 1
-            if nearest == 0:
-                agreeing += 1
-            elif abs(cells - nearest) < nearly:
-                if nearest == 1:
-                    above += 1
-                elif nearest == -1:
-                    below += 1
+                cells -= np.float32(rules.repeat) * np.float32(round(cells * np.float32(1 / rules.repeat)))
+            valid += cells == cells  # not NaN
+            agreeing += abs(cells) <= HALF
+            above += abs(cells - ONE) < nearly
+            below += abs(cells + ONE) < nearly
     return valid, agreeing, above, below
 
 
