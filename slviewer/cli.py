@@ -6,52 +6,109 @@ Results go to standard output, progress and warnings to standard error. Exit sta
 
 import sys
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import tyro
 
 from slviewer import __version__, terminal
-from slviewer.commands.calibration import accept, calibrate, check, detect, validate
-from slviewer.commands.devices import capture, devices, preflight
-from slviewer.commands.documents import inspect, patterns, report, target
-from slviewer.commands.exports import decode, export
+from slviewer.commands.calibration import CALIBRATED, run_calibrate
+from slviewer.commands.command import JSON, read_command, show_result, union
+from slviewer.commands.devices import CHECKED, PORT, run_capture, run_preflight
 from slviewer.commands.imports import import_command
-from slviewer.commands.measurements import measure, measurements
-from slviewer.commands.parsing import union
-from slviewer.commands.scans import batch, compare, merge, mesh, reconstruct, verify
-from slviewer.commands.validation import bench, prove, reproduce, simulate
+from slviewer.commands.meshing import MESHING, run_meshing
 from slviewer.commands.wizard import wizard
 from slviewer.errors import Cancelled, SlviewerError
 
+
+def describe_rigs(drivers: str) -> str:
+    """The drivers, then the rigs that can be chosen by name."""
+    from slviewer.pipeline.rig_presets import rigs
+
+    return f"{drivers}\n{rigs()}"
+
+
+def describe_measurement(made: Any, **_: Any) -> str:
+    """The measurement in one line."""
+    from slviewer.pipeline.measurements import in_words
+
+    return in_words(made)
+
+
+def describe_simulation(names: list[str], session: Path, **_: Any) -> str:
+    """How many captures were simulated, and the next command."""
+    from slviewer.pipeline.simulate import TARGET
+
+    return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
+
+
+def describe_patterns(count: int, out: Path, **_: Any) -> str:
+    """How many images were written."""
+    return f"{count} patterns written to {out}"
+
+
+def describe_target(_: None, board: str, out: Path) -> str:
+    """What to do with the drawing."""
+    return f"{board} drawn to {out}: print at 100 %, and measure it"
+
+
+def describe_report(_: None, session: Path, out: Path) -> str:
+    """Where the report is."""
+    return f"report written to {out}"
+
+
 COMMANDS: dict[str, Callable[..., Any]] = {
     "wizard": wizard,
-    "devices": devices,
-    "preflight": preflight,
-    "capture": capture,
+    "devices": read_command("pipeline.devices:devices", run=partial(show_result, describe=describe_rigs)),
+    "preflight": read_command("preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
+    "capture": read_command("pipeline.capture:capture", "session", "name", options=[PORT], run=run_capture),
     "import": import_command,
-    "calibrate": calibrate,
-    "validate": validate,
-    "decode": decode,
-    "reconstruct": reconstruct,
-    "verify": verify,
-    "merge": merge,
-    "mesh": mesh,
-    "compare": compare,
-    "measure": measure,
-    "measurements": measurements,
-    "export": export,
-    "batch": batch,
-    "check": check,
-    "accept": accept,
-    "simulate": simulate,
-    "reproduce": reproduce,
-    "prove": prove,
-    "patterns": patterns,
-    "target": target,
-    "detect": detect,
-    "report": report,
-    "inspect": inspect,
-    "bench": bench,
+    "calibrate": read_command("pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate),
+    "validate": read_command("pipeline.validate:validate", "session", options=[JSON]),
+    "decode": read_command("pipeline.decode:decode", "session", "capture", names={"file_format": "format"}),
+    "reconstruct": read_command("pipeline.reconstruct:reconstruct", "session", "capture"),
+    "verify": read_command(
+        "pipeline.verify:verify",
+        "session",
+        "captures",
+        options=[JSON],
+        names={"models": "model", "depth_range": "range"},
+    ),
+    "merge": read_command("pipeline.merge:merge", "session", "captures", options=[JSON]),
+    "mesh": read_command("pipeline.mesh:mesh", "session", "names", options=[*MESHING, JSON], run=run_meshing),
+    "compare": read_command("pipeline.compare:compare", "session", "scan", "nominal", options=[JSON]),
+    "measure": read_command(
+        "pipeline.measure:measure",
+        "session",
+        "scan",
+        "what",
+        run=partial(show_result, describe=describe_measurement),
+    ),
+    "measurements": read_command("pipeline.measure:edit_measurements", "session"),
+    "export": read_command(
+        "pipeline.export:export",
+        "session",
+        "what",
+        "name",
+        options=MESHING,
+        names={"file_format": "format"},
+        run=run_meshing,
+    ),
+    "batch": read_command("pipeline.batch:batch", "sessions", options=[JSON]),
+    "check": read_command("pipeline.check:check", "session", "capture", options=[JSON]),
+    "accept": read_command("pipeline.accept:accept", "session", options=[JSON]),
+    "simulate": read_command(
+        "pipeline.simulate:simulate", "session", run=partial(show_result, describe=describe_simulation)
+    ),
+    "reproduce": read_command("validation.reproduce:reproduce", options=[JSON]),
+    "prove": read_command("validation.prove:prove", options=[JSON], names={"cases": "case"}),
+    "patterns": read_command("pipeline.printouts:patterns", run=partial(show_result, describe=describe_patterns)),
+    "target": read_command("pipeline.printouts:target", "board", run=partial(show_result, describe=describe_target)),
+    "detect": read_command("pipeline.detect:detect_board", "images", options=[JSON], names={"csv_out": "csv"}),
+    "report": read_command("pipeline.report:report", "session", run=partial(show_result, describe=describe_report)),
+    "inspect": read_command("pipeline.inspect:inspect", "session"),
+    "bench": read_command("validation.bench:bench", options=[JSON]),
 }
 
 

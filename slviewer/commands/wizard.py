@@ -1,20 +1,18 @@
 """The wizard in the browser."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from tyro.conf import Positional
 
-from slviewer.commands.parsing import deferred
 
-
-@deferred
 def wizard(
     session: Positional[Path | None] = None,
     rig: str = "",
     host: str = "127.0.0.1",
     port: int = 8080,
     no_browser: bool = False,
-) -> None:
+) -> Callable[[], None]:
     """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does the same.
 
     Args:
@@ -25,6 +23,10 @@ def wizard(
         port: Port to serve at; 0 takes any free one.
         no_browser: Print the address, and open no browser.
     """
-    from slviewer.gui.app import run
 
-    run(session, rig, host, port, open_browser=not no_browser)
+    def start() -> None:
+        from slviewer.gui.app import run
+
+        run(session, rig, host, port, open_browser=not no_browser)
+
+    return start

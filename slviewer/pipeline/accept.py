@@ -20,10 +20,10 @@ from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decoded
 from slviewer.pipeline.check import Checked, history
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.pipeline.models import best, check_accepted, load_model, load_stereo, warn_if_stale
+from slviewer.pipeline.models import ModelName, best, check_accepted, load_model, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.reconstruct import board_region
-from slviewer.pipeline.scale import apply_scale, scale_factor
+from slviewer.pipeline.scale import record_scale, scale_factor
 from slviewer.session.store import Session
 
 
@@ -67,16 +67,22 @@ def accept(
     session: SessionLike,
     artefact: Path | str,
     *,
-    model: str | None = None,
+    model: ModelName | None = None,
     still: Sequence[str] = (),
-    apply_scale_found: bool = False,
+    apply_scale: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Accepted:
-    """Test one calibration with the artefact that a TOML file describes, in the captures that it names.
+    """Test a calibration with a ball bar, a sphere or a plane that has a certificate, against the operator's limits.
 
-    ``still``: captures of a still object, for the repeatability. ``apply_scale_found`` records the scale that was found
-    as a correction of later clouds. The result stays in the session as ``acceptance/1``, ``acceptance/2``, ...
+    Args:
+        session: Session folder.
+        artefact: TOML file with what the certificate says, the captures that show the artefact, and the limits.
+        model: Which calibration to test; by default the best one available.
+        still: Captures (ten) of one still object, for the repeatability.
+        apply_scale: Record the measured scale as a correction of later clouds.
+
+    The result stays in the session as ``acceptance/1``, ``acceptance/2``, ...
     """
     thing = read_artefact(artefact)
     with opened(session, write=True) as store:
@@ -84,7 +90,7 @@ def accept(
         name = model or best(store)
         chosen, factor = load_model(store, name), scale_factor(store, name)
         warn_if_stale(store, warn)
-        if apply_scale_found and thing.kind == "plane":
+        if apply_scale and thing.kind == "plane":
             raise InputError("a plane says nothing of scale: apply that of a ball bar or a sphere")
         captures = _captures(store, thing)
         check_capture_sizes(store, [*captures, *still])
@@ -115,7 +121,7 @@ def accept(
             steady = repeatability(clouds())
         calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
         checks = [checked for checked in history(store) if checked.calibration == calibration]
-        applied = apply_scale(store, test) if apply_scale_found else None
+        applied = record_scale(store, test) if apply_scale else None
         result = Accepted(test, factor, applied, _budget(test, applied, checks), steady)
         numbers = [int(n.removeprefix("acceptance/")) for n in store.result_names() if n.startswith("acceptance/")]
         meta = {

@@ -15,6 +15,7 @@ from slviewer.evaluation.render import render
 from slviewer.pipeline.batch_storage import resolved, swept
 from slviewer.pipeline.batch_tasks import Do, Task, TaskResult, joined, listed, verification_file, worked
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.verify import Shape, Verification
 
 INSTALL = "pip install 'slviewer[batch]'"
@@ -45,6 +46,11 @@ class Batch:
         """{session, or session and capture: why}."""
         failed = {f"{done.session} {done.capture}": done.failed for done in self.done if done.failed}
         return {**self.broken, **failed}
+
+    @property
+    def failure(self) -> str:
+        """How many captures and sessions failed; empty where none did."""
+        return f"{len(self.failed)} of the batch failed: the summary says which, and why" if self.failed else ""
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``batch --json``."""
@@ -77,7 +83,7 @@ def batch(
     do: Do,
     *,
     captures: Sequence[str] = (),
-    model: str | None = None,
+    model: ModelName | None = None,
     shape: Shape | None = None,
     radius: float | None = None,
     accept_rejected: bool = False,
@@ -85,13 +91,22 @@ def batch(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Batch:
-    """Do the same with captures of many sessions, each as the command of that name does it alone.
+    """Reconstruct, verify or mesh the captures of many sessions, on this machine's cores or a Dask cluster.
 
-    ``sessions``: folders that every worker sees, or fsspec addresses; captures are read, and files written into the
-    sessions' exports, where the workers are. ``captures``: names or patterns such as ``plane_*``; by default the scans.
-    ``scheduler``: the address of a Dask scheduler; by default a cluster of this machine's cores is started and ended.
+    What it makes is what each command makes alone, in each session's exports. A capture that fails is named in the end,
+    with status 1, and stops no other.
 
-    A capture that fails is named in the result and ends nothing else; one whose worker dies is done again by another.
+    Args:
+        sessions: Session folders that all workers see, or addresses such as s3://bucket/session.
+        do: What to do with each capture.
+        captures: Their names, or patterns such as 'plane_*'; by default all scans.
+        shape: What the captures show, with --do verify.
+        radius: Nominal radius of the spheres, mm, with --do verify.
+        model: Which calibration to use; by default each session's best one, and all there are with --do verify.
+        scheduler: Address of a Dask scheduler, such as tcp://host:8786; by default a cluster of this machine's cores.
+        accept_rejected: Use calibrations although their verdict rejects them.
+
+    Captures are read, and files written, where the workers are; a capture whose worker dies is done again by another.
     Raises SlviewerError without ``distributed``, or where no scheduler answers or it has no workers.
     """
     if do == "verify" and shape is None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.calibration_verdict import attempt, attempt_poses, keep_rejected, rejected, save_verdict
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.pipeline.models import available, preferred, save_fitted, save_stereo, warn_if_frame_changed
+from slviewer.pipeline.models import ModelName, available, preferred, save_fitted, save_stereo, warn_if_frame_changed
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
 from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.session.store import Session
@@ -27,6 +27,7 @@ from slviewer.target.board import Board
 _LENGTH = {"pixelwise": 1.0, "splined": 2.0}
 """How long each model takes, roughly, for the progress."""
 DEFAULT_MODELS = ("stereo", "pixelwise", "splined")
+SmoothingKind = Literal["spline", "polynomial"]
 T = TypeVar("T")
 
 
@@ -110,22 +111,31 @@ def calibrate(
     session: SessionLike,
     target: str,
     *,
-    models: Sequence[str] = (),
+    models: Sequence[ModelName] = (),
     poses: Sequence[str] = (),
     exclude: Sequence[str] = (),
-    smoothing: str = "spline",
+    smoothing: SmoothingKind = "spline",
     degree: int = 5,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> CalibrationResult:
-    """Calibrate from the session's captures of role calibration, and save the models in the session.
+    """Calibrate from the session's target poses, and report whether the calibration is good, and if not, why.
 
-    ``models``: by default stereo, pixelwise and splined. ``stereo`` is always made; ``pixelwise`` is fitted on
-    top of it, and ``splined`` starts from it. ``poses``: the only ones to calibrate from, ``exclude``: those
-    to leave out; names or patterns such as ``pose_0*``, for this calibration alone. A pose that cannot be used is left
-    out with the reason. The verdict is saved beside the models. Raises CalibrationRejected with its reason where it
-    rejects them: then stereo alone is kept to look into, and used only where that is insisted on; where none could be
-    made at all, what the session held stays.
+    One that is rejected ends with status 3; it is stored to be inspected, and not used.
+
+    Args:
+        session: Session folder; with --camera-only also a folder of pictures of the board.
+        target: circles:21x16:9 (columns x rows : pitch mm), acircles:..., chessboard:9x7:75 (inner corners : square
+            mm), charuco:....
+        models: Which models to fit; by default stereo, which is always made, the Letter's pixelwise, and splined.
+        poses: Calibrate from these target poses alone: names, or patterns such as 'pose_0*'.
+        exclude: Exclude these target poses, this time; the wizard excludes poses for good.
+        smoothing: How the Letter's step 2 smooths a board's phase; the spline preserves the local distortion.
+        degree: Degree of the polynomial, with --smoothing polynomial.
+
+    A pose that cannot be used is excluded with the reason. The verdict is saved beside the models. Raises
+    CalibrationRejected with its reason: then stereo alone is stored to be inspected, and used only where the operator
+    accepts that; where none could be made at all, what the session held stays.
     """
     board = Board.parse(target)
     models = models or DEFAULT_MODELS

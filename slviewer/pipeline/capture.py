@@ -14,7 +14,7 @@ from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.frame_residuals import keep_residuals
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
-from slviewer.pipeline.rig_presets import load_rig
+from slviewer.pipeline.rig_presets import RigLike, load_rig
 from slviewer.session.atomic import megabytes
 from slviewer.session.capture import Capture, Role
 from slviewer.session.names import safe_name
@@ -28,7 +28,7 @@ PATTERNS = "complementary"
 def capture(
     session: Path | str,
     name: str,
-    rig: Mapping[str, Any] | Path | str,
+    rig: RigLike,
     *,
     role: Role = "calibration",
     board: str | None = None,
@@ -41,13 +41,24 @@ def capture(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Capture:
-    """Show a pattern sequence, photograph it, and save it in a session, which is made if it does not exist.
+    """Capture with a rig, without the wizard.
 
-    `rig` is a choice, a TOML file that holds one, or a preset's name. `patterns` names a sequence, by default the
-    session's, and `board` the target of a calibration pose, by default the session's too. `exposure_ms` and `gain` are
-    by default the rig's; two or more `exposures_ms` are merged, pixel by pixel, when the capture is read. `warn` hears
-    what the camera could not be set to, and which frames contradict the others. Raises InputError, DeviceError,
-    SessionError, and whatever `progress` raises before the capture is saved; nothing is kept then.
+    Args:
+        session: Session folder; made if it does not exist.
+        name: Name of the capture.
+        rig: A TOML file that describes the rig, or the name of one that `slviewer devices` lists.
+        role: calibration for a target pose, scan for anything else.
+        board: What the target is, circles:21x16:9 and the like; by default as the session knows it.
+        patterns: p18, complementary, gray or multifrequency; by default the session's, else complementary.
+        exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
+        exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the longest that does not
+            clip it.
+        gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
+        force: Replace a capture of that name (the old one goes to the session's trash).
+
+    ``warn`` is called with what the camera could not be set to, and with frames that contradict the others. Raises
+    InputError, DeviceError, SessionError, and whatever `progress` raises before the capture is saved; nothing is saved
+    then.
     """
     if exposure_ms is not None and exposures_ms:
         raise InputError("one exposure and several were asked for: give either")

@@ -72,10 +72,14 @@ def told(checked: Checked) -> str:
 
 
 def check(session: SessionLike, capture: str, *, progress: Progress = unheard, warn: Warn = unwarned) -> CheckResult:
-    """Whether the session's calibration still holds, from one later capture of its board, of any role.
+    """Say from one capture of the board whether the saved calibration is still good, and why if it is not.
 
-    Kept in the session as ``drift/1``, ``drift/2``, ... Raises DetectionError where the capture does not show the
-    board, InputError where the calibration has too few poses to tell, or was made elsewhere.
+    Args:
+        session: Session folder.
+        capture: Name of a capture, of any role, that shows the calibration's board.
+
+    The session stores the answer as ``drift/1``, ``drift/2``, ... Raises DetectionError where the capture does not show
+    the board, InputError where the calibration has too few poses to tell, or was made elsewhere.
     """
     with opened(session, write=True) as store:
         stereo = load_stereo(store)

@@ -57,3 +57,16 @@ class Preflight:
             "seconds": round(self.seconds, 2),
             "checks": [vars(check) for check in self.checks],
         }
+
+    def text(self) -> str:
+        """Each check with its remedy, then what to set."""
+        lines = []
+        for check in self.checks:
+            lines.append(f"{check.verdict:<8} {check.name}: {check.sentence}")
+            if check.remedy:
+                lines.append(f"         -> {check.remedy}")
+        if self.settle_ms is not None:
+            lines.append(f"settle_ms = {self.settle_ms:g} is what the rig's file should say")
+        if self.exposure_ms is not None:
+            lines.append(f"exposure_ms = {self.exposure_ms:g} would be better")
+        return "\n".join([*lines, f"{self.verdict} after {self.seconds:.1f} s"])

@@ -15,6 +15,7 @@ from slviewer.inspection.tolerance import DECIDED, RULE, ToleranceVerdict, judge
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.measured_surface import MeasuredSurface, surface
 from slviewer.pipeline.measurements import triangles_of
+from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.records import to_plain
 from slviewer.session.measurements import Measurement, save_measurement
@@ -103,18 +104,27 @@ def compare(
     units: Units | None = None,
     reach: float | None = None,
     out: Path | str | None = None,
-    model: str | None = None,
+    model: ModelName | None = None,
     name: str = "",
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Compared:
-    """Compare a capture, or a kept merge (``merge/<number>``), with a nominal model (STL, PLY or OBJ) after best-fit
-    alignment, and keep what is found.
+    """Compare a scan with a nominal model after best-fit alignment: figures, coloured points, pictures in the report.
 
-    ``tolerance``: plus and minus, mm. ``units`` of the model's numbers; where none are given and the sizes do not fit,
-    InputError asks for them. ``reach``: mm, beyond which points belong to something else. ``out``: the coloured PLY, by
-    default in the session's exports.
+    Args:
+        session: Session folder.
+        scan: Name of the capture, or merge/1 and the like for a merge of the session.
+        nominal: STL, PLY or OBJ file of the part as it should be.
+        tolerance: Plus and minus, mm; the answer is pass, fail, or too close to tell.
+        units: What the file's numbers are; required where its size does not fit the scan's.
+        reach: Points farther than this from the nominal, mm, belong to something else (a table, a clamp); by default
+            2 % of the nominal's diagonal.
+        out: PLY file, the deviation as a scalar and as colours; by default in the session's exports.
+        model: Which calibration to use; by default the best one available.
+        accept_rejected: Use the calibration although its verdict rejects it.
+
+    The session stores the result as a measurement called ``name``.
     """
     if out is not None and Path(out).suffix.lower() != ".ply":
         raise UsageError(f"coloured points are written as .ply, not as {Path(out).name}: end its name so")

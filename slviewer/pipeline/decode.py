@@ -121,11 +121,17 @@ def decode(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> DecodedFiles:
-    """Decode a capture and write its maps into the folder ``out``, replacing files of the same names.
+    """Decode a capture: absolute phase and projector coordinate of each pixel, the mask with its reasons, a picture.
 
-    For each axis ``phase`` (rad), ``coordinate`` and ``sigma`` (projector px), ``modulation`` (grey levels) as (h, w)
-    float32 .npy or .exr, NaN where masked (not the modulation), and ``reason``, uint8 codes, as .npy or .png; one
-    ``decoded.json`` that explains them, and the picture ``decoded.png``. Raises InputError like `decode_capture`.
+    Args:
+        session: Session folder.
+        capture: Name of the capture.
+        out: Folder for the files; made if it does not exist. decoded.json in it explains them.
+        file_format: npy (NumPy) or exr (OpenEXR) for the maps, float32, NaN where masked.
+
+    For each axis ``phase`` (rad), ``coordinate`` and ``sigma`` (projector px), ``modulation`` (grey levels, not masked)
+    as (h, w) maps, and ``reason``, uint8 codes, as .npy or .png; the picture is ``decoded.png``. Files of the same
+    names are replaced. Raises InputError like `decode_capture`.
     """
     if file_format not in ("npy", "exr"):
         raise InputError(f"maps cannot be written as '{file_format}': use npy or exr")

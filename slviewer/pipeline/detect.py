@@ -47,6 +47,12 @@ class BoardsDetected:
         """Number of photographs in which the board was detected."""
         return sum(image.detection is not None for image in self.images)
 
+    @property
+    def failure(self) -> str:
+        """In how many photographs the board was not detected; empty where it was in all."""
+        missing = len(self.images) - self.detected
+        return f"{self.board} not detected in {missing} of {len(self.images)} images" if missing else ""
+
     def rows(self) -> list[tuple[str, int, float, float, float, float]]:
         """The table: image, index of the feature, its place on the board in mm, and in the image in px."""
         return [
@@ -92,18 +98,26 @@ class BoardsDetected:
 
 def detect_board(
     images: Sequence[Path | str],
-    target: str | Board,
+    target: str,
     *,
     out: Path | str | None = None,
     csv_out: Path | str | None = None,
 ) -> BoardsDetected:
-    """Detect a board in photographs: files, or folders of them.
+    """Detect a calibration board in photographs: where its circles or corners are, or why it cannot be measured.
 
-    ``out``: the overlay, each photograph with its features numbered and the board's axes: a picture for one photograph,
-    a folder for several. ``csv_out``: the table of all features. A photograph that cannot be read, or in which the
-    board is not detected, is a result with its reason. Raises InputError where there is no photograph at all.
+    Ends with status 1 where the board is not detected in every image.
+
+    Args:
+        images: Image files, or folders of them.
+        target: circles:21x16:9 (columns x rows : pitch mm), acircles:..., chessboard:9x7:75 (inner corners : square
+            mm), charuco:....
+        out: The picture with numbered features and the board's axes; a folder where there are several images.
+        csv_out: Table of all features: image, index, place on the board in mm, place in the image in px.
+
+    A photograph that cannot be read, or in which the board is not detected, is a result with its reason. Raises
+    InputError where there is no photograph at all.
     """
-    board = target if isinstance(target, Board) else Board.parse(target)
+    board = Board.parse(target)
     paths = _photographs([Path(image) for image in images])
     results = []
     for path in paths:

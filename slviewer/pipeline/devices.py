@@ -28,7 +28,7 @@ def list_drivers() -> list[DriverView]:
 
 
 def devices() -> str:
-    """The same in words, for the terminal."""
+    """List the drivers: which can be used here, what is connected, what each needs, and the rigs to choose from."""
     blocks = []
     for driver in list_drivers():
         lines = [f"{driver.name} ({', '.join(driver.offers)}): {driver.what}"]

@@ -13,7 +13,7 @@ from slviewer.pipeline.export_documents import (
 )
 from slviewer.pipeline.export_shapes import merge_name, merge_shape, scan_shape
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.pipeline.models import check_accepted, preferred, warn_if_stale
+from slviewer.pipeline.models import ModelName, check_accepted, preferred, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
 from slviewer.session.atomic import megabytes
@@ -107,19 +107,27 @@ def export(
     *,
     out: Path | str | None = None,
     file_format: str = "",
-    model: str | None = None,
+    model: ModelName | None = None,
     plan: MeshingPlan | None = None,
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Exported:
-    """Write one file for other programs, whole or not at all.
+    """Write a file for other programs: shapes in mm as .ply .stl .obj .xyz, in metres as .glb; the calibration; poses.
 
-    ``name``: the scan of a cloud or a mesh (not needed where there is one alone), the number of a merge (the last one
-    by default), the model of the coefficients. ``out``: the file, whose suffix says how it is written, or a folder; by
-    default the session's exports, as ``file_format`` or the first of ``FORMATS``. ``model``: the calibration that
-    clouds are made with, or that is written, by default the one they are kept from, else the preferred one.
-    ``plan``: how to mesh.
+    Args:
+        session: Session folder.
+        what: cloud and mesh of a scan; merge (the points) and merged-mesh; calibration for OpenCV or as JSON;
+            coefficients of each pixel as .npz; poses of camera, projector, target and scans as 4x4 matrices; report as
+            HTML; table of the verifications as CSV.
+        name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model of coefficients.
+        out: The file, whose suffix says how it is written, or a folder; by default the session's exports.
+        file_format: ply, stl, obj, glb, xyz, yml, xml, json, ..., where --out is a folder or not given.
+        model: Which calibration to make a cloud with, by default the one of the stored cloud, or the best; or which to
+            write (of splined the pinhole and Brown lenses that come nearest, and their remaining error).
+        accept_rejected: Use the calibration although its verdict rejects it.
+
+    The file is written whole or not at all.
     """
     with opened(session) as store:
         chosen = file_format.lower().removeprefix(".")

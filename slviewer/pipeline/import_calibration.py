@@ -20,24 +20,32 @@ from slviewer.session.importers import opencv_calibration
 from slviewer.session.store import Session
 
 Size = str | tuple[int, int]
+Keys = tuple[str, str, str, str, str, str]
 
 
 def import_opencv_calibration(
     file: Path | str,
     session: Path | str,
-    keys: Sequence[str] | None = None,
+    keys: Keys | None = None,
     *,
     projector: Size | None = None,
     camera: Size | None = None,
     force: bool = False,
     warn: Warn = unwarned,
 ) -> StereoModel | None:
-    """Make a stereo calibration from an OpenCV FileStorage file the session's own.
+    """Import a stereo calibration made elsewhere, from an OpenCV FileStorage file.
 
-    ``keys`` are the file's names for K_camera, D_camera, K_projector, D_projector, R and T (camera to projector, mm),
-    by default those of `identify_calibration_keys`. Image sizes that are not given are those that the file states,
-    else those of the session's captures. Returns the model, or None while nothing tells a size. The session's other
-    calibrations go to the trash with the stereo one that they were made from.
+    Args:
+        file: The .yml, .xml or .json file.
+        session: Session folder; made if it does not exist.
+        keys: The file's names for the matrices K_camera D_camera K_projector D_projector R T; R and T (mm) map camera
+            to projector. By default the common names are recognised, and those used are printed.
+        projector: Width x height of the projector, px; by default what the file states, else the session's captures.
+        camera: Width x height of the camera, px; by default what the file states, else the session's captures.
+        force: Replace the session's stereo calibration (the old one goes to the session's trash).
+
+    Returns the model, or None while nothing states a size. The session's other calibrations go to the trash with the
+    stereo one that they were made from.
 
     Raises InputError, and replaces nothing, where sizes contradict each other, and where the patterns of a capture in
     the session contradict the calibration: R and T inverted, matrices exchanged or at another pixel scale, another rig.

@@ -50,14 +50,23 @@ def import_captures(
 ) -> list[str]:
     """Import a folder of captures that another tool made; returns the captures' names.
 
-    ``layout`` is one of `layouts.LAYOUTS`, or "detect": the one that the file names show. ``source`` is one capture
-    folder or a folder of them; captures are named after their folders, behind ``prefix_``. ``sequence`` is the TOML of
-    the layout frames, by default the one in ``source``. ``projector`` is by default the layout's own, else what
-    the session knows of its projector. ``channel`` is that of colour frames, green where nothing states it. ``origin``
-    is recorded as where the captures come from, by default their folders. ``options`` are those of the layout's `read`.
+    Args:
+        source: One capture folder, or a folder of them.
+        session: Session folder; made if it does not exist.
+        role: calibration for target poses, scan for anything else.
+        prefix: Put before each capture's name: planes gives planes_pose_03.
+        projector: Width x height of the projector, px; by default what the layout or the images' TOML states, else
+            what the session knows.
+        channel: Of colour images; green where nothing states it.
+        force: Replace captures of the same name (the old ones go to the session's trash).
+        strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
 
-    Captures that cannot be read or decoded are skipped, and ``warn`` hears why. Raises InputError where none is left,
-    or, with ``strict``, for the first of them; nothing is saved then.
+    ``layout`` is one of `layouts.LAYOUTS`, or "detect": the one that the file names show. Captures are named after
+    their folders. ``sequence`` is the TOML of the layout frames, by default the one in ``source``. ``origin`` is
+    recorded as where the captures come from, by default their folders. ``options`` are those of the layout's `read`.
+
+    Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason. Raises InputError where
+    none is left, or, with ``strict``, for the first of them; nothing is saved then.
     """
     found = _find_captures(source, layout, sequence, prefix, projector, channel, session, warn, options)
     return _save(found, session, role, origin, force, strict, progress, warn)

@@ -13,7 +13,11 @@ from slviewer.session.capture import Capture
 
 
 def inspect(session: SessionLike) -> str:
-    """Captures with their role, size and sequence, calibrations with their quality, and what is stale."""
+    """List what a session holds, and what is stale.
+
+    Args:
+        session: Session folder.
+    """
     with opened(session) as store:
         excluded = store.excluded()
         captures = store.captures()

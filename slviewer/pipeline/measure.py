@@ -1,4 +1,4 @@
-"""One measurement on a scan in words, and the list of those that a session holds: what the terminal asks for."""
+"""One measurement on a scan by its command's arguments, and edits of the list of those that a session holds."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +21,7 @@ from slviewer.pipeline.measurements import (
     rename,
     restore,
 )
+from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.session.measurements import Measurement
 
@@ -36,15 +37,24 @@ def measure(
     ball: Sequence[float] = (),
     box: Sequence[float] = (),
     name: str = "",
-    model: str | None = None,
+    model: ModelName | None = None,
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Measurement:
-    """Measure on a scan, and keep it.
+    """Measure on a scan: a distance between points, a section, a shape fitted to a region; the session stores it.
 
-    ``at``: pixels u v of the point, or of both ends of the distance or section (of a merge, the points' indices).
-    ``ball`` (x, y, z, radius) or ``box`` (two corners) mm, in the camera's frame: the region of a fit.
+    Args:
+        session: Session folder.
+        scan: Name of the capture, or merge/1 and the like for a merge of the session.
+        what: point, distance and section take --at; plane, sphere and cylinder take --ball or --box.
+        at: Pixel u v (column, row of the camera's picture) of the point, or u v u v of both ends of the distance or
+            section; for a merge the points' numbers in its file, from 0.
+        ball: The region to fit to: centre x y z and radius, mm, in the camera's frame (x right, y down, z away).
+        box: The region to fit to: two corners x y z x y z, mm, in the camera's frame.
+        name: What to call it.
+        model: Which calibration to use; by default the best one available.
+        accept_rejected: Use the calibration although its verdict rejects it.
     """
     fitted = what in ("plane", "sphere", "cylinder")
     if fitted and (len(ball), len(box)) not in ((4, 0), (0, 6)):
@@ -74,7 +84,7 @@ def _refuse_places(what: What, ends: int, which: str) -> NoReturn:
     )
 
 
-def tell_measurements(
+def edit_measurements(
     session: SessionLike,
     *,
     relate: tuple[str, str] | None = None,
@@ -83,8 +93,16 @@ def tell_measurements(
     bring_back: bool = False,
     csv: Path | None = None,
 ) -> str:
-    """The measurements that a session holds, in words, after what is asked for: two of them related, one named (id,
-    name), some deleted, the last one deleted brought back, all written as CSV."""
+    """List the measurements that a session holds.
+
+    Args:
+        session: Session folder.
+        relate: Two of them, such as m1 m2: their distances and angles are measured too.
+        name: One of them, and what to call it from now on.
+        delete: Some of them, to the trash.
+        bring_back: Undo the last deletion.
+        csv: Write them all to this table too.
+    """
     if not (relate or name or delete or bring_back):
         return _told(session, csv)
     with opened(session, write=True) as store:

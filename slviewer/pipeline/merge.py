@@ -13,7 +13,7 @@ from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decoded
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.frame_residuals import told
-from slviewer.pipeline.models import check_accepted, frame_of, load_model, preferred, warn_if_stale
+from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.reconstruction.cloud import Cloud
@@ -147,7 +147,7 @@ def merge(
     reference: str,
     out: Path | str | None = None,
     *,
-    model: str | None = None,
+    model: ModelName | None = None,
     start: StartKind = "features",
     angle: float | None = None,
     axis: TurntableAxis | None = None,
@@ -158,14 +158,26 @@ def merge(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Merge:
-    """Reconstruct scans, register them into the frame of ``reference``, fuse them, and write the surface as one PLY.
+    """Register scans to a reference scan, close their loops, and fuse them into one surface.
 
-    Scans are given in the order in which they were taken. ``start``: where registration starts from; "turntable" needs
-    the ``angle`` in degrees from each scan to the next and finds the ``axis`` where it is not given; "identity" takes
-    scans to lie in one frame already, or as ``poses`` (4, 4) by name say. ``picked``: of a pair (scan, onto), three or
-    more points (n, 3) mm on either, in their cameras' frames; these pairs start from there. What stands still while
-    the object moves is measured apart from it and left off the surface, unless ``keep_background``. Without ``out`` the
-    session keeps the merge, as ``merge/<number>``, and its file in the exports.
+    Reports the uncertainty of each registered pair, how well loops close, and what was excluded, and why.
+
+    Args:
+        session: Session folder.
+        captures: Names of the captures, in the order in which they were captured.
+        reference: The capture whose frame the merged cloud takes.
+        out: PLY file. Without it the session stores the merge as merge/1 and so on, for mesh, compare, measure and
+            export, and its file is in the session's exports.
+        start: Initial alignment: features estimates it from the scans; turntable uses --angle; identity assumes that
+            the scans are nearly aligned already.
+        angle: Degrees that the turntable turns from each capture to the next, with --start turntable.
+        model: Which calibration to use; by default the best one available.
+        accept_rejected: Use the calibration although its verdict rejects it.
+
+    Python alone: ``axis`` of the turntable, estimated where it is not given; ``poses`` (4, 4) by name, the initial
+    alignment with "identity"; ``picked``, for a pair (scan, onto), three or more points (n, 3) mm on either, in their
+    cameras' frames, that these pairs start from. What stands still while the object moves is measured apart from it
+    and excluded from the surface, unless ``keep_background``.
     """
     given = list(dict.fromkeys(captures))
     names = given if reference in given else [*given, reference]

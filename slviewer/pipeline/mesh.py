@@ -10,7 +10,7 @@ from slviewer.pipeline.export import check_export
 from slviewer.pipeline.export_shapes import merged_points, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.merge import Merge, StartKind, merge
-from slviewer.pipeline.models import check_accepted, warn_if_stale
+from slviewer.pipeline.models import ModelName, check_accepted, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape
@@ -43,21 +43,30 @@ class MeshResult:
 
 def mesh(
     session: SessionLike,
-    names: Sequence[str],
+    names: Sequence[str] = (),
     out: Path | str | None = None,
     *,
     plan: MeshingPlan | None = None,
-    model: str | None = None,
+    model: ModelName | None = None,
     start: StartKind = "features",
     angle: float | None = None,
     accept_rejected: bool = False,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> MeshResult:
-    """Mesh a scan, several scans merged, or a merge that the session keeps (``merge/2``, ``merge/`` for the last one).
+    """Make a mesh of a scan, or of several that are merged, and write it as .ply, .stl, .obj or .glb.
 
-    ``out``: .ply, .stl, .obj or .glb; by default a .ply in the session's exports. Scans are merged into the frame of
-    the first of them, their points written beside the mesh; ``start`` and ``angle`` as ``merge`` takes them.
+    Args:
+        session: Session folder.
+        names: One scan; several, to be merged into the frame of the first; or a merge of the session, as merge/1.
+        out: The file; by default a .ply in the session's exports.
+        start: Initial alignment of several scans: features estimates it from the scans; turntable uses --angle;
+            identity assumes that they are nearly aligned already.
+        angle: Degrees that the turntable turns from each scan to the next, with --start turntable.
+        model: Which calibration to use; by default the best one available.
+        accept_rejected: Use the calibration although its verdict rejects it.
+
+    ``merge/`` alone is the session's last merge. The points of merged scans are written beside the mesh.
     """
     sources = tuple(dict.fromkeys(names))
     if not sources:

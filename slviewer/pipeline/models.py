@@ -20,6 +20,8 @@ from slviewer.session.store import Session
 
 Model = StereoModel | PixelwiseModel | SplinedModel
 
+ModelName = str
+"""stereo, pixelwise or splined."""
 MODELS = ("stereo", "pixelwise", "splined")
 VERDICT = "calibration/verdict"
 VALIDATION = "calibration/validation"

@@ -10,8 +10,16 @@ from slviewer.target.board import Board
 from slviewer.target.sheet import write_sheet
 
 
-def patterns(preset: str, projector: str | tuple[int, int], out: Path | str) -> int:
-    """Write every image of a preset sequence as PNG, with the TOML that ``import_frames`` reads; returns how many."""
+def patterns(preset: str, projector: str, out: Path | str) -> int:
+    """Write the images of a pattern sequence, and the TOML that `import frames` reads.
+
+    Args:
+        preset: p18, complementary, gray or multifrequency.
+        projector: Width x height of the projector, px.
+        out: Folder to make.
+
+    Returns the number of images.
+    """
     if preset not in PRESETS:
         raise InputError(f"no pattern sequence is called {preset!r}: use {', '.join(PRESETS)}")
     sequence = PRESETS[preset](parse_size(projector))
@@ -19,6 +27,11 @@ def patterns(preset: str, projector: str | tuple[int, int], out: Path | str) -> 
     return len(sequence.frames)
 
 
-def target(board: str | Board, out: Path | str) -> None:
-    """Draw a printable target, to exact scale, as .pdf or .svg."""
-    write_sheet(board if isinstance(board, Board) else Board.parse(board), Path(out))
+def target(board: str, out: Path | str) -> None:
+    """Draw a printable target to exact scale.
+
+    Args:
+        board: circles:21x16:9, acircles:..., chessboard:9x7:75 or charuco:....
+        out: A .pdf or .svg file.
+    """
+    write_sheet(Board.parse(board), Path(out))

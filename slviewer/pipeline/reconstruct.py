@@ -15,7 +15,16 @@ from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, che
 from slviewer.pipeline.capture_phases import capture_texture, decode_capture, loss_warnings
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.frame_residuals import told
-from slviewer.pipeline.models import Model, check_accepted, frame_of, load_models, load_stereo, preferred, warn_if_stale
+from slviewer.pipeline.models import (
+    Model,
+    ModelName,
+    check_accepted,
+    frame_of,
+    load_models,
+    load_stereo,
+    preferred,
+    warn_if_stale,
+)
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import told_scale
 from slviewer.reconstruction.cloud import Cloud
@@ -84,7 +93,7 @@ def reconstruct(
     session: SessionLike,
     capture: str,
     *,
-    model: str | None = None,
+    model: ModelName | None = None,
     axis: Axis | None = None,
     depth_range: tuple[float, float] | None = None,
     out: Path | str | None = None,
@@ -94,11 +103,20 @@ def reconstruct(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Reconstruction:
-    """Reconstruct a capture, write it as PLY, and ``grid`` as an organised (h, w, 3) float32 .npy.
+    """Reconstruct a capture as a cloud; a board pose also says how flat each model measures the board.
 
-    The PLY of a board pose holds the points inside the board's outline; a scan's holds every point. That of a ``mesh``
-    also holds the triangles between neighbouring pixels. ``depth_range`` (near, far) mm: the depths between which a
-    capture whose phase repeats has its surfaces; by default the calibrated ones.
+    Args:
+        session: Session folder.
+        capture: Name of the capture.
+        model: Which calibration to use; by default the best one available.
+        axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
+        depth_range: For patterns that do not cover the projector: near and far end, mm, of the depths between which
+            all surfaces lie; by default the calibrated depths.
+        out: PLY file; by default in the session's exports. That of a board pose holds the points inside the board's
+            outline.
+        grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as .npy.
+        mesh: Put the triangles between neighbouring pixels into the PLY.
+        accept_rejected: Use the calibration although its verdict rejects it.
     """
     with opened(session) as store:
         check_accepted(store, accept_rejected)

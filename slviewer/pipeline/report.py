@@ -60,7 +60,12 @@ MOST_MAPS = 8
 
 
 def report(session: SessionLike, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> None:
-    """Write what a session holds and how well it is calibrated to ``out``."""
+    """Write one self-contained HTML report of a session.
+
+    Args:
+        session: Session folder.
+        out: The .html file.
+    """
     if Path(out).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{out} is no HTML file: end its name in .html")
     with opened(session) as store:

@@ -18,6 +18,8 @@ from slviewer.pipeline.rig_choice import ABOUT, Choice, rig_factory
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset_folder
 
+RigLike = Mapping[str, Any] | Path | str
+"""A choice of devices, a TOML file that holds one, or the name of a preset."""
 FOLDER = "rigs"
 _NUMBERS = ("settle_ms", "focal_px", "exposure_ms", "gain")
 

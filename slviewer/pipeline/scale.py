@@ -12,7 +12,7 @@ from slviewer.session.store import Session
 
 
 def correction(store: Session, model: str) -> dict[str, Any] | None:
-    """What was applied to a calibration, as ``apply_scale`` recorded it; None where it was made anew."""
+    """What was applied to a calibration, as ``record_scale`` stored it; None where it was made anew."""
     name = f"scale/{model}"
     return store.load_result(name, only=())[0] if store.state_of(name) == "fresh" else None
 
@@ -53,7 +53,7 @@ def scaled(cloud: Cloud, factor: float) -> Cloud:
     )
 
 
-def apply_scale(store: Session, found: Acceptance) -> float:
+def record_scale(store: Session, found: Acceptance) -> float:
     """Record that the calibration's clouds are to be corrected by the scale that a test found; returns the new factor.
 
     A correction that was in force during the test stays in it.

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -29,7 +29,7 @@ TARGET = "circles:21x16:9"
 TRUTH = "truth.json"
 """In the session's folder: read by nothing but what scores a result."""
 KINDS = ("pose", "plane", "sphere", "object", "turn")
-PRESETS = ("letter", "turn")
+Preset = Literal["letter", "turn"]
 NOMINAL = "stone.ply"
 """Beside the truth: the surface of what turns, in its own frame, for comparing with."""
 MIN_POSES = 3
@@ -38,21 +38,31 @@ MIN_POSES = 3
 def simulate(
     session: Path | str,
     *,
-    preset: str = "letter",
+    preset: Preset = "letter",
     scale: float = 1.0,
     poses: int = 25,
     seed: int = 0,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> list[str]:
-    """Make a session with ``pose_XX`` (both axes), ``plane_01`` ... ``plane_10``, ``sphere_1`` ... ``sphere_6`` and
-    ``object_r1`` ... ``object_r3`` (axis x), as the simulated rig sees them; returns their names.
+    """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object at three depths.
 
-    The preset "turn" has, beside the target poses, ``object_r1`` ... ``object_r3`` turned by up to 15 degrees from one
-    to the next, and ``turn_01`` ... ``turn_12``, another object on a turntable in steps of 30 degrees.
+    The preset turn has, beside target poses, the object turned by up to 15 degrees between its three depths, and
+    another on a turntable, in twelve steps round.
+
+    Args:
+        session: Session folder to make.
+        preset: letter: planes, spheres and an object at three depths; turn: an object at three depths, and another on a
+            turntable.
+        scale: Resolution of the camera, as a share of 1600x1200 px; 0.25 is quick.
+        poses: How many target poses.
+        seed: Another seed is another rig of the same kind.
+
+    Returns the captures' names: ``pose_XX`` (both axes), ``plane_01`` ... ``plane_10``, ``sphere_1`` ... ``sphere_6``,
+    ``object_r1`` ... ``object_r3``, ``turn_01`` ... ``turn_12`` (axis x).
     """
-    if preset not in PRESETS:
-        raise InputError(f"no rig preset is called {preset!r}: use {' or '.join(PRESETS)}")
+    if preset not in get_args(Preset):
+        raise InputError(f"no rig preset is called {preset!r}: use {' or '.join(get_args(Preset))}")
     if not MIN_POSES <= poses <= 200:
         raise InputError(f"{poses} target poses cannot be simulated: ask for {MIN_POSES} to 200")
     board = Board.parse(TARGET)

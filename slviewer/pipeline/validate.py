@@ -23,6 +23,7 @@ from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.models import (
     MODELS,
     VALIDATION,
+    ModelName,
     available,
     load_stereo,
     preferred,
@@ -45,16 +46,20 @@ FITS: dict[str, Fit] = {
 def validate(
     session: SessionLike,
     *,
-    models: Sequence[str] = (),
+    models: Sequence[ModelName] = (),
     folds: int = FOLDS,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> CrossValidation:
-    """Calibrate from all poses but a fold of them, measure that fold's boards, and so on for every fold.
+    """Measure target poses with calibrations made without them, and recommend the best model.
 
-    ``models``: those to compare; by default all that the session holds. Nothing is decoded again: the poses are read
-    from what the session keeps of them. The result stays in the session as ``calibration/validation``, and the model
-    that it recommends becomes the one that is used where none is named.
+    Args:
+        session: Session folder, calibrated.
+        models: Which models to compare; by default all there are. The recommended one is used where none is named.
+        folds: Into how many parts the poses are split, each excluded once.
+
+    Nothing is decoded again: the session stores what it needs of the poses. The result stays in the session as
+    ``calibration/validation``.
     """
     with opened(session, write=True) as store:
         stereo = load_stereo(store)

@@ -17,7 +17,7 @@ from slviewer.pipeline.capture_clouds import check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decoded, loss_warnings
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.frame_residuals import told
-from slviewer.pipeline.models import check_accepted, load_models, load_stereo, warn_if_stale
+from slviewer.pipeline.models import ModelName, check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.reconstruct import board_region, lit, reconstruct_models, unsupported
 from slviewer.pipeline.scale import told_scale
@@ -82,7 +82,7 @@ def verify(
     captures: Sequence[str],
     shape: Shape,
     *,
-    models: Sequence[str] = (),
+    models: Sequence[ModelName] = (),
     depth_range: tuple[float, float] | None = None,
     radius: float | None = None,
     axis: Axis | None = None,
@@ -90,10 +90,17 @@ def verify(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Verification:
-    """Fit a plane or a sphere to each capture, by each model, over the pixels that all of them measure.
+    """Measure captures of a plane or a sphere with each model, over the pixels that all of them measure, and compare.
 
-    ``depth_range`` bounds R2 in mm; by default the depths of the board poses. ``radius`` mm,
-    roughly, helps to find a sphere; the fitted radius stays free, as in the Letter's Table 2.
+    Args:
+        session: Session folder.
+        captures: Names of the captures.
+        shape: What the captures show.
+        models: Which calibrations to compare; by default all there are.
+        depth_range: Near and far end of the calibrated depths R2, mm; by default those of the board poses.
+        radius: Nominal radius of the sphere, mm: helps to detect it; the fitted radius stays free.
+        axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
+        accept_rejected: Use the calibration although its verdict rejects it.
     """
     if not captures:
         raise UsageError("no capture named: give the captures to measure, for instance plane_01 plane_02")

@@ -2,21 +2,20 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from slviewer.pipeline.capture import set_camera
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.rig_choice import SetUp, set_up
-from slviewer.pipeline.rig_presets import load_rig
+from slviewer.pipeline.rig_presets import RigLike, load_rig
 from slviewer.preflight.recorded_capture import preflight_capture
 from slviewer.preflight.run import preflight
 from slviewer.session.store import Session
 
 
 def check_rig(
-    rig: Mapping[str, Any] | Path | str,
+    rig: RigLike,
     *,
     session: Path | str | None = None,
     exposure_ms: float | None = None,
@@ -25,8 +24,16 @@ def check_rig(
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Preflight:
-    """What the preflight says of a rig: a choice, a TOML file that holds one, or the name of a preset, `session`'s own
-    too. Its camera is set as for a capture. Raises InputError, DeviceError, and whatever `progress` raises.
+    """Check a rig in about 10 s: right screen, delay, order of frames, light, stillness; or the frames of a capture.
+
+    Reports of each what is wrong, and what to do. Ends with status 1 where something is bad.
+
+    Args:
+        session: A session, whose own rigs are known by name too.
+        exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
+        gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
+
+    Raises InputError, DeviceError, and whatever `progress` raises.
     """
     if isinstance(rig, Mapping):
         choice = dict(rig)
@@ -47,18 +54,3 @@ def check_capture(session: SessionLike, capture: str, *, progress: Progress = un
     """
     with opened(session) as store:
         return preflight_capture(store.load_capture(capture), progress)
-
-
-def in_words(found: Preflight) -> str:
-    """A preflight for the terminal: each check with its remedy, then what to set."""
-    lines = []
-    for check in found.checks:
-        lines.append(f"{check.verdict:<8} {check.name}: {check.sentence}")
-        if check.remedy:
-            lines.append(f"         -> {check.remedy}")
-    if found.settle_ms is not None:
-        lines.append(f"settle_ms = {found.settle_ms:g} is what the rig's file should say")
-    if found.exposure_ms is not None:
-        lines.append(f"exposure_ms = {found.exposure_ms:g} would be better")
-    lines.append(f"{found.verdict} after {found.seconds:.1f} s")
-    return "\n".join(lines)

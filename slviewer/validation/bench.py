@@ -39,6 +39,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.validation.bench_floors import beside, fastest, median, megabytes, row, through
 from slviewer.validation.bench_gpu import gpu_rows
+from slviewer.validation.bench_live import LiveFigures, live_rate
 from slviewer.validation.bench_peers import fringes_row, icp_rows, missing
 
 PERIOD_PX = 18.0
@@ -52,22 +53,39 @@ class Benchmark:
     rows: list[Row]
     peak_memory_gb: float | None
     missing: tuple[str, ...] = ()
+    live: LiveFigures | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The rows as they are."""
-        return {"stages": self.rows, "peak_memory_gb": self.peak_memory_gb, "missing": list(self.missing)}
+        figures = {"stages": self.rows, "peak_memory_gb": self.peak_memory_gb, "missing": list(self.missing)}
+        return figures if self.live is None else figures | {"live": self.live.to_json()}
 
     def text(self) -> str:
         """For people."""
         lines = [render(self.rows), *self.missing]
         if self.peak_memory_gb is not None:
             lines.append(f"peak memory of the whole run {self.peak_memory_gb:.2f} GB")
+        if self.live is not None:
+            lines.append(self.live.text())
         return "\n".join(lines)
 
 
-def bench(*, calibration: bool = False, scale: float = 1.0, progress: Progress = unheard) -> Benchmark:
-    """Time the stages from a rendered pose to a file, with the peers that are installed; with ``calibration``, also the
-    pixel-wise fit of 25 recorded poses, and all of their calibration."""
+def bench(
+    *,
+    calibration: bool = False,
+    live: bool = False,
+    minutes: float = 0.5,
+    scale: float = 1.0,
+    progress: Progress = unheard,
+) -> Benchmark:
+    """Time the main stages on this machine, beside what they cannot beat.
+
+    Args:
+        calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full size).
+        live: Also scan live, at half the resolution, with one viewer that draws and one that stalls.
+        minutes: How long.
+        scale: Resolution of the camera, as a share of 1600x1200.
+    """
     progress(0.0, "rendering a pose")
     rig = letter(scale)
     plan = letter_plan(rig, poses=3)
@@ -92,7 +110,8 @@ def bench(*, calibration: bool = False, scale: float = 1.0, progress: Progress =
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         memory = peak / (1e9 if sys.platform == "darwin" else 1e6)
     progress(1.0, "measured")
-    return Benchmark(rows + peers, memory, absent)
+    streamed = live_rate(0.5 * scale, 60 * minutes, progress) if live else None
+    return Benchmark(rows + peers, memory, absent, streamed)
 
 
 def _decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:

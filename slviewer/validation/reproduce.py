@@ -27,19 +27,23 @@ OBJECTS = ("object_r1", "object_r2", "object_r3")
 
 
 def reproduce(
-    out: Path | str,
+    out: Path | str | None = None,
     *,
     quick: bool = False,
     seed: int = 0,
     progress: Progress = unheard,
     warn: Warn = unwarned,
 ) -> Reproduction:
-    """Simulate, calibrate, verify planes and spheres, merge the object, and write ``report.html`` into ``out``.
+    """Repeat the Letter's experiments on the simulated rig, and put its figures beside ours.
 
-    ``quick`` halves the camera's resolution. The session stays in ``out/session``, and serves the next run with
-    the same settings.
+    Args:
+        quick: Half resolution; its figures are its own.
+        out: Folder for the session and the report; by default reproduction, or reproduction-quick.
+        seed: Another seed is another rig of the same kind.
+
+    The session stays in ``out/session``, and serves the next run with the same settings.
     """
-    out = Path(out)
+    out = Path(out or ("reproduction-quick" if quick else "reproduction"))
     session = out / "session"
     scale = QUICK_SCALE if quick else 1.0
     _simulated(session, scale, seed, part(progress, 0.0, 0.4))

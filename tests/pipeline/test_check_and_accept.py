@@ -82,7 +82,7 @@ def test_accept_finds_a_scale_and_applies_it_on_request(measured, tmp_path):
     assert first.applied is None and "--apply-scale" in first.text()
     assert first.repeatability.sigma_mm == pytest.approx(first.repeatability.predicted_mm, rel=0.15)
     assert first.budget.unknown == ("drift",) and first.budget.U_mm > 2e-6 * scale.ppm * 99
-    applied = accept(measured, short, apply_scale_found=True)
+    applied = accept(measured, short, apply_scale=True)
     assert applied.applied == pytest.approx(1 / (1 + 1e-6 * scale.ppm), abs=1e-9)
     again = accept(measured, short)
     assert again.factor == applied.applied and abs(again.acceptance.scale.ppm) < 1

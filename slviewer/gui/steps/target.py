@@ -116,7 +116,7 @@ class Panel(StepPanel):
     def _write_sheet(self) -> None:
         board = self._entered()
         path = self._context.session.exports / f"{str(board).replace(':', '_')}.pdf"
-        write_target(board, path)
+        write_target(str(board), path)
         note = to_html("Print at 100 %, glue it to a flat plate, and measure the scale bar.")
         button = link(self._context.offer(path), f"Download {path.name}")
         self._sheet.set(paragraph(Html(f"{button}<div style='margin-top:0.4em'>{note}</div>")))

@@ -1,0 +1,196 @@
+"""A command of the terminal from a function of the program, whose signature and docstring nobody repeats.
+
+Both are read from the function's source, so that arguments are parsed and `--help` is shown before anything heavy, such
+as NumPy, is imported. The parameters that `Args:` of the docstring describes are the command's arguments; the others,
+and the text behind `Args:`, are for Python alone.
+"""
+
+import ast
+import inspect
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import GenericAlias, MappingProxyType
+from typing import Annotated, Any, Literal, Union, get_args
+
+import tyro
+
+from slviewer import terminal
+from slviewer.errors import SlviewerError
+
+ModelName = Literal["stereo", "pixelwise", "splined"]
+Run = Callable[[Callable[..., Any], dict[str, Any]], None]
+TYPES: dict[str, Any] = {"SessionLike": Path, "ModelName": ModelName, "Size": str}
+"""What the terminal takes for types that are wider in Python; all others are looked up in the function's module."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """An argument of a command that its function does not have."""
+
+    name: str
+    type: Any
+    default: Any
+    help: str
+
+
+JSON = Option("json", Path | None, None, "Write the result to this file too.")
+
+
+def read_command(
+    source: str,
+    *positional: str,
+    options: Sequence[Option] = (),
+    names: Mapping[str, str] = MappingProxyType({}),
+    defaults: Mapping[str, Any] = MappingProxyType({}),
+    description: str = "",
+    run: Run | None = None,
+) -> Callable[..., Callable[[], None]]:
+    """The command of the function ``module:function`` of slviewer, for tyro; its value is the work to do once all
+    arguments are parsed.
+
+    ``positional``: the parameters that are given without a name, ``options``: arguments that the function does not
+    have, ``names``: {parameter: option} where these differ, ``defaults`` and ``description``: in place of the
+    function's own, ``run``: what to do with the function and its arguments, by default `show_result`.
+    """
+    module, _, name = source.partition(":")
+    module = f"slviewer.{module}"
+    definition = _definitions(module)[name]
+    assert isinstance(definition, ast.FunctionDef)
+    doc = ast.get_docstring(definition) or ""
+    described = re.match(r".*?^Args:\n(?:[ ].*\n?|\n(?=[ ]))*", doc, re.DOTALL | re.MULTILINE)
+    doc = described[0] if described else re.split(r"\n\n", doc)[0]
+    shown = re.findall(r"^ {4}(\w+):", doc, re.MULTILINE)
+    parameters = []
+    for argument, default in _arguments(definition):
+        if argument.arg not in shown:
+            continue
+        assert argument.annotation is not None
+        kind = _terminal_type(_evaluate(argument.annotation, module))
+        if defaults.get(argument.arg, ...) is None:
+            kind = kind | None
+        if argument.arg in positional:
+            kind = Annotated[kind, tyro.conf.Positional]
+        if argument.arg in names:
+            kind = Annotated[kind, tyro.conf.arg(name=names[argument.arg])]
+        value = inspect.Parameter.empty if default is None else _evaluate(default, module)
+        value = defaults.get(argument.arg, value)
+        parameters.append(_parameter(argument.arg, kind, value))
+    for each in options:
+        kind = Annotated[each.type, tyro.conf.arg(help=each.help)]
+        parameters.append(_parameter(each.name, kind, each.default))
+
+    def parse(**arguments: Any) -> Callable[[], None]:
+        return lambda: (run or show_result)(getattr(import_module(module), name), arguments)
+
+    parse.__doc__ = description + doc[doc.index("\n\n") :] if description else doc
+    parse.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    parse.__annotations__ = {each.name: each.annotation for each in parameters}
+    return parse
+
+
+def show_result(
+    function: Callable[..., Any], arguments: dict[str, Any], describe: Callable[..., str] | None = None
+) -> None:
+    """Call the function, write what it returns as JSON where that is requested, and print it.
+
+    ``describe``: the text to print, from the result and the arguments; by default the result's own ``text()``. Raises
+    SlviewerError with the result's ``failure``, where it has one.
+    """
+    json_file = arguments.pop("json", None)
+    result = call(function, **arguments)
+    write_json(json_file, result.to_json() if hasattr(result, "to_json") else result)
+    if describe is not None:
+        print(describe(result, **arguments))
+    else:
+        print(result if isinstance(result, str) else result.text())
+    if failure := getattr(result, "failure", ""):
+        raise SlviewerError(failure)
+
+
+def call(function: Callable[..., Any], **arguments: Any) -> Any:
+    """What the function returns; its progress and warnings go to standard error."""
+    callbacks = {"progress": terminal.progress, "warn": terminal.warn}
+    heard = {name: callbacks[name] for name in callbacks if name in inspect.signature(function).parameters}
+    return function(**arguments, **heard)
+
+
+def write_json(path: Path | None, result: object) -> None:
+    """Write a result, plain values or dataclasses, to the file that ``--json`` names; nothing without one."""
+    if path is not None:
+        from slviewer.records import to_plain  # lazily: it brings NumPy
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(result, indent=2, default=to_plain) + "\n")
+
+
+def union(commands: Mapping[str, Callable[..., Any]]) -> Any:
+    """The type whose value is one of the commands, for tyro."""
+    choices = [Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)] for name, f in commands.items()]
+    return Union[tuple(choices)]  # noqa: UP007 (built at run time)
+
+
+def _parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
+
+
+def _arguments(definition: ast.FunctionDef) -> list[tuple[ast.arg, ast.expr | None]]:
+    """Every parameter of a function, and its default where it has one."""
+    places, defaults = definition.args.args, definition.args.defaults
+    required = [None] * (len(places) - len(defaults))
+    keywords = zip(definition.args.kwonlyargs, definition.args.kw_defaults, strict=True)
+    return [*zip(places, [*required, *defaults], strict=True), *keywords]
+
+
+@cache
+def _definitions(module: str) -> dict[str, ast.stmt]:
+    """{name: where it is defined or imported from} of a module's functions, types, constants and imports."""
+    spec = find_spec(module)
+    assert spec is not None and spec.origin is not None
+    found: dict[str, ast.stmt] = {}
+    for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef):
+            found[node.name] = node
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            if isinstance(target, ast.Name):
+                found[target.id] = node
+        elif isinstance(node, ast.ImportFrom):
+            found |= {alias.asname or alias.name: node for alias in node.names}
+    return found
+
+
+class _Names(dict[str, Any]):
+    """Types and constants of a module by name; those of slviewer are read from their source."""
+
+    def __init__(self, module: str) -> None:
+        super().__init__(TYPES)
+        self._module = module
+
+    def __missing__(self, name: str) -> Any:
+        node = _definitions(self._module).get(name)
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            return _evaluate(node.value, self._module)
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            inside = node.module.startswith("slviewer.")
+            return _Names(node.module)[name] if inside else getattr(import_module(node.module), name)
+        raise KeyError(name)
+
+
+def _evaluate(expression: ast.expr, module: str) -> Any:
+    return eval(ast.unparse(expression), {}, _Names(module))
+
+
+def _terminal_type(kind: Any) -> Any:
+    """Without the alternatives that a terminal's text cannot be: a path is always a `Path`."""
+    choices = get_args(kind)
+    if Path in choices and str in choices:
+        return Path | None if type(None) in choices else Path
+    if getattr(kind, "__origin__", None) is Sequence:
+        return GenericAlias(tuple, (_terminal_type(choices[0]), ...))
+    return kind
