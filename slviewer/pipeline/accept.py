@@ -17,7 +17,7 @@ from slviewer.evaluation.acceptance.result import Acceptance, conclude_test
 from slviewer.evaluation.budget import Contribution, ErrorBudget, budget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
-from slviewer.pipeline.capture_phases import capture_texture, decoded
+from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.check import Checked, history
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.models import ModelName, best, check_accepted, load_model, load_stereo, warn_if_stale
@@ -97,7 +97,7 @@ def accept(
         depth_range = load_stereo(store).depth_range_mm
         measuring = part(progress, 0, 0.9 if not still else 0.5)
         found: list[Position] = []
-        for i, (shot, frames, phases) in enumerate(decoded(store, list(captures))):
+        for i, (shot, frames, phases) in enumerate(decode_captures(store, list(captures), warn)):
             measuring(i / len(captures), f"measuring {shot.name}")
             cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
             plate = None
@@ -113,7 +113,7 @@ def accept(
             watching = part(progress, 0.5, 0.95)
 
             def clouds() -> Any:
-                for i, (shot, _, phases) in enumerate(decoded(store, list(still))):
+                for i, (shot, _, phases) in enumerate(decode_captures(store, list(still))):
                     watching(i / len(still), f"repeating {shot.name}")
                     cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
                     yield cloud.points[..., 2], cloud.sigma_z

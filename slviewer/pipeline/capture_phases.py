@@ -16,6 +16,8 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.pipeline.feedback import Warn, unwarned
+from slviewer.pipeline.frame_residuals import frame_warnings
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
@@ -100,7 +102,8 @@ def check_capture(
 def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> list[str]:
     """Why many pixels of a decoded capture (n, h, w) are masked, where saturation or weak fringes are the reason."""
     messages = []
-    saturated = max((_saturated_share(phase) for phase in phases.values()), default=0.0)
+    reasons = [phase.reason[phase.lit] for phase in phases.values()]
+    saturated = max((float(np.mean(each == Reason.SATURATED)) for each in reasons if each.size), default=0.0)
     if saturated > MANY_SATURATED:
         messages.append(
             f"{100 * saturated:.0f} % of the illuminated pixels are saturated and masked: lower the exposure or the "
@@ -141,11 +144,6 @@ def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:
     ]
 
 
-def _saturated_share(phase: PhaseMap) -> float:
-    illuminated = phase.reason[phase.lit]
-    return float(np.mean(illuminated == Reason.SATURATED)) if illuminated.size else 0.0
-
-
 def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
     """(h, w) or (h, w, 3) uint8: what the scene looks like under white light."""
     colour = capture.texture
@@ -168,8 +166,14 @@ def eight_bit(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image, np.uint8)
 
 
-def decoded(session: Session, names: Sequence[str]) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
-    """Captures with their frames and phases, in order; the next one's frames are read while one is worked on."""
+def decode_captures(
+    session: Session, names: Sequence[str], warn: Warn = unwarned, *, relative: bool = False
+) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
+    """Captures with their frames and phases, in order; the next one's frames are read while one is processed.
+
+    ``warn`` is called with frames that contradict the others, and with the reasons why many pixels are masked;
+    ``relative`` as in `decode_capture`.
+    """
     captures = [session.load_capture(name) for name in names]
     if not captures:
         return
@@ -179,4 +183,10 @@ def decoded(session: Session, names: Sequence[str]) -> Iterator[tuple[Capture, n
             frames = ahead.result()
             if i + 1 < len(captures):
                 ahead = reader.submit(captures[i + 1].stack)
-            yield capture, frames, decode_capture(capture, frames)
+            phases = decode_capture(capture, frames, relative=relative)
+            if warn is not unwarned:
+                for message in frame_warnings(session, capture.name, frames):
+                    warn(f"{capture.name}: {message}")
+                for message in loss_warnings(capture.sequence, frames, phases):
+                    warn(f"{capture.name}: {message}")
+            yield capture, frames, phases

@@ -11,9 +11,8 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.capture_phases import decode_capture
+from slviewer.pipeline.capture_phases import decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
-from slviewer.pipeline.frame_residuals import told
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.report.phase_maps import REASON_LABELS, phase_maps, reason_shares
 from slviewer.session.atomic import to_json
@@ -102,14 +101,9 @@ def axis_figures(phase: PhaseMap) -> dict[str, Any]:
         float(np.median(phase.modulation[valid])),
         background,
         float(np.sqrt(a + b * background)),
-        float(np.median(sigma_px(phase)[valid])),
+        float(np.median(phase.sigma_px[valid])),
     )
     return figures | dict(zip(names, values, strict=True))
-
-
-def sigma_px(phase: PhaseMap) -> np.ndarray:
-    """(h, w) float32 px: the standard deviation of the projector coordinate; NaN where masked."""
-    return phase.sigma_px
 
 
 def decode(
@@ -137,13 +131,8 @@ def decode(
         raise InputError(f"maps cannot be written as '{file_format}': use npy or exr")
     folder = Path(out)
     with opened(session) as store:
-        shot = store.load_capture(capture)
-        progress(0.1, "reading frames")
-        frames = shot.stack()
-        for sentence in told(store, capture, frames):
-            warn(f"{capture}: {sentence}")
-    progress(0.4, "decoding")
-    phases = decode_capture(shot, frames, relative=True)
+        progress(0.1, "decoding")
+        _, _, phases = next(decode_captures(store, [capture], warn, relative=True))
     progress(0.6, "writing")
     folder.mkdir(parents=True, exist_ok=True)
     files: dict[str, str] = {}
@@ -151,7 +140,7 @@ def decode(
         maps = {
             "phase": phase.phase,
             "coordinate": phase.coordinate,
-            "sigma": sigma_px(phase),
+            "sigma": phase.sigma_px,
             "modulation": phase.modulation,
         }
         for name, values in maps.items():

@@ -8,9 +8,8 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
-from slviewer.pipeline.capture_phases import capture_texture, decode_capture
+from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, part
-from slviewer.pipeline.frame_residuals import told
 from slviewer.pipeline.models import frame_of, load_model, preferred
 from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.reconstruction.cloud import Cloud
@@ -88,11 +87,8 @@ def scan_cloud(
     fitted = load_model(store, model or preferred(store))
     progress(0.1, f"reading {name}")
     check_capture_sizes(store, [name])
-    frames = capture.stack()
-    for sentence in told(store, name, frames):
-        warn(f"{name}: {sentence}")
+    _, frames, phases = next(decode_captures(store, [name], warn))
     progress(0.4, f"reconstructing {name}")
-    phases = decode_capture(capture, frames)
     texture = capture_texture(capture, frames)
     return capture_cloud(store, fitted, capture, phases, texture=texture, accept_rejected=accept_rejected, warn=warn)
 

@@ -10,9 +10,8 @@ import numpy as np
 from slviewer.errors import UsageError
 from slviewer.evaluation import letter
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
-from slviewer.pipeline.capture_phases import capture_texture, decoded
+from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
-from slviewer.pipeline.frame_residuals import told
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor, told_scale
@@ -195,9 +194,7 @@ def merge(
         warn_if_stale(store, warn)
         check_capture_sizes(store, names)
         scale, clouds = told_scale(store, fitted.name), {}
-        for i, (shot, frames, phases) in enumerate(decoded(store, names)):
-            for sentence in told(store, shot.name, frames):
-                warn(f"{shot.name}: {sentence}")
+        for i, (shot, frames, phases) in enumerate(decode_captures(store, names, warn)):
             progress(0.4 * i / len(names), f"reconstructing {shot.name}")
             clouds[shot.name] = capture_cloud(
                 store,

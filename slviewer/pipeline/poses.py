@@ -10,7 +10,7 @@ from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.capture_phases import capture_texture, check_capture, decoded
+from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_captures
 from slviewer.pipeline.pose_evidence import examine as examine_frames
 from slviewer.pipeline.pose_evidence import keep_evidence, known_evidence
 from slviewer.session.capture import Capture
@@ -119,7 +119,7 @@ def judge_all(
         for name, judged in kept.items():
             evidence = known_evidence(store, name, board)
             kept[name] = replace(judged, evidence=evidence) if judged and evidence else None
-    fresh = decoded(store, [name for name in names if kept[name] is None])
+    fresh = decode_captures(store, [name for name in names if kept[name] is None])
     for name in names:
         yield kept[name] or judge(store, *next(fresh), board, smoothing, examine)
 

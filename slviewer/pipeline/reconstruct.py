@@ -12,9 +12,8 @@ from slviewer.evaluation.compare import Comparison, compare
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
-from slviewer.pipeline.capture_phases import capture_texture, decode_capture, loss_warnings
+from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
-from slviewer.pipeline.frame_residuals import told
 from slviewer.pipeline.models import (
     Model,
     ModelName,
@@ -122,16 +121,9 @@ def reconstruct(
         check_accepted(store, accept_rejected)
         name = model or preferred(store)
         warn_if_stale(store, warn)
-        shot = store.load_capture(capture)
         check_capture_sizes(store, [capture])
-        progress(0.1, "reading frames")
-        frames = shot.stack()
-        for sentence in told(store, capture, frames):
-            warn(f"{capture}: {sentence}")
-        progress(0.3, "decoding")
-        decoded = decode_capture(shot, frames, relative=True)
-        for message in loss_warnings(shot.sequence, frames, decoded):
-            warn(f"{capture}: {message}")
+        progress(0.1, "reading and decoding")
+        shot, frames, decoded = next(decode_captures(store, [capture], warn, relative=True))
         phases = absolute_phases(store, capture, decoded, depth_range, warn)
         texture = capture_texture(shot, frames)
         is_pose = shot.role == "calibration"

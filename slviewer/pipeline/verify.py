@@ -14,9 +14,8 @@ from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import check_capture_sizes
-from slviewer.pipeline.capture_phases import capture_texture, decoded, loss_warnings
+from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
-from slviewer.pipeline.frame_residuals import told
 from slviewer.pipeline.models import ModelName, check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.reconstruct import board_region, lit, reconstruct_models, unsupported
@@ -116,11 +115,7 @@ def verify(
         warn_if_stale(store, warn)
         reach = depth_range or load_stereo(store).depth_range_mm
         check_capture_sizes(store, captures)
-        for i, (shot, frames, phases) in enumerate(decoded(store, captures)):
-            for sentence in told(store, shot.name, frames):
-                warn(f"{shot.name}: {sentence}")
-            for message in loss_warnings(shot.sequence, frames, phases):
-                warn(f"{shot.name}: {message}")
+        for i, (shot, frames, phases) in enumerate(decode_captures(store, captures, warn)):
             progress(i / len(captures), f"measuring {shot.name}")
             clouds = reconstruct_models(store, chosen, shot, phases, axis, accept_rejected=accept_rejected, warn=warn)
             region: np.ndarray | None = None

@@ -18,7 +18,7 @@ from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.pipeline.check_results import Preflight
-from slviewer.pipeline.frame_residuals import keep_residuals
+from slviewer.pipeline.frame_residuals import save_residuals
 from slviewer.pipeline.poses import judge_all
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, needs_page
 from slviewer.pipeline.rig_presets import save_rig
@@ -281,7 +281,7 @@ class Engine:
                 self.notices.add("warning", f"{capture.name} cannot be used: {judged.refused}")
             self.publisher.mark_changed(session=True)  # the check of the frames may take longer
         if reader.session.state_of(f"trust/{capture.name}") != "fresh":
-            for sentence in keep_residuals(session, capture.name):
+            for sentence in save_residuals(session, capture.name):
                 self.notices.add("warning", f"{capture.name}: {sentence}")
 
     def _handle_processing_failure(self, reader: SessionReader, capture: Capture, error: BaseException) -> None:

@@ -10,7 +10,14 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
-from slviewer.pipeline.frame_residuals import capture_warnings, described, keep_residuals, residuals, told, warnings_of
+from slviewer.pipeline.frame_residuals import (
+    capture_warnings,
+    describe,
+    frame_warnings,
+    residuals,
+    save_residuals,
+    warnings_of,
+)
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
@@ -58,7 +65,7 @@ def test_frames_that_do_not_fit_are_told(wrong, said):
 def test_residuals_are_kept_as_plain_values():
     sequence, stack = taken(late={6})
     found = residuals(sequence, stack)
-    plain = json.loads(json.dumps(described(found)))
+    plain = json.loads(json.dumps(describe(found)))
     assert [axis["axis"] for axis in plain] == ["x", "y"]
     assert len(plain[0]["frames"]) == 18 and plain[0]["suspects"][0]["frame"] == 6
     assert all(0.8 < frame["sigmas"] < 1.3 for frame in plain[1]["frames"])
@@ -69,6 +76,6 @@ def test_what_was_kept_is_told_again(tmp_path):
     sequence, stack = taken(lag=1)
     with Session.create(tmp_path / "session") as session:
         session.save_capture("part", "scan", sequence, stack, source="a test")
-        found = told(session, "part", stack)
+        found = frame_warnings(session, "part", stack)
         assert found
-        assert keep_residuals(session, "part") == found == told(session, "part", stack[:0])
+        assert save_residuals(session, "part") == found == frame_warnings(session, "part", stack[:0])
