@@ -4,7 +4,6 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.check import Checked, history
 from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
 from slviewer.pipeline.models import ModelName, best, check_accepted, load_model, load_stereo, warn_if_stale
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.open_session import SessionLike, match_names, next_number, opened
 from slviewer.pipeline.reconstruct import board_region
 from slviewer.pipeline.scale import record_scale, scale_factor
 from slviewer.session.store import Session
@@ -123,13 +122,12 @@ def accept(
         checks = [checked for checked in history(store) if checked.calibration == calibration]
         applied = record_scale(store, test) if apply_scale else None
         result = Accepted(test, factor, applied, _budget(test, applied, checks), steady)
-        numbers = [int(n.removeprefix("acceptance/")) for n in store.result_names() if n.startswith("acceptance/")]
         meta = {
             "accepted": result.to_json(),
             "time": datetime.now(UTC).isoformat(timespec="seconds"),
             "inputs": store.input_hashes(f"calibration/{name}", *captures, *still),
         }
-        store.save_result(f"acceptance/{1 + max(numbers, default=0)}", meta, {})
+        store.save_result(f"acceptance/{next_number(store, 'acceptance')}", meta, {})
         progress(1.0, "tested")
     return result
 
@@ -150,10 +148,7 @@ def _captures(store: Session, thing: Artefact) -> dict[str, str]:
     """{capture: position}; a capture's own name where a pattern stands for several."""
     found: dict[str, str] = {}
     for position, pattern in thing.positions.items():
-        names = [name for name in store.capture_names() if fnmatchcase(name, pattern)]
-        if not names:
-            there = ", ".join(store.capture_names()) or "none"
-            raise InputError(f"no capture is called {pattern!r}: the captures are {there}")
+        names = match_names(store.capture_names(), [pattern], "capture", InputError)
         found |= {name: position if len(names) == 1 else name for name in names}
     return found
 

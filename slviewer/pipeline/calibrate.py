@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -13,22 +12,21 @@ from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import CalibrationRejected, InputError, UsageError
+from slviewer.errors import CalibrationRejected, InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.calibration_verdict import attempt, attempt_poses, keep_rejected, rejected, save_verdict
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
-from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, part, stage, unheard, unwarned
 from slviewer.pipeline.models import ModelName, available, preferred, save_fitted, save_stereo, warn_if_frame_changed
-from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
+from slviewer.pipeline.open_session import SessionLike, match_names, opened, opened_or_made
 from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
-_LENGTH = {"pixelwise": 1.0, "splined": 2.0}
-"""How long each model takes, roughly, for the progress."""
 DEFAULT_MODELS = ("stereo", "pixelwise", "splined")
 SmoothingKind = Literal["spline", "polynomial"]
-T = TypeVar("T")
+M = TypeVar("M", PixelwiseModel, SplinedModel)
+Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], M]
 
 
 @dataclass(frozen=True)
@@ -261,45 +259,30 @@ def _unselected(names: Sequence[str], poses: Sequence[str], exclude: Sequence[st
 
     Raises UsageError for a name or pattern that fits no target pose.
     """
-    for pattern in (*poses, *exclude):
-        if not any(fnmatchcase(name, pattern) for name in names):
-            raise UsageError(f"no target pose is called {pattern!r}: there are {', '.join(names)}")
-    chosen = {name for name in names if not poses or any(fnmatchcase(name, pattern) for pattern in poses)}
+    chosen = match_names(names, poses, "target pose") if poses else names
     out = {name: "not among the poses that were named" for name in names if name not in chosen}
-    return out | {name: "excluded for this calibration" for name in names for p in exclude if fnmatchcase(name, p)}
+    return out | dict.fromkeys(match_names(names, exclude, "target pose"), "excluded for this calibration")
 
 
 def _made(
     models: Sequence[str], stereo: StereoModel, observations: Sequence[Observation], progress: Progress, warn: Warn
 ) -> CalibrationResult:
-    """The models that follow from stereo; what one of them lacks is told, and keeps none of the others."""
-    wanted = [name for name in models if name != "stereo"]
-    longest = sum(_LENGTH[name] for name in wanted) or 1
-    ended = 0.0
+    """The models that follow from stereo; one that cannot be fitted is a warning, and stops no other."""
 
-    def told(name: str, doing: str) -> Callable[[float], None]:
-        nonlocal ended
-        begun, ended = ended, ended + _LENGTH[name] / longest
-        span = part(progress, begun, ended)
-        span(0.0, doing)
-        return lambda done: span(done, doing)
-
-    def tried(name: str, make: Callable[[], T]) -> T | None:
+    def fit(name: str, calibrate_model: Fit[M], begin: float, end: float, doing: str) -> M | None:
+        if name not in models:
+            return None
         try:
-            return make()
+            return calibrate_model(observations, stereo, stage(progress, begin, end, doing))
         except (CalibrationRejected, InputError) as error:
             if len(models) == 1:
                 raise
             warn(f"no {'pixel-wise' if name == 'pixelwise' else name} model: {error}")
             return None
 
-    pixelwise = splined = None
-    if "pixelwise" in models:
-        fitting = told("pixelwise", "pixel-wise fit")
-        pixelwise = tried("pixelwise", lambda: calibrate_pixelwise(observations, stereo, fitting))
-    if "splined" in models:
-        adjusting = told("splined", "joint adjustment")
-        splined = tried("splined", lambda: calibrate_splined(observations, stereo, adjusting))
-        for name, why in splined.bundle.left_out.items() if splined else ():
-            warn(f"{name} is left out of the splined model: it {why}")
+    pixelwise_end = 0.0 if "pixelwise" not in models else 0.33 if "splined" in models else 1.0
+    pixelwise = fit("pixelwise", calibrate_pixelwise, 0.0, pixelwise_end, "pixel-wise fit")
+    splined = fit("splined", calibrate_splined, pixelwise_end, 1.0, "joint adjustment")
+    for name, why in splined.bundle.left_out.items() if splined else ():
+        warn(f"{name} is excluded from the splined model: it {why}")
     return CalibrationResult(stereo, pixelwise, splined)

@@ -1,16 +1,16 @@
 """The camera alone, from the pictures of a board that a folder or a session holds."""
 
 from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
 
 from slviewer import __version__
 from slviewer.calibration.camera import CameraCalibration, calibrate_camera
-from slviewer.errors import DetectionError, InputError, UsageError
+from slviewer.errors import DetectionError, InputError
 from slviewer.pipeline.capture_phases import capture_texture
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.open_session import match_names
 from slviewer.session.exporters import write_calibration
 from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.images import read_image
@@ -36,11 +36,8 @@ def calibrate_camera_alone(
     """
     board, source = Board.parse(target), Path(source)
     names = _names(source)
-    for pattern in (*poses, *exclude):
-        if not any(fnmatchcase(name, pattern) for name in names):
-            raise UsageError(f"no picture is called {pattern!r}: there are {', '.join(names)}")
-    chosen = [name for name in names if not poses or any(fnmatchcase(name, p) for p in poses)]
-    chosen = [name for name in chosen if not any(fnmatchcase(name, p) for p in exclude)]
+    without = match_names(names, exclude, "picture")
+    chosen = [name for name in (match_names(names, poses, "picture") if poses else names) if name not in without]
     detections: dict[str, Detection] = {}
     excluded: dict[str, str] = {}
     size: tuple[int, int] | None = None

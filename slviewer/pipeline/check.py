@@ -13,7 +13,7 @@ from slviewer.errors import InputError
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.models import load_stereo, warn_if_stale
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.open_session import SessionLike, next_number, numbered_results, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.records import from_plain, to_plain
@@ -103,9 +103,8 @@ def check(session: SessionLike, capture: str, *, progress: Progress = unheard, w
         calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
         before = tuple(checked for checked in history(store) if checked.calibration == calibration)
         found = Checked(datetime.now(UTC).isoformat(timespec="seconds"), calibration, drift)
-        number = 1 + max((int(name.removeprefix("drift/")) for name in _names(store)), default=0)
         inputs = store.input_hashes(capture, "calibration/stereo")
-        store.save_result(f"drift/{number}", {"checked": found.to_json(), "inputs": inputs}, {})
+        store.save_result(f"drift/{next_number(store, 'drift')}", {"checked": found.to_json(), "inputs": inputs}, {})
         progress(1.0, "checked")
     return CheckResult(found, before)
 
@@ -125,14 +124,10 @@ def _reference(store: Session, stereo: StereoModel, capture: str) -> DriftRefere
 def history(store: Session) -> tuple[Checked, ...]:
     """Every drift check that the session remembers, the oldest first."""
     found = []
-    for name in _names(store):
+    for name in numbered_results(store, "drift"):
         values = store.load_result(name, only=())[0]["checked"]
         found.append(Checked(values["time"], values["calibration"], from_plain(values, Drift)))
     return tuple(found)
-
-
-def _names(store: Session) -> list[str]:
-    return [name for name in store.result_names() if name.startswith("drift/")]
 
 
 def _smoothing(store: Session) -> Smoothing:

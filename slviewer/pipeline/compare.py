@@ -12,7 +12,7 @@ from slviewer.inspection.colours import colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import DECIDED, RULE, ToleranceVerdict, judge_deviation
-from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, part, stage, unheard, unwarned
 from slviewer.pipeline.measured_surface import MeasuredSurface, surface
 from slviewer.pipeline.measurements import triangles_of
 from slviewer.pipeline.models import ModelName
@@ -167,7 +167,6 @@ def compare_surface(
     normals = None if on.normals is None else on.normals[measured]
     sigma = on.sigma_mm[measured]
     typical = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None
-    aligning = part(progress, 0.0, 0.85)
     found = deviation(
         points,
         nominal.mesh,
@@ -175,7 +174,7 @@ def compare_surface(
         sigma_mm=typical,
         reach_mm=reach,
         initial=initial,
-        progress=lambda done: aligning(done, "aligning"),
+        progress=stage(progress, 0.0, 0.85, "aligning"),
     )
     if found.coverage < LIKELY_COVERAGE:
         warn(f"only {100 * found.coverage:.1f} % of {nominal.name} were measured: see that it is the same part")

@@ -15,6 +15,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.export_shapes import is_fresh
 from slviewer.pipeline.models import available, frame_of, load_model, load_stereo
+from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.scale import scale_factor
 from slviewer.session.atomic import arriving_file, replace_file
 from slviewer.session.exporters import write_calibration
@@ -187,7 +188,7 @@ def write_poses(store: Session, model: str, path: Path) -> None:
     }
     if targets := _targets(store, model):
         entries["targets"] = targets
-    if merges := sorted((name for name in store.result_names() if name.startswith("merge/")), key=natural_key):
+    if merges := numbered_results(store, "merge"):
         entries["merges"] = [_merge(store, name) for name in merges]
     write_calibration(path, entries, {name: said for name, said in _POSES.items() if name in entries})
 
@@ -243,9 +244,8 @@ def _moved(T: np.ndarray, factor: float) -> np.ndarray:
 
 def write_table(store: Session, path: Path) -> None:
     """The captures of planes and spheres as each model measures them, as CSV."""
-    results = sorted((name for name in store.result_names() if name.startswith("verify/")), key=natural_key)
     there, labels = set(store.capture_names()), store.decision("names") or {}
-    results = [name for name in results if name.removeprefix("verify/") in there]
+    results = [name for name in numbered_results(store, "verify") if name.removeprefix("verify/") in there]
     if not results:
         raise InputError("nothing is verified yet: capture a plane or a sphere, and measure it in the step Verify")
     figures = ["rms_mm", "noise_floor_mm", "radius_mm", "points", "set_aside", "coverage"]

@@ -11,10 +11,10 @@ from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, part
 from slviewer.pipeline.models import frame_of, load_model, preferred
+from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.session.names import natural_key
 from slviewer.session.ply import Ply, read_ply
 from slviewer.session.store import Session
 from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh
@@ -95,7 +95,7 @@ def scan_cloud(
 
 def merge_name(store: Session, name: str) -> str:
     """The merge of that number, or the last one where none is named; InputError where there is none."""
-    there = sorted((n.removeprefix("merge/") for n in store.result_names() if n.startswith("merge/")), key=natural_key)
+    there = [result.removeprefix("merge/") for result in numbered_results(store, "merge")]
     if not there:
         raise InputError("there is no merge yet: merge scans first")
     if name and name not in there:

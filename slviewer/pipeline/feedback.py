@@ -1,4 +1,4 @@
-"""How long work speaks to whoever asked for it."""
+"""How long work reports progress and warnings to its caller."""
 
 from collections.abc import Callable
 
@@ -10,17 +10,23 @@ Warn = Callable[[str], None]
 
 
 def unheard(done: float, doing: str) -> None:
-    """A Progress that nobody listens to."""
+    """Ignore the progress."""
 
 
 def unwarned(message: str) -> None:
-    """A Warn that nobody listens to."""
+    """Ignore the warning."""
 
 
-def part(progress: Progress, begin: float, end: float) -> Progress:
-    """The progress of one stage, as a share of the whole."""
+def part(progress: Progress, begin: float, end: float, label: str = "") -> Progress:
+    """The progress of one stage, as a share of the whole; ``label`` stands before what is being done."""
 
     def report(done: float, doing: str) -> None:
-        progress(begin + (end - begin) * done, doing)
+        progress(begin + (end - begin) * done, f"{label}: {doing}" if label else doing)
 
     return report
+
+
+def stage(progress: Progress, begin: float, end: float, doing: str) -> Callable[[float], None]:
+    """Report that a stage begins; returns what reports the share of it that is done."""
+    progress(begin, doing)
+    return lambda done: progress(begin + (end - begin) * done, doing)

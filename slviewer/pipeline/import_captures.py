@@ -68,7 +68,17 @@ def import_captures(
     Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason. Raises InputError where
     none is left, or, with ``strict``, for the first of them; nothing is saved then.
     """
-    found = _find_captures(source, layout, sequence, prefix, projector, channel, session, warn, options)
+    found = find_captures(
+        source,
+        layout,
+        sequence,
+        prefix=prefix,
+        projector=projector,
+        channel=channel,
+        session=session,
+        warn=warn,
+        **options,
+    )
     return _save(found, session, role, origin, force, strict, progress, warn)
 
 
@@ -87,22 +97,23 @@ def read_captures(
     Of several exposures each pixel comes from the longest that did not clip it. Raises InputError where an image cannot
     be used; captures that are incomplete are skipped with a warning.
     """
-    found = _find_captures(source, layout, sequence, None, projector, channel, None, warn, options)
+    found = find_captures(source, layout, sequence, projector=projector, channel=channel, warn=warn, **options)
     for message in (*found.warnings, *map(str, found.skipped)):
         warn(message)
     return [replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in found]
 
 
-def _find_captures(
+def find_captures(
     source: Path | str,
-    layout: str,
-    sequence: Path | str | None,
-    prefix: str | None,
-    projector: Size | None,
-    channel: Channel | None,
-    session: SessionLike | None,
-    warn: Warn,
-    options: dict[str, Any],
+    layout: str = "detect",
+    sequence: Path | str | None = None,
+    *,
+    prefix: str | None = None,
+    projector: Size | None = None,
+    channel: Channel | None = None,
+    session: SessionLike | None = None,
+    warn: Warn = unwarned,
+    **options: Any,
 ) -> Imports:
     """The captures of a folder, not yet read; ``session`` knows the projector's size where nobody states it."""
     source = Path(source).expanduser()

@@ -11,9 +11,9 @@ from slviewer.errors import UsageError
 from slviewer.evaluation import letter
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, stage, unheard, unwarned
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred, warn_if_stale
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.open_session import SessionLike, next_number, opened
 from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Alignment, Pair, Starts
@@ -205,20 +205,19 @@ def merge(
                 accept_rejected=accept_rejected,
                 warn=warn,
             )
-        registering, fusing = part(progress, 0.4, 0.75), part(progress, 0.75, 0.9)
-        registered = register_object(clouds, reference, starts, lambda done: registering(done, "registering"))
+        registered = register_object(clouds, reference, starts, stage(progress, 0.4, 0.75, "registering"))
         alignment = registered.alignment
         for why in [*alignment.dropped.values(), *_scene_warnings(clouds, registered, keep_background)]:
             warn(why)
         clouds = clouds if keep_background else dict(registered.clouds)
-        fused = fuse(clouds, alignment.T_reference_scan, lambda done: fusing(done, "fusing"))
+        fused = fuse(clouds, alignment.T_reference_scan, stage(progress, 0.75, 0.9, "fusing"))
         progress(0.9, "writing")
         surface = fused.surface
         scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
         scalars |= {"seen_by": fused.seen_by, "source": fused.source}
         frame = f"{frame_of(store, fitted.name)}, at {reference}"
         notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {fitted.name}")
-        number = 0 if out is not None else next_merge(store)
+        number = 0 if out is not None else next_number(store, "merge")
         path = store.exports / f"merged_{number}.ply" if out is None else out
         path.parent.mkdir(parents=True, exist_ok=True)
         write_ply(path, surface.points, surface.colours, surface.normals, scalars, notes=notes)
@@ -258,12 +257,6 @@ def _removed_text(fused: Fused) -> str:
     if not far:
         return ""
     return "removed as far from everything else: " + ", ".join(f"{n} points of {name}" for name, n in far.items())
-
-
-def next_merge(store: Session) -> int:
-    """The number of the session's next merge."""
-    numbers = (int(name.removeprefix("merge/")) for name in store.result_names() if name.startswith("merge/"))
-    return max(numbers, default=0) + 1
 
 
 def merge_record(store: Session, found: Merge, model: str) -> dict[str, Any]:

@@ -1,10 +1,13 @@
-"""A session by its folder, or one that is open already."""
+"""A session by its folder, or one that is open already, and names in it."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
 
+from slviewer.errors import SlviewerError, UsageError
+from slviewer.session.names import natural_key
 from slviewer.session.store import Session, is_session
 
 SessionLike = Path | str | Session
@@ -39,3 +42,26 @@ def opened_or_made(session: SessionLike) -> Iterator[Session]:
             if parent_fresh:
                 folder.rmdir()
         raise
+
+
+def match_names(
+    names: Sequence[str], patterns: Sequence[str], kind: str, error: type[SlviewerError] = UsageError
+) -> list[str]:
+    """Those of ``names`` that match a pattern such as ``pose_0*``, in their order.
+
+    Raises ``error`` for a pattern that matches none; ``kind``: what they are names of.
+    """
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise error(f"no {kind} is called {pattern!r}: there are {', '.join(names) or 'none'}")
+    return [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
+
+
+def numbered_results(store: Session, kind: str) -> list[str]:
+    """Names of the session's results of a kind, ``merge/1``, ``merge/2``, ..., in the order of their numbers."""
+    return sorted((name for name in store.result_names() if name.startswith(f"{kind}/")), key=natural_key)
+
+
+def next_number(store: Session, kind: str) -> int:
+    """The number of the next result of a kind."""
+    return 1 + max((int(name.removeprefix(f"{kind}/")) for name in numbered_results(store, kind)), default=0)

@@ -1,22 +1,20 @@
 """Recorded captures as a rig: those of a session, or of a folder that can be imported, one after another."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
 from slviewer.devices.protocols import Rig
 from slviewer.devices.replay import Recording, replayed
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import PatternSequence, parse_size
+from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import unwarned
-from slviewer.pipeline.import_captures import checked
-from slviewer.session.importers import frames, p18, procam_calibration
-from slviewer.session.importers.imported import Imports
+from slviewer.pipeline.import_captures import checked, find_captures
+from slviewer.session.importers.imported import ImportableRecording
 from slviewer.session.store import Session, is_session
 
-Layout = Literal["session", "p18", "procam-calibration", "frames"]
 Shot = tuple[np.ndarray, PatternSequence]
 
 
@@ -50,14 +48,14 @@ class Reel:
 def reel(
     source: Path | str,
     capture: str | None = None,
-    layout: Layout | None = None,
+    layout: str | None = None,
     sequence: Path | str | None = None,
     projector: str | None = None,
 ) -> Reel:
     """The captures in `source`, or the one of that name.
 
-    `layout` says what `source` is, by default whatever it looks like; `sequence` is the TOML that the layout frames
-    needs, `projector` its size, such as "912x1140", where it is not the layout's own. Raises InputError,
+    `layout` is session or one of `layouts.LAYOUTS`, by default what `source` looks like; `sequence` is the TOML of the
+    layout frames, `projector` its size, such as "912x1140", where it is not the layout's own. Raises InputError,
     SessionError.
     """
     folder = Path(source).expanduser()
@@ -80,31 +78,11 @@ def _recorded(folder: Path) -> dict[str, Callable[[], Shot]]:
 
 
 def _imported(
-    folder: Path, layout: Layout | None, sequence: Path | str | None, projector: str | None
+    folder: Path, layout: str | None, sequence: Path | str | None, projector: str | None
 ) -> dict[str, Callable[[], Shot]]:
-    def read(recording) -> Shot:
+    def read(recording: ImportableRecording) -> Shot:
         found = checked(recording.read(), unwarned)
         return found.frames, found.sequence
 
-    size: dict[str, Any] = {} if projector is None else {"projector": parse_size(projector)}
-    refusals = []
-    for name in [layout] if layout else ["frames"] if sequence else ["p18", "procam-calibration"]:
-        try:
-            found = _found(folder, name, sequence, size)
-        except InputError as error:
-            refusals.append(f"as {name}, {error}")
-            continue
-        return {recording.name: lambda one=recording: read(one) for recording in found.recordings}  # type: ignore[misc]
-    raise InputError(f"{folder} cannot be played back: {'; '.join(refusals)}")
-
-
-def _found(folder: Path, layout: str, sequence: Path | str | None, size: dict[str, Any]) -> Imports:
-    if layout == "p18":
-        return p18.read(folder, **size)
-    if layout == "procam-calibration":
-        return procam_calibration.read(folder, **size)
-    if layout != "frames":
-        raise InputError(f"no layout is called {layout!r}: use session, p18, procam-calibration or frames")
-    if sequence is None:
-        raise InputError("the layout frames needs the TOML that names each frame: give sequence")
-    return frames.read(folder, Path(sequence).expanduser(), **size)
+    recordings = find_captures(folder, layout or "detect", sequence, projector=projector).recordings
+    return {recording.name: partial(read, recording) for recording in recordings}

@@ -28,7 +28,7 @@ from slviewer.pipeline.models import (
     recommended,
     validation,
 )
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import scale_factor, told_scale
 from slviewer.records import from_plain
@@ -128,13 +128,9 @@ def _models(store: Session) -> ModelsView | None:
     )
 
 
-def _results(store: Session, kind: str) -> list[str]:
-    return [name for name in store.result_names() if name.startswith(f"{kind}/")]
-
-
 def _acceptances(store: Session) -> list[AcceptanceView]:
     found = []
-    for name in _results(store, "acceptance"):
+    for name in numbered_results(store, "acceptance"):
         meta = store.load_result(name, only=())[0]
         found.append(AcceptanceView(meta["accepted"], meta["time"], store.state_of(name) == "stale"))
     return found
@@ -152,7 +148,7 @@ def _verifications(store: Session) -> tuple[list[VerificationView], list[Spacing
     labels = store.decision("names") or {}
     views: list[VerificationView] = []
     centres: dict[str, dict[str, np.ndarray]] = {}
-    for result in _results(store, "verify"):
+    for result in numbered_results(store, "verify"):
         name = result.removeprefix("verify/")
         if store.state_of(result) != "fresh":
             continue

@@ -1,7 +1,6 @@
 """Each calibration measured on target poses that it was not made from."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from slviewer.evaluation.crossvalidation import (
     measure_held_out,
     split_folds,
 )
-from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, part, stage, unheard, unwarned
 from slviewer.pipeline.models import (
     MODELS,
     VALIDATION,
@@ -111,20 +110,15 @@ def cross_validate(
             ) from error
         fitted: dict[str, Model] = {}
         for i, name in enumerate(n for n in models if n not in failed):
-            fitting = part(report, i / (len(models) + 1), (i + 1) / (len(models) + 1))
             doing = f"{name} without fold {k + 1} of {len(parts)}"
-            fitting(0.0, doing)
+            fitting = stage(report, i / (len(models) + 1), (i + 1) / (len(models) + 1), doing)
             try:
-                fitted[name] = FITS[name](training, without, partial(_told, fitting, doing))
+                fitted[name] = FITS[name](training, without, fitting)
             except (CalibrationRejected, InputError) as error:
                 failed[name] = str(error)
         report(len(models) / (len(models) + 1), f"measuring fold {k + 1} of {len(parts)}")
         measured.append({o.name: measure_held_out(fitted, o, axis, stereo.rig) for o in observations if o.name in fold})
     return gather_results(models, measured, parts, failed)
-
-
-def _told(progress: Progress, doing: str, share: float) -> None:
-    progress(share, doing)
 
 
 def _depths(observation: Observation, stereo: StereoModel) -> np.ndarray:

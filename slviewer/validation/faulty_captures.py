@@ -11,24 +11,21 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.diagnosis.attempt import Attempt, attempt_stereo
-from slviewer.calibration.diagnosis.evidence import PoseEvidence
 from slviewer.calibration.diagnosis.poses import FEW_POSES
 from slviewer.calibration.diagnosis.verdict import Cause
-from slviewer.calibration.observe import Observation, observe
-from slviewer.errors import InputError
+from slviewer.calibration.observe import Smoothing
 from slviewer.fringe.decode import texture
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
-from slviewer.pipeline.capture_phases import check_capture, decode_frames
-from slviewer.pipeline.pose_evidence import examine
+from slviewer.pipeline.capture_phases import decode_frames
+from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.simulation.boards import BoardShape, Pose, printed_board
 from slviewer.simulation.hostile_frames import delay_frames, drop_frame, swap_groups
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.target.board import Board
-from slviewer.target.detect import detect
 
 BOARD = Board.parse("circles:21x16:9")
 PERIOD_PX, BITS = 18.0, 7
@@ -37,14 +34,6 @@ EVERY = 5
 """Poses that a fault of every one of them is put into; more would show the same."""
 MANY = 18
 """Poses from which those that reach a corner are taken away."""
-
-
-@dataclass(frozen=True)
-class Looked:
-    """A capture that was examined."""
-
-    evidence: PoseEvidence
-    observation: Observation | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +46,7 @@ class FaultBench:
     shape: BoardShape = field(default_factory=BoardShape)
     steps: int = 18
     _frames: dict[int, np.ndarray] = field(default_factory=dict, init=False, repr=False)
-    _looked: dict[int, Looked] = field(default_factory=dict, init=False, repr=False)
+    _examined: dict[int, Judged] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def sequence(self) -> PatternSequence:
@@ -81,17 +70,17 @@ class FaultBench:
     def frames(self, i: int) -> np.ndarray:
         """A clean capture of the i-th pose, kept to be spoilt."""
         if i not in self._frames:
-            self._frames[i] = self.rendered(self.poses[i], i)
+            self._frames[i] = self.render(self.poses[i], i)
         return self._frames[i]
 
-    def looked(self, i: int) -> Looked:
+    def examine_clean(self, i: int) -> Judged:
         """The same, examined."""
-        if i not in self._looked:
+        if i not in self._examined:
             frames = self._frames.get(i)
-            self._looked[i] = self.look(i, self.rendered(self.poses[i], i) if frames is None else frames)
-        return self._looked[i]
+            self._examined[i] = self.examine(i, self.render(self.poses[i], i) if frames is None else frames)
+        return self._examined[i]
 
-    def rendered(self, pose: Pose, seed: int, exposure: float = 1.0, reverse: Axis | None = None) -> np.ndarray:
+    def render(self, pose: Pose, seed: int, exposure: float = 1.0, reverse: Axis | None = None) -> np.ndarray:
         """(n, h, w) uint8: a capture of the board at a pose, in so many times the usual light, with the patterns of one
         axis reversed.
         """
@@ -106,39 +95,31 @@ class FaultBench:
             renderer.frame((axis, levels), keys, out, exposure=exposure * renderer.exposure)
         return stack
 
-    def look(
+    def examine(
         self, i: int, frames: np.ndarray, sequence: PatternSequence | None = None, board: Board | None = None
-    ) -> Looked:
-        """What is seen in a capture, described by ``sequence`` and taken of ``board``, by default the true ones."""
+    ) -> Judged:
+        """The reading of a capture with its evidence; ``sequence`` and ``board``: as described, by default the true ones."""
         name, sequence, board = f"pose_{i + 1:02d}", sequence or self.sequence, board or self.board
         phases = decode_frames(name, sequence, frames)
-        image = texture(sequence, frames)
-        found = seen = None
-        refused = ""
-        try:
-            found = detect(board, image)
-            seen = observe(name, board, found, phases)
-            check_capture(name, sequence, frames, phases)
-        except InputError as error:
-            refused = str(error)
-        evidence = examine(name, sequence, frames, phases, board, image, found, seen, refused)
-        return Looked(evidence, None if refused else seen)
+        return read_pose(name, sequence, frames, phases, texture(sequence, frames), board, Smoothing(), examine=True)
 
-    def attempt(self, looked: Sequence[Looked], board: Board | None = None) -> Attempt:
+    def attempt(self, captures: Sequence[Judged], board: Board | None = None) -> Attempt:
         """The calibration from examined captures."""
-        observations = [each.observation for each in looked if each.observation is not None]
-        evidence = [each.evidence for each in looked]
+        observations = [each.observation for each in captures if each.observation is not None]
+        evidence = [each.evidence for each in captures if each.evidence is not None]
         return attempt_stereo(observations, evidence, self.rig.projector.size, board or self.board)
 
-    def clean(self) -> list[Looked]:
-        """All captures as they are."""
-        return [self.looked(i) for i in range(self.count)]
+    def examine_all(self) -> list[Judged]:
+        """All captures without a fault, examined."""
+        return [self.examine_clean(i) for i in range(self.count)]
 
-    def spoilt(self, spoil: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> list[Looked]:
+    def examine_with(self, change: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> list[Judged]:
         """All captures, or only one of them, with their frames spoilt."""
         if only is None:
-            return [self.look(i, spoil(self.frames(i))) for i in self.every]
-        return [self.look(i, spoil(self.frames(i))) if only == i else self.looked(i) for i in range(self.count)]
+            return [self.examine(i, change(self.frames(i))) for i in self.every]
+        return [
+            self.examine(i, change(self.frames(i))) if only == i else self.examine_clean(i) for i in range(self.count)
+        ]
 
 
 Fault = Callable[[FaultBench], Attempt]
@@ -153,7 +134,7 @@ def _described(**change: Any) -> Fault:
             for f in bench.sequence.frames
         )
         sequence = replace(bench.sequence, frames=frames)
-        return bench.attempt([bench.look(i, bench.frames(i), sequence) for i in bench.every])
+        return bench.attempt([bench.examine(i, bench.frames(i), sequence) for i in bench.every])
 
     return attempt
 
@@ -163,7 +144,7 @@ def _given(columns: int, rows: int) -> Fault:
 
     def attempt(bench: FaultBench) -> Attempt:
         board = replace(bench.board, columns=columns, rows=rows)
-        return bench.attempt([bench.look(i, bench.frames(i), board=board) for i in bench.every], board)
+        return bench.attempt([bench.examine(i, bench.frames(i), board=board) for i in bench.every], board)
 
     return attempt
 
@@ -172,15 +153,15 @@ def _renumbered(order: Callable[[np.ndarray], np.ndarray]) -> Fault:
     """Features of one pose in another order; ``order`` turns (rows, columns) indices."""
 
     def attempt(bench: FaultBench) -> Attempt:
-        looked = bench.clean()
-        seen = looked[2].observation
+        captures = bench.examine_all()
+        seen = captures[2].observation
         assert seen is not None
         columns, rows = bench.board.features
         turned = order(np.arange(columns * rows).reshape(rows, columns)).ravel()
         slopes = None if seen.slopes is None else seen.slopes[turned]
         wrong = replace(seen, camera=seen.camera[turned], projector=seen.projector[turned], slopes=slopes)
-        looked[2] = replace(looked[2], observation=wrong)
-        return bench.attempt(looked)
+        captures[2] = replace(captures[2], observation=wrong)
+        return bench.attempt(captures)
 
     return attempt
 
@@ -191,21 +172,21 @@ def _moved(by_mm: Sequence[float], share: float) -> Fault:
     def attempt(bench: FaultBench) -> Attempt:
         pose, frames = bench.poses[2], bench.frames(2).copy()
         from_frame = round(share * len(frames))
-        frames[from_frame:] = bench.rendered(Pose(pose.R, pose.t + np.array(by_mm)), 2)[from_frame:]
-        looked = bench.clean()
-        looked[2] = bench.look(2, frames)
-        return bench.attempt(looked)
+        frames[from_frame:] = bench.render(Pose(pose.R, pose.t + np.array(by_mm)), 2)[from_frame:]
+        captures = bench.examine_all()
+        captures[2] = bench.examine(2, frames)
+        return bench.attempt(captures)
 
     return attempt
 
 
-def _spoilt(spoil: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> Fault:
-    return lambda bench: bench.attempt(bench.spoilt(spoil, only))
+def _with_changed_frames(change: Callable[[np.ndarray], np.ndarray], only: int | None = None) -> Fault:
+    return lambda bench: bench.attempt(bench.examine_with(change, only))
 
 
 def _rendered(**change: Any) -> Fault:
     def attempt(bench: FaultBench) -> Attempt:
-        return bench.attempt([bench.look(i, bench.rendered(bench.poses[i], i, **change)) for i in bench.every])
+        return bench.attempt([bench.examine(i, bench.render(bench.poses[i], i, **change)) for i in bench.every])
 
     return attempt
 
@@ -214,7 +195,7 @@ def _gamma(gamma: float) -> Fault:
     def attempt(bench: FaultBench) -> Attempt:
         light = replace(bench.rig.light, gamma=gamma)
         curved = replace(bench, rig=replace(bench.rig, light=light))
-        return curved.attempt([curved.look(i, curved.rendered(bench.poses[i], i)) for i in bench.every])
+        return curved.attempt([curved.examine(i, curved.render(bench.poses[i], i)) for i in bench.every])
 
     return attempt
 
@@ -225,13 +206,13 @@ def _parallel(tilt_deg: float, spread_deg: float) -> Fault:
     def attempt(bench: FaultBench) -> Attempt:
         rng = np.random.default_rng(5)
         middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
-        looked = []
+        captures = []
         for i in range(FEW_POSES):  # fewer would be a fault of its own
             pose = bench.poses[i]
             R = rotation(np.radians([tilt_deg, 0, 0]) + np.radians(spread_deg) * rng.uniform(-1, 1, 3))
             place = 0.7 * (pose.to_camera(middle) * [1, 1, 0]) + [0, 0, pose.to_camera(middle)[2]]
-            looked.append(bench.look(i, bench.rendered(Pose(R, place - R @ middle), i)))
-        return bench.attempt(looked)
+            captures.append(bench.examine(i, bench.render(Pose(R, place - R @ middle), i)))
+        return bench.attempt(captures)
 
     return attempt
 
@@ -240,16 +221,16 @@ def _without_corner(bench: FaultBench) -> Attempt:
     """Poses of which none reaches the image's top right."""
     wide = replace(bench, count=MANY)
     width, height = bench.rig.camera.size
-    looked = []
+    captures = []
     for i, pose in enumerate(wide.poses):
         u, v = bench.rig.camera.project(pose.to_camera(bench.board.points)).T
         if np.mean((u > 0.78 * width) & (v < 0.3 * height)) == 0:
-            looked.append(wide.look(i, wide.rendered(pose, i)))
-    return wide.attempt(looked)
+            captures.append(wide.examine(i, wide.render(pose, i)))
+    return wide.attempt(captures)
 
 
 def _few(count: int) -> Fault:
-    return lambda bench: bench.attempt([bench.looked(i) for i in range(count)])
+    return lambda bench: bench.attempt([bench.examine_clean(i) for i in range(count)])
 
 
 def _exchange_halves(frames: np.ndarray) -> np.ndarray:
@@ -260,7 +241,7 @@ def _exchange_halves(frames: np.ndarray) -> np.ndarray:
 FAULTS: Mapping[str, tuple[Cause, Fault]] = {
     "x and y frames exchanged": (
         "axes-swapped",
-        _spoilt(_exchange_halves),
+        _with_changed_frames(_exchange_halves),
     ),
     "columns from right to left": ("axis-reversed", _rendered(reverse="x")),
     "rows from bottom to top": ("axis-reversed", _rendered(reverse="y")),
@@ -276,11 +257,11 @@ FAULTS: Mapping[str, tuple[Cause, Fault]] = {
     "one pose moved between the axes": ("moved", _moved((0.5, 0.2, 0.0), 0.5)),
     "one pose moved among the frames of x": ("moved", _moved((1.0, -0.5, 0.5), 0.18)),
     "one pose moved a little": ("moved", _moved((0.15, 0.0, 0.15), 0.5)),
-    "lag of one frame": ("frame-lag", _spoilt(delay_frames)),
-    "lag of one frame in one pose": ("frame-lag", _spoilt(delay_frames, 3)),
-    "fifth frame missing": ("missing-frame", _spoilt(lambda frames: drop_frame(frames, 4))),
-    "Gray bit missing": ("missing-frame", _spoilt(lambda frames: drop_frame(frames, -7))),
-    "fifth frame missing in one pose": ("missing-frame", _spoilt(lambda frames: drop_frame(frames, 4), 3)),
+    "lag of one frame": ("frame-lag", _with_changed_frames(delay_frames)),
+    "lag of one frame in one pose": ("frame-lag", _with_changed_frames(delay_frames, 3)),
+    "fifth frame missing": ("missing-frame", _with_changed_frames(lambda frames: drop_frame(frames, 4))),
+    "Gray bit missing": ("missing-frame", _with_changed_frames(lambda frames: drop_frame(frames, -7))),
+    "fifth frame missing in one pose": ("missing-frame", _with_changed_frames(lambda frames: drop_frame(frames, 4), 3)),
     "overexposed": ("saturation", _rendered(exposure=1.8)),
     "much overexposed": ("saturation", _rendered(exposure=4.0)),
     "gamma 2.2": ("gamma", _gamma(2.2)),

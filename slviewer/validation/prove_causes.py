@@ -130,6 +130,6 @@ def _clean(scale: float, count: int, poses: int, steps: int, seed: int) -> Itera
         )
         yield (
             f"clean, seed {seed + 1 + k}, {board}, {bench.count} poses",
-            bench.attempt(bench.clean()),
+            bench.attempt(bench.examine_all()),
             perf_counter() - begun,
         )

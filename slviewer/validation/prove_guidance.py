@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -18,11 +17,13 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.shapes import fit_plane
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, unheard
-from slviewer.simulation.boards import BoardScene, Pose
+from slviewer.pipeline.feedback import Progress, part, unheard
+from slviewer.records import to_plain
+from slviewer.simulation.boards import Pose
 from slviewer.simulation.plans import planes, rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
 from slviewer.validation.faulty_captures import BOARD, FaultBench
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, plan
@@ -46,7 +47,7 @@ class Outcome:
     floor_mm: tuple[float, ...]
     supported: tuple[float, ...]
     unmeasured: int
-    predicted_mm: float
+    predicted_sigma_mm: float
     seconds: float
 
     @property
@@ -106,20 +107,7 @@ class GuidanceProof:
         return {
             "scale": self.scale,
             "holds": self.holds,
-            "outcomes": [
-                {
-                    "way": o.way,
-                    "seed": o.seed,
-                    "poses": o.poses,
-                    "rms_mm": list(o.rms_mm),
-                    "floor_mm": list(o.floor_mm),
-                    "over_floor": o.over_floor,
-                    "supported": list(o.supported),
-                    "unmeasured": o.unmeasured,
-                    "predicted_sigma_mm": o.predicted_mm,
-                }
-                for o in self.outcomes
-            ],
+            "outcomes": [to_plain(o) | {"over_floor": o.over_floor} for o in self.outcomes],
         }
 
 
@@ -142,10 +130,11 @@ def prove_guidance(
         bench = FaultBench(letter(scale, seed + k), BOARD, poses, steps=steps)
         targets = _targets(bench)
         for way in ways:
-            told = partial(_tell, progress, len(outcomes) / total, 1 / total, f"rig {k + 1} of {rigs}, {way}")
+            label = f"rig {k + 1} of {rigs}, {way}"
+            report = part(progress, len(outcomes) / total, (len(outcomes) + 1) / total, label)
             begun = perf_counter()
-            observations, predicted = _guided(bench, told) if way == "guided" else (_drawn(bench, told), np.nan)
-            told(0.9, "calibrating")
+            observations, predicted = _guided(bench, report) if way == "guided" else (_drawn(bench, report), np.nan)
+            report(0.9, "calibrating")
             stereo, centred = calibrate_centres(observations, bench.rig.projector.size, str(BOARD))
             figures = _measured(calibrate_splined(centred, stereo), targets)
             outcomes.append(
@@ -155,21 +144,17 @@ def prove_guidance(
     return GuidanceProof(tuple(outcomes), scale)
 
 
-def _tell(progress: Progress, done: float, share: float, which: str, of_it: float, words: str) -> None:
-    progress(done + share * of_it, f"{which}: {words}")
-
-
-def _drawn(bench: FaultBench, told: Progress) -> list[Observation]:
+def _drawn(bench: FaultBench, report: Progress) -> list[Observation]:
     seen = []
     for i, pose in enumerate(target_poses(bench.rig, BOARD, bench.count)):
-        told(0.9 * i / bench.count, f"pose {i + 1}")
-        observation = bench.look(i, bench.rendered(pose, i)).observation
+        report(0.9 * i / bench.count, f"pose {i + 1}")
+        observation = bench.examine(i, bench.render(pose, i)).observation
         if observation is not None:
             seen.append(observation)
     return seen
 
 
-def _guided(bench: FaultBench, told: Progress) -> tuple[list[Observation], float]:
+def _guided(bench: FaultBench, report: Progress) -> tuple[list[Observation], float]:
     """Poses where the wizard asks for them, and the sigma that it predicts in the end."""
     rig, board = bench.rig, bench.board
     rng = np.random.default_rng([rig.seed, 0x6D])
@@ -181,11 +166,11 @@ def _guided(bench: FaultBench, told: Progress) -> tuple[list[Observation], float
         if len(seen) == bench.count:
             return seen, np.nan if planned.sigma_mm is None else planned.sigma_mm
         i = len(seen) + refused
-        told(0.9 * len(seen) / bench.count, f"pose {len(seen) + 1}")
+        report(0.9 * len(seen) / bench.count, f"pose {len(seen) + 1}")
         if planned.suggestion is None or refused > bench.count:
             raise InputError(f"{refused} of {i} suggested poses could not be read, at {rig.camera.size} px")
         pose = _held(rig, board, _asked(rig, board, planned.suggestion.outline_px), rng)
-        observation = bench.look(i, bench.rendered(pose, i)).observation
+        observation = bench.examine(i, bench.render(pose, i)).observation
         if observation is None:
             refused += 1
         else:
@@ -240,19 +225,8 @@ def _targets(bench: FaultBench) -> list[_Target]:
         renderer = Renderer(rig, scene)
         truth = renderer.truth()
         phase = decode_frames(name, sequence, renderer.capture(sequence, 100 + i))["x"]
-        lit = truth.mask & phase.mask
-        found.append(_Target(phase, lit, _exact(rig, scene, phase, truth.points)))
-    return found
-
-
-def _exact(rig: SimulatedRig, scene: BoardScene, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
-    """(h, w, 3) mm: what the true lenses make of the phase, by Newton's steps from the true points."""
-    z, found = points[..., 2].copy(), points
-    rays = points / points[..., 2:]
-    for _ in range(3):
-        here, ahead = rig.project(found)[..., 0], rig.project(rays * (z + 0.01)[..., None])[..., 0]
-        z = z + 0.01 * (phase.coordinate - here) / (ahead - here)
-        found = rays * z[..., None]
+        exact = PerfectModel(rig).points(phase)
+        found.append(_Target(phase, truth.mask & phase.mask & np.isfinite(exact[..., 2]), exact))
     return found
 
 

@@ -14,12 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slviewer.calibration.centres import calibrate_centres
-from slviewer.calibration.observe import observe
 from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.errors import InputError
 from slviewer.evaluation import letter as the_letter
 from slviewer.evaluation.render import Row, render
-from slviewer.fringe.decode import texture
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.rigid import fit_rigid
@@ -40,8 +38,8 @@ from slviewer.simulation.scenes import Scene, sphere
 from slviewer.simulation.turning import STEP_DEG, stone
 from slviewer.surface.shapes import Mesh
 from slviewer.target.board import Board
-from slviewer.target.detect import detect
 from slviewer.validation.prove_accuracy import BandCheck
+from slviewer.validation.prove_rigs import observe_scene
 from slviewer.validation.prove_surface import SurfaceProof, prove_surface
 
 POSES = 25
@@ -74,12 +72,7 @@ class RegisteredScans:
         T = np.linalg.multi_dot([np.eye(4), *(pairs[step].T_reference_scan for step in steps)])
         D = T @ np.linalg.inv(pairs[names[-1], names[0]].T_reference_scan)
         middle = self.poses[names[0]][:3, 3]
-        shift = np.linalg.norm(D[:3, :3] @ middle + D[:3, 3] - middle)
-        return float(shift), float(np.degrees(np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec())))
-
-    def true(self, scan: str, onto: str) -> np.ndarray:
-        """(4, 4): how a scan really lies on another."""
-        return np.asarray(self.poses[onto] @ np.linalg.inv(self.poses[scan]))
+        return _size_of(D, middle)
 
     def error(self, scan: str, onto: str, found: Registration | np.ndarray) -> tuple[float, float]:
         """mm, at the object's middle or where a pair overlaps, and degrees."""
@@ -87,9 +80,7 @@ class RegisteredScans:
             T, centre = found.T_reference_scan, found.uncertainty.centre
         else:
             T, centre = found, self.poses[onto][:3, 3]
-        D = T @ np.linalg.inv(self.true(scan, onto))
-        shift = np.linalg.norm(D[:3, :3] @ centre + D[:3, 3] - centre)
-        return float(shift), float(np.degrees(np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec())))
+        return _size_of(T @ self.poses[scan] @ np.linalg.inv(self.poses[onto]), centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,21 +188,22 @@ def prove_registration(
         known = np.flatnonzero(clouds[name].mask & renderer.truth().mask)[::_EVERY]
         measured.append(clouds[name].points.reshape(-1, 3)[known].astype(float))
         true.append(renderer.truth().points.reshape(-1, 3)[known])
-    frame = _frame(np.concatenate(true), np.concatenate(measured))
+    # A calibration's camera frame is a gauge: turned by a part of a milliradian it measures every distance the same.
+    T_calibrated_camera = fit_rigid(np.concatenate(true), np.concatenate(measured))
     depths, turn = (
         {name: cloud for name, cloud in clouds.items() if name.startswith(kind)} for kind in ("object_", "turn_")
     )
-    truth = {name: frame @ _matrix(scene.pose) for name, scene in scans.items()}
+    truth = {name: T_calibrated_camera @ _matrix(scene.pose) for name, scene in scans.items()}
     first = _registered(depths, "object_r3", truth, None, part(progress, 0.75, 0.8))
     around = _registered(turn, "turn_01", truth, Starts(step_deg=STEP_DEG), part(progress, 0.8, 0.88))
     progress(0.88, "fusing and meshing")
     surface = prove_surface(
         depths,
         first.alignment.T_reference_scan,
-        (_mesh(scans["object_r3"]), truth),
+        (Mesh(scans["object_r3"].vertices, scans["object_r3"].triangles), truth),
         turn,
         around.alignment.T_reference_scan,
-        (_mesh(scans["turn_01"]), truth["turn_01"]),
+        (Mesh(scans["turn_01"].vertices, scans["turn_01"].triangles), truth["turn_01"]),
     )
     refusals = {}
     for k, (what, (wanted, one, other)) in enumerate(_doubtful().items()):
@@ -229,9 +221,7 @@ def _calibrated(rig: SimulatedRig, board: Board, targets: Mapping[str, Scene], p
     observations = []
     for i, (name, scene) in enumerate(targets.items()):
         progress(0.8 * i / len(targets), name)
-        frames = Renderer(rig, scene).capture(both, i)
-        found = detect(board, texture(both, frames))
-        observations.append(observe(name, board, found, decode_frames(name, both, frames)))
+        observations.append(observe_scene(name, rig, scene, board, both, i))
     progress(0.8, "calibrating")
     stereo, observations = calibrate_centres(observations, rig.projector.size, TARGET)
     return calibrate_splined(observations, stereo)
@@ -240,12 +230,6 @@ def _calibrated(rig: SimulatedRig, board: Board, targets: Mapping[str, Scene], p
 def _scanned(renderer: Renderer, model: Model, name: str, number: int) -> Cloud:
     only_x = one_axis(p18(renderer.rig.projector.size), "x")
     return reconstruct(model, decode_frames(name, only_x, renderer.capture(only_x, number)))
-
-
-def _frame(true: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """(4, 4): from the true camera's frame to the calibrated one's. A calibration is free to choose it: turned by a
-    part of a milliradian, with the optical axis where no lens says it is, it measures every distance the same."""
-    return fit_rigid(true, measured)
 
 
 def _registered(
@@ -303,6 +287,12 @@ def _cylinder(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.concatenate([np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)])
 
 
+def _size_of(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
+    """How far a motion (4, 4) shifts a point (3,), mm, and its angle, degrees."""
+    shift = np.linalg.norm(D[:3, :3] @ centre + D[:3, 3] - centre)
+    return float(shift), float(np.degrees(Rotation.from_matrix(D[:3, :3]).magnitude()))
+
+
 def _row(scan: str, onto: str, found: Registration, shift: float, turn: float) -> Row:
     return {
         "scan": scan,
@@ -316,10 +306,6 @@ def _row(scan: str, onto: str, found: Registration, shift: float, turn: float) -
         "overlap %": 100 * found.overlap,
         "start": found.start,
     }
-
-
-def _mesh(scene: MeshScene) -> Mesh:
-    return Mesh(scene.vertices, scene.triangles)
 
 
 def _matrix(pose: Pose) -> np.ndarray:

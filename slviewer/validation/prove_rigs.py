@@ -124,7 +124,7 @@ def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = un
     observations: list[Observation] = []
     for name, scene in targets.items():
         progress(0.8 * len(observations) / total, f"{case.name}: {name}")
-        observations.append(_seen(name, rig, scene, board, both, numbers[name]))
+        observations.append(observe_scene(name, rig, scene, board, both, numbers[name]))
     rendered = perf_counter()
     progress(0.8 * len(targets) / total, f"{case.name}: calibrating")
     stereo, observations = calibrate_centres(observations, rig.projector.size, TARGET)
@@ -198,9 +198,10 @@ def scored(
     return comparison, int(np.count_nonzero(comparison.common)) / max(to_score, 1)
 
 
-def _seen(
+def observe_scene(
     name: str, rig: SimulatedRig, scene: Scene, board: Board, sequence: PatternSequence, number: int
 ) -> Observation:
+    """The observation of a rendered target pose, the capture of that number of its rig."""
     frames = Renderer(rig, scene).capture(sequence, number)
     return observe(name, board, detect(board, texture(sequence, frames)), decode_frames(name, sequence, frames))
 

@@ -85,7 +85,7 @@ class UncertaintyProof:
                 "true um": round(1000 * row["true"], 1),
                 "predicted / true": round(row["ratio"], 2),
                 "below 2 sigma %": round(100 * row["below_2_sigma"], 1),
-                "where no pose looked": round(row["ratio_elsewhere"], 2),
+                "where no pose captures": round(row["ratio_elsewhere"], 2),
             }
             for row in self.rows()
         ]
@@ -93,7 +93,7 @@ class UncertaintyProof:
         return (
             f"{render(table)}\npredicted over true 3D error, pooled over {len(self.rigs)} rigs of {self.poses} poses "
             f"at scale {self.scale:g}: {self.ratio():.2f} {verdict} between {BAND[0]} and {BAND[1]}; "
-            f"where no pose looked {self.ratio(supported=False):.2f}"
+            f"where no pose captures {self.ratio(supported=False):.2f}"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -123,11 +123,11 @@ def prove_uncertainty(
 def calibrated(case: RigCase, rig: SimulatedRig, poses: int, progress: Progress = unheard) -> SplinedModel:
     """The splined model from rendered target poses."""
     bench = FaultBench(rig, count=poses, shape=case.shape)
-    looks = []
+    captures = []
     for i in range(poses):
         progress(0.7 * i / poses, f"{case.name}: pose {i + 1} of {poses}")
-        looks.append(bench.looked(i))
-    attempt = bench.attempt(looks)
+        captures.append(bench.examine_clean(i))
+    attempt = bench.attempt(captures)
     if attempt.stereo is None:
         raise CalibrationRejected(f"{case.name}: {attempt.verdict.reason}")
     progress(0.7, f"{case.name}: calibrating")

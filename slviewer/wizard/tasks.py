@@ -17,8 +17,9 @@ from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record, next_merge
+from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE, available, best, insisted
+from slviewer.pipeline.open_session import next_number
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.validate import validate
@@ -170,7 +171,7 @@ def merge_scans(
     picked: Picked | None = None,
 ) -> Merge:
     """Register scans to a reference, save the alignment, and write the merged PLY into the exports."""
-    number = next_merge(session)
+    number = next_number(session, "merge")
     insist = insisted(session)
     model = best(session, insist)
     with staged_export(session, f"merged_{number}.ply", report) as ply:
