@@ -98,7 +98,7 @@ class FaultBench:
     def examine(
         self, i: int, frames: np.ndarray, sequence: PatternSequence | None = None, board: Board | None = None
     ) -> Judged:
-        """The reading of a capture with its evidence; ``sequence`` and ``board``: as described, by default the true ones."""
+        """The reading of a capture with its evidence; ``sequence`` and ``board`` as described to the program."""
         name, sequence, board = f"pose_{i + 1:02d}", sequence or self.sequence, board or self.board
         phases = decode_frames(name, sequence, frames)
         return read_pose(name, sequence, frames, phases, texture(sequence, frames), board, Smoothing(), examine=True)
