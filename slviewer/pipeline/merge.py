@@ -62,9 +62,25 @@ class Merge:
         return self.alignment.on_reference()
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``merge --json``."""
+        """The contract of ``merge --json``: every scan on the reference, every registered pair, the loops, what was
+        dropped or refused, and the surface."""
+        alignment = self.alignment
         return {
-            **alignment_json(self.alignment),
+            "reference": alignment.reference,
+            "pairs": {name: _figures(pair) for name, pair in self.pairs.items()},
+            "registered": [{"scan": a, "onto": b, **_figures(pair)} for (a, b), pair in alignment.pairs.items()],
+            "loops": [
+                {
+                    "scans": list(loop.names),
+                    "error_mm": loop.before.shift_mm,
+                    "error_deg": loop.before.turn_deg,
+                    "left_mm": loop.after.shift_mm,
+                    "left_deg": loop.after.turn_deg,
+                }
+                for loop in alignment.loops
+            ],
+            "dropped": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.dropped.items()],
+            "refused": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.refused.items()],
             "static_points": dict(self.static_points),
             "contradictions": [
                 {"scan": a, "onto": b, "share": found.share, "compared": found.compared, "gate_mm": found.gate_mm}
@@ -77,67 +93,43 @@ class Merge:
         }
 
     def text(self) -> str:
-        """For people."""
-        lines = [alignment_text(self.alignment)]
-        if self.contradictions:
-            worst = max(self.contradictions.values(), key=lambda found: found.share)
+        """A line a pair, the loop that closes worst, what was excluded, and the surface."""
+        alignment = self.alignment
+        r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
+        lines = [
+            f"{a} -> {b}: RMS {pair.rms_mm:.3f} mm, point to point {pair.inlier_rmse_mm:.3f} mm, "
+            f"overlap {100 * pair.overlap:.0f} %, standard deviations {1000 * pair.uncertainty.shift_mm:.1f} um "
+            f"and {pair.uncertainty.turn_deg:.4f} degrees"
+            for (a, b), pair in alignment.pairs.items()
+        ]
+        lines.append(f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)")
+        if alignment.loops:
+            worst = alignment.loops[0]
+            way = " - ".join([*worst.names, worst.names[0]])
             lines.append(
-                f"contradicting points: {100 * worst.share:.2g} % at most of what both scans of a pair cover lies more "
-                f"than {worst.gate_mm:.2g} mm in front of the other's surface"
+                f"loop error, the worst of {len(alignment.loops)}: {worst.before.shift_mm:.3f} mm and "
+                f"{worst.before.turn_deg:.4f} degrees round {len(worst.names)} pairs ({way}); "
+                f"{max(loop.after.shift_mm for loop in alignment.loops):.3f} mm at most once closed"
             )
-        if removed := _removed_text(self.fused):
-            lines.append(removed)
+        lines += [f"excluded: {why}" for why in alignment.dropped.values()]
+        lines += [f"not registered: {a} -> {b}: {why}" for (a, b), why in alignment.refused.items()]
+        if self.contradictions:
+            worst_pair = max(self.contradictions.values(), key=lambda found: found.share)
+            lines.append(
+                f"contradicting points: {100 * worst_pair.share:.2g} % at most of what both scans of a pair cover lies "
+                f"more than {worst_pair.gate_mm:.2g} mm in front of the other's surface"
+            )
+        far = {name: counts["far"] for name, counts in self.fused.left_out.items() if counts.get("far")}
+        if far:
+            counted = ", ".join(f"{count} points of {name}" for name, count in far.items())
+            lines.append(f"removed as far from everything else: {counted}")
         if self.scale:
             lines.append(self.scale)
         seen = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
         lines.append(f"{len(self.fused.surface)} points, {seen} -> {self.out}")
         if self.kept:
-            lines.append(f"the session keeps it as {self.kept}: mesh, compare and measure take it by that name")
+            lines.append(f"the session stores it as {self.kept}: mesh, compare and measure know it by that name")
         return "\n".join(lines)
-
-
-def alignment_json(alignment: Alignment) -> dict[str, Any]:
-    """Plain values: every scan on the reference, every registered pair, the loops, what was dropped or refused."""
-    return {
-        "reference": alignment.reference,
-        "pairs": {name: _figures(pair) for name, pair in alignment.on_reference().items()},
-        "registered": [{"scan": a, "onto": b, **_figures(found)} for (a, b), found in alignment.pairs.items()],
-        "loops": [
-            {
-                "scans": list(loop.names),
-                "error_mm": loop.before.shift_mm,
-                "error_deg": loop.before.turn_deg,
-                "left_mm": loop.after.shift_mm,
-                "left_deg": loop.after.turn_deg,
-            }
-            for loop in alignment.loops
-        ],
-        "dropped": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.dropped.items()],
-        "refused": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.refused.items()],
-    }
-
-
-def alignment_text(alignment: Alignment) -> str:
-    """A line a pair, the loop that closes worst, and what was left out, for people."""
-    r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
-    lines = [
-        f"{a} -> {b}: RMS {found.rms_mm:.3f} mm, point to point {found.inlier_rmse_mm:.3f} mm, "
-        f"overlap {100 * found.overlap:.0f} %, sure to {1000 * found.uncertainty.shift_mm:.1f} um "
-        f"and {found.uncertainty.turn_deg:.4f} degrees"
-        for (a, b), found in alignment.pairs.items()
-    ]
-    lines.append(f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)")
-    if alignment.loops:
-        worst = alignment.loops[0]
-        way = " - ".join([*worst.names, worst.names[0]])
-        lines.append(
-            f"loop error, the worst of {len(alignment.loops)}: {worst.before.shift_mm:.3f} mm and "
-            f"{worst.before.turn_deg:.4f} degrees round {len(worst.names)} pairs ({way}); "
-            f"{max(loop.after.shift_mm for loop in alignment.loops):.3f} mm at most once closed"
-        )
-    lines += [f"left out: {why}" for why in alignment.dropped.values()]
-    lines += [f"not registered: {a} -> {b}: {why}" for (a, b), why in alignment.refused.items()]
-    return "\n".join(lines)
 
 
 def merge(
@@ -249,14 +241,6 @@ def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, ke
                 "stands still; restrict the scans to the object, or scan again"
             )
     return said
-
-
-def _removed_text(fused: Fused) -> str:
-    """How many points were removed from the surface as far from everything else; empty where none were."""
-    far = {name: counts.get("far", 0) for name, counts in fused.left_out.items() if counts.get("far")}
-    if not far:
-        return ""
-    return "removed as far from everything else: " + ", ".join(f"{n} points of {name}" for name, n in far.items())
 
 
 def merge_record(store: Session, found: Merge, model: str) -> dict[str, Any]:

@@ -63,9 +63,9 @@ def test_several_photographs_give_a_line_each_and_status_1(photographs: Path, tm
 
 def test_what_is_no_photograph_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError):
-        detect_board([tmp_path / "nowhere.png"], BOARD)
+        detect_board([tmp_path / "nowhere.png"], str(BOARD))
     with pytest.raises(InputError):
-        detect_board([tmp_path], BOARD)
+        detect_board([tmp_path], str(BOARD))
     (tmp_path / "broken.png").write_bytes(b"no image")
     result = detect_board([tmp_path], "circles:7x5:20")
     assert result.detected == 0 and "broken.png" in result.images[0].refusal
@@ -76,7 +76,7 @@ def test_corners_that_are_seen_of_a_charuco_board_keep_their_numbers(tmp_path: P
     board = Board.parse("charuco:7x5:20")
     view = View(size=(400, 300), supersample=4, fill=0.6, hide=(-30, -30, 30, 90))
     cv2.imwrite(str(tmp_path / "part.png"), view.render(board))
-    result = detect_board([tmp_path / "part.png"], board, out=tmp_path / "part_overlay.png")
+    result = detect_board([tmp_path / "part.png"], str(board), out=tmp_path / "part_overlay.png")
     detection = result.images[0].detection
     assert detection is not None and 8 <= len(detection.ids) < len(board.points)
     assert f"{len(detection.ids)} of 24 corners detected" in result.text()
