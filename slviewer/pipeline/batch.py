@@ -12,8 +12,16 @@ from typing import Any
 
 from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.evaluation.render import render
-from slviewer.pipeline.batch_storage import resolved, swept
-from slviewer.pipeline.batch_tasks import Do, Task, TaskResult, joined, listed, verification_file, worked
+from slviewer.pipeline.batch_storage import absolute_address, remove_leftovers
+from slviewer.pipeline.batch_tasks import (
+    Do,
+    Task,
+    TaskResult,
+    list_captures,
+    run_task,
+    verification_file,
+    write_verification,
+)
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.verify import Shape, Verification
@@ -113,7 +121,7 @@ def batch(
         raise UsageError("what the captures show is not known: give --shape plane or --shape sphere")
     if do != "verify" and (shape is not None or radius is not None):
         raise UsageError(f"--shape and --radius belong to --do verify, not to --do {do}")
-    addresses = list(dict.fromkeys(resolved(session) for session in sessions))
+    addresses = list(dict.fromkeys(absolute_address(session) for session in sessions))
     if not addresses:
         raise UsageError("no session named: give the folders or addresses of one or more")
     task = Task(do, secrets.token_hex(4), model, shape, radius, accept_rejected)
@@ -122,27 +130,31 @@ def batch(
     try:
         with ExitStack() as ended:
             if scheduler is None:  # workers will see what is seen from here, and are as many as there is work for
-                plans: dict[str, list[str] | str] = {address: listed(*given) for address, given in looking.items()}
-                client = ended.enter_context(_own(sum(len(plan) for plan in plans.values() if isinstance(plan, list))))
+                plans: dict[str, list[str] | str] = {
+                    address: list_captures(*given) for address, given in looking.items()
+                }
+                client = ended.enter_context(
+                    _start_cluster(sum(len(plan) for plan in plans.values() if isinstance(plan, list)))
+                )
             else:
-                client = ended.enter_context(_theirs(scheduler))
-                plans = _gathered(client, {a: (listed, *given) for a, given in looking.items()}, unheard, warn)
+                client = ended.enter_context(_connect(scheduler))
+                plans = _gather(client, {a: (list_captures, *given) for a, given in looking.items()}, unheard, warn)
             broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
             wanted = [(a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan]
-            done = _worked(client, wanted, task, progress, warn)
-            broken |= _joined(client, done, task, warn)
+            done = _run_tasks(client, wanted, task, progress, warn)
+            broken |= _write_verifications(client, done, task, warn)
             progress(1.0, "done")
     finally:
         for address in addresses:
-            swept(address, task.batch)
+            remove_leftovers(address, task.batch)
     return Batch(done, broken, task)
 
 
-def _worked(
+def _run_tasks(
     client: Any, wanted: Sequence[tuple[str, str]], task: Task, progress: Progress, warn: Warn
 ) -> tuple[TaskResult, ...]:
     """What came of each (session, capture)."""
-    found = _gathered(client, {(a, name): (worked, a, name, task) for a, name in wanted}, progress, warn)
+    found = _gather(client, {(a, name): (run_task, a, name, task) for a, name in wanted}, progress, warn)
     done = tuple(
         came if isinstance(came, TaskResult) else TaskResult(a, name, failed=came) for (a, name), came in found.items()
     )
@@ -151,18 +163,18 @@ def _worked(
     return done
 
 
-def _joined(client: Any, done: Sequence[TaskResult], task: Task, warn: Warn) -> dict[str, str]:
+def _write_verifications(client: Any, done: Sequence[TaskResult], task: Task, warn: Warn) -> dict[str, str]:
     """Have each session's verifications written; {session: why it could not be done}."""
     parts: dict[str, list[Verification]] = {}
     for one in done:
         if one.verification is not None:
             parts.setdefault(one.session, []).append(one.verification)
-    writing = {address: (joined, address, tuple(verified), task) for address, verified in parts.items()}
-    return {address: why for address, why in _gathered(client, writing, unheard, warn).items() if why}
+    writing = {address: (write_verification, address, tuple(verified), task) for address, verified in parts.items()}
+    return {address: why for address, why in _gather(client, writing, unheard, warn).items() if why}
 
 
 @contextmanager
-def _theirs(scheduler: str) -> Iterator[Any]:
+def _connect(scheduler: str) -> Iterator[Any]:
     """A client of a scheduler that runs already, and has a worker."""
     _check_installed()
     from distributed import Client
@@ -185,7 +197,7 @@ def _theirs(scheduler: str) -> Iterator[Any]:
 
 
 @contextmanager
-def _own(most: int) -> Iterator[Any]:
+def _start_cluster(most: int) -> Iterator[Any]:
     """A client of worker processes on this machine, which end with it and share its cores among them: ``most``, or as
     many as cores and memory allow."""
     _check_installed()
@@ -220,7 +232,7 @@ def _check_installed() -> None:
             raise SlviewerError(f"a batch needs the package {package}, which is missing: {INSTALL}")
 
 
-def _gathered(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progress, warn: Warn) -> dict[Any, Any]:
+def _gather(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progress, warn: Warn) -> dict[Any, Any]:
     """What each call (function, arguments ...) returned, in their order; the reason as text where a worker could not.
 
     What is left of them is given up if this raises.
@@ -236,7 +248,7 @@ def _gathered(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progr
             ready = ahead.next_batch(block=False)
             for future in ready:
                 key = futures[future]
-                answers[key] = _answer(future)
+                answers[key] = _result_of(future)
                 name = " ".join(key) if isinstance(key, tuple) else key
                 progress(len(answers) / len(futures), f"{len(answers)} of {len(futures)}: {name}")
             if not ready:
@@ -250,7 +262,7 @@ def _gathered(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progr
     return {key: answers[key] for key in calls}
 
 
-def _answer(future: Any) -> Any:
+def _result_of(future: Any) -> Any:
     """Its result, or why there is none."""
     from concurrent.futures import CancelledError
 

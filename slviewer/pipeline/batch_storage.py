@@ -19,21 +19,21 @@ def is_remote(address: str) -> bool:
     return "://" in address or "::" in address
 
 
-def resolved(session: Path | str) -> str:
+def absolute_address(session: Path | str) -> str:
     """The address of a session as every worker understands it: folders become absolute."""
     address = os.fspath(session)
     return address.rstrip("/") if is_remote(address) else str(Path(address).expanduser().absolute())
 
 
 @contextmanager
-def described(address: str) -> Iterator[Path]:
+def fetch_descriptions(address: str) -> Iterator[Path]:
     """A folder with the session, in which captures may lack their frames; raises SessionError where there is none."""
-    with _at_hand(address, lambda path: path.split("/")[-1] in ("session.json", "capture.json")) as folder:
+    with _session_folder(address, lambda path: path.split("/")[-1] in ("session.json", "capture.json")) as folder:
         yield folder
 
 
 @contextmanager
-def at_hand(address: str, capture: str) -> Iterator[Path]:
+def fetch_capture(address: str, capture: str) -> Iterator[Path]:
     """A folder with the session, in which one capture is whole; raises SessionError where there is none.
 
     From an fsspec address it is copied, with the calibrations, and goes when the block ends.
@@ -43,12 +43,12 @@ def at_hand(address: str, capture: str) -> Iterator[Path]:
         whole = (f"captures/{capture}/", "results/calibration/", "results/scale/")
         return path.startswith(whole) or path.endswith(".json")
 
-    with _at_hand(address, wanted) as folder:
+    with _session_folder(address, wanted) as folder:
         yield folder
 
 
 @contextmanager
-def delivered(address: str, batch: str) -> Iterator[Path]:
+def export_folder(address: str, batch: str) -> Iterator[Path]:
     """A folder for files that appear in the session's exports when the block ends, each whole, and none if it fails.
 
     They replace files of their names. What a worker that is killed leaves behind goes with ``swept``.
@@ -60,14 +60,14 @@ def delivered(address: str, batch: str) -> Iterator[Path]:
                 fs, root = _file_system(address)
                 fs.makedirs(f"{root}/exports", exist_ok=True)
                 for path in sorted(Path(made).iterdir()):
-                    arriving = f"{root}/exports/{_hidden(batch)}-{secrets.token_hex(4)}-{path.name}"
+                    arriving = f"{root}/exports/{_hidden_name(batch)}-{secrets.token_hex(4)}-{path.name}"
                     fs.put_file(str(path), arriving)
                     fs.mv(arriving, f"{root}/exports/{path.name}")
             return
         exports = Path(address, "exports")
         # beside those of other workers, not in one folder for all: whoever removed that one once it was empty would do
         # so right as another makes its own in it
-        folder = exports / f"{_hidden(batch)}-{secrets.token_hex(4)}"
+        folder = exports / f"{_hidden_name(batch)}-{secrets.token_hex(4)}"
         folder.mkdir(parents=True)
         yield folder
         for path in sorted(folder.iterdir()):
@@ -77,21 +77,21 @@ def delivered(address: str, batch: str) -> Iterator[Path]:
         raise SessionError(f"{address} cannot be written ({error}): check its permissions and free space") from error
 
 
-def swept(address: str, batch: str) -> None:
+def remove_leftovers(address: str, batch: str) -> None:
     """Remove what killed or cancelled workers of a batch left unfinished, as far as it can be reached from here."""
     with contextlib.suppress(OSError, InputError):
         if not is_remote(address):
-            for folder in Path(address, "exports").glob(f"{_hidden(batch)}-*"):
+            for folder in Path(address, "exports").glob(f"{_hidden_name(batch)}-*"):
                 shutil.rmtree(folder, ignore_errors=True)
             return
         fs, root = _file_system(address)
         for path in fs.ls(f"{root}/exports", detail=False):
-            if path.split("/")[-1].startswith(_hidden(batch)):
+            if path.split("/")[-1].startswith(_hidden_name(batch)):
                 fs.rm(path)
 
 
 @contextmanager
-def _at_hand(address: str, wanted: Callable[[str], bool]) -> Iterator[Path]:
+def _session_folder(address: str, wanted: Callable[[str], bool]) -> Iterator[Path]:
     if not is_remote(address):
         if not is_session(address):
             raise SessionError(
@@ -135,5 +135,5 @@ def _file_system(address: str) -> tuple[Any, str]:
     return fs, root.rstrip("/")
 
 
-def _hidden(batch: str) -> str:
+def _hidden_name(batch: str) -> str:
     return f".batch-{batch}"

@@ -13,7 +13,7 @@ import numpy as np
 
 from slviewer import __version__
 from slviewer.errors import InputError, SlviewerError
-from slviewer.pipeline.batch_storage import at_hand, delivered, described
+from slviewer.pipeline.batch_storage import export_folder, fetch_capture, fetch_descriptions
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.verify import Shape, Verification, verify
 from slviewer.session.atomic import write_bytes
@@ -54,11 +54,11 @@ class TaskResult:
     verification: Verification | None = None
 
 
-def listed(address: str, patterns: Sequence[str], version: str) -> list[str] | str:
+def list_captures(address: str, patterns: Sequence[str], version: str) -> list[str] | str:
     """Names of a session's captures that match any of the patterns, of its scans where there is none; else why not."""
     try:
         _check(version)
-        with described(address) as folder, Session.open(folder) as store:
+        with fetch_descriptions(address) as folder, Session.open(folder) as store:
             if not patterns:
                 names = store.capture_names("scan")
                 return names or "it holds no scan: name the captures, such as 'pose_*'"
@@ -69,28 +69,28 @@ def listed(address: str, patterns: Sequence[str], version: str) -> list[str] | s
         return _reason(error)
 
 
-def worked(address: str, capture: str, task: Task) -> TaskResult:
+def run_task(address: str, capture: str, task: Task) -> TaskResult:
     """Do the task with one capture; what it makes lies in the session's exports when this returns."""
     warnings: list[str] = []
     started = time.perf_counter()
     try:
         _check(task.version)
-        with at_hand(address, capture) as folder, _ONE, Session.open(folder) as store:
-            done = _verified(store, capture, task, warnings) if task.do == "verify" else None
+        with fetch_capture(address, capture) as folder, _ONE, Session.open(folder) as store:
+            done = _verify(store, capture, task, warnings) if task.do == "verify" else None
             if done is None:
-                with delivered(address, task.batch) as made:
-                    done = _reconstructed(store, capture, task, made, warnings)
+                with export_folder(address, task.batch) as made:
+                    done = _reconstruct(store, capture, task, made, warnings)
     except Exception as error:  # whatever it is ends this capture alone
         return TaskResult(address, capture, warnings=tuple(warnings), failed=_reason(error))
     figures = done.figures | {"s": round(time.perf_counter() - started, 1)}
     return replace(done, session=address, figures=figures, warnings=tuple(warnings))
 
 
-def joined(address: str, parts: Sequence[Verification], task: Task) -> str:
+def write_verification(address: str, parts: Sequence[Verification], task: Task) -> str:
     """Write the verifications of one session as one, as ``verify --json`` does; returns why not, or an empty text."""
     whole = Verification({name: comparison for part in parts for name, comparison in part.captures.items()})
     try:
-        with delivered(address, task.batch) as made:
+        with export_folder(address, task.batch) as made:
             text = json.dumps(whole.to_json(), indent=2) + "\n"
             write_bytes(made / verification_file(task), text.encode())
     except Exception as error:
@@ -112,7 +112,7 @@ def _check(version: str) -> None:
         raise InputError(f"the worker runs slviewer {__version__}, the batch {version}: install the same on both")
 
 
-def _reconstructed(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> TaskResult:
+def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> TaskResult:
     found = reconstruct(
         store,
         capture,
@@ -128,7 +128,7 @@ def _reconstructed(store: Session, capture: str, task: Task, made: Path, warning
     return TaskResult("", capture, {"points": found.points, "noise mm": sigma, "file": name})
 
 
-def _verified(store: Session, capture: str, task: Task, warnings: list[str]) -> TaskResult:
+def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> TaskResult:
     assert task.shape is not None
     found = verify(
         store,

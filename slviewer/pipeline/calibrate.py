@@ -147,7 +147,7 @@ def calibrate(
                 f"{store.folder} holds no target poses: import some with --role calibration, or capture them first"
             )
         left_out = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
-        left_out |= _unselected(names, poses, exclude)
+        left_out |= _reasons_to_exclude(names, poses, exclude)
         names = [name for name in names if name not in left_out]
         if not names:
             raise InputError("every target pose is excluded: include some again")
@@ -161,18 +161,18 @@ def calibrate(
             keep_rejected(store, stereo, settings, found.verdict)
             save_verdict(store, found.verdict, names)
             raise rejected(found.verdict, kept=True)
-        made = _fit_models(found, models, part(progress, 0.66, 0.97), warn, left_out)
-        if made.verdict.level == "rejected":
-            keep_rejected(store, stereo, settings, made.verdict)
-            save_verdict(store, made.verdict, names)
-            raise rejected(made.verdict, kept=True)
+        result = _fit_models(found, models, part(progress, 0.66, 0.97), warn, left_out)
+        if result.verdict.level == "rejected":
+            keep_rejected(store, stereo, settings, result.verdict)
+            save_verdict(store, result.verdict, names)
+            raise rejected(result.verdict, kept=True)
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
-        _save_models(store, made, inputs, settings)
-        save_verdict(store, made.verdict, names)
+        _save_models(store, result, inputs, settings)
+        save_verdict(store, result.verdict, names)
         warn_if_frame_changed(store, before, warn)
         progress(1.0, "calibrated")
-    return made
+    return result
 
 
 def calibrate_frames(
@@ -205,10 +205,10 @@ def calibrate_frames(
     found = attempt_poses(read(), len(poses), sequence, board, {}, part(progress, 0, 0.65))
     if found.stereo is None or found.verdict.level == "rejected":
         raise rejected(found.verdict, kept=False)
-    made = _fit_models(found, models or DEFAULT_MODELS, part(progress, 0.66, 1.0), warn)
-    if made.verdict.level == "rejected":
-        raise rejected(made.verdict, kept=False)
-    return made
+    result = _fit_models(found, models or DEFAULT_MODELS, part(progress, 0.66, 1.0), warn)
+    if result.verdict.level == "rejected":
+        raise rejected(result.verdict, kept=False)
+    return result
 
 
 def save_calibration(session: SessionLike, result: CalibrationResult) -> None:
@@ -246,15 +246,15 @@ def _fit_models(
     for finding in found.verdict.findings:
         if finding.severity == "doubtful":
             warn(finding.text())
-    made = _made(models, stereo, found.observations, progress, warn)
-    verdict = judge_splined(found.verdict, made.splined.bundle.noise) if made.splined else found.verdict
+    result = _fit(models, stereo, found.observations, progress, warn)
+    verdict = judge_splined(found.verdict, result.splined.bundle.noise) if result.splined else found.verdict
     for finding in verdict.findings:
         if finding not in found.verdict.findings:
             warn(finding.text())
-    return replace(made, verdict=verdict)
+    return replace(result, verdict=verdict)
 
 
-def _unselected(names: Sequence[str], poses: Sequence[str], exclude: Sequence[str]) -> dict[str, str]:
+def _reasons_to_exclude(names: Sequence[str], poses: Sequence[str], exclude: Sequence[str]) -> dict[str, str]:
     """{pose: why} of the target poses that are not among ``poses``, where any are named, or that ``exclude`` names.
 
     Raises UsageError for a name or pattern that fits no target pose.
@@ -264,7 +264,7 @@ def _unselected(names: Sequence[str], poses: Sequence[str], exclude: Sequence[st
     return out | dict.fromkeys(match_names(names, exclude, "target pose"), "excluded for this calibration")
 
 
-def _made(
+def _fit(
     models: Sequence[str], stereo: StereoModel, observations: Sequence[Observation], progress: Progress, warn: Warn
 ) -> CalibrationResult:
     """The models that follow from stereo; one that cannot be fitted is a warning, and stops no other."""

@@ -57,11 +57,11 @@ class CheckResult:
         lines = [self.drift.text()]
         if self.before:
             lines.append("earlier checks of this calibration:")
-            lines += [f"  {told(checked)}" for checked in self.before]
+            lines += [f"  {describe_check(checked)}" for checked in self.before]
         return "\n".join(lines)
 
 
-def told(checked: Checked) -> str:
+def describe_check(checked: Checked) -> str:
     """One line of the history."""
     d = checked.drift
     across = "" if d.across_px is None else f", {d.across_px:+.4f} px off its epipolar lines"

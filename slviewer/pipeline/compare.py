@@ -132,7 +132,7 @@ def compare(
     with opened(session, write=True) as store:
         reading = part(progress, 0.0, 0.4)
         on = surface(store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn)
-        default = store.exports / f"{_plain(scan)}_{_plain(Path(ideal.name).stem)}_deviation.ply"
+        default = store.exports / f"{_safe_name(scan)}_{_safe_name(Path(ideal.name).stem)}_deviation.ply"
         return compare_surface(
             store,
             on,
@@ -189,7 +189,7 @@ def compare_surface(
         ply = Path(out)
         ply.parent.mkdir(parents=True, exist_ok=True)
         _write(ply, on, found, nominal, tolerance)
-    measurement = _kept(store, on, nominal, found, verdict, noise, points, name)
+    measurement = _save(store, on, nominal, found, verdict, noise, points, name)
     progress(1.0, "compared")
     return Compared(on.source, on.model, nominal, found, verdict, noise, ply, measurement)
 
@@ -233,7 +233,7 @@ def _write(ply: Path, on: MeasuredSurface, found: Deviation, nominal: Nominal, t
     )
 
 
-def _kept(
+def _save(
     store: Session,
     on: MeasuredSurface,
     nominal: Nominal,
@@ -285,6 +285,6 @@ def _kept(
     )
 
 
-def _plain(name: str) -> str:
+def _safe_name(name: str) -> str:
     """A name that a file can have on every system."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in name)[:60]

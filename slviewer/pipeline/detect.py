@@ -69,7 +69,7 @@ class BoardsDetected:
 
     def text(self) -> str:
         """One line for each photograph; for a single one also the table."""
-        lines = [_line(self.board, image) for image in self.images]
+        lines = [_describe(self.board, image) for image in self.images]
         if len(self.images) == 1 and self.detected:
             lines.append(f"{'index':>5} {'x mm':>9} {'y mm':>9} {'u px':>10} {'v px':>10}")
             lines += [f"{index:5d} {x:9.2f} {y:9.2f} {u:10.3f} {v:10.3f}" for _, index, x, y, u, v in self.rows()]
@@ -123,7 +123,7 @@ def detect_board(
     for path in paths:
         try:
             picture = read_image(path)
-            result = _detected(board, path, picture)
+            result = _detect_in(board, path, picture)
         except InputError as error:
             results.append(BoardImageResult(path, None, str(error)))
             continue
@@ -180,7 +180,7 @@ def _photographs(given: list[Path]) -> list[Path]:
     return paths
 
 
-def _detected(board: Board, path: Path, picture: np.ndarray) -> BoardImageResult:
+def _detect_in(board: Board, path: Path, picture: np.ndarray) -> BoardImageResult:
     try:
         detection = detect(board, picture[..., ::-1] if picture.ndim == 3 else picture)
     except DetectionError as error:
@@ -189,7 +189,7 @@ def _detected(board: Board, path: Path, picture: np.ndarray) -> BoardImageResult
     return BoardImageResult(path, detection, rms_px=float(np.sqrt((residuals**2).sum(1).mean())))
 
 
-def _line(board: Board, image: BoardImageResult) -> str:
+def _describe(board: Board, image: BoardImageResult) -> str:
     if image.detection is None:
         return f"{image.path.name}: not detected: {image.refusal}"
     features = "circles" if board.kind in ("circles", "acircles") else "corners"

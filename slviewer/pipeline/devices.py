@@ -24,7 +24,7 @@ class DriverView:
 
 def list_drivers() -> list[DriverView]:
     """All drivers, those that can be used here first."""
-    return [_looked(found) for found in available()]
+    return [_view(found) for found in available()]
 
 
 def devices() -> str:
@@ -43,7 +43,7 @@ def devices() -> str:
     return "\n".join(blocks)
 
 
-def _looked(driver: Driver) -> DriverView:
+def _view(driver: Driver) -> DriverView:
     offers = tuple(part for part in ("camera", "projector", "rig") if getattr(driver, part) is not None)
     connected, trouble = None, ""
     if driver.found is not None and not driver.missing:

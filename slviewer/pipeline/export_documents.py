@@ -88,7 +88,7 @@ def write_calibration_file(store: Session, path: Path, model: str) -> str:
         )
     elif isinstance(fitted, PixelwiseModel):
         fits = {"camera": pixelwise_residuals(fitted, rig.camera)}
-    T = _moved(rig.T_projector_camera, factor)
+    T = _scaled_transform(rig.T_projector_camera, factor)
     depths = fitted.bundle.depth_range_mm if isinstance(fitted, SplinedModel) else stereo.depth_range_mm
     poses = fitted.bundle.poses if isinstance(fitted, SplinedModel) else tuple(stereo.poses)
     entries: dict[str, Any] = {
@@ -207,7 +207,9 @@ def _targets(store: Session, model: str) -> list[dict[str, Any]]:
     targets = []
     for name in sorted(poses, key=natural_key):
         figures = dict(zip(("camera_rms_px", "projector_rms_px"), map(float, rms.get(name, ())), strict=False))
-        targets.append({"name": name, "T_camera_board": _moved(poses[name], scale_factor(store, model)), **figures})
+        targets.append(
+            {"name": name, "T_camera_board": _scaled_transform(poses[name], scale_factor(store, model)), **figures}
+        )
     return targets
 
 
@@ -227,15 +229,15 @@ def _merge(store: Session, name: str) -> dict[str, Any]:
 def _projector(store: Session, model: str) -> np.ndarray:
     """T_projector_camera (4, 4) mm by a model, with its correction of scale."""
     if model != "splined":
-        return _moved(load_stereo(store).rig.T_projector_camera, scale_factor(store, model))
+        return _scaled_transform(load_stereo(store).rig.T_projector_camera, scale_factor(store, model))
     splined = load_model(store, model)
     assert isinstance(splined, SplinedModel)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = splined.rig.R, splined.rig.t
-    return _moved(T, scale_factor(store, model))
+    return _scaled_transform(T, scale_factor(store, model))
 
 
-def _moved(T: np.ndarray, factor: float) -> np.ndarray:
+def _scaled_transform(T: np.ndarray, factor: float) -> np.ndarray:
     """A transform in a space that is larger by a factor."""
     larger = np.array(T, float)
     larger[:3, 3] *= factor
@@ -255,13 +257,13 @@ def write_table(store: Session, path: Path) -> None:
     writer.writerow(["capture", "name", "shape", "model", *figures, *(f"{r}_percent" for r in ranges), "up_to_date"])
     for result in results:
         meta, name = store.load_result(result, only=())[0], result.removeprefix("verify/")
-        label, shares, fresh = _harmless(str(labels.get(name, name))), meta["incidence"] or {}, is_fresh(store, result)
+        label, shares, fresh = _safe_text(str(labels.get(name, name))), meta["incidence"] or {}, is_fresh(store, result)
         for model, found in meta["models"].items():
             measured = [found.get(each) for each in figures] + [shares.get(each) for each in ranges]
             writer.writerow([name, label, meta["shape"], model, *measured, "yes" if fresh else "no"])
     replace_file(path, text.getvalue().encode())
 
 
-def _harmless(text: str) -> str:
+def _safe_text(text: str) -> str:
     """A name that a spreadsheet does not take for a formula."""
     return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t") else text

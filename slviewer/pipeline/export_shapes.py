@@ -12,7 +12,7 @@ from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, part
 from slviewer.pipeline.models import frame_of, load_model, preferred
 from slviewer.pipeline.open_session import numbered_results
-from slviewer.pipeline.scale import scale_factor, told_scale
+from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.ply import Ply, read_ply
@@ -62,9 +62,9 @@ def scan_shape(
     if not mask.any():
         raise InputError(f"{name}: no pixel was measured: does the calibration belong to this camera and projector?")
     frame = f"frame: {frame_of(store, cloud.model)}, x right, y down, z away"
-    notes = (f"scan {name}, {frame}", *_of_model(store, cloud.model))
+    notes = (f"scan {name}, {frame}", *_model_notes(store, cloud.model))
     if plan is not None:
-        return _meshed(name, build_mesh(cloud, plan, part(progress, 0.5, 1)), notes)
+        return _describe_mesh(name, build_mesh(cloud, plan, part(progress, 0.5, 1)), notes)
     progress(0.7, "normals")
     normals, colours = grid_normals(cloud.points)[mask], cloud.colours()
     if colours is not None and colours.ndim == 1:
@@ -107,25 +107,25 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
     """The points of a merge, or where there is a ``plan`` one mesh through them."""
     name = merge_name(store, name)
     progress(0.1, "reading the merged points")
-    meta, merged = _kept_merge(store, name, warn)
+    meta, merged = _read_merge(store, name, warn)
     model = str(meta.get("model", ""))
     notes = (
         f"merge {name} of {', '.join(meta['scans'])}, frame: {frame_of(store, model)}, at {meta['reference']}",
-        *_of_model(store, model),
+        *_model_notes(store, model),
     )
     if plan is None:
         said = "sigma: expected error along the normal, mm"
-        points = PointSet(merged.points, merged.normals, _rgb(merged))
+        points = PointSet(merged.points, merged.normals, _colours(merged))
         return Described(points, f"merge {name}", merged.scalars, (*notes, said))
-    return _meshed(f"merge {name}", build_mesh(_with_normals(merged), plan, part(progress, 0.1, 1)), notes)
+    return _describe_mesh(f"merge {name}", build_mesh(_with_normals(merged), plan, part(progress, 0.1, 1)), notes)
 
 
 def merged_points(store: Session, name: str, warn: Warn) -> PointSet:
     """The points of a merge whose outside is known, to make a mesh of; of the last one where none is named."""
-    return _with_normals(_kept_merge(store, merge_name(store, name), warn)[1])
+    return _with_normals(_read_merge(store, merge_name(store, name), warn)[1])
 
 
-def _kept_merge(store: Session, name: str, warn: Warn) -> tuple[dict[str, Any], Ply]:
+def _read_merge(store: Session, name: str, warn: Warn) -> tuple[dict[str, Any], Ply]:
     if not is_fresh(store, f"merge/{name}"):
         warn(f"merge {name} came from scans or a calibration that have changed since: merge again")
     meta = store.load_result(f"merge/{name}", only=())[0]
@@ -137,7 +137,7 @@ def _with_normals(merged: Ply) -> PointSet:
     if merged.normals is None:
         raise InputError("the merged cloud has no normals: merge the scans again")
     known = merged.normals.any(axis=1)
-    colours, sigma = _rgb(merged), merged.scalars.get("sigma")
+    colours, sigma = _colours(merged), merged.scalars.get("sigma")
     if sigma is not None and not (sigma[known] > 0).all():
         sigma = None
     return PointSet(
@@ -148,16 +148,16 @@ def _with_normals(merged: Ply) -> PointSet:
     )
 
 
-def _meshed(whose: str, made: BuiltMesh, notes: tuple[str, ...]) -> Described:
+def _describe_mesh(whose: str, made: BuiltMesh, notes: tuple[str, ...]) -> Described:
     done = tuple(made.text().splitlines())
     return Described(made.mesh, whose, {}, (*notes, "sigma: expected error along the normal, mm", *done), done)
 
 
-def _of_model(store: Session, model: str) -> tuple[str, ...]:
-    scale = told_scale(store, model) if model else ""
+def _model_notes(store: Session, model: str) -> tuple[str, ...]:
+    scale = describe_scale(store, model) if model else ""
     return (f"calibration {model}", *((scale,) if scale else ())) if model else ()
 
 
-def _rgb(merged: Ply) -> np.ndarray | None:
+def _colours(merged: Ply) -> np.ndarray | None:
     colours = merged.colours
     return np.repeat(colours[:, None], 3, axis=1) if colours is not None and colours.ndim == 1 else colours

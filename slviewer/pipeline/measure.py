@@ -104,7 +104,7 @@ def edit_measurements(
         csv: Write them all to this table too.
     """
     if not (relate or name or delete or bring_back):
-        return _told(session, csv)
+        return _list(session, csv)
     with opened(session, write=True) as store:
         if relate:
             add_relation(store, *relate)
@@ -114,10 +114,10 @@ def edit_measurements(
             remove(store, each)
         if bring_back:
             restore(store)
-        return _told(store, csv)
+        return _list(store, csv)
 
 
-def _told(session: SessionLike, csv: Path | None) -> str:
+def _list(session: SessionLike, csv: Path | None) -> str:
     lines = [in_words(each) for each in measurements(session)] or ["nothing was measured yet"]
     if csv is not None:
         lines.append(f"{export_measurements(session, csv)} measurements -> {csv}")

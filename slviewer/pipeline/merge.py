@@ -14,7 +14,7 @@ from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, stage, unheard, unwarned
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, next_number, opened
-from slviewer.pipeline.scale import scale_factor, told_scale
+from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Alignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
@@ -185,7 +185,7 @@ def merge(
         fitted = load_model(store, model or preferred(store))
         warn_if_stale(store, warn)
         check_capture_sizes(store, names)
-        scale, clouds = told_scale(store, fitted.name), {}
+        scale, clouds = describe_scale(store, fitted.name), {}
         for i, (shot, frames, phases) in enumerate(decode_captures(store, names, warn)):
             progress(0.4 * i / len(names), f"reconstructing {shot.name}")
             clouds[shot.name] = capture_cloud(

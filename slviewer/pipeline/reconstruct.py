@@ -25,7 +25,7 @@ from slviewer.pipeline.models import (
     warn_if_stale,
 )
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.scale import told_scale
+from slviewer.pipeline.scale import describe_scale
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.mesh import grid_triangles
 from slviewer.reconstruction.reconstruct import JUMP
@@ -140,7 +140,7 @@ def reconstruct(
         board = None
         if region is not None:
             depth_range = load_stereo(store).depth_range_mm
-            board = compare("plane", clouds, lit(phases, clouds), region=region, depth_range=depth_range)
+            board = compare("plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depth_range)
         keep = cloud.mask if region is None else cloud.mask & region
         if not keep.any():
             raise InputError(
@@ -155,8 +155,8 @@ def reconstruct(
         write_ply(ply, cloud.points[keep], texture[keep], scalars=cloud.sigmas(keep), faces=faces, notes=notes)
         if grid is not None:
             write_grid(Path(grid), cloud.points)
-        scale, fitted, frame = told_scale(store, name), chosen[name], frame_of(store, name)
-        masked = unsupported(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
+        scale, fitted, frame = describe_scale(store, name), chosen[name], frame_of(store, name)
+        masked = masked_share(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
         raised = fitted.residuals_over_noise(cloud.axis) if isinstance(fitted, SplinedModel) else 1.0
         progress(1.0, "reconstructed")
     return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked, frame, raised)
@@ -181,7 +181,7 @@ def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn)
     return board_mask(Board.parse(board), found, texture.shape[:2])
 
 
-def lit(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:
+def illuminated_pixels(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:
     """(h, w) bool: what a perfect decoder could have measured on the axis that the clouds came from."""
     return phases[next(iter(clouds.values())).axis].lit
 
@@ -204,7 +204,7 @@ def reconstruct_models(
     return clouds
 
 
-def unsupported(model: SplinedModel, phase: PhaseMap, region: np.ndarray | None = None) -> float:
+def masked_share(model: SplinedModel, phase: PhaseMap, region: np.ndarray | None = None) -> float:
     """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are masked, because they
     look through parts of camera or projector that no target pose lit."""
     every = np.isfinite(model.points(phase, supported=False)[..., 2])

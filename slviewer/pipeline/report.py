@@ -30,7 +30,7 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
 from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.scale import scale_factor, told_scale
+from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.records import from_plain
 from slviewer.report.data import (
     AcceptanceView,
@@ -124,7 +124,7 @@ def _models(store: Session) -> ModelsView | None:
         recommended=recommended(store),
         comparison=validation(store),
         splined=None if splined is None else splined.summary(),
-        scales={name: words for name in there if (words := told_scale(store, name))},
+        scales={name: words for name in there if (words := describe_scale(store, name))},
     )
 
 

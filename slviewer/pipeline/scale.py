@@ -30,7 +30,7 @@ def scale_sigma(store: Session, model: str) -> float:
     return 0.0 if applied is None else 1e-6 * float(applied["U_ppm"]) / 2
 
 
-def told_scale(store: Session, model: str) -> str:
+def describe_scale(store: Session, model: str) -> str:
     """What was applied to a calibration, in words; empty where nothing was."""
     applied = correction(store, model)
     if applied is None:

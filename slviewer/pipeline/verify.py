@@ -18,8 +18,8 @@ from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
 from slviewer.pipeline.models import ModelName, check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.reconstruct import board_region, lit, reconstruct_models, unsupported
-from slviewer.pipeline.scale import told_scale
+from slviewer.pipeline.reconstruct import board_region, illuminated_pixels, masked_share, reconstruct_models
+from slviewer.pipeline.scale import describe_scale
 
 Shape = Literal["plane", "sphere"]
 
@@ -122,7 +122,9 @@ def verify(
             if shape == "plane" and shot.role == "calibration":
                 region = board_region(store, shot, capture_texture(shot, frames), warn)
             try:
-                result = compare(shape, clouds, lit(phases, clouds), region=region, depth_range=reach, radius=radius)
+                result = compare(
+                    shape, clouds, illuminated_pixels(phases, clouds), region=region, depth_range=reach, radius=radius
+                )
             except InputError as error:
                 raise InputError(f"{shot.name}: {error}") from error
             for message in result.warnings:
@@ -130,10 +132,10 @@ def verify(
             results[shot.name] = result
             axis_used = next(iter(clouds.values())).axis
             masked[shot.name] = {
-                name: unsupported(model, phases[axis_used], result.region)
+                name: masked_share(model, phases[axis_used], result.region)
                 for name, model in chosen.items()
                 if isinstance(model, SplinedModel)
             }
-        scales = {name: words for name in chosen if (words := told_scale(store, name))}
+        scales = {name: words for name in chosen if (words := describe_scale(store, name))}
         progress(1.0, "measured")
     return Verification(results, masked, scales)

@@ -46,7 +46,7 @@ def reproduce(
     out = Path(out or ("reproduction-quick" if quick else "reproduction"))
     session = out / "session"
     scale = QUICK_SCALE if quick else 1.0
-    _simulated(session, scale, seed, part(progress, 0.0, 0.4))
+    _simulate(session, scale, seed, part(progress, 0.0, 0.4))
     found = calibrate(session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn)
     assert found.pixelwise is not None
     with Session.open(session) as store:
@@ -61,7 +61,7 @@ def reproduce(
         progress=part(progress, 0.65, 0.75),
         warn=warn,
     ).captures
-    round_ones = verify(
+    spheres = verify(
         session,
         [n for n in names if n.startswith("sphere_")],
         "sphere",
@@ -79,8 +79,8 @@ def reproduce(
         stereo=found.stereo,
         pixelwise=found.pixelwise,
         planes=planes,
-        spheres=round_ones.captures,
-        spacings_mm=_spacings(session, round_ones),
+        spheres=spheres.captures,
+        spacings_mm=_spacings(session, spheres),
         merged=merged,
         report=out / "report.html",
     )
@@ -91,7 +91,7 @@ def reproduce(
     return result
 
 
-def _simulated(session: Path, scale: float, seed: int, progress: Progress) -> None:
+def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> None:
     """Fills the session, unless it holds this scale and seed already; refuses one that holds anything else."""
     if is_session(session):
         made = _truth(session)

@@ -78,11 +78,11 @@ class Reproduction:
                 f"(the Letter: {theirs['camera']:.3f}, {theirs['projector']:.3f}).",
                 "",
                 "Flat board (Table 1)",
-                render(_shown(letter_rows(self.planes))),
+                render(_terminal_columns(letter_rows(self.planes))),
                 f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
                 "",
                 f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
-                render(_shown(letter_rows(self.spheres))),
+                render(_terminal_columns(letter_rows(self.spheres))),
                 "Distances between the sphere centres, RMS error: "
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",
@@ -96,7 +96,7 @@ class Reproduction:
         )
 
 
-def _shown(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _terminal_columns(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The columns that fit a terminal; coverage and points set aside stand in the report."""
     return [{k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k} for row in table]
 

@@ -27,7 +27,7 @@ from slviewer.pipeline.models import (
     rejection,
     validation,
 )
-from slviewer.pipeline.scale import scale_factor, told_scale
+from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.session.capture import Capture
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
@@ -301,7 +301,7 @@ class SessionReader:
             is_pinned=insisted(session),
             splined=splined,
             comparison=validation(session),
-            scales={model: words for model in models if (words := told_scale(session, model))},
+            scales={model: words for model in models if (words := describe_scale(session, model))},
             missing="" if "splined" in models or not stereo.poses else missing_for_splined(session),
         )
 

@@ -3,7 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from slviewer.pipeline.batch_storage import delivered, swept
+from slviewer.pipeline.batch_storage import export_folder, remove_leftovers
 
 BATCH = "0a1b2c3d"
 WORKERS, EACH = 4, 150
@@ -12,7 +12,7 @@ WORKERS, EACH = 4, 150
 def test_workers_that_deliver_at_once_do_not_trip_each_other(tmp_path: Path) -> None:
     def worker(w: int) -> None:
         for k in range(EACH):
-            with delivered(str(tmp_path), BATCH) as made:
+            with export_folder(str(tmp_path), BATCH) as made:
                 (made / f"{w}_{k}.ply").write_bytes(bytes([w]))
 
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -23,11 +23,11 @@ def test_workers_that_deliver_at_once_do_not_trip_each_other(tmp_path: Path) -> 
 
 def test_what_a_killed_worker_leaves_goes_with_its_batch_alone(tmp_path: Path) -> None:
     for batch in (BATCH, "another"):
-        killed = delivered(str(tmp_path), batch)
+        killed = export_folder(str(tmp_path), batch)
         (killed.__enter__() / "half.ply").write_bytes(b"ply")
         del killed  # closing it raises GeneratorExit in it, as little of it runs as of a killed worker
     left = {path.name for path in (tmp_path / "exports").iterdir()}
     assert len(left) == 2 and all(name.startswith(".batch-") for name in left)
-    swept(str(tmp_path), BATCH)
+    remove_leftovers(str(tmp_path), BATCH)
     (other,) = (tmp_path / "exports").iterdir()
     assert other.name.startswith(".batch-another")
