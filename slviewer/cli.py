@@ -22,13 +22,6 @@ from slviewer.commands.wizard import wizard
 from slviewer.errors import Cancelled, SlviewerError
 
 
-def describe_rigs(drivers: str) -> str:
-    """The drivers, then the rigs that can be chosen by name."""
-    from slviewer.pipeline.rig_presets import rigs
-
-    return f"{drivers}\n{rigs()}"
-
-
 def describe_measurement(made: Any, **_: Any) -> str:
     """The measurement in one line."""
     from slviewer.pipeline.measurements import in_words
@@ -43,24 +36,9 @@ def describe_simulation(names: list[str], session: Path, **_: Any) -> str:
     return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
 
 
-def describe_patterns(count: int, out: Path, **_: Any) -> str:
-    """How many images were written."""
-    return f"{count} patterns written to {out}"
-
-
-def describe_target(_: None, board: str, out: Path) -> str:
-    """What to do with the drawing."""
-    return f"{board} drawn to {out}: print at 100 %, and measure it"
-
-
-def describe_report(_: None, session: Path, out: Path) -> str:
-    """Where the report is."""
-    return f"report written to {out}"
-
-
 COMMANDS: dict[str, Callable[..., Any]] = {
     "wizard": wizard,
-    "devices": read_command("pipeline.devices:devices", run=partial(show_result, describe=describe_rigs)),
+    "devices": read_command("pipeline.devices:devices"),
     "preflight": read_command("preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
     "capture": read_command("pipeline.capture:capture", "session", "name", options=[PORT], run=run_capture),
     "import": import_command,
@@ -103,10 +81,10 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     ),
     "reproduce": read_command("validation.reproduce:reproduce", options=[JSON]),
     "prove": read_command("validation.prove:prove", options=[JSON], names={"cases": "case"}),
-    "patterns": read_command("pipeline.printouts:patterns", run=partial(show_result, describe=describe_patterns)),
-    "target": read_command("pipeline.printouts:target", "board", run=partial(show_result, describe=describe_target)),
+    "patterns": read_command("pipeline.printouts:patterns"),
+    "target": read_command("pipeline.printouts:target", "board"),
     "detect": read_command("pipeline.detect:detect_board", "images", options=[JSON], names={"csv_out": "csv"}),
-    "report": read_command("pipeline.report:report", "session", run=partial(show_result, describe=describe_report)),
+    "report": read_command("pipeline.report:report", "session"),
     "inspect": read_command("pipeline.inspect:inspect", "session"),
     "bench": read_command("validation.bench:bench", options=[JSON]),
 }

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from slviewer.devices.drivers import Driver, available
 from slviewer.errors import SlviewerError
+from slviewer.pipeline.rig_presets import rigs
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ def devices() -> str:
         if driver.connected is not None:
             lines += [f"  connected: {line}" for line in driver.connected] or ["  connected: nothing was found"]
         blocks.append("\n".join(lines))
-    return "\n".join(blocks)
+    return "\n".join([*blocks, rigs()])
 
 
 def _view(driver: Driver) -> DriverView:

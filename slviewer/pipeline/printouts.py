@@ -10,7 +10,7 @@ from slviewer.target.board import Board
 from slviewer.target.sheet import write_sheet
 
 
-def patterns(preset: str, projector: str, out: Path | str) -> int:
+def patterns(preset: str, projector: str, out: Path | str) -> str:
     """Write the images of a pattern sequence, and the TOML that `import frames` reads.
 
     Args:
@@ -18,20 +18,23 @@ def patterns(preset: str, projector: str, out: Path | str) -> int:
         projector: Width x height of the projector, px.
         out: Folder to make.
 
-    Returns the number of images.
+    Returns how many images were written, in words.
     """
     if preset not in PRESETS:
         raise InputError(f"no pattern sequence is called {preset!r}: use {', '.join(PRESETS)}")
     sequence = PRESETS[preset](parse_size(projector))
     write_pattern_folder(Path(out), sequence)
-    return len(sequence.frames)
+    return f"{len(sequence.frames)} patterns written to {out}"
 
 
-def target(board: str, out: Path | str) -> None:
+def target(board: str, out: Path | str) -> str:
     """Draw a printable target to exact scale.
 
     Args:
         board: circles:21x16:9, acircles:..., chessboard:9x7:75 or charuco:....
         out: A .pdf or .svg file.
+
+    Returns what to do with it, in words.
     """
     write_sheet(Board.parse(board), Path(out))
+    return f"{board} drawn to {out}: print at 100 %, and measure it"

@@ -59,12 +59,14 @@ MOST_MAPS = 8
 """Verified captures whose error maps are drawn; the tables hold them all."""
 
 
-def report(session: SessionLike, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> None:
+def report(session: SessionLike, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> str:
     """Write one self-contained HTML report of a session.
 
     Args:
         session: Session folder.
         out: The .html file.
+
+    Returns where it is, in words.
     """
     if Path(out).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{out} is no HTML file: end its name in .html")
@@ -77,6 +79,7 @@ def report(session: SessionLike, out: Path | str, *, progress: Progress = unhear
         title, subtitle = session_title(data)
         write_page(out, title, subtitle, session_headlines(data), session_sections(data))
     progress(1.0, "written")
+    return f"report written to {out}"
 
 
 def _data(store: Session) -> SessionData:
