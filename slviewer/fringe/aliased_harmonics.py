@@ -67,7 +67,7 @@ class AliasedHarmonics:
 
 
 def estimate_aliased_harmonics(
-    found: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]
+    layout: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]
 ) -> AliasedHarmonics:
     """What harmonics leave in the finest period of an axis; nothing where it has five or more steps.
 
@@ -75,9 +75,9 @@ def estimate_aliased_harmonics(
     pixels along the image lines that cross the fringes are used.
     """
     none = AliasedHarmonics()
-    if not 0 < found.steps <= MOST_STEPS:
+    if not 0 < layout.steps <= MOST_STEPS:
         return none
-    pieces = _cut_pieces(found, stack, white, noise)
+    pieces = _cut_pieces(layout, stack, white, noise)
     if pieces is None:
         return none
     fit = _fit_ripple(pieces)
@@ -98,22 +98,22 @@ def estimate_aliased_harmonics(
 
 
 def correct_harmonics(
-    harmonics: AliasedHarmonics, found: Layout, phase: np.ndarray, wrapped: np.ndarray
+    harmonics: AliasedHarmonics, layout: Layout, phase: np.ndarray, wrapped: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Absolute and wrapped phase (h, w) float32 rad without the ripple, where it is to be corrected; else as given."""
     if not harmonics.is_corrected:
         return phase, wrapped
-    added = harmonics.correction(wrapped + np.float32(found.offset_rad))
+    added = harmonics.correction(wrapped + np.float32(layout.offset_rad))
     turned = wrapped + added
     turned -= np.float32(2 * np.pi) * np.rint(turned * np.float32(0.5 / np.pi))
     return phase + added, turned
 
 
-def describe_gamma(harmonics: AliasedHarmonics, found: Layout) -> list[Suspect]:
+def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> list[Suspect]:
     """What the operator should know about gamma, and change."""
     if not harmonics.is_significant:
         return []
-    per_rad = found.period_px / (2 * np.pi)
+    per_rad = layout.period_px / (2 * np.pi)
     theta = np.linspace(0, 2 * np.pi, 361)
     largest = float(np.abs(harmonics.correction(theta)).max()) * per_rad
     remaining = harmonics.error_rad * per_rad
@@ -124,10 +124,10 @@ def describe_gamma(harmonics: AliasedHarmonics, found: Layout) -> list[Suspect]:
     )
     text = (
         f"the light does not grow evenly with the grey level (gamma): with {harmonics.steps} phase steps this shifts "
-        f"the coordinates of axis {found.axis} by up to {largest:.2g} px: {treated}; make the responses of projector "
+        f"the coordinates of axis {layout.axis} by up to {largest:.2g} px: {treated}; make the responses of projector "
         "and camera linear, or use 5 phase steps or more"
     )
-    return [Suspect(found.shifts[-1].indices[0], "gamma", text)]
+    return [Suspect(layout.shifts[-1].indices[0], "gamma", text)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +153,8 @@ class _Amplitude:
         return abs(self.value) > max(SIGMAS * self.error, CONTROL * abs(self.control))
 
 
-def _cut_pieces(found: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]) -> _Pieces | None:
-    indices = list(found.shifts[-1].indices)
+def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]) -> _Pieces | None:
+    indices = list(layout.shifts[-1].indices)
     candidates = [_sample_lines(stack, indices, white, noise)]
     candidates.append(_sample_lines(stack.transpose(0, 2, 1), indices, white, noise))
     phasor, background, valid, cycles = max(candidates, key=lambda c: c[3])

@@ -5,8 +5,8 @@ import numpy as np
 from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
 from slviewer.fringe.frame_light import CLIPPED, equalize_axis
 from slviewer.fringe.kernels_spikes import spike_rules
-from slviewer.fringe.layout import Layout, Shift, check_stack, layout, white_level
-from slviewer.fringe.levels import cell_misfit, code_cell_px, found_levels, lowest_coordinate, unambiguous_px
+from slviewer.fringe.layout import Layout, Shift, axis_layout, check_stack, white_level
+from slviewer.fringe.levels import cell_misfit, code_cell_px, layout_levels, lowest_coordinate, unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.reference import code_bits, complete_map, dark_sigmas, decode_reference, phase_shift
@@ -25,26 +25,26 @@ def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap
     or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
-    found = layout(sequence, axis)
+    layout = axis_layout(sequence, axis)
     stack = np.ascontiguousarray(stack)
     white = white_level(stack, sequence.select(axis))
     sequence, stack, factor = equalize_axis(sequence, stack, axis)
     if factor != 1:
-        found = layout(sequence, axis)
+        layout = axis_layout(sequence, axis)
     clipped = white if factor == 1 else CLIPPED
-    noise = measure_noise(found, stack, clipped)
-    scale = grey_scale(found, noise, white * factor)._replace(white=clipped)
-    if not found.shifts:
-        maps = _gray_alone(found, stack, scale)
-    elif found.numbers_periods:
-        maps = _coded(found, stack, scale)
-    elif found.gray:
-        maps = _cells(found, stack, scale)
+    noise = measure_noise(layout, stack, clipped)
+    scale = grey_scale(layout, noise, white * factor)._replace(white=clipped)
+    if not layout.shifts:
+        maps = _gray_alone(layout, stack, scale)
+    elif layout.numbers_periods:
+        maps = _coded(layout, stack, scale)
+    elif layout.gray:
+        maps = _cells(layout, stack, scale)
     else:
-        maps = _levels(found, stack, scale)
+        maps = _levels(layout, stack, scale)
     phase, *others = maps
-    _repair_spikes(found, phase, others[-1])
-    return complete_map(axis, found, stack, clipped, (phase, *others), noise, factor)
+    _repair_spikes(layout, phase, others[-1])
+    return complete_map(axis, layout, stack, clipped, (phase, *others), noise, factor)
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
@@ -60,22 +60,22 @@ def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
                 return stack[i].copy()
     for axis in sequence.axes:
         if sequence.periods_px(axis):
-            shift = layout(sequence, axis).shifts[-1]
+            shift = axis_layout(sequence, axis).shifts[-1]
             _, _, background, _ = phase_shift(stack, shift.indices, sequence.sign(axis))
             return np.rint(background).astype(stack.dtype)
     return stack.max(axis=0)
 
 
-def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
+def _coded(layout: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
     phase, wrapped, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(4))
     reason = np.empty(stack.shape[1:], np.uint8)
-    rules = code_rules(found, fringe_mean(found, stack) if found.is_plain else MIDDLE)
+    rules = code_rules(layout, fringe_mean(layout, stack) if layout.is_plain else MIDDLE)
     kernels_coded.decode_coded(
         stack,
-        steps_of(found.shifts[0], found.sign, found.offset_rad),
-        np.array(found.gray, np.int64),
-        np.array(found.inverse, np.int64),
-        -1 if found.complementary is None else found.complementary,
+        steps_of(layout.shifts[0], layout.sign, layout.offset_rad),
+        np.array(layout.gray, np.int64),
+        np.array(layout.inverse, np.int64),
+        -1 if layout.complementary is None else layout.complementary,
         scale,
         rules,
         phase,
@@ -87,28 +87,28 @@ def _coded(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.n
     return phase, wrapped, modulation, background, reason
 
 
-def _levels(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
+def _levels(layout: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
     maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
-    kernels_levels.decode_levels(stack, shifts_of(found), ladder_of(found), scale, *maps)
+    kernels_levels.decode_levels(stack, shifts_of(layout), ladder_of(layout), scale, *maps)
     return maps
 
 
-def _cells(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
+def _cells(layout: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
     maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
-    bits = code_bits(found)
-    inverses = [*found.inverse, *[-1] * (len(bits) - len(found.inverse))]
+    bits = code_bits(layout)
+    inverses = [*layout.inverse, *[-1] * (len(bits) - len(layout.inverse))]
     rules = kernels_cells.CellRules(
-        found.gray_origin_px,
-        code_cell_px(found),
+        layout.gray_origin_px,
+        code_cell_px(layout),
         limits.WEAK_BIT,
         limits.WEAKER,
-        fringe_mean(found, stack),
+        fringe_mean(layout, stack),
         limits.UNDECIDED_BIT,
     )
     kernels_cells.decode_cells(
         stack,
-        shifts_of(found),
-        ladder_of(found),
+        shifts_of(layout),
+        ladder_of(layout),
         np.array(bits, np.int64),
         np.array(inverses, np.int64),
         scale,
@@ -118,25 +118,25 @@ def _cells(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.n
     return maps
 
 
-def _gray_alone(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
+def _gray_alone(layout: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
     phase, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(3))
     reason = np.empty(stack.shape[1:], np.uint8)
     rules = kernels_gray.GrayRules(
-        found.gray_origin_px,
-        found.gray_cell_px,
+        layout.gray_origin_px,
+        layout.gray_cell_px,
         -0.5,
-        found.extent - 0.5,
-        np.sqrt(0.5 if found.inverse else 1.5),
+        layout.extent - 0.5,
+        np.sqrt(0.5 if layout.inverse else 1.5),
         limits.GRAY_UNDECIDED_SIGMAS,
         limits.GRAY_UNDECIDED_PART,
         limits.DARK_BITS,
     )
     kernels_gray.decode_gray(
         stack,
-        np.array(found.gray, np.int64),
-        np.array(found.inverse, np.int64),
-        -1 if found.white is None else found.white,
-        -1 if found.black is None else found.black,
+        np.array(layout.gray, np.int64),
+        np.array(layout.inverse, np.int64),
+        -1 if layout.white is None else layout.white,
+        -1 if layout.black is None else layout.black,
         scale,
         rules,
         phase,
@@ -147,9 +147,9 @@ def _gray_alone(found: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple
     return phase, np.full_like(phase, np.nan), modulation, background, reason
 
 
-def _repair_spikes(found: Layout, phase: np.ndarray, reason: np.ndarray) -> None:
+def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> None:
     """Move phases that were read from the wrong side of a code edge, and mask those without support."""
-    rules, lists = spike_rules(found), kernels_spikes.allocate_lists(phase.shape)
+    rules, lists = spike_rules(layout), kernels_spikes.allocate_lists(phase.shape)
     if rules.is_plain:
         kernels_spikes.list_changes(phase, rules, False, *lists)
         kernels_spikes.move_phases(*lists, phase)
@@ -157,15 +157,15 @@ def _repair_spikes(found: Layout, phase: np.ndarray, reason: np.ndarray) -> None
     kernels_spikes.mask_phases(*lists, phase, reason)
 
 
-def grey_scale(found: Layout, noise: tuple[float, float], white: float) -> kernels.Scale:
+def grey_scale(layout: Layout, noise: tuple[float, float], white: float) -> kernels.Scale:
     """The grey levels that decide about a pixel, from the noise (a, b) and the level at which the camera clips."""
-    return kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(found), white)
+    return kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(layout), white)
 
 
-def code_rules(found: Layout, mean: float) -> kernels_coded.CodeRules:
+def code_rules(layout: Layout, mean: float) -> kernels_coded.CodeRules:
     """How the Gray bits of a layout are read; ``mean`` as `threshold.fringe_mean` has it."""
     return kernels_coded.CodeRules(
-        found.gray_origin_px / found.period_px,
+        layout.gray_origin_px / layout.period_px,
         limits.EDGE,
         limits.WEAK_BIT,
         limits.WEAKER,
@@ -196,9 +196,9 @@ def steps_of(shift: Shift, sign: int, offset_rad: float = 0.0) -> kernels.Steps:
     )
 
 
-def shifts_of(found: Layout) -> kernels.Shifts:
+def shifts_of(layout: Layout) -> kernels.Shifts:
     """All periods of a layout, as the kernels read them."""
-    shifts = [steps_of(shift, found.sign, found.offset_rad) for shift in found.shifts]
+    shifts = [steps_of(shift, layout.sign, layout.offset_rad) for shift in layout.shifts]
     return kernels.Shifts(
         np.concatenate([shift.frames for shift in shifts]),
         np.concatenate([shift.cosines for shift in shifts]),
@@ -212,18 +212,18 @@ def shifts_of(found: Layout) -> kernels.Shifts:
     )
 
 
-def ladder_of(found: Layout) -> kernels_levels.Ladder:
+def ladder_of(layout: Layout) -> kernels_levels.Ladder:
     """How a layout's periods become one absolute phase; empty where Gray bits number the periods."""
-    if found.numbers_periods:
+    if layout.numbers_periods:
         return kernels_levels.Ladder(np.zeros((0, 0)), np.zeros(0), 0.0, 0.0, 0.0)
-    levels = found_levels(found)
-    extent = min(found.extent, unambiguous_px(found))
+    levels = layout_levels(layout)
+    extent = min(layout.extent, unambiguous_px(layout))
     return kernels_levels.Ladder(
         np.array([level.weights for level in levels], np.float64),
         np.array([level.period_px for level in levels], np.float64),
-        0.0 if found.gray else lowest_coordinate(levels[0].period_px, extent),
+        0.0 if layout.gray else lowest_coordinate(levels[0].period_px, extent),
         limits.LEVEL_MISFIT,
-        cell_misfit(found),
+        cell_misfit(layout),
     )
 
 

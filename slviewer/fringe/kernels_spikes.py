@@ -48,17 +48,17 @@ class SpikeRules(NamedTuple):
     lonely_neighbours: int = limits.LONELY_NEIGHBOURS
 
 
-def spike_rules(found: Layout) -> SpikeRules:
+def spike_rules(layout: Layout) -> SpikeRules:
     """The rules for the phases of a layout."""
     period = 2 * np.pi
     # Gray code alone has no period: neighbouring cells agree
-    cell = period if found.shifts else period * max(limits.GRAY_CELL_PX / found.gray_cell_px, limits.GRAY_CELLS)
-    unambiguous, low, high = unambiguous_px(found), -np.inf, np.inf
+    cell = period if layout.shifts else period * max(limits.GRAY_CELL_PX / layout.gray_cell_px, limits.GRAY_CELLS)
+    unambiguous, low, high = unambiguous_px(layout), -np.inf, np.inf
     if not np.isfinite(unambiguous):
-        low, high = -0.5 - limits.OUTSIDE_PX, found.extent - 0.5 + limits.OUTSIDE_PX
-    per_px = period / found.period_px
+        low, high = -0.5 - limits.OUTSIDE_PX, layout.extent - 0.5 + limits.OUTSIDE_PX
+    per_px = period / layout.period_px
     return SpikeRules(
-        cell, found.is_plain, found.origin_rad, low * per_px, high * per_px, unambiguous / found.period_px
+        cell, layout.is_plain, layout.origin_rad, low * per_px, high * per_px, unambiguous / layout.period_px
     )
 
 

@@ -80,7 +80,7 @@ class Layout:
         return 2 * np.pi * self.gray_origin_px / self.period_px
 
 
-def layout(sequence: PatternSequence, axis: Axis) -> Layout:
+def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
     """The layout of one axis. Raises InputError where its frames cannot give an absolute phase."""
     if axis not in sequence.axes:
         there = f"use axis {sequence.axes[0]}" if sequence.axes else "phase steps or Gray bits are needed"
@@ -158,17 +158,17 @@ def _by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...
     return tuple(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
 
 
-def _check_code(found: Layout) -> None:
-    where = f"axis {found.axis}"
-    if not found.gray:
+def _check_code(layout: Layout) -> None:
+    where = f"axis {layout.axis}"
+    if not layout.gray:
         raise InputError(f"{where}: a complementary bit without Gray bits says nothing: add them")
-    if found.extent == np.inf:
+    if layout.extent == np.inf:
         return
-    cells = (found.extent - 0.5 - found.gray_origin_px) / found.gray_cell_px
-    if 2 ** len(found.gray) < cells - 0.5:
-        what = "periods" if found.numbers_periods else f"cells of {found.gray_cell_px:g} px"
+    cells = (layout.extent - 0.5 - layout.gray_origin_px) / layout.gray_cell_px
+    if 2 ** len(layout.gray) < cells - 0.5:
+        what = "periods" if layout.numbers_periods else f"cells of {layout.gray_cell_px:g} px"
         raise InputError(
-            f"{where}: {len(found.gray)} Gray bits number {2 ** len(found.gray)} {what}, and {found.extent:g} px hold "
-            f"{cells:.0f}: give the fringe period, gray_cell_px and the size of the projector that were used, or the "
-            "missing bits"
+            f"{where}: {len(layout.gray)} Gray bits number {2 ** len(layout.gray)} {what}, and {layout.extent:g} px "
+            f"hold {cells:.0f}: give the fringe period, gray_cell_px and the size of the projector that were used, or "
+            "the missing bits"
         )

@@ -26,15 +26,15 @@ WHOLE = 1e-3
 """How far from whole a ratio of periods may be: over fifty repetitions it comes to a twentieth of a period."""
 
 
-def found_levels(found: Layout) -> tuple[Level, ...]:
+def layout_levels(layout: Layout) -> tuple[Level, ...]:
     """The levels of a layout whose Gray code, if any, does not number the periods of its one phase shift.
 
     Raises InputError where the periods do not cover what they must: a Gray cell, the projector, or, where a relative
     phase will do, a range of whole periods.
     """
-    periods, where = tuple(shift.period_px for shift in found.shifts), f"axis {found.axis}: "
-    if found.gray:
-        cell = code_cell_px(found)
+    periods, where = tuple(shift.period_px for shift in layout.shifts), f"axis {layout.axis}: "
+    if layout.gray:
+        cell = code_cell_px(layout)
         try:
             return plan_levels(periods, cell * (1 - SAME_WIDTH))
         except InputError as error:
@@ -43,9 +43,9 @@ def found_levels(found: Layout) -> tuple[Level, ...]:
                 f"bits or the steps of a period of {cell:g} px or more"
             ) from error
     try:
-        return plan_levels(periods, found.extent)
+        return plan_levels(periods, layout.extent)
     except InputError as error:
-        if not found.relative:
+        if not layout.relative:
             raise InputError(
                 f"{where}{error}, which the projector spans: add a longer period or Gray code, or set relative = true "
                 "for a phase that is not absolute"
@@ -53,12 +53,12 @@ def found_levels(found: Layout) -> tuple[Level, ...]:
     return plan_levels(periods, repeating_range(periods))
 
 
-def unambiguous_px(found: Layout) -> float:
+def unambiguous_px(layout: Layout) -> float:
     """The range of projector px that a layout tells apart, where it is less than the projector; else infinite."""
-    if found.gray or not found.shifts:
+    if layout.gray or not layout.shifts:
         return np.inf
-    reach = found_levels(found)[0].period_px
-    return np.inf if reach >= found.extent else reach
+    reach = layout_levels(layout)[0].period_px
+    return np.inf if reach >= layout.extent else reach
 
 
 def lowest_coordinate(period_px: float, extent: float) -> float:
@@ -66,15 +66,15 @@ def lowest_coordinate(period_px: float, extent: float) -> float:
     return -0.5 - (period_px - extent) / 2
 
 
-def code_cell_px(found: Layout) -> float:
+def code_cell_px(layout: Layout) -> float:
     """Width of the cells that all `code_bits` number."""
-    return found.gray_cell_px / (1 if found.complementary is None else 2)
+    return layout.gray_cell_px / (1 if layout.complementary is None else 2)
 
 
-def cell_misfit(found: Layout) -> float:
+def cell_misfit(layout: Layout) -> float:
     """Largest distance, in periods of the first level, between a coordinate and the middle of the cell that holds it:
     half way between half a cell, where the cell ends, and half a period, where the next order begins."""
-    return 0.25 * (1 + code_cell_px(found) / found_levels(found)[0].period_px)
+    return 0.25 * (1 + code_cell_px(layout) / layout_levels(layout)[0].period_px)
 
 
 def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ...]:

@@ -5,7 +5,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.axis_agreement import FEWEST_EDGES, AxisReader, described_frames, measure_agreement
 from slviewer.fringe.frame_light import equalize_frames, estimate_frame_light
-from slviewer.fringe.layout import check_stack, layout
+from slviewer.fringe.layout import axis_layout, check_stack
 from slviewer.fringe.line_sample import coded_frames, sample_lines
 from slviewer.fringe.sequence import Axis, PatternSequence
 
@@ -35,11 +35,11 @@ def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axi
     edges fall at no common phase (wrong period, order of bits, or order of frames).
     """
     check_stack(sequence, stack)
-    found = layout(sequence, axis)
+    layout = axis_layout(sequence, axis)
     light = estimate_frame_light(sequence, stack)
     if light.is_significant:
         stack = equalize_frames(stack, light, sequence)[0]
-    if not (found.shifts and found.gray):
+    if not (layout.shifts and layout.gray):
         raise InputError(
             f"axis {axis}: the origin of a Gray code shows only beside a phase shift: there is none to compare"
         )

@@ -5,11 +5,11 @@ import numpy as np
 from slviewer.fringe import limits
 from slviewer.fringe.aliased_harmonics import correct_harmonics, estimate_aliased_harmonics
 from slviewer.fringe.frame_light import CLIPPED, equalize_axis, restore_levels
-from slviewer.fringe.layout import Layout, check_stack, layout, white_level
+from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
 from slviewer.fringe.levels import (
     cell_misfit,
     code_cell_px,
-    found_levels,
+    layout_levels,
     lowest_coordinate,
     needed_modulation,
     unambiguous_px,
@@ -27,41 +27,41 @@ TWO_PI = 2 * np.pi
 def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
     """What `decode.decode` returns, computed without kernels: same wrapped phase to 1e-5 rad, absolute to 1e-4 rad."""
     check_stack(sequence, stack)
-    found = layout(sequence, axis)
+    layout = axis_layout(sequence, axis)
     full = white_level(stack, sequence.select(axis))
     sequence, stack, factor = equalize_axis(sequence, stack, axis)
     if factor != 1:
-        found = layout(sequence, axis)
+        layout = axis_layout(sequence, axis)
     white = full if factor == 1 else CLIPPED
-    noise = measure_noise(found, stack, white)
-    if not found.shifts:
-        phase, modulation, background, inconsistent, dark = _gray_alone(found, stack, noise)
+    noise = measure_noise(layout, stack, white)
+    if not layout.shifts:
+        phase, modulation, background, inconsistent, dark = _gray_alone(layout, stack, noise)
         wrapped = np.full_like(phase, np.nan)
         weakest, saturated = modulation, np.zeros(phase.shape, bool)
     else:
-        shifted = [phase_shift(stack, shift.indices, found.sign, found.offset_rad) for shift in found.shifts]
+        shifted = [phase_shift(stack, shift.indices, layout.sign, layout.offset_rad) for shift in layout.shifts]
         wrapped, modulation, background, _ = shifted[-1]
         weakest = np.minimum.reduce([b for _, b, _, _ in shifted])
         saturated = np.logical_or.reduce([(peak >= white) & (a + b >= white) for _, b, a, peak in shifted])
-        if found.numbers_periods:
-            order, inconsistent = _order(found, stack, wrapped, modulation, background)
+        if layout.numbers_periods:
+            order, inconsistent = _order(layout, stack, wrapped, modulation, background)
         else:
-            cell = _cell(found, stack, modulation, background) if found.gray else None
-            order, inconsistent = _order_by_levels(found, [psi for psi, _, _, _ in shifted], cell)
+            cell = _cell(layout, stack, modulation, background) if layout.gray else None
+            order, inconsistent = _order_by_levels(layout, [psi for psi, _, _, _ in shifted], cell)
         phase = (wrapped + TWO_PI * order).astype(np.float32)
         dark = np.zeros(phase.shape, bool)
-    dark |= weakest < dark_limit(background, noise, full * factor, dark_sigmas(found))
+    dark |= weakest < dark_limit(background, noise, full * factor, dark_sigmas(layout))
     reason = np.select(
         [saturated, dark, inconsistent], [Reason.SATURATED, Reason.DARK, Reason.INCONSISTENT], Reason.VALID
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
-    phase, reason = settle(found, phase, reason)
-    return complete_map(axis, found, stack, white, (phase, wrapped, modulation, background, reason), noise, factor)
+    phase, reason = settle(layout, phase, reason)
+    return complete_map(axis, layout, stack, white, (phase, wrapped, modulation, background, reason), noise, factor)
 
 
 def complete_map(
     axis: Axis,
-    found: Layout,
+    layout: Layout,
     stack: np.ndarray,
     white: float,
     maps: tuple[np.ndarray, ...],
@@ -73,21 +73,21 @@ def complete_map(
     phase. ``white`` and ``noise`` are those of the ``stack`` that was decoded.
     """
     phase, wrapped, modulation, background, reason = maps
-    harmonics = estimate_aliased_harmonics(found, stack, white, noise)
-    phase, wrapped = correct_harmonics(harmonics, found, phase, wrapped)
+    harmonics = estimate_aliased_harmonics(layout, stack, white, noise)
+    phase, wrapped = correct_harmonics(harmonics, layout, phase, wrapped)
     if factor != 1:
         modulation, background, noise = restore_levels(modulation, background, noise, factor)
-    unambiguous = unambiguous_px(found)
+    unambiguous = unambiguous_px(layout)
     phase_map = PhaseMap(
         axis,
-        found.period_px,
+        layout.period_px,
         phase,
         wrapped,
         modulation,
         background,
         reason,
         noise,
-        found.steps,
+        layout.steps,
         unambiguous,
         harmonics.error_rad,
     )
@@ -118,12 +118,12 @@ def phase_shift(
     return wrapped, np.hypot(cosine, sine) * np.float32(2 / n), first + total * np.float32(1 / n), peak
 
 
-def dark_sigmas(found: Layout) -> float:
+def dark_sigmas(layout: Layout) -> float:
     """The modulation, in standard deviations of a grey level, below which a pixel is DARK."""
-    if found.numbers_periods or not found.shifts:
+    if layout.numbers_periods or not layout.shifts:
         return limits.DARK_SIGMAS
-    steps = min(len(shift.indices) for shift in found.shifts)
-    return max(limits.DARK_SIGMAS, needed_modulation(found_levels(found), steps))
+    steps = min(len(shift.indices) for shift in layout.shifts)
+    return max(limits.DARK_SIGMAS, needed_modulation(layout_levels(layout), steps))
 
 
 def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float, sigmas: float) -> np.ndarray:
@@ -132,21 +132,21 @@ def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float,
     return np.maximum(np.float32(limits.DARK_LEVELS * white / 255), np.float32(sigmas) * sigma)
 
 
-def bit_heights(found: Layout, stack: np.ndarray, index: int, threshold: np.ndarray) -> np.ndarray:
+def bit_heights(layout: Layout, stack: np.ndarray, index: int, threshold: np.ndarray) -> np.ndarray:
     """(h, w) float32 grey levels by which a bit lies above its threshold: half of gray - inverse where there is one."""
     frame = stack[index].astype(np.float32)
-    if index in found.gray and found.inverse:
-        inverse = stack[found.inverse[found.gray.index(index)]].astype(np.float32)
+    if index in layout.gray and layout.inverse:
+        inverse = stack[layout.inverse[layout.gray.index(index)]].astype(np.float32)
         return (frame - inverse) * np.float32(0.5)
     return frame - threshold
 
 
 def _order(
-    found: Layout, stack: np.ndarray, wrapped: np.ndarray, modulation: np.ndarray, background: np.ndarray
+    layout: Layout, stack: np.ndarray, wrapped: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """What to add to the wrapped phase, in periods, and where it cannot be known."""
     threshold = background
-    heights = [bit_heights(found, stack, i, threshold) for i in found.gray]
+    heights = [bit_heights(layout, stack, i, threshold) for i in layout.gray]
     code = np.zeros(wrapped.shape, np.int32)
     bit = np.zeros(wrapped.shape, np.int32)
     least = np.full(wrapped.shape, np.inf, np.float32)
@@ -157,19 +157,19 @@ def _order(
         np.minimum(least, np.abs(height), out=least)
         np.maximum(top, height, out=top)
         np.minimum(bottom, height, out=bottom)
-    turns = wrapped * np.float32(1 / TWO_PI) - np.float32(found.gray_origin_px / found.period_px)
+    turns = wrapped * np.float32(1 / TWO_PI) - np.float32(layout.gray_origin_px / layout.period_px)
     whole = np.floor(turns)
     part = turns - whole  # of a period, since the code edge
     undecided = np.float32(limits.UNDECIDED_BIT) * modulation
     middle = (part >= 0.25) & (part < 0.75)
-    if found.complementary is not None:
-        last = bit_heights(found, stack, found.complementary, threshold)
+    if layout.complementary is not None:
+        last = bit_heights(layout, stack, layout.complementary, threshold)
         half = 2 * code + (bit ^ (last > 0))
         # Near an order's edge the half-period cell before it counts as the one after it, and the phase says which.
         order = np.where(middle, half >> 1, ((half + 1) >> 1) - (part >= 0.75))
         inconsistent = np.where(middle, least, np.abs(last)) < undecided
     else:
-        mean = np.float32(fringe_mean(found, stack))
+        mean = np.float32(fringe_mean(layout, stack))
         contrast = np.maximum(top / (1 - mean), -bottom / mean)
         order = code + _misread(code, heights, part, contrast, (np.float32(0.5) - mean) * contrast)
         inner = (part >= np.float32(limits.EDGE)) & (part < np.float32(1 - limits.EDGE))
@@ -199,19 +199,19 @@ def _misread(
 
 
 def _cell(
-    found: Layout, stack: np.ndarray, modulation: np.ndarray, background: np.ndarray
+    layout: Layout, stack: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(coordinate px, undecided): the middle of the cell that the Gray bits name, or its border where the bit that
     changes there lies near the middle of black and white. Undecided where any other bit is."""
-    bits = code_bits(found)
-    heights = [bit_heights(found, stack, i, background) for i in bits]
+    bits = code_bits(layout)
+    heights = [bit_heights(layout, stack, i, background) for i in bits]
     code, bit = (np.zeros(background.shape, np.int32) for _ in range(2))
     for height in heights:
         bit ^= height > 0
         code = 2 * code + bit
     top = np.maximum(np.max(heights, axis=0), np.float32(0))
     bottom = np.minimum(np.min(heights, axis=0), np.float32(0))
-    mean = np.float32(fringe_mean(found, stack))
+    mean = np.float32(fringe_mean(layout, stack))
     contrast = np.maximum(top / (1 - mean), -bottom / mean)
     middle = (np.float32(0.5) - mean) * contrast
     lower, upper, least = (np.full(code.shape, np.inf, np.float32) for _ in range(3))
@@ -224,22 +224,22 @@ def _cell(
     weak, weaker = np.float32(limits.WEAK_BIT / 2) * contrast, np.float32(limits.WEAKER)
     ahead, behind = (upper < weak) & (upper < weaker * lower), (lower < weak) & (lower < weaker * upper)
     part = np.where(ahead, 1.0, np.where(behind, 0.0, 0.5))
-    return found.gray_origin_px + code_cell_px(found) * (code + part), least < np.float32(
+    return layout.gray_origin_px + code_cell_px(layout) * (code + part), least < np.float32(
         limits.UNDECIDED_BIT
     ) * modulation
 
 
-def code_bits(found: Layout) -> tuple[int, ...]:
+def code_bits(layout: Layout) -> tuple[int, ...]:
     """The frames of all Gray bits, the most significant first and the complementary one last."""
-    return (*found.gray, *(() if found.complementary is None else (found.complementary,)))
+    return (*layout.gray, *(() if layout.complementary is None else (layout.complementary,)))
 
 
 def _order_by_levels(
-    found: Layout, wrapped: list[np.ndarray], cell: tuple[np.ndarray, np.ndarray] | None
+    layout: Layout, wrapped: list[np.ndarray], cell: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """What to add to the finest wrapped phase, in periods, and where the levels contradict each other, or the cell (see
     `_cell`) where there is one."""
-    levels = found_levels(found)
+    levels = layout_levels(layout)
     inconsistent = np.zeros(wrapped[0].shape, bool)
     coordinate, order = np.zeros(wrapped[0].shape), np.zeros(wrapped[0].shape)
     for number, level in enumerate(levels):
@@ -248,9 +248,9 @@ def _order_by_levels(
         if number == 0 and cell is not None:
             turns = (cell[0] - own) / level.period_px
             order = np.rint(turns)
-            inconsistent = cell[1] | (np.abs(turns - order) > cell_misfit(found))
+            inconsistent = cell[1] | (np.abs(turns - order) > cell_misfit(layout))
         elif number == 0:
-            low = lowest_coordinate(level.period_px, min(found.extent, unambiguous_px(found)))
+            low = lowest_coordinate(level.period_px, min(layout.extent, unambiguous_px(layout)))
             order = -np.floor((own - low) / level.period_px)
         else:
             turns = (coordinate - own) / level.period_px
@@ -261,14 +261,14 @@ def _order_by_levels(
 
 
 def _gray_alone(
-    found: Layout, stack: np.ndarray, noise: tuple[float, float]
+    layout: Layout, stack: np.ndarray, noise: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(phase, modulation, background, inconsistent, dark) from Gray bits alone.
 
     One undecided bit whose two readings are neighbouring columns puts the pixel on the border between them.
     """
-    modulation, background = contrast(found, stack)
-    part_of_sigma = np.sqrt(0.5 if found.inverse else 1.5)
+    modulation, background = contrast(layout, stack)
+    part_of_sigma = np.sqrt(0.5 if layout.inverse else 1.5)
     sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background) * np.float32(part_of_sigma)
     limit = np.maximum(
         np.float32(limits.GRAY_UNDECIDED_SIGMAS) * sigma, np.float32(limits.GRAY_UNDECIDED_PART) * modulation
@@ -276,8 +276,8 @@ def _gray_alone(
     code, other = np.zeros(modulation.shape, np.int32), np.zeros(modulation.shape, np.int32)
     bit, flipped = np.zeros_like(code), np.zeros_like(code)
     doubts = np.zeros_like(code)
-    for i in found.gray:
-        height = bit_heights(found, stack, i, background)
+    for i in layout.gray:
+        height = bit_heights(layout, stack, i, background)
         doubt = np.abs(height) < limit
         bit ^= height > 0
         flipped ^= (height > 0) ^ doubt
@@ -285,24 +285,24 @@ def _gray_alone(
         doubts += doubt
     inconsistent = (doubts > 1) | (np.abs(code - other) > 1)
     # At the projector's ends only a part of a cell may have been shown.
-    cell, origin = found.gray_cell_px, found.gray_origin_px
+    cell, origin = layout.gray_cell_px, layout.gray_origin_px
     start, end = origin + cell * np.minimum(code, other), origin + cell * (np.maximum(code, other) + 1.0)
-    first, last = np.maximum(start, -0.5), np.minimum(end, found.extent - 0.5)
+    first, last = np.maximum(start, -0.5), np.minimum(end, layout.extent - 0.5)
     centre = 0.5 * np.where(first < last, first + last, start + end)
     phase = (TWO_PI / cell * centre).astype(np.float32)
     return phase, modulation, background, inconsistent, doubts >= limits.DARK_BITS
 
 
-def contrast(found: Layout, stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def contrast(layout: Layout, stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(modulation, background) of Gray code alone: half of white - black and their mean, else from the inverses."""
-    if found.white is not None and found.black is not None:
-        white, black = (stack[i].astype(np.float32) for i in (found.white, found.black))
+    if layout.white is not None and layout.black is not None:
+        white, black = (stack[i].astype(np.float32) for i in (layout.white, layout.black))
         return (white - black) * np.float32(0.5), (white + black) * np.float32(0.5)
     modulation = np.zeros(stack.shape[1:], np.float32)
     background = np.zeros(stack.shape[1:], np.float32)
-    for i, j in zip(found.gray, found.inverse, strict=True):
+    for i, j in zip(layout.gray, layout.inverse, strict=True):
         gray, inverse = stack[i].astype(np.float32), stack[j].astype(np.float32)
         modulation += np.abs(gray - inverse)
         background += gray + inverse
-    scale = np.float32(0.5 / len(found.gray))
+    scale = np.float32(0.5 / len(layout.gray))
     return modulation * scale, background * scale

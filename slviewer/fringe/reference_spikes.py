@@ -9,14 +9,14 @@ from slviewer.fringe.phase import Reason
 TWO_PI = 2 * np.pi
 
 
-def settle(found: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def settle(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Phase and reason after a look at each pixel's neighbourhood; (h, w) each, new arrays.
 
     A plain Gray code may be read from the wrong side of its edge: where a clear majority of the neighbours says so,
     such a pixel is moved by the one period. What then still stands alone is INCONSISTENT. A depth step has enough
     neighbours on its own side, and is left as it is.
     """
-    rules = spike_rules(found)
+    rules = spike_rules(layout)
     phase, reason = phase.copy(), reason.copy()
     if rules.is_plain:
         v, u, votes = _count_votes(phase, rules)

@@ -14,7 +14,7 @@ import numpy as np
 from slviewer.fringe.aliased_harmonics import describe_gamma, estimate_aliased_harmonics
 from slviewer.fringe.description_check import find_contradictions
 from slviewer.fringe.frame_light import CLIPPED, FrameLight, detect_light_faults, equalize_frames, estimate_frame_light
-from slviewer.fringe.layout import Layout, check_stack, layout, white_level
+from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps
 from slviewer.fringe.residual_sample import Fringe, fringe
@@ -63,33 +63,33 @@ def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
     only who contradicts the others.
     """
     check_stack(sequence, stack)
-    found = layout(sequence, axis)
+    layout = axis_layout(sequence, axis)
     light = estimate_frame_light(sequence, stack)
     white, factor = white_level(stack, sequence.select(axis)), 1.0
     if not light.is_significant:
-        return _compare(sequence, found, stack, white, light, factor)
+        return _compare(sequence, layout, stack, white, light, factor)
     if light.drift < SMALL_DRIFT and light.wave < SMALL_DRIFT:
         # A frame out of its place is a simpler explanation than many frames each in a light of its own.
-        as_seen = _compare(sequence, found, stack, white, light, factor)
+        as_seen = _compare(sequence, layout, stack, white, light, factor)
         if any(suspect.fault in ORDER_FAULTS for suspect in as_seen.suspects):
             return as_seen
     stack, factor = equalize_frames(stack, light, sequence)
-    compared = _compare(sequence, found, stack, CLIPPED, light, factor)
+    compared = _compare(sequence, layout, stack, CLIPPED, light, factor)
     if any(suspect.fault != "gamma" for suspect in compared.suspects):
         return compared  # a frame out of its place spoils what is known of the light, too
     return replace(compared, suspects=tuple(_deduplicate([*detect_light_faults(sequence, light), *compared.suspects])))
 
 
 def _compare(
-    sequence: PatternSequence, found: Layout, stack: np.ndarray, white: float, light: FrameLight, factor: float
+    sequence: PatternSequence, layout: Layout, stack: np.ndarray, white: float, light: FrameLight, factor: float
 ) -> FrameResiduals:
     """The residuals of one axis, from frames whose grey levels were multiplied by ``factor``."""
-    axis = found.axis
-    noise = measure_noise(found, stack, white)
+    axis = layout.axis
+    noise = measure_noise(layout, stack, white)
     residuals: list[FrameResidual] = []
     suspects: list[Suspect] = []
     said: list[str] = []
-    for shift in found.shifts:
+    for shift in layout.shifts:
         sampled = fringe(stack, shift, noise, white)
         what = f"axis {axis}, period {shift.period_px:g} px"
         if sampled is None:
@@ -100,8 +100,8 @@ def _compare(
             said.append(f"{what}: three steps fit any three frames, so that only a repeated one can be told")
         suspects += detect_misordered_steps(sampled) or detect_foreign_frames(sampled)
         residuals += _residuals(sampled, _light(sampled) * light.light.gain[list(shift.indices)], factor)
-    suspects += describe_gamma(estimate_aliased_harmonics(found, stack, white, noise), found)
-    if found.gray and not suspects:
+    suspects += describe_gamma(estimate_aliased_harmonics(layout, stack, white, noise), layout)
+    if layout.gray and not suspects:
         suspects += _detect_code_faults(sequence, stack, axis)
     return FrameResiduals(axis, tuple(residuals), tuple(_deduplicate(suspects)), "; ".join(said))
 

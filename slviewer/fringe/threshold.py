@@ -10,17 +10,17 @@ FARTHEST = 0.3
 """A share farther than this from the middle is no gamma but a mistake."""
 
 
-def fringe_mean(found: Layout, stack: np.ndarray) -> float:
+def fringe_mean(layout: Layout, stack: np.ndarray) -> float:
     """Where the mean of the fringes lies between black (0) and white (1): 0.5 without gamma, 0.37 at a gamma of 2.2.
 
     Bits without inverses are told apart at this mean, so that a blurred edge moves towards the dark side where it is
     below the middle. Blur does not change the mean, hence one figure holds for the whole image: the median over sampled
     pixels that saw both a black and a white bit. 0.5 where there are inverses, or no such pixels.
     """
-    if found.inverse or not (found.shifts and found.gray):
+    if layout.inverse or not (layout.shifts and layout.gray):
         return MIDDLE
-    fringes = sample(stack, found.shifts[-1].indices)
-    heights = sample(stack, found.gray) - fringes.mean(axis=0)
+    fringes = sample(stack, layout.shifts[-1].indices)
+    heights = sample(stack, layout.gray) - fringes.mean(axis=0)
     swing = 0.25 * (fringes.max(axis=0) - fringes.min(axis=0))
     above, below = heights.max(axis=0), -heights.min(axis=0)
     both = (above > swing) & (below > swing) & (swing > 1)

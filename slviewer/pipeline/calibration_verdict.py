@@ -11,7 +11,7 @@ from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
-from slviewer.fringe.layout import layout
+from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.models import VERDICT, available, save_stereo
@@ -71,7 +71,7 @@ def contradicting(sequence: PatternSequence) -> str:
     for axis in sequence.axes:
         if sequence.periods_px(axis) and sequence.find("gray", axis):
             try:
-                layout(sequence, axis)
+                axis_layout(sequence, axis)
             except InputError as error:
                 return str(error)
     return ""

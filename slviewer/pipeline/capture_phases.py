@@ -11,7 +11,7 @@ from slviewer.fringe.decode import decode, texture
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.frame_light import describe_disturbance, estimate_frame_light
 from slviewer.fringe.hdr import radiance, toned
-from slviewer.fringe.layout import layout, white_level
+from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
@@ -114,7 +114,9 @@ def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping
             continue
         modulation, background = (float(np.median(m[phase.mask])) for m in (phase.modulation, phase.background))
         white = white_level(frames, sequence.select(axis))
-        least = dark_limit(np.array([background], np.float32), phase.noise, white, dark_sigmas(layout(sequence, axis)))
+        least = dark_limit(
+            np.array([background], np.float32), phase.noise, white, dark_sigmas(axis_layout(sequence, axis))
+        )
         if modulation < NEAR_DARK * float(least[0]):
             if unexplained := estimate_frame_light(sequence, frames).unexplained:
                 cause = describe_disturbance(unexplained)[1]

@@ -8,7 +8,7 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic, measure_second_harmonic
 from slviewer.errors import InputError
-from slviewer.fringe.layout import layout, white_level
+from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.residual import FrameResiduals
@@ -124,7 +124,7 @@ def _response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[Fram
         why = "fewer than five phase steps, or too few pixels that see fringes"
         return Check("gamma", "unknown", f"The response cannot be measured: {why}.", "", {})
     axis = max(known, key=lambda each: abs(known[each]))
-    gamma, steps = gamma_from_harmonic(known[axis]), layout(sequence, axis).steps
+    gamma, steps = gamma_from_harmonic(known[axis]), axis_layout(sequence, axis).steps
     shown = np.linspace(0, 255, 18)
     seen = (shown / 255) ** gamma
     curved, error = nonlinearity(shown, seen), harmonic_error_rad(shown, seen, steps)
@@ -147,7 +147,9 @@ def _noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, 
         noise = float(np.sqrt(phase.noise[0] + phase.noise[1] * background))
         sigma = float(np.median(phase.sigma_phase[valid])) * phase.period_px / (2 * np.pi)
         white = white_level(frames, sequence.select(axis))
-        least = dark_limit(np.array([background], np.float32), phase.noise, white, dark_sigmas(layout(sequence, axis)))
+        least = dark_limit(
+            np.array([background], np.float32), phase.noise, white, dark_sigmas(axis_layout(sequence, axis))
+        )
         weak |= modulation < NEAR_DARK * float(least[0])
         figures[axis] = {
             "noise_levels": round(noise, 3),

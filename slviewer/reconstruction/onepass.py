@@ -11,7 +11,7 @@ from slviewer.fringe import kernels_spikes as spikes
 from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of, waves
 from slviewer.fringe.kernels import Shifts
 from slviewer.fringe.kernels_levels import Ladder
-from slviewer.fringe.layout import Layout, check_stack, clip_level, layout, white_level
+from slviewer.fringe.layout import Layout, axis_layout, check_stack, clip_level, white_level
 from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -190,15 +190,15 @@ class OnePass:
 
 def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
     """The layout of one axis. Raises InputError for a sequence that takes more than one pass to decode."""
-    found = layout(sequence, axis)
-    if not found.shifts:
+    layout = axis_layout(sequence, axis)
+    if not layout.shifts:
         what = "Gray code without phase steps"
-    elif found.numbers_cells:
+    elif layout.numbers_cells:
         what = "Gray code whose cells are not the periods of one phase shift"
-    elif np.isfinite(unambiguous_px(found)):
+    elif np.isfinite(unambiguous_px(layout)):
         what = "A relative phase"
     else:
-        return found
+        return layout
     raise InputError(f"{what} is not measured in one pass: decode and reconstruct it")
 
 
@@ -206,21 +206,21 @@ def _maps(scan: PassResult) -> kernels.Maps:
     return kernels.Maps(scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture)
 
 
-def _order(sequence: PatternSequence, found: Layout) -> kernels.Order:
-    turned = [waves(shift, found.sign, found.offset_rad) for shift in found.shifts]
+def _order(sequence: PatternSequence, layout: Layout) -> kernels.Order:
+    turned = [waves(shift, layout.sign, layout.offset_rad) for shift in layout.shifts]
     frames, cosines, sines = (np.concatenate(parts) for parts in zip(*turned, strict=True))
-    read = {*frames.tolist(), *found.gray, *found.inverse}
+    read = {*frames.tolist(), *layout.gray, *layout.inverse}
     kinds = [frame.kind for frame in sequence.frames]
     return kernels.Order(
         frames,
-        np.cumsum([0, *(len(shift.indices) for shift in found.shifts)]),
+        np.cumsum([0, *(len(shift.indices) for shift in layout.shifts)]),
         cosines,
         sines,
-        np.array(found.gray, np.int64),
-        np.array(found.inverse, np.int64),
-        -1 if found.complementary is None else found.complementary,
+        np.array(layout.gray, np.int64),
+        np.array(layout.inverse, np.int64),
+        -1 if layout.complementary is None else layout.complementary,
         next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), -1),
-        np.array([i for i in sequence.select(found.axis) if i not in read], np.int64),
+        np.array([i for i in sequence.select(layout.axis) if i not in read], np.int64),
     )
 
 

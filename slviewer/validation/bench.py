@@ -19,7 +19,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import render
 from slviewer.fringe import kernels_coded, kernels_levels
 from slviewer.fringe.decode import code_rules, decode, grey_scale, ladder_of, shifts_of, steps_of
-from slviewer.fringe.layout import layout
+from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import multifrequency, p18
 from slviewer.fringe.reference import decode_reference
@@ -130,16 +130,16 @@ def _decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row],
 
 def _kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
     """The decoding of axis x into arrays made before, with the noise known, and without a look at neighbours."""
-    found = layout(sequence, "x")
-    scale = grey_scale(found, measure_noise(found, frames, 255.0), 255.0)
+    layout = axis_layout(sequence, "x")
+    scale = grey_scale(layout, measure_noise(layout, frames, 255.0), 255.0)
     maps = (*(np.zeros(frames.shape[1:], np.float32) for _ in range(4)), np.zeros(frames.shape[1:], np.uint8))
-    shifts = shifts_of(found)
-    if not found.gray:
-        ladder = ladder_of(found)
+    shifts = shifts_of(layout)
+    if not layout.gray:
+        ladder = ladder_of(layout)
         return lambda: kernels_levels.decode_levels(frames, shifts, ladder, scale, *maps)
-    rules = code_rules(found, fringe_mean(found, frames))
-    steps, gray = steps_of(found.shifts[0], found.sign), np.array(found.gray, np.int64)
-    inverse, extra = np.array(found.inverse, np.int64), -1 if found.complementary is None else found.complementary
+    rules = code_rules(layout, fringe_mean(layout, frames))
+    steps, gray = steps_of(layout.shifts[0], layout.sign), np.array(layout.gray, np.int64)
+    inverse, extra = np.array(layout.inverse, np.int64), -1 if layout.complementary is None else layout.complementary
     return lambda: kernels_coded.decode_coded(frames, steps, gray, inverse, extra, scale, rules, *maps)
 
 

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.layout import layout
+from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.jit import kernel
 
@@ -34,7 +34,7 @@ def mask_motion(
     `phase` (h, w) rad, NaN where there is none, `modulation` (h, w) grey levels and `noise` are those that decoding
     the axis gave, as a `PhaseMap` has them. Raises InputError where the finest period has an odd number of steps.
     """
-    shifts = layout(sequence, axis).shifts
+    shifts = axis_layout(sequence, axis).shifts
     finest = np.array(shifts[-1].indices, np.int64)
     if len(finest) % 2:
         raise InputError(f"{len(finest)} steps of the finest period do not reveal motion: use an even number")

@@ -7,7 +7,7 @@ from fringe_scene import capture, slope
 from slviewer.fringe import reference
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.decode import decode, decode_reference
-from slviewer.fringe.layout import layout
+from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import complementary, multifrequency
 from slviewer.fringe.residual import frame_residuals
@@ -124,5 +124,5 @@ def test_noise_of_three_steps_is_measured_along_the_stripes():
     truth = 40 + 0.6 * U
     for image, axis_stack in ((truth, lambda s: s), (truth, lambda s: s.transpose(0, 2, 1))):
         stack = np.ascontiguousarray(axis_stack(capture(sequence, image, gamma=2.2, read=1.5)))
-        a, b = measure_noise(layout(sequence, "x"), stack, 255.0)
+        a, b = measure_noise(axis_layout(sequence, "x"), stack, 255.0)
         assert 0.92 < (a + 80 * b) / (1.5**2 + 1 / 12) < 1.12

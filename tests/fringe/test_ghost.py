@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slviewer.fringe.ghost import detect_ghosting, ghost_share
-from slviewer.fringe.layout import layout, white_level
+from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import p18
 from slviewer.fringe.residual_sample import fringe
@@ -19,8 +19,8 @@ LIGHT, RENDERER = render_light(RIG, blank_board(Pose(np.eye(3), np.array([0.0, 0
 
 def sampled(fault=None, severity="mild", axis="y"):
     frames = expose_frames(RIG, LIGHT, SEQUENCE, RENDERER.room_light(), 0, FAULTS[fault] if fault else None, severity)
-    found, white = layout(SEQUENCE, axis), white_level(frames, SEQUENCE.select(axis))
-    return fringe(frames, found.shifts[-1], measure_noise(found, frames, white), white)
+    layout, white = axis_layout(SEQUENCE, axis), white_level(frames, SEQUENCE.select(axis))
+    return fringe(frames, layout.shifts[-1], measure_noise(layout, frames, white), white)
 
 
 @pytest.mark.parametrize(("severity", "share"), [("mild", 0.02), ("medium", 0.06), ("severe", 0.15)])

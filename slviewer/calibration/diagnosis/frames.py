@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import AxisEvidence
-from slviewer.fringe.layout import Layout, layout, white_level
+from slviewer.fringe.layout import Layout, axis_layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.origin import MIN_CONCENTRATION, MIN_EDGES, MIN_RISING
 from slviewer.fringe.phase import PhaseMap, Reason
@@ -46,10 +46,10 @@ def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: 
     """The second harmonic of the finest fringe over the first, signed: positive where light grows ever faster with the
     grey level, as gamma makes it. NaN where five steps or more do not show it, or too few pixels see fringes.
     """
-    found = layout(sequence, axis)
-    if found.steps < 5:
+    layout = axis_layout(sequence, axis)
+    if layout.steps < 5:
         return np.nan
-    indices = found.shifts[-1].indices
+    indices = layout.shifts[-1].indices
     rows = spread_rows(*stack.shape[1:])
     frames = np.stack([stack[i][rows].ravel() for i in indices])
     white = white_level(stack, list(indices))
@@ -76,36 +76,36 @@ def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> 
     The code's edges show at which phase it begins, and that place, in px, is known beforehand. NaN without a Gray code
     beside a phase shift, where it begins too near to a column's middle, or where the frames are in no order.
     """
-    found = layout(sequence, axis)
-    if not (found.shifts and found.gray) or abs(found.gray_origin_px) < MIN_ORIGIN_PX:
+    layout = axis_layout(sequence, axis)
+    if not (layout.shifts and layout.gray) or abs(layout.gray_origin_px) < MIN_ORIGIN_PX:
         return np.nan
     size = stack.shape[2 if axis == "y" else 1]
     step = max(1, size // ORIGIN_ROWS)
     thin = np.ascontiguousarray(stack[:, :, ::step] if axis == "y" else stack[:, ::step])
-    begin = _measure_code_origin(found, thin, white_level(stack, sequence.select(axis)))
-    turns = found.gray_origin_px / found.period_px
+    begin = _measure_code_origin(layout, thin, white_level(stack, sequence.select(axis)))
+    turns = layout.gray_origin_px / layout.period_px
     ratio = turns / begin if np.isfinite(begin) and abs(begin) > 1e-3 else np.nan
-    return float(found.period_px * ratio) if 0.1 < ratio < 10 else np.nan
+    return float(layout.period_px * ratio) if 0.1 < ratio < 10 else np.nan
 
 
-def _measure_code_origin(found: Layout, stack: np.ndarray, white: float) -> float:
+def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> float:
     """Turns, -0.5 ... 0.5, of the phase at which each code begins; NaN where the edges do not agree.
 
     An edge lies somewhere between the phases of two neighbouring pixels: the place that lies in the most of such
     intervals is known better than any of them.
     """
-    wrapped, modulation, background, _ = phase_shift(stack, found.shifts[0].indices, found.sign, found.offset_rad)
-    lit = modulation >= dark_limit(background, measure_noise(found, stack, white), white, dark_sigmas(found))
+    wrapped, modulation, background, _ = phase_shift(stack, layout.shifts[0].indices, layout.sign, layout.offset_rad)
+    lit = modulation >= dark_limit(background, measure_noise(layout, stack, white), white, dark_sigmas(layout))
     code, digit = np.zeros(lit.shape, np.int32), np.zeros(lit.shape, np.int32)
-    for i in [*found.gray] + ([] if found.complementary is None else [found.complementary]):
-        digit ^= bit_heights(found, stack, i, background) > 0
+    for i in [*layout.gray] + ([] if layout.complementary is None else [layout.complementary]):
+        digit ^= bit_heights(layout, stack, i, background) > 0
         code = 2 * code + digit
-    first, second = (np.s_[:, :-1], np.s_[:, 1:]) if found.axis == "x" else (np.s_[:-1], np.s_[1:])
+    first, second = (np.s_[:, :-1], np.s_[:, 1:]) if layout.axis == "x" else (np.s_[:-1], np.s_[1:])
     begins, lengths = [], []
     for here, there in ((first, second), (second, first)):
         edge = lit[here] & lit[there] & (code[there] == code[here] + 1)
         below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
-        if found.complementary is not None:  # the cell that begins here is the second half of a period if odd
+        if layout.complementary is not None:  # the cell that begins here is the second half of a period if odd
             below = below - (code[there][edge] & 1) * np.pi
             above = above - (code[there][edge] & 1) * np.pi
         begins.append(below)
@@ -174,10 +174,10 @@ def measure_motion_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.n
 
 def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarray | None:
     """(h, w) float32: the scene in even light, from the frames of one axis alone; None where they give none."""
-    found = layout(sequence, axis)
-    frames = list(found.shifts[-1].indices) if found.shifts else []
-    if not frames and found.inverse:
-        frames = [*found.gray, *found.inverse]
+    layout = axis_layout(sequence, axis)
+    frames = list(layout.shifts[-1].indices) if layout.shifts else []
+    if not frames and layout.inverse:
+        frames = [*layout.gray, *layout.inverse]
     if not frames:
         return None
     total = np.zeros(stack.shape[1:], np.float32)
