@@ -58,7 +58,7 @@ class _Between:
 
 
 class ImperfectCamera:
-    """A camera whose images are stale or lit by more than the projector."""
+    """A camera whose images are stale or illuminated by more than the projector."""
 
     def __init__(self, camera: Camera, wrong: Imperfections, between: _Between) -> None:
         self._camera, self._wrong, self._between = camera, wrong, between
@@ -110,8 +110,8 @@ class ImperfectCamera:
         # A swing that is seen for a whole period of it, or several, adds nothing.
         middle = 2 * np.pi * wrong.mains_hz * (begin + exposure / 2)
         swing = float(np.sinc(wrong.mains_hz * exposure) * np.cos(middle))
-        lit = out * (1 + wrong.lamp_depth * swing) + wrong.room * (1 + wrong.mains_depth * swing)
-        np.copyto(out, np.clip(lit + 0.5, 0, np.iinfo(out.dtype).max), casting="unsafe")
+        illuminated = out * (1 + wrong.lamp_depth * swing) + wrong.room * (1 + wrong.mains_depth * swing)
+        np.copyto(out, np.clip(illuminated + 0.5, 0, np.iinfo(out.dtype).max), casting="unsafe")
 
 
 class ImperfectProjector:

@@ -127,7 +127,7 @@ def suggest(
     lens: Lens,
     poses: Sequence[np.ndarray],
     *,
-    lit: Callable[[np.ndarray], np.ndarray] | None = None,
+    illuminated: Callable[[np.ndarray], np.ndarray] | None = None,
     skip: int = 0,
 ) -> Suggestion:
     """The pose that adds most to what `poses` cover, with the whole board in view.
@@ -138,7 +138,7 @@ def suggest(
     have = coverage(board, lens, poses)
     taken = [_signature(T, board, have.range_mm) for T in poses]
     ranked = []
-    for T in _candidates(board, lens, have.range_mm, len(poses), lit):
+    for T in _candidates(board, lens, have.range_mm, len(poses), illuminated):
         seen, third, tilt = _classify(board, lens, T, have.range_mm)
         lacks = (
             (seen * np.maximum(CELL_GOAL - have.cells, 0)).sum() / (CELL_GOAL * seen.size)
@@ -190,7 +190,11 @@ def projector_reach(
 
 
 def _candidates(
-    board: Board, lens: Lens, span: tuple[float, float], count: int, lit: Callable[[np.ndarray], np.ndarray] | None
+    board: Board,
+    lens: Lens,
+    span: tuple[float, float],
+    count: int,
+    illuminated: Callable[[np.ndarray], np.ndarray] | None,
 ) -> list[np.ndarray]:
     """Poses in every third, tilt and direction, each as far out as keeps the whole board in view and in the light."""
     angle = np.radians((18.0, 25.0, 14.0)[count % 3])
@@ -199,7 +203,7 @@ def _candidates(
     width, height = lens.size
     found = []
     # Before two poses have shown the projector's field of view, the middle of the image is most likely inside it.
-    places = list(product((-1, 0, 1), (-1, 0, 1))) if lit is not None else [(0, 0)]
+    places = list(product((-1, 0, 1), (-1, 0, 1))) if illuminated is not None else [(0, 0)]
     for third, tilt, place in product(range(3), range(len(TILTS)), places):
         R = _tilt_rotation(tilt, angle)
         depth = near + (far - near) * (third + 0.5) / 3
@@ -209,20 +213,20 @@ def _candidates(
             ray = np.array([(u - lens.K[0, 2]) / lens.K[0, 0], (v - lens.K[1, 2]) / lens.K[1, 1], 1.0])
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = R, depth * ray - R @ middle
-            if _in_view(board, lens, T, lit):
+            if _in_view(board, lens, T, illuminated):
                 if share > 0.15 or place == (0, 0):
                     found.append(T)
                 break
     return found
 
 
-def _in_view(board: Board, lens: Lens, T: np.ndarray, lit: Callable[[np.ndarray], np.ndarray] | None) -> bool:
+def _in_view(board: Board, lens: Lens, T: np.ndarray, illuminated: Callable[[np.ndarray], np.ndarray] | None) -> bool:
     corners = _place_board(T, board.outline())
     pixels = lens.project(corners)
     free = _FREE * lens.size[0]
     if not (np.isfinite(pixels).all() and (pixels > free).all() and (pixels < np.array(lens.size) - 1 - free).all()):
         return False
-    return lit is None or bool(lit(corners).all())
+    return illuminated is None or bool(illuminated(corners).all())
 
 
 def _classify(board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]) -> tuple[np.ndarray, int, int]:

@@ -81,11 +81,11 @@ def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> Pinh
     )
 
 
-def _fit_device(device: Device, lit: np.ndarray) -> PinholeFit:
+def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:
     width, height = device.size
     across = np.linspace(0, width - 1, GRID)
     down = np.linspace(0, height - 1, max(2, round(GRID * height / width)))
     u, v = np.meshgrid(across, down)
     pixels = np.column_stack([u.ravel(), v.ravel()])
-    rays = np.where(is_supported(device, pixels, lit)[:, None], undistort(device, pixels), np.nan)
+    rays = np.where(is_supported(device, pixels, illuminated)[:, None], undistort(device, pixels), np.nan)
     return fit_lens(pixels, rays, lens_of(device))

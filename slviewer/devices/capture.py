@@ -28,12 +28,12 @@ def capture(
     used again once its device answers. The projector is left showing the last frame.
     """
     rig.projector.load(sequence)
-    out = _room(rig, len(sequence.frames), out)
+    out = _allocate(rig, len(sequence.frames), out)
     _shoot(rig, len(sequence.frames), out, progress)
     return out
 
 
-def _room(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
+def _allocate(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
     """`out`, if `n` frames of the rig's camera fit it, or a new array for them. Raises InputError."""
     width, height = rig.camera.size
     if out is None:
@@ -64,7 +64,7 @@ def _shoot(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, int], Non
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
+class CapturedFrames:
     """What `take` brings home: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the whole sequence in one after
     the other; what else the camera was set to; and a colour texture (h, w, 3), None of a camera that sees none.
     """
@@ -81,7 +81,7 @@ def take(
     exposures_ms: Sequence[float] = (),
     out: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Taken:
+) -> CapturedFrames:
     """Capture `sequence`, in each of two or more `exposures_ms` if they are given, and the colours after it.
 
     `out` is (k n, h, w) where it is given, and `progress(done, k n)` as in `capture`. The camera's settings are as
@@ -90,10 +90,10 @@ def take(
     """
     if not exposures_ms:
         frames = capture(rig, sequence, out, progress)
-        return Taken(frames, rig.camera.settings(), (), _colours(rig))
+        return CapturedFrames(frames, rig.camera.settings(), (), _colours(rig))
     wanted = check_exposures(exposures_ms)
     n = len(sequence.frames)
-    out = _room(rig, n * len(wanted), out)
+    out = _allocate(rig, n * len(wanted), out)
     rig.projector.load(sequence)  # once: a projector that is lost between two exposures must not be taken for the same
     before, taken = rig.camera.settings(), []
     try:
@@ -108,7 +108,7 @@ def take(
     finally:
         with contextlib.suppress(DeviceError):  # one that is lost tells so itself
             rig.camera.apply(before)
-    return Taken(out, rig.camera.settings(), tuple(taken), _colours(rig))
+    return CapturedFrames(out, rig.camera.settings(), tuple(taken), _colours(rig))
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:

@@ -136,12 +136,12 @@ def listed_as(info: Any, file: str) -> Found:
     """What a producer tells of a camera in its list."""
 
     def word(what: str) -> str:
-        return str(told(info, what) or "").strip() or "?"
+        return str(read_info(info, what) or "").strip() or "?"
 
     return Found(word("vendor"), word("model"), word("serial_number"), file, word("id_"))
 
 
-def told(module: Any, what: str) -> Any:
+def read_info(module: Any, what: str) -> Any:
     """A fact about a GenTL module, None where its producer does not tell."""
     try:
         return getattr(module, what)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.devices.gentl import LOCK, Found, answering, listed_as, loaded, quietly, told
+from slviewer.devices.gentl import LOCK, Found, answering, listed_as, loaded, quietly, read_info
 from slviewer.errors import DeviceError
 
 _POLL_S = 0.0005
@@ -153,13 +153,13 @@ class Link:
     def _image(self, buffer: Any, nbytes: Callable[[tuple[int, int], int], int]) -> Image:
         """Read from the raw buffer: harvesters' own components unpack into copies, and keep the rows' padding."""
         nodes = self.node_map
-        size = (told(buffer, "width") or nodes.Width.value, told(buffer, "height") or nodes.Height.value)
-        padding, offset = told(buffer, "padding_x") or 0, told(buffer, "image_offset") or 0
-        if (told(buffer, "pixel_format") or self._format) != self._format:
+        size = (read_info(buffer, "width") or nodes.Width.value, read_info(buffer, "height") or nodes.Height.value)
+        padding, offset = read_info(buffer, "padding_x") or 0, read_info(buffer, "image_offset") or 0
+        if (read_info(buffer, "pixel_format") or self._format) != self._format:
             raise DeviceError(f"{self.name} sends another pixel format than was set: choose another one")
         data = np.frombuffer(buffer.raw_buffer, np.uint8)[offset:]
         needed = nbytes(size, padding)
-        filled = told(buffer, "size_filled")
+        filled = read_info(buffer, "size_filled")
         if min(len(data), len(data) if filled is None else filled - offset) < needed:
             raise DeviceError(_lossy(self.name))
         return Image(data, size, padding)

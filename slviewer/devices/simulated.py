@@ -136,7 +136,7 @@ DRIVER = Driver("simulated", "a rig that exists in numbers only, with known trut
 
 
 def _auto_exposure(renderer: Renderer) -> float:
-    """Grey levels of full white light on an albedo of 1; for a white plate in focus where nothing is lit."""
+    """Grey levels of full white light on an albedo of 1; for a white plate in focus where nothing is illuminated."""
     if renderer.truth().mask.any():
         return renderer.exposure
     sensor, light = renderer.rig.sensor, renderer.rig.light

@@ -37,7 +37,7 @@ class Comparison:
 
     ``results`` by model name, each over the pixels of ``common`` ``(h, w)`` bool: those of ``region`` ``(h, w)`` bool
     that every model measures. ``coverage`` by model: measured over lit pixels of the region, NaN if it is not known
-    what is lit. ``incidence``: percent of the measured region in R1, R2, R3, or None without a depth range.
+    what is illuminated. ``incidence``: percent of the measured region in R1, R2, R3, or None without a depth range.
     ``share``: of the pixels that all models measure, those in the region; ``is_searched``: the region was not given,
     it is the largest patch of the shape.
     """
@@ -116,7 +116,7 @@ class Comparison:
 def compare(
     shape: Shape,
     clouds: Mapping[str, Cloud],
-    lit: np.ndarray | None = None,
+    illuminated: np.ndarray | None = None,
     *,
     region: np.ndarray | None = None,
     depth_range: tuple[float, float] | None = None,
@@ -124,7 +124,7 @@ def compare(
 ) -> Comparison:
     """Fit the shape to every model's cloud of one capture, over the pixels that all of them measure.
 
-    ``lit`` ``(h, w)`` bool: what a perfect decoder could measure (``PhaseMap.lit``). ``region`` ``(h, w)`` bool: the
+    ``illuminated`` ``(h, w)`` bool: what a perfect decoder could measure. ``region`` ``(h, w)`` bool: the
     pixels that show the shape, such as a board's outline; None: the shape is looked for where every model measures, and
     its region grown in the first model's cloud, completed by the others'. ``depth_range`` in mm bounds R2. ``radius``
     in mm, roughly, helps to find a sphere; the fitted one is free all the same.
@@ -173,7 +173,7 @@ def compare(
         results=results,
         region=region,
         common=common,
-        coverage={model: _coverage(cloud, region, lit) for model, cloud in clouds.items()},
+        coverage={model: _coverage(cloud, region, illuminated) for model, cloud in clouds.items()},
         incidence=None if depth_range is None else incidence(every, region, depth_range),
         share=int(np.count_nonzero(common)) / max(1, int(np.count_nonzero(shared))),
         is_searched=is_searched,
@@ -190,11 +190,11 @@ def _union(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
     return points, sigma_z
 
 
-def _coverage(cloud: Cloud, region: np.ndarray, lit: np.ndarray | None) -> float:
-    measurable = 0 if lit is None else np.count_nonzero(region & lit)
-    if lit is None or measurable == 0:
+def _coverage(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | None) -> float:
+    measurable = 0 if illuminated is None else np.count_nonzero(region & illuminated)
+    if illuminated is None or measurable == 0:
         return float("nan")
-    return np.count_nonzero(region & lit & cloud.mask) / measurable
+    return np.count_nonzero(region & illuminated & cloud.mask) / measurable
 
 
 def _known(value: float) -> float | None:

@@ -128,10 +128,18 @@ def smoothed_phases(observation: Observation) -> dict[Axis, PhaseMap]:
     for axis in (a for a in AXES if a in observation.surfaces):
         phase = np.full((height, width), np.nan, np.float32)
         phase[v0:v1, u0:u1] = observation.smoothed_phase(axis)
-        lit = np.isfinite(phase).astype(np.float32)
-        reason = np.where(lit > 0, Reason.VALID, Reason.DARK).astype(np.uint8)
+        illuminated = np.isfinite(phase).astype(np.float32)
+        reason = np.where(illuminated > 0, Reason.VALID, Reason.DARK).astype(np.uint8)
         found[axis] = PhaseMap(
-            axis, observation.periods_px[axis], phase, np.full_like(phase, np.nan), lit, lit, reason, (1.0, 0.0), 18
+            axis,
+            observation.periods_px[axis],
+            phase,
+            np.full_like(phase, np.nan),
+            illuminated,
+            illuminated,
+            reason,
+            (1.0, 0.0),
+            18,
         )
     return found
 

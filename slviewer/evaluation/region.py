@@ -111,7 +111,7 @@ def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     if np.count_nonzero(measured) < LEAST_PIXELS:
         raise InputError(
             f"{np.count_nonzero(measured)} points were measured where the shape is looked for: at least "
-            f"{LEAST_PIXELS} are needed; check that it is in view and lit."
+            f"{LEAST_PIXELS} are needed; check that it is in view and illuminated."
         )
     return measured
 

@@ -262,7 +262,7 @@ def _split_segment(
 
 
 def _leading_bits(waiting: list[Bit], even: dict[int, Even], with_inverse: bool) -> list[Bit]:
-    """Of the evenly lit images before a code, the most significant bits, which are 0 in all of the view."""
+    """Of the evenly illuminated images before a code, the most significant bits, which are 0 in all of the view."""
     leading: list[Bit] = []
     while waiting and waiting[-1].even == "black" and (waiting[-1].inverse is not None) == with_inverse:
         leading.insert(0, waiting.pop())

@@ -12,7 +12,7 @@ ALIKE = 0.04
 """Squared difference of two images over the variance of the pattern that one shows: between two patterns of a code,
 which have no edge in common, it is 1 and more."""
 LEAST_PATTERN = 0.05
-"""Standard deviation of the pattern as a share of the contrast; below it images are evenly lit, or blurred."""
+"""Standard deviation of the pattern as a share of the contrast; below it images are evenly illuminated, or blurred."""
 DECIDED, SHARP = 0.2, 0.5
 """Of the contrast, that a pixel lies away from the middle where it is no edge; and share of such pixels in an image
 whose stripes are not blurred: blurred ones of two patterns may look alike."""
@@ -78,7 +78,7 @@ class FrameLikeness:
         return bool(np.array_equal(self._levels[i], self._levels[j]))
 
     def copied(self, i: int) -> int | None:
-        """An earlier image that image i equals in every grey level; evenly lit ones may do so without noise."""
+        """An earlier image that image i equals in every grey level; evenly illuminated ones may do so without noise."""
         earlier = [j for j in self._images if j < i] if len(self._weight) >= FEWEST else []
         return next((j for j in reversed(earlier) if self._is_copy(i, j)), None)
 

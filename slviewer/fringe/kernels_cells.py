@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from slviewer.fringe.kernels import ROWS
-from slviewer.fringe.kernels_levels import levels_room, levels_row, phases_row
+from slviewer.fringe.kernels_levels import allocate_levels, levels_row, phases_row
 from slviewer.geometry.jit import kernel
 
 
@@ -67,7 +67,7 @@ def decode_cells(stack, shifts, ladder, bits, inverses, scale, rules, phase, wra
     finest period."""
     count, height, width = len(shifts.steps), stack.shape[1], stack.shape[2]
     for block in numba.prange((height + ROWS - 1) // ROWS):
-        psi, peak, room = np.empty((count, width), np.float32), np.empty(width, stack.dtype), levels_room(width)
+        psi, peak, room = np.empty((count, width), np.float32), np.empty(width, stack.dtype), allocate_levels(width)
         clipped, weakest, coordinate, order, own, worst, _, _, _ = room
         heights, cell = np.empty(len(bits), np.float32), np.empty(width, np.float32)
         for row in range(block * ROWS, min((block + 1) * ROWS, height)):

@@ -82,7 +82,7 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order,
 
 
 @numba.njit(inline="always")
-def levels_room(width):
+def allocate_levels(width):
     """Room for a row: whether clipped, and eight of float32."""
     a, b, c, d, e = five(width)
     f, g, h = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
@@ -124,7 +124,7 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, room):
 def levels_rows(stack, shifts, ladder, scale, first, phase, wrapped, modulation, background, reason):
     """`decode_levels` of some rows from ``first`` on: the five maps hold only those."""
     count, width = len(shifts.steps), stack.shape[2]
-    psi, peak, room = np.empty((count, width), np.float32), np.empty(width, stack.dtype), levels_room(width)
+    psi, peak, room = np.empty((count, width), np.float32), np.empty(width, stack.dtype), allocate_levels(width)
     clipped, weakest, coordinate, order, own, worst, _, _, _ = room
     anywhere = np.empty(0, np.float32)
     for i in range(len(phase)):

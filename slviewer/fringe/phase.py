@@ -67,8 +67,8 @@ class PhaseMap:
         return self.reason == Reason.VALID
 
     @property
-    def lit(self) -> np.ndarray:
-        """(h, w) bool, lit and modulated: what a perfect decoder could measure; the denominator of coverage."""
+    def illuminated(self) -> np.ndarray:
+        """(h, w) bool, illuminated and modulated: what a perfect decoder could measure; the denominator of coverage."""
         return self.reason != Reason.DARK
 
     @property

@@ -94,7 +94,7 @@ class Frame:
             }
             numbers["period_px"] = float(data.get("period_px", 0.0))
         except (TypeError, ValueError) as error:
-            raise InputError(f"a {data['kind']} frame has an entry that is no number ({error}): mend it") from error
+            raise InputError(f"a {data['kind']} frame has an entry that is no number ({error}): correct it") from error
         kind = data["kind"]
         values = {name: value for name, value in numbers.items() if name in _FIELDS.get(kind, ())}
         return cls(kind=kind, axis=data.get("axis"), **values)
@@ -338,7 +338,7 @@ def _check_complete(found: list[int], wanted: range, what: str) -> None:
     missing = sorted(set(wanted) - set(found))
     if missing:
         raise InputError(
-            f"{what} {_listed(missing)} of {len(wanted)} is missing: add the frame, or mend its description"
+            f"{what} {_listed(missing)} of {len(wanted)} is missing: add the frame, or correct its description"
         )
     double = [value for value, count in Counter(found).items() if count > 1]
     if double:

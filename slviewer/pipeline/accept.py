@@ -18,7 +18,7 @@ from slviewer.evaluation.repeatability import Repeatability, repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.check import Checked, history
-from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.models import ModelName, best, check_accepted, load_model, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, match_names, next_number, opened
 from slviewer.pipeline.reconstruct import board_region
@@ -69,8 +69,8 @@ def accept(
     model: ModelName | None = None,
     still: Sequence[str] = (),
     apply_scale: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Accepted:
     """Test a calibration with a ball bar, a sphere or a plane that has a certificate, against the operator's limits.
 

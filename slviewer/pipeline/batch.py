@@ -22,7 +22,7 @@ from slviewer.pipeline.batch_tasks import (
     verification_file,
     write_verification,
 )
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.verify import Shape, Verification
 
@@ -96,8 +96,8 @@ def batch(
     radius: float | None = None,
     accept_rejected: bool = False,
     scheduler: str | None = None,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Batch:
     """Reconstruct, verify or mesh the captures of many sessions, on this machine's cores or a Dask cluster.
 
@@ -138,7 +138,9 @@ def batch(
                 )
             else:
                 client = ended.enter_context(_connect(scheduler))
-                plans = _gather(client, {a: (list_captures, *given) for a, given in looking.items()}, unheard, warn)
+                plans = _gather(
+                    client, {a: (list_captures, *given) for a, given in looking.items()}, ignore_progress, warn
+                )
             broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
             wanted = [(a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan]
             done = _run_tasks(client, wanted, task, progress, warn)
@@ -170,7 +172,7 @@ def _write_verifications(client: Any, done: Sequence[TaskResult], task: Task, wa
         if one.verification is not None:
             parts.setdefault(one.session, []).append(one.verification)
     writing = {address: (write_verification, address, tuple(verified), task) for address, verified in parts.items()}
-    return {address: why for address, why in _gather(client, writing, unheard, warn).items() if why}
+    return {address: why for address, why in _gather(client, writing, ignore_progress, warn).items() if why}
 
 
 @contextmanager

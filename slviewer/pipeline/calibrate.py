@@ -16,7 +16,7 @@ from slviewer.errors import CalibrationRejected, InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.calibration_verdict import attempt, attempt_poses, keep_rejected, rejected, save_verdict
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
-from slviewer.pipeline.feedback import Progress, Warn, part, stage, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import ModelName, available, preferred, save_fitted, save_stereo, warn_if_frame_changed
 from slviewer.pipeline.open_session import SessionLike, match_names, opened, opened_or_made
 from slviewer.pipeline.poses import Judged, read_pose
@@ -114,8 +114,8 @@ def calibrate(
     exclude: Sequence[str] = (),
     smoothing: SmoothingKind = "spline",
     degree: int = 5,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> CalibrationResult:
     """Calibrate from the session's target poses, and report whether the calibration is good, and if not, why.
 
@@ -183,8 +183,8 @@ def calibrate_frames(
     models: Sequence[str] = (),
     smoothing: str = "spline",
     degree: int = 5,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> CalibrationResult:
     """Calibrate from the frames of target poses in memory; nothing is saved.
 

@@ -9,7 +9,7 @@ from slviewer import __version__
 from slviewer.calibration.camera import CameraCalibration, calibrate_camera
 from slviewer.errors import DetectionError, InputError
 from slviewer.pipeline.capture_phases import capture_texture
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import match_names
 from slviewer.session.exporters import write_calibration
 from slviewer.session.importers.frame_groups import images_by_name
@@ -26,8 +26,8 @@ def calibrate_camera_alone(
     poses: Sequence[str] = (),
     exclude: Sequence[str] = (),
     out: Path | str | None = None,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> CameraCalibration:
     """Calibrate the camera from a folder of pictures, or from the target poses of a session; a session stays as it is.
 

@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from slviewer.devices.capture import Taken, check_exposures, take
+from slviewer.devices.capture import CapturedFrames, check_exposures, take
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.frame_residuals import save_residuals
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
@@ -38,8 +38,8 @@ def capture(
     gain: float | None = None,
     force: bool = False,
     set_up: SetUp = set_up,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Capture:
     """Capture with a rig, without the wizard.
 
@@ -118,7 +118,7 @@ def keep(
     name: str,
     role: Role,
     sequence: PatternSequence,
-    taken: Taken,
+    taken: CapturedFrames,
     *,
     source: str,
     purpose: str,

@@ -11,7 +11,7 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.feedback import Warn, unwarned
+from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import Model, load_stereo
 from slviewer.pipeline.scale import scale_factor, scaled
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
@@ -39,7 +39,7 @@ def capture_cloud(
     axis: Axis | None = None,
     texture: np.ndarray | None = None,
     accept_rejected: bool = False,
-    warn: Warn = unwarned,
+    warn: Warn = ignore_warnings,
 ) -> Cloud:
     """The organised cloud of a decoded capture, with the scale that was applied to the calibration.
 
@@ -62,7 +62,7 @@ def absolute_phases(
     name: str,
     phases: Mapping[Axis, PhaseMap],
     depth_range: tuple[float, float] | None = None,
-    warn: Warn = unwarned,
+    warn: Warn = ignore_warnings,
 ) -> dict[Axis, PhaseMap]:
     """A capture's phases, those that repeat made absolute by the depths (near, far) mm between which the scene lies; by
     default the calibrated ones. An axis that more than one depth fits is left to the other axis, with a warning.

@@ -16,7 +16,7 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.feedback import Warn, unwarned
+from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.frame_residuals import frame_warnings
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
@@ -77,14 +77,14 @@ def check_capture(
         others = "".join(f". Or else: {c.message}" for c in found[1:] if c.axis == found[0].axis)
         raise InputError(f"{name}: {found[0].message}{others}")
     for axis, phase in phases.items():
-        illuminated, decoded = np.count_nonzero(phase.lit), np.count_nonzero(phase.mask)
+        illuminated, decoded = np.count_nonzero(phase.illuminated), np.count_nonzero(phase.mask)
         if decoded and decoded >= MIN_DECODED * illuminated:
             continue
         if illuminated:
             share = (
                 f"{decoded} of {illuminated} illuminated pixels ({100 * decoded / illuminated:.1f} %) give a coordinate"
             )
-            shares = [np.mean(phase.reason[phase.lit] == reason) for reason in _REASONS]
+            shares = [np.mean(phase.reason[phase.illuminated] == reason) for reason in _REASONS]
             worst = int(np.argmax(shares))
             seen, cure = list(_REASONS.values())[worst]
             raise InputError(f"{name}: {share} along {axis}; {100 * shares[worst]:.0f} % of them {seen}: {cure}")
@@ -102,7 +102,7 @@ def check_capture(
 def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> list[str]:
     """Why many pixels of a decoded capture (n, h, w) are masked, where saturation or weak fringes are the reason."""
     messages = []
-    reasons = [phase.reason[phase.lit] for phase in phases.values()]
+    reasons = [phase.reason[phase.illuminated] for phase in phases.values()]
     saturated = max((float(np.mean(each == Reason.SATURATED)) for each in reasons if each.size), default=0.0)
     if saturated > MANY_SATURATED:
         messages.append(
@@ -169,7 +169,7 @@ def eight_bit(image: np.ndarray) -> np.ndarray:
 
 
 def decode_captures(
-    session: Session, names: Sequence[str], warn: Warn = unwarned, *, relative: bool = False
+    session: Session, names: Sequence[str], warn: Warn = ignore_warnings, *, relative: bool = False
 ) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
     """Captures with their frames and phases, in order; the next one's frames are read while one is processed.
 
@@ -186,7 +186,7 @@ def decode_captures(
             if i + 1 < len(captures):
                 ahead = reader.submit(captures[i + 1].stack)
             phases = decode_capture(capture, frames, relative=relative)
-            if warn is not unwarned:
+            if warn is not ignore_warnings:
                 for message in frame_warnings(session, capture.name, frames):
                     warn(f"{capture.name}: {message}")
                 for message in loss_warnings(capture.sequence, frames, phases):

@@ -11,7 +11,7 @@ from slviewer.calibration.observe import Smoothing, observe
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, next_number, numbered_results, opened
 from slviewer.pipeline.poses import load_observations
@@ -71,7 +71,9 @@ def describe_check(checked: Checked) -> str:
     )
 
 
-def check(session: SessionLike, capture: str, *, progress: Progress = unheard, warn: Warn = unwarned) -> CheckResult:
+def check(
+    session: SessionLike, capture: str, *, progress: Progress = ignore_progress, warn: Warn = ignore_warnings
+) -> CheckResult:
     """Say from one capture of the board whether the saved calibration is still good, and why if it is not.
 
     Args:

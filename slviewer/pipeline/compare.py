@@ -12,7 +12,7 @@ from slviewer.inspection.colours import colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import DECIDED, RULE, ToleranceVerdict, judge_deviation
-from slviewer.pipeline.feedback import Progress, Warn, part, stage, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.measured_surface import MeasuredSurface, surface
 from slviewer.pipeline.measurements import triangles_of
 from slviewer.pipeline.models import ModelName
@@ -107,8 +107,8 @@ def compare(
     model: ModelName | None = None,
     name: str = "",
     accept_rejected: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Compared:
     """Compare a scan with a nominal model after best-fit alignment: figures, coloured points, pictures in the report.
 
@@ -156,8 +156,8 @@ def compare_surface(
     initial: np.ndarray | None = None,
     out: Path | str | None = None,
     name: str = "",
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Compared:
     """As ``compare``, of a surface that is there already, in a session open for writing. ``initial`` (4, 4), scan to
     nominal, replaces the search for a start; without ``out`` no file is written."""

@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.report.phase_maps import REASON_LABELS, phase_maps, reason_shares
 from slviewer.session.atomic import to_json
@@ -112,8 +112,8 @@ def decode(
     out: Path | str,
     *,
     file_format: MapFormat = "npy",
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> DecodedFiles:
     """Decode a capture: absolute phase and projector coordinate of each pixel, the mask with its reasons, a picture.
 

@@ -12,7 +12,7 @@ from slviewer.pipeline.export_documents import (
     write_table,
 )
 from slviewer.pipeline.export_shapes import merge_name, merge_shape, scan_shape
-from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.models import ModelName, check_accepted, preferred, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
@@ -110,8 +110,8 @@ def export(
     model: ModelName | None = None,
     plan: MeshingPlan | None = None,
     accept_rejected: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Exported:
     """Write a file for other programs: shapes in mm as .ply .stl .obj .xyz, in metres as .glb; the calibration; poses.
 

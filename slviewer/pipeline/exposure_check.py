@@ -19,7 +19,7 @@ WEAK, TOO_WEAK = 0.4, 0.12
 def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
     """Whether the frames (n, h, w) of a capture are too bright or too dark, by the pixels that see the patterns."""
     full = float(white_level(frames, list(range(len(frames)))))
-    illuminated = np.logical_or.reduce([phase.lit for phase in phases.values()])
+    illuminated = np.logical_or.reduce([phase.illuminated for phase in phases.values()])
     if not illuminated.any():
         return Check("exposure", "bad", "No pixel sees the patterns.", "Raise the exposure, or open the aperture.", {})
     rows = spread_rows(*frames.shape[1:])
@@ -27,7 +27,7 @@ def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases
     brightest = np.max([frames[i][rows] for i in coded], axis=0)
     seen = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()
     bright = float(np.quantile(seen, 0.995))
-    clipped = max(float(np.mean(phase.reason[phase.lit] == Reason.SATURATED)) for phase in phases.values())
+    clipped = max(float(np.mean(phase.reason[phase.illuminated] == Reason.SATURATED)) for phase in phases.values())
     figures = {"bright_share_of_full_scale": round(bright / full, 3), "saturated_share": round(clipped, 4)}
     if clipped > CLIPPED:
         said = f"{100 * clipped:.1f} % of the illuminated pixels are saturated."

@@ -9,11 +9,11 @@ Warn = Callable[[str], None]
 """Called with one sentence that the operator should know of."""
 
 
-def unheard(done: float, doing: str) -> None:
+def ignore_progress(done: float, doing: str) -> None:
     """Ignore the progress."""
 
 
-def unwarned(message: str) -> None:
+def ignore_warnings(message: str) -> None:
     """Ignore the warning."""
 
 

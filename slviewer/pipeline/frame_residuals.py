@@ -1,4 +1,4 @@
-"""What a capture says about itself: frames that were late, lost, out of order or lit otherwise."""
+"""What a capture says about itself: frames that were late, lost, out of order or illuminated otherwise."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -12,7 +12,7 @@ from slviewer.fringe.sequence import parse_size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture
-from slviewer.pipeline.feedback import Warn, unwarned
+from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import available, load_stereo, save_imported_stereo
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.reconstruction.axis_agreement import check_phases
@@ -31,7 +31,7 @@ def import_opencv_calibration(
     projector: Size | None = None,
     camera: Size | None = None,
     force: bool = False,
-    warn: Warn = unwarned,
+    warn: Warn = ignore_warnings,
 ) -> StereoModel | None:
     """Import a stereo calibration made elsewhere, from an OpenCV FileStorage file.
 

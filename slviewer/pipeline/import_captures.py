@@ -15,7 +15,7 @@ from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import PerAxis, parse_size
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.frame_residuals import save_residuals
 from slviewer.pipeline.models import available
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
@@ -44,8 +44,8 @@ def import_captures(
     origin: str | None = None,
     force: bool = False,
     strict: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
     **options: Any,
 ) -> list[str]:
     """Import a folder of captures that another tool made; returns the captures' names.
@@ -89,7 +89,7 @@ def read_captures(
     sequence: Path | str | None = None,
     projector: Size | None = None,
     channel: Channel | None = None,
-    warn: Warn = unwarned,
+    warn: Warn = ignore_warnings,
     **options: Any,
 ) -> list[NewCapture]:
     """Read a folder of captures of any known layout into memory, as ``import_captures`` does; nothing is saved.
@@ -112,7 +112,7 @@ def find_captures(
     projector: Size | None = None,
     channel: Channel | None = None,
     session: SessionLike | None = None,
-    warn: Warn = unwarned,
+    warn: Warn = ignore_warnings,
     **options: Any,
 ) -> Imports:
     """The captures of a folder, not yet read; ``session`` knows the projector's size where nobody states it."""

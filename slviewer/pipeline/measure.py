@@ -6,7 +6,7 @@ from typing import Literal, NoReturn
 
 from slviewer.errors import UsageError
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measured_surface import Place, surface
 from slviewer.pipeline.measurements import (
     add_distance,
@@ -39,8 +39,8 @@ def measure(
     name: str = "",
     model: ModelName | None = None,
     accept_rejected: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Measurement:
     """Measure on a scan: a distance between points, a section, a shape fitted to a region; the session stores it.
 

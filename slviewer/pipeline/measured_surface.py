@@ -11,7 +11,7 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
 from slviewer.pipeline.export_shapes import is_fresh, scan_cloud
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import Model, check_accepted, load_model, preferred, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor, scale_sigma
@@ -107,8 +107,8 @@ def surface(
     *,
     model: str | None = None,
     accept_rejected: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> MeasuredSurface:
     """Reconstruct a capture to measure on it, or read a merge that the session keeps, named ``merge/<number>``."""
     with opened(session) as store:
@@ -147,7 +147,7 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Measur
     )
 
 
-def merged_surface(store: Session, merge: str, warn: Warn = unwarned) -> MeasuredSurface:
+def merged_surface(store: Session, merge: str, warn: Warn = ignore_warnings) -> MeasuredSurface:
     """A merge that the session keeps as ``merge/<number>``, in the frame of its reference's camera."""
     meta = store.load_result(merge, only=())[0]
     if not is_fresh(store, merge):

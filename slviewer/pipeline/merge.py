@@ -11,7 +11,7 @@ from slviewer.errors import UsageError
 from slviewer.evaluation import letter
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, stage, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, stage
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, next_number, opened
 from slviewer.pipeline.scale import describe_scale, scale_factor
@@ -146,8 +146,8 @@ def merge(
     picked: Picked | None = None,
     keep_background: bool = False,
     accept_rejected: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Merge:
     """Register scans to a reference scan, close their loops, and fuse them into one surface.
 

@@ -8,7 +8,7 @@ from typing import Any
 from slviewer.errors import UsageError
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.export_shapes import merged_points, scan_cloud
-from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import Merge, StartKind, merge
 from slviewer.pipeline.models import ModelName, check_accepted, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -51,8 +51,8 @@ def mesh(
     start: StartKind = "features",
     angle: float | None = None,
     accept_rejected: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> MeshResult:
     """Make a mesh of a scan, or of several that are merged, and write it as .ply, .stl, .obj or .glb.
 

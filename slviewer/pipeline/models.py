@@ -192,17 +192,15 @@ def check_accepted(store: Session, accept_rejected: bool = False) -> None:
     """Raise CalibrationRejected, with the reason, where the calibration was rejected and that is not accepted."""
     reason = rejection(store)
     if reason and not accept_rejected:
-        raise CalibrationRejected(
-            f"the calibration was rejected, and is not used unless you insist (--accept-rejected): {reason}"
-        )
+        raise CalibrationRejected(f"the calibration was rejected, and is not used without --accept-rejected: {reason}")
 
 
-def insist(store: Session, on: bool) -> None:
+def accept_rejected_calibration(store: Session, on: bool) -> None:
     """Remember whether the calibration at hand is to be used although it was rejected; another one is asked anew."""
     store.decide("use_anyway", store.input_hashes("calibration/stereo")["calibration/stereo"] if on else None)
 
 
-def insisted(store: Session) -> bool:
+def accepts_rejected(store: Session) -> bool:
     """Whether that was decided of the calibration at hand."""
     decided = store.decision("use_anyway")
     if not decided or "stereo" not in available(store):

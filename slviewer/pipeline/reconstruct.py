@@ -13,7 +13,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
     ModelName,
@@ -99,8 +99,8 @@ def reconstruct(
     grid: Path | str | None = None,
     mesh: bool = False,
     accept_rejected: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Reconstruction:
     """Reconstruct a capture as a cloud; a board pose also says how flat each model measures the board.
 
@@ -183,7 +183,7 @@ def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn)
 
 def illuminated_pixels(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:
     """(h, w) bool: what a perfect decoder could have measured on the axis that the clouds came from."""
-    return phases[next(iter(clouds.values())).axis].lit
+    return phases[next(iter(clouds.values())).axis].illuminated
 
 
 def reconstruct_models(
@@ -194,7 +194,7 @@ def reconstruct_models(
     axis: Axis | None,
     *,
     accept_rejected: bool = False,
-    warn: Warn = unwarned,
+    warn: Warn = ignore_warnings,
 ) -> dict[str, Cloud]:
     """One cloud a model, all from the same axis so that they can be compared pixel by pixel."""
     clouds: dict[str, Cloud] = {}
@@ -206,7 +206,7 @@ def reconstruct_models(
 
 def masked_share(model: SplinedModel, phase: PhaseMap, region: np.ndarray | None = None) -> float:
     """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are masked, because they
-    look through parts of camera or projector that no target pose lit."""
+    look through parts of camera or projector that no target pose illuminated."""
     every = np.isfinite(model.points(phase, supported=False)[..., 2])
     if region is not None:
         every &= region

@@ -10,7 +10,7 @@ from slviewer.devices.protocols import Rig
 from slviewer.devices.replay import Recording, replayed
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.feedback import unwarned
+from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import checked, find_captures
 from slviewer.session.importers.imported import ImportableRecording
 from slviewer.session.store import Session, is_session
@@ -81,7 +81,7 @@ def _imported(
     folder: Path, layout: str | None, sequence: Path | str | None, projector: str | None
 ) -> dict[str, Callable[[], Shot]]:
     def read(recording: ImportableRecording) -> Shot:
-        found = checked(recording.read(), unwarned)
+        found = checked(recording.read(), ignore_warnings)
         return found.frames, found.sequence
 
     recordings = find_captures(folder, layout or "detect", sequence, projector=projector).recordings

@@ -16,7 +16,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibration_verdict import last_verdict
 from slviewer.pipeline.check import history
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measurements import measurements, quantities_of, section_lines
 from slviewer.pipeline.models import (
     available,
@@ -59,7 +59,9 @@ MOST_MAPS = 8
 """Verified captures whose error maps are drawn; the tables hold them all."""
 
 
-def report(session: SessionLike, out: Path | str, *, progress: Progress = unheard, warn: Warn = unwarned) -> str:
+def report(
+    session: SessionLike, out: Path | str, *, progress: Progress = ignore_progress, warn: Warn = ignore_warnings
+) -> str:
     """Write one self-contained HTML report of a session.
 
     Args:

@@ -27,7 +27,7 @@ _NUMBERS = ("settle_ms", "focal_px", "exposure_ms", "gain")
 @dataclass(frozen=True)
 class Preset:
     """A rig with a name: `what` it is in a sentence, the `choice` it stands for, the file that says so, and `problem`,
-    why it cannot be used here and how to mend that, empty if it can.
+    why it cannot be used here and how to correct that, empty if it can.
     """
 
     name: str
@@ -91,9 +91,9 @@ def check_choice(choice: Choice, where: str) -> None:
             or not 0 <= value < float("inf")
             or (not value and key != _NUMBERS[0])
         ):
-            raise InputError(f"{where}: {key} = {value!r} is no number above 0: mend it")
+            raise InputError(f"{where}: {key} = {value!r} is no number above 0: correct it")
     if not isinstance(choice.get("name", ""), str):
-        raise InputError(f"{where}: name = {choice['name']!r} is no text: mend it")
+        raise InputError(f"{where}: name = {choice['name']!r} is no text: correct it")
     if "driver" in choice:
         given = {key: value for key, value in choice.items() if key not in (*ABOUT, "driver")}
         if {"camera", "projector"} & set(given):
@@ -129,10 +129,10 @@ def _read(name: str, path: Path) -> Preset:
     try:
         choice = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} cannot be read as TOML ({error}): mend it") from error
+        raise InputError(f"{path} cannot be read as TOML ({error}): correct it") from error
     what = choice.pop("what", "")
     if not isinstance(what, str):
-        raise InputError(f"{path}: what = {what!r} is no text: mend it")
+        raise InputError(f"{path}: what = {what!r} is no text: correct it")
     check_choice(choice, str(path))
     return Preset(name, what, choice, path)
 

@@ -12,7 +12,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.session.capture import NewCapture
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
@@ -42,8 +42,8 @@ def simulate(
     scale: float = 1.0,
     poses: int = 25,
     seed: int = 0,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> list[str]:
     """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object at three depths.
 

@@ -18,7 +18,7 @@ from slviewer.evaluation.crossvalidation import (
     measure_held_out,
     split_folds,
 )
-from slviewer.pipeline.feedback import Progress, Warn, part, stage, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import (
     MODELS,
     VALIDATION,
@@ -47,8 +47,8 @@ def validate(
     *,
     models: Sequence[ModelName] = (),
     folds: int = FOLDS,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> CrossValidation:
     """Measure target poses with calibrations made without them, and recommend the best model.
 
@@ -90,7 +90,7 @@ def cross_validate(
     stereo: StereoModel,
     models: Sequence[str],
     folds: int = FOLDS,
-    progress: Progress = unheard,
+    progress: Progress = ignore_progress,
 ) -> CrossValidation:
     """The same for poses that are at hand, with circles at their centres, and the calibration made from all of them."""
     depths = {o.name: float(np.median(_depths(o, stereo))) for o in observations}

@@ -15,7 +15,7 @@ from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName, check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.reconstruct import board_region, illuminated_pixels, masked_share, reconstruct_models
@@ -86,8 +86,8 @@ def verify(
     radius: float | None = None,
     axis: Axis | None = None,
     accept_rejected: bool = False,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Verification:
     """Measure captures of a plane or a sphere with each model, over the pixels that all of them measure, and compare.
 

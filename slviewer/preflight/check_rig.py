@@ -5,7 +5,7 @@ from pathlib import Path
 
 from slviewer.pipeline.capture import set_camera
 from slviewer.pipeline.check_results import Preflight
-from slviewer.pipeline.feedback import Progress, Warn, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.rig_choice import SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
@@ -21,8 +21,8 @@ def check_rig(
     exposure_ms: float | None = None,
     gain: float | None = None,
     set_up: SetUp = set_up,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Preflight:
     """Check a rig in about 10 s: right screen, delay, order of frames, light, stillness; or the frames of a capture.
 
@@ -48,7 +48,7 @@ def check_rig(
         return preflight(devices, progress=progress)
 
 
-def check_capture(session: SessionLike, capture: str, *, progress: Progress = unheard) -> Preflight:
+def check_capture(session: SessionLike, capture: str, *, progress: Progress = ignore_progress) -> Preflight:
     """What the frames of a recorded capture say about the rig that took them: order, light, exposure, response, noise,
     description, decoded share. Raises SessionError for a capture that cannot be read, and whatever `progress` raises.
     """

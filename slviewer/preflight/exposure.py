@@ -6,16 +6,16 @@ from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
 from slviewer.preflight.rig_under_test import RigUnderTest
 
-_TARGET = 0.85  # of full scale, for the 99.5th percentile of what is lit
+_TARGET = 0.85  # of full scale, for the 99.5th percentile of what is illuminated
 _BACK_OFF = 0.5  # how much light is too much cannot be seen: half of it, then look again
 
 
 def exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     """The check, and the exposure in ms to set instead; None where the present one is right or unknown."""
-    level, full = bench.white[bench.lit], bench.full
+    level, full = bench.white[bench.illuminated], bench.full
     bright = float(np.quantile(level, 0.995))
     clipped = float(np.mean(level >= 0.985 * full))
-    black = float(np.median(bench.dark[bench.lit]))
+    black = float(np.median(bench.dark[bench.illuminated]))
     present = bench.rig.camera.settings().exposure_ms
     factor = _BACK_OFF if bright >= 0.985 * full else (_TARGET * full - black) / max(bright - black, 1.0)
     wanted = None if present is None else _round(present * factor)

@@ -17,7 +17,7 @@ def gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, float]:
     """The check, the table for `PatternSequence.levels`, and the light of grey level 127.5 as a share of white."""
     where = bench.usable()
     if np.count_nonzero(where) < _FEWEST:
-        sentence = "The response cannot be measured: too few pixels are lit and not saturated."
+        sentence = "The response cannot be measured: too few pixels are illuminated and not saturated."
         return Check("gamma", "unknown", sentence, "Mend the exposure first.", {}), None, 0.5
     if bench.unsteady > _UNSTEADY:
         said = f"The response cannot be measured: the light flickers by {100 * bench.unsteady:.0f} %."

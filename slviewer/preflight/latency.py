@@ -35,7 +35,7 @@ class _Change:
 
 def latency(bench: RigUnderTest) -> tuple[Check, float | None]:
     """The check, and the `settle_ms` that follows from it; fills in the bench's frame time, delay and stale images."""
-    if bench.lit.mean() < _FEWEST_LIT:
+    if bench.illuminated.mean() < _FEWEST_LIT:
         return Check("latency", "unknown", "The delay cannot be measured: no change of light is seen.", "", {}), None
     begun = [bench.timed()[0] for _ in range(6)]
     bench.frame_ms = 1000 * float(np.median(np.diff(begun)))
@@ -101,7 +101,7 @@ def _change(bench: RigUnderTest, i: int) -> _Change:
     while True:
         begin, image = bench.timed()
         begun.append(begin - shown)
-        if abs(bench.share(image, bench.lit) - target) < _near(bench):
+        if abs(bench.share(image, bench.illuminated) - target) < _near(bench):
             return _Change(tuple(begun), True)
         if begin - shown > _GIVE_UP_S:
             return _Change(tuple(begun), False)
@@ -113,7 +113,7 @@ def _stale(bench: RigUnderTest, settle_ms: float, i: int) -> int:
     bench.show(255 if target else None, "freshness of the images")
     time.sleep((2 * settle_ms + bench.frame_ms) / 1000)
     old = 0
-    while old < 8 and abs(bench.share(bench.grab(), bench.lit) - target) >= _near(bench):
+    while old < 8 and abs(bench.share(bench.grab(), bench.illuminated) - target) >= _near(bench):
         old += 1
     return old
 

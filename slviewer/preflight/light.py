@@ -15,7 +15,7 @@ _DRIFTS = 0.8
 
 def ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
     """Light in the dark frames, and whether it was the same at the end."""
-    where = bench.lit
+    where = bench.illuminated
     room = float(np.median(bench.dark[where])) / max(bench.contrast, 1e-6)
     step = float(np.median((last_dark - bench.dark)[where])) / max(bench.contrast, 1e-6)
     figures = {"room_over_projector": round(room, 3), "change_over_projector": round(step, 4)}
@@ -43,7 +43,7 @@ def flicker(bench: RigUnderTest, burst: Burst) -> Check:
     """Brightness of whole images from one to the next, beyond what noise makes of it."""
     where, span = bench.usable(), max(bench.contrast, 1e-6)
     if not where.any():
-        return Check("flicker", "unknown", "Flicker cannot be measured: all that is lit is saturated.", "", {})
+        return Check("flicker", "unknown", "Flicker cannot be measured: all that is illuminated is saturated.", "", {})
     white, dark = (
         np.array([float(i[where].mean(dtype=float)) for i in images]) for images in (burst.white, burst.dark)
     )

@@ -37,7 +37,9 @@ def order(bench: RigUnderTest) -> tuple[Check, Check]:
 def _judged(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -> Check:
     n = len(stack)
     levels = {i: int(f.kind == "white") for i, f in enumerate(sequence.frames) if f.kind in ("white", "black")}
-    shares = {i: bench.share(stack[i][:: bench.stride, :: bench.stride].astype(np.float32), bench.lit) for i in levels}
+    shares = {
+        i: bench.share(stack[i][:: bench.stride, :: bench.stride].astype(np.float32), bench.illuminated) for i in levels
+    }
     wrong = [i for i, on in levels.items() if abs(shares[i] - on) > 0.4]
     part = max(0.08, 5 * bench.unsteady)
     mixed = [i for i, on in levels.items() if part < abs(shares[i] - on) <= 0.4]

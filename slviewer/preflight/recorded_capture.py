@@ -17,7 +17,7 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
 from slviewer.pipeline.exposure_check import check_capture_exposure
-from slviewer.pipeline.feedback import Progress, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.frame_residuals import residuals
 from slviewer.preflight.gamma import CURVED
 from slviewer.preflight.order import repeated_images
@@ -32,7 +32,7 @@ _LEAST_ILLUMINATED = 0.005
 """Share of the image that must carry a pattern: half a percent is a board in a corner of the image."""
 
 
-def preflight_capture(capture: Capture, progress: Progress = unheard) -> Preflight:
+def preflight_capture(capture: Capture, progress: Progress = ignore_progress) -> Preflight:
     """What the frames of a capture say about the rig that took them, in the words of `run.preflight`."""
     began = time.monotonic()
     progress(0.0, "reading frames")
@@ -171,7 +171,7 @@ def _decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
     figures: dict[str, Any] = {}
     said, worst, least = [], 1.0, 1.0
     for axis, phase in phases.items():
-        illuminated = float(phase.lit.mean())
+        illuminated = float(phase.illuminated.mean())
         counts = {reason: float(np.mean(phase.reason == reason)) for reason in Reason}
         share = counts[Reason.VALID] / illuminated if illuminated else 0.0
         worst, least = min(worst, share), min(least, illuminated)

@@ -22,7 +22,7 @@ class RigUnderTest:
     """An open rig. Images come as (h, w) float32 grey levels of every `stride`-th row and column.
 
     ``settle_ms`` and ``stale`` are what the latency check finds: the time to wait after a change, and how many images
-    to throw away. ``dark`` and ``white`` are the references, ``lit`` (h, w) bool where the projector's light is seen;
+    to throw away. ``dark`` and ``white`` are the references, ``illuminated`` (h, w) bool sees the projector's light;
     ``noise`` of one grey level, and ``unsteady``, by how much whole images differ, as a share of the white light (rms).
     """
 
@@ -37,7 +37,7 @@ class RigUnderTest:
         self.noise, self.unsteady = 0.0, 0.0
         shape = self._frame[:: self.stride, :: self.stride].shape
         self.dark, self.white = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        self.lit = np.zeros(shape, bool)
+        self.illuminated = np.zeros(shape, bool)
 
     def grab(self) -> np.ndarray:
         """The next image, sampled."""
@@ -83,9 +83,9 @@ class RigUnderTest:
         self.noise = float(np.median(np.abs(difference - np.median(difference)))) / 0.6745 / math.sqrt(2)
         # Light that flickers lifts whole images, and must not pass for the projector's.
         swing = max(float(np.std([np.median(image) for image in images])) for images in taken)
-        self.lit = self.white - self.dark > max(_SIGMAS * self.noise, 0.02 * self.full, 3 * swing)
-        if self.lit.any():
-            self.unsteady = max(float(np.std([self.share(i, self.lit) for i in images])) for images in taken)
+        self.illuminated = self.white - self.dark > max(_SIGMAS * self.noise, 0.02 * self.full, 3 * swing)
+        if self.illuminated.any():
+            self.unsteady = max(float(np.std([self.share(i, self.illuminated) for i in images])) for images in taken)
 
     @property
     def full(self) -> float:
@@ -96,11 +96,11 @@ class RigUnderTest:
     @property
     def contrast(self) -> float:
         """Grey levels of the projector's white light where it is seen, in the middle."""
-        return float(np.median((self.white - self.dark)[self.lit])) if self.lit.any() else 0.0
+        return float(np.median((self.white - self.dark)[self.illuminated])) if self.illuminated.any() else 0.0
 
     def usable(self) -> np.ndarray:
-        """(h, w) bool: lit, and not clipped in white light."""
-        return self.lit & (self.white < 0.985 * self.full) & (self.dark < 0.9 * self.full)
+        """(h, w) bool: illuminated, and not clipped in white light."""
+        return self.illuminated & (self.white < 0.985 * self.full) & (self.dark < 0.9 * self.full)
 
     def share(self, image: np.ndarray, where: np.ndarray) -> float:
         """The projector's light in an image, 0 for dark, 1 for white, summed over some pixels."""

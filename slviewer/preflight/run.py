@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from slviewer.devices.protocols import Rig
 from slviewer.pipeline.check_results import Check, Preflight
-from slviewer.pipeline.feedback import Progress, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.preflight import burst
 from slviewer.preflight.exposure import exposure
 from slviewer.preflight.gamma import gamma
@@ -33,7 +33,7 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
     """
     began, shown = time.monotonic(), 0
     checks: list[Check] = []
-    heard = progress or unheard
+    heard = progress or ignore_progress
 
     def tick(doing: str) -> None:
         nonlocal shown

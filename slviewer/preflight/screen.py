@@ -21,7 +21,7 @@ def screen(bench: RigUnderTest) -> Check:
     follows = (correlation > _FOLLOWS) & (amplitude > max(4 * bench.noise, 0.01 * bench.full))
     share = float(follows.mean())
     if share >= _NOTHING:
-        bench.lit = follows
+        bench.illuminated = follows
     figures = {"share_that_follows": round(share, 4), "contrast_levels": round(float(_middle(amplitude, follows)), 1)}
     if share < _NOTHING:
         return Check(

@@ -9,15 +9,15 @@ from slviewer.preflight.rig_under_test import RigUnderTest
 _BLOCK = 6  # sampled pixels
 _SIGMAS = 8.0
 _CHANGE = 0.04  # of the projector's light
-_SOMETHING, _MUCH = 0.004, 0.05  # shares of what is lit
+_SOMETHING, _MUCH = 0.004, 0.05  # shares of what is illuminated
 
 
 def stillness(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Check:
     """White images of the beginning, the middle and the end, block by block, whatever the light as a whole did."""
-    blocks = np.stack([_blocks(image, bench.lit) for image in (bench.white, *burst.white, last_white)])
+    blocks = np.stack([_blocks(image, bench.illuminated) for image in (bench.white, *burst.white, last_white)])
     seen = np.isfinite(blocks[0])
     if not seen.any():
-        return Check("motion", "unknown", "Motion cannot be seen: too little is lit.", "", {})
+        return Check("motion", "unknown", "Motion cannot be seen: too little is illuminated.", "", {})
     blocks = blocks[:, seen]
     blocks = np.stack([_with_light_of(image, blocks[0]) for image in blocks])
     noise = 1.4826 * float(np.median(np.abs(np.diff(blocks[1:-1], axis=0)))) / np.sqrt(2)
@@ -29,7 +29,7 @@ def stillness(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Chec
         return Check(
             "motion",
             "bad" if share > _MUCH else "warning",
-            f"{100 * share:.1f} % of the lit image changed while nothing should have: something moved.",
+            f"{100 * share:.1f} % of the illuminated image changed while nothing should have: something moved.",
             "Let nothing move in front of the rig, stand it firmly, then check again.",
             figures,
         )
@@ -48,10 +48,10 @@ def _with_light_of(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     return fitted
 
 
-def _blocks(image: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    """(n,) means of square blocks; NaN where not all of a block is lit."""
+def _blocks(image: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
+    """(n,) means of square blocks; NaN where not all of a block is illuminated."""
     height, width = (size // _BLOCK * _BLOCK for size in image.shape)
     shape = (height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
     mean = image[:height, :width].reshape(shape).mean(axis=(1, 3))
-    whole = lit[:height, :width].reshape(shape).all(axis=(1, 3))
+    whole = illuminated[:height, :width].reshape(shape).all(axis=(1, 3))
     return np.where(whole, mean, np.nan).ravel()

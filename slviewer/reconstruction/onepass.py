@@ -118,13 +118,13 @@ class OnePass:
         return LightLevels(measure_noise(self._layout, frames, white), mean, white)
 
     def run(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
-        """The scan of frames (n, h, w) uint8 or uint16, spikes mended.
+        """The scan of frames (n, h, w) uint8 or uint16, spikes repaired.
 
         ``light``: of earlier frames of the same rig; None measures it from these. ``out``: an earlier scan of frames
         like these, whose arrays are used again; None makes new ones.
         """
         scan = self.sweep(frames, light, out)
-        self.mend(scan)
+        self.repair_spikes(scan)
         return scan
 
     def sweep(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
@@ -148,7 +148,7 @@ class OnePass:
             return self.sweep(frames, self.light(frames), scan)
         return scan
 
-    def mend(self, scan: PassResult) -> None:
+    def repair_spikes(self, scan: PassResult) -> None:
         """The second pass, over few pixels: spikes of one period are moved, lonely and outside pixels masked."""
         rules, maps = spikes.spike_rules(self._layout), _maps(scan)
         columns, words, counts = self._lists
@@ -176,12 +176,12 @@ class OnePass:
         self._check(frames)
         frames = np.ascontiguousarray(frames)
         light = light or self.light(frames)
-        scan = self._room(frames.dtype, light) if out is None else replace(out, light=light)
+        scan = self._allocate(frames.dtype, light) if out is None else replace(out, light=light)
         if scan.texture.dtype != frames.dtype or scan.points.shape[:2] != self.shape:
             raise InputError("The arrays to write into belong to other frames: leave them out, and new ones are made.")
         return frames, scan
 
-    def _room(self, dtype: np.dtype, light: LightLevels) -> PassResult:
+    def _allocate(self, dtype: np.dtype, light: LightLevels) -> PassResult:
         phase, sigma_z, modulation = (np.empty(self.shape, np.float32) for _ in range(3))
         points, reason = np.empty((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
         texture = np.empty(self.shape, dtype)

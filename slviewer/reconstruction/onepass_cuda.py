@@ -42,7 +42,7 @@ def has_pass(model: object) -> TypeGuard[Fast]:
 class CudaPass(OnePass):
     """`OnePass` on a CUDA device, for stereo calibrations too; for one thread at a time.
 
-    Coefficients stay on the device, frames go there once, and maps come back when spikes are mended. Frames and scans
+    Coefficients stay on the device, frames go there once, and maps come back when spikes are repaired. Frames and scans
     in memory from `cuda_device.allocate_frames` travel at full speed. Should the device fail, the processor goes on.
     """
 
@@ -70,10 +70,10 @@ class CudaPass(OnePass):
     def sweep(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
         return self._scan(frames, light, out, False)
 
-    def mend(self, scan: PassResult) -> None:
+    def repair_spikes(self, scan: PassResult) -> None:
         if isinstance(self.model, StereoModel):
-            raise InputError("a stereo calibration's spikes are mended where they are found: use run, not sweep")
-        super().mend(scan)
+            raise InputError("a stereo calibration's spikes are repaired where they are found: use run, not sweep")
+        super().repair_spikes(scan)
 
     def card(self, dtype: np.dtype) -> "Card":
         """What lies on the device for frames of a dtype, to be used step by step: its errors are not caught."""
@@ -84,29 +84,31 @@ class CudaPass(OnePass):
             self._card = Card(self._job(), dtype)
         return self._card
 
-    def _scan(self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None, mended: bool) -> PassResult:
+    def _scan(
+        self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None, repaired: bool
+    ) -> PassResult:
         frames, scan = self._begun(frames, light, out)
         if cuda_device.find_device() is not None:
             try:
-                return self._on_card(frames, scan, mended)
+                return self._on_card(frames, scan, repaired)
             except Exception as error:  # of the driver, the compiler, or memory: whatever it is, there is a processor
                 cuda_device.disable_device(error)
         self._card = None
         if isinstance(self.model, StereoModel):
             return self._defined(frames, scan)
-        return super().run(frames, scan.light, scan) if mended else super().sweep(frames, scan.light, scan)
+        return super().run(frames, scan.light, scan) if repaired else super().sweep(frames, scan.light, scan)
 
-    def _on_card(self, frames: np.ndarray, scan: PassResult, mended: bool) -> PassResult:
+    def _on_card(self, frames: np.ndarray, scan: PassResult, repaired: bool) -> PassResult:
         card = self.card(frames.dtype)
         card.load(frames)
         card.sweep(scan.light)
-        if mended:
-            card.mend()
+        if repaired:
+            card.repair_spikes()
         if self._order.texture >= 0:  # the device has no use for it
             np.copyto(scan.texture, frames[self._order.texture])
         highest = card.fetch(scan)
         if clip_level(frames.dtype, highest) > scan.light.white:  # a camera of more bits than it seemed
-            return self._on_card(frames, replace(scan, light=self.light(frames)), mended)
+            return self._on_card(frames, replace(scan, light=self.light(frames)), repaired)
         return scan
 
     def _job(self) -> Job:
@@ -125,7 +127,7 @@ class CudaPass(OnePass):
             texture(self.sequence, frames), light,
         )  # fmt: skip
 
-    def _room(self, dtype: np.dtype, light: LightLevels) -> PassResult:
+    def _allocate(self, dtype: np.dtype, light: LightLevels) -> PassResult:
         phase, sigma_z, modulation = (cuda_device.allocate_frames(self.shape, np.float32) for _ in range(3))
         points, reason = cuda_device.allocate_frames((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
         grey = cuda_device.allocate_frames(self.shape, dtype)

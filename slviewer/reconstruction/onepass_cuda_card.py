@@ -79,8 +79,8 @@ class Card:
             self._reason, self._modulation, self._points, self._sigma_z, self._texture, self._highest,
         )  # fmt: skip
 
-    def mend(self) -> None:
-        """The second: what `OnePass.mend` does."""
+    def repair_spikes(self) -> None:
+        """The second: what `OnePass.repair_spikes` does."""
         list_moves, move, list_masked, mask = self._spikes
         if self._is_plain:
             list_moves[self._grid](self._phase_map, self._words)

@@ -51,7 +51,7 @@ class Scattered(Protocol):
 
 
 @runtime_checkable
-class Sure(Protocol):
+class HasCalibrationSigma(Protocol):
     """A calibration that knows how far it may be off."""
 
     def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def reconstruct(
         measured = _measure_all(model, phases)
         axis = _best_axis(measured)
         points, sigma_z, edges = measured[axis]
-    left = model.sigma_calibration(axis, points) if isinstance(model, Sure) else None
+    left = model.sigma_calibration(axis, points) if isinstance(model, HasCalibrationSigma) else None
     return Cloud(points, axis, model.name, sigma_z, texture, left, edges)
 
 

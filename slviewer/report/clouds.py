@@ -66,7 +66,7 @@ def draw_clouds(views: Sequence[CloudView]) -> Figure:
 
 
 def draw_merged_cloud(view: CloudView) -> Figure:
-    """The merged cloud: lit as one surface, and coloured by the scan that each point comes from."""
+    """The merged cloud: illuminated as one surface, and coloured by the scan that each point comes from."""
     points, normals, source = _sampled(view)
     size = (2 * HALF - 40, 2 * HALF - 240)
     rotation = view_rotation(YAW_DEG, PITCH_DEG)

@@ -10,7 +10,7 @@ from slviewer.report.tables import UNKNOWN, format_number
 
 _LEVELS: dict[str, tuple[str, str]] = {
     "good": ("Good: nothing that was seen speaks against this calibration.", "good"),
-    "doubtful": ("Doubtful: it may be used with care, better mended first.", "warning"),
+    "doubtful": ("Doubtful: it may be used with care, better corrected first.", "warning"),
     "rejected": ("Rejected: do not measure with this calibration.", "warning"),
 }
 _DECISIONS: dict[str | None, tuple[str, Mark]] = {
@@ -26,9 +26,9 @@ def verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
     words, kind = _LEVELS[verdict.level]
     items: list[Item] = [PageNotice(words, kind)]  # type: ignore[arg-type]
     for finding in verdict.findings:
-        mended = finding.severity == "note"
-        what = "Mended already." if mended else f"What to do: {finding.remedy}."
-        items.append(PageNotice(f"{finding.sentence}. {what}", "plain" if mended else "warning"))
+        is_corrected = finding.severity == "note"
+        what = "Already corrected." if is_corrected else f"What to do: {finding.remedy}."
+        items.append(PageNotice(f"{finding.sentence}. {what}", "plain" if is_corrected else "warning"))
     text = "" if of_calibration else "This is said of the last attempt to calibrate, of which nothing came."
     return Section("Verdict", text, items)
 
@@ -90,7 +90,7 @@ def models_section(models: ModelsView) -> Section:
 
 
 def _splined_table(found: Mapping[str, Any]) -> Table:
-    noise, local, lit = found["noise_px"], found["local_distortion_rms_px"], found["cells_lit"]
+    noise, local, illuminated = found["noise_px"], found["local_distortion_rms_px"], found["cells_lit"]
     low, high = found["board_height_mm"]
     rows = [
         ["noise left in the camera", f"{noise['camera']:.4f} px"],
@@ -99,12 +99,14 @@ def _splined_table(found: Mapping[str, Any]) -> Table:
         ["the board's bow, lowest to highest place", f"{high - low:.3f} mm"],
         ["the board's features, misplaced by", f"{found['board_offsets_rms_mm']:.4f} mm RMS"],
         [
-            "field cells that target poses lit, camera / projector",
-            f"{100 * lit['camera']:.0f} / {100 * lit['projector']:.0f} %",
+            "field cells that target poses illuminated, camera / projector",
+            f"{100 * illuminated['camera']:.0f} / {100 * illuminated['projector']:.0f} %",
         ],
     ]
     columns = [Column("quantity", align="left"), Column("value")]
-    return Table(columns, rows, "The joint adjustment (splined)", ["What looks through cells never lit is masked."])
+    return Table(
+        columns, rows, "The joint adjustment (splined)", ["What looks through cells never illuminated is masked."]
+    )
 
 
 def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:

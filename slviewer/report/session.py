@@ -337,10 +337,10 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
             rows.append(row)
     notes = [
         "Set aside: points beyond 5 robust sigma, above 2 % the RMS does not speak for the shape. Coverage: measured "
-        "pixels of those lit and modulated."
+        "pixels of those illuminated and modulated."
     ]
     if masked:
-        notes.append("Masked: pixels that look through parts of camera or projector that no target pose lit.")
+        notes.append("Masked: pixels that look through parts of camera or projector that no target pose illuminated.")
     return Table(columns, rows, caption, notes)
 
 

@@ -49,7 +49,7 @@ def render_points(
         return np.full((size[1], size[0], 3), BACKGROUND, np.uint8)
     view = (points[known] @ rotation.T).astype(np.float32)
     shade = _shade(normals[known] @ rotation.T)
-    lit = (np.clip(colours[known] * shade[:, :1] + shade[:, 1:], 0, 1)).astype(np.float32)
+    illuminated = (np.clip(colours[known] * shade[:, :1] + shade[:, 1:], 0, 1)).astype(np.float32)
 
     low, high = np.percentile(view[:: max(1, len(view) // 50_000)], [0.3, 99.7], axis=0)
     scale = 0.92 * float(min(width / max(high[0] - low[0], 1e-6), height / max(high[1] - low[1], 1e-6)))
@@ -59,7 +59,7 @@ def render_points(
     depth = np.full((height, width), np.inf, np.float32)
     blended = np.zeros((height, width, 4), np.float32)
     thickness = np.float32(2.5 * radius / scale)
-    _splat(uv, view[:, 2], lit, np.float32(radius), thickness, depth, blended)
+    _splat(uv, view[:, 2], illuminated, np.float32(radius), thickness, depth, blended)
 
     weight = blended[..., 3:]
     background = np.array(BACKGROUND, np.float32) / 255

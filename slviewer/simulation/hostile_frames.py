@@ -79,9 +79,9 @@ def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
 def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
     """A lamp switched on half way through the phase steps of x: even light, as a share of the projector's."""
     steps = _indices(shot, "phase", "x")
-    lit = light.copy()
-    lit[steps[len(steps) // 2] :] += np.float32(share) * shot.room
-    return lit
+    illuminated = light.copy()
+    illuminated[steps[len(steps) // 2] :] += np.float32(share) * shot.room
+    return illuminated
 
 
 def add_colour_wheel(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:

@@ -15,7 +15,7 @@ from slviewer.simulation.light import OVERSAMPLING, blur_levels, blurred_profile
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 
-_EXPOSURE_QUANTILE = 0.995  # of the lit pixels; a few brighter ones do not decide an exposure
+_EXPOSURE_QUANTILE = 0.995  # of the illuminated pixels; a few brighter ones do not decide an exposure
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class _Maps:
 class Renderer:
     """Renders one scene with one rig: geometry once, then frame after frame of any pattern sequence.
 
-    The exposure is set as an operator would: the brightest half percent of the lit surface reaches the sensor's
+    The exposure is set as an operator would: the brightest half percent of the illuminated surface reaches the sensor's
     `peak_level` in full white light. Defocus and pixel response blur the projected profile by the surface's depth;
     the camera's PSF blurs each frame. Silhouettes are not anti-aliased, printed edges are.
     """
@@ -117,14 +117,14 @@ class Renderer:
     ) -> np.ndarray:
         """(h, w) float32: the light of one frame in grey levels above dark, before noise and clipping; as `frame`."""
         rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
-        lit, stray = self._light(self.exposure if exposure is None else exposure)
+        illuminated, stray = self._light(self.exposure if exposure is None else exposure)
         # Rows and columns are blurred alike in space, hence by different numbers of pixels.
         sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
         light = blurred_profile((grey_levels / 255.0) ** rig.light.gamma, sigmas)
         width, height = rig.camera.size
         out = np.empty((height, width), np.float32)
         image_light(
-            maps.coordinates[varies or "x"], maps.level, lit, np.float32(lamp) * light.table, light.offset,
+            maps.coordinates[varies or "x"], maps.level, illuminated, np.float32(lamp) * light.table, light.offset,
             OVERSAMPLING, self._taps, stray, out,
         )  # fmt: skip
         return out
@@ -154,10 +154,10 @@ class Renderer:
     def exposure(self) -> float:
         """Grey levels of full white light on an albedo of 1 that faces the projector at its focus."""
         maps, sensor = self._maps, self.rig.sensor
-        lit = (maps.gain + self.rig.light.ambient * maps.even)[self._frame][maps.truth.mask]
-        if not lit.size:
-            raise InputError("nothing in the scene is lit by the projector: move it to where both fields meet")
-        return (sensor.peak_level - sensor.dark_level) / float(np.quantile(lit, _EXPOSURE_QUANTILE))
+        illuminated = (maps.gain + self.rig.light.ambient * maps.even)[self._frame][maps.truth.mask]
+        if not illuminated.size:
+            raise InputError("nothing in the scene is illuminated by the projector: move it to where both fields meet")
+        return (sensor.peak_level - sensor.dark_level) / float(np.quantile(illuminated, _EXPOSURE_QUANTILE))
 
     @cached_property
     def _taps(self) -> np.ndarray:
@@ -193,12 +193,12 @@ class Renderer:
         u, v = projector[..., 0], projector[..., 1]
         lens_falloff = (1 + (rays**2).sum(-1)) ** -2  # cos^4 of the angle to the camera's axis
         seen = surface.albedo * lens_falloff
-        lit = window(u, columns, blur) * window(v, rows, blur * self._rows_per_column)
+        illuminated = window(u, columns, blur) * window(v, rows, blur * self._rows_per_column)
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
         sigmas, level = blur_levels(blur)
         return _Maps(
-            gain=(seen * shade * reached * lit).astype(np.float32),
+            gain=(seen * shade * reached * illuminated).astype(np.float32),
             even=(seen * hit).astype(np.float32),
             level=level,
             sigmas=sigmas,

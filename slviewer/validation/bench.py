@@ -26,7 +26,7 @@ from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.fringe.threshold import fringe_mean
 from slviewer.pipeline.calibrate import calibrate
-from slviewer.pipeline.feedback import Progress, part, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.open_session import opened
 from slviewer.pipeline.poses import load_observations
@@ -76,7 +76,7 @@ def bench(
     live: bool = False,
     minutes: float = 0.5,
     scale: float = 1.0,
-    progress: Progress = unheard,
+    progress: Progress = ignore_progress,
 ) -> Benchmark:
     """Time the main stages on this machine, beside what they cannot beat.
 
@@ -161,7 +161,7 @@ def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
     rows.append(_one_pass(one, frames, 7))
     rows.append(_one_pass(OnePass(sequence, _made_up(compiled, rays), "x"), frames, 5))
     rows += gpu_rows(sequence, pixelwise, frames)
-    rows.append(row("second pass, over spikes", median(lambda: one.mend(scan), 9), megabytes(scan.phase)))
+    rows.append(row("second pass, over spikes", median(lambda: one.repair_spikes(scan), 9), megabytes(scan.phase)))
     rows.append(row("noise and fringe mean of a capture, sampled", median(lambda: one.light(frames), 5)))
     rows.append(_file(scan.cloud()))
     return rows
@@ -172,7 +172,7 @@ def _one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
     light = one.light(frames)
     scan = one.run(frames, light)
     seconds, moved, least = _beside_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
-    note = "frames to phase, points, depth noise, modulation and texture; spikes not mended"
+    note = "frames to phase, points, depth noise, modulation and texture; spikes not repaired"
     stage = f"one pass over {len(frames)} frames, {one.model.name}"
     return row(stage, seconds, moved, least, note=note, target="1.5 floors")
 

@@ -21,7 +21,7 @@ AHEAD = 8
 def gpu_rows(
     sequence: PatternSequence, model: PixelwiseModel | SplinedModel, frames: np.ndarray
 ) -> list[dict[str, Any]]:
-    """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, mended, with the copies there and
+    """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, repaired, with copies there and
     back; nothing without a device."""
     name = cuda_device.find_device()
     if name is None:

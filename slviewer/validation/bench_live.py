@@ -22,7 +22,7 @@ from websockets.sync.connection import Connection
 
 from slviewer.errors import SlviewerError
 from slviewer.gui.app import App
-from slviewer.pipeline.feedback import Progress, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.server.secure import SafeServer
 from slviewer.session.store import Session
@@ -80,7 +80,7 @@ class LiveFigures:
         )
 
 
-def live_rate(scale: float = 0.5, seconds: float = 30.0, progress: Progress = unheard) -> LiveFigures:
+def live_rate(scale: float = 0.5, seconds: float = 30.0, progress: Progress = ignore_progress) -> LiveFigures:
     """Scan the demo object live on the simulated rig, its camera 1600x1200 times `scale`, settled at once.
 
     Clouds are reconstructed by the stereo model of the true lenses. Raises SlviewerError where live scanning fails.
@@ -114,7 +114,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
             time.sleep(min(0.25, seconds / 20))
             live = operator.snapshot().live
             if live is None:
-                raise SlviewerError(f"the live scan ended: {_told(operator)}")
+                raise SlviewerError(f"the live scan ended: {_last_notice(operator)}")
             made.append(live.clouds_per_s)
             shown.append(live.shown_per_s)
             behind += [] if live.latency_ms is None else [live.latency_ms]
@@ -219,7 +219,7 @@ def _wait(condition: Callable[[], bool], operator: Operator) -> None:
     end = time.monotonic() + _PATIENCE_S
     while not condition():
         if time.monotonic() > end:
-            raise SlviewerError(f"the live scan did not begin within {_PATIENCE_S:.0f} s: {_told(operator)}")
+            raise SlviewerError(f"the live scan did not begin within {_PATIENCE_S:.0f} s: {_last_notice(operator)}")
         time.sleep(0.02)
 
 
@@ -228,7 +228,7 @@ def _shown(operator: Operator) -> float:
     return 0.0 if live is None else live.shown_per_s
 
 
-def _told(operator: Operator) -> str:
+def _last_notice(operator: Operator) -> str:
     notices = operator.snapshot().notices
     return notices[-1].text if notices else "nobody said why"
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args
 
-from slviewer.pipeline.feedback import Progress, part, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.validation.prove_accuracy import prove_accuracy
 from slviewer.validation.prove_causes import prove_causes
 from slviewer.validation.prove_guidance import prove_guidance
@@ -76,7 +76,7 @@ def prove(
     quick: bool = False,
     cases: Sequence[str] = (),
     seed: int = 0,
-    progress: Progress = unheard,
+    progress: Progress = ignore_progress,
 ) -> Proofs:
     """Prove on simulated rigs that results reach the noise floor, faults are named, and predicted errors are honest.
 
@@ -92,14 +92,14 @@ def prove(
     """
     scale = QUICK_SCALE if quick else 1.0
     work: Mapping[Claim, Callable[[Progress], Proof]] = {
-        "accuracy": lambda told: prove_accuracy(scale, seed=seed, progress=told),
-        "causes": lambda told: prove_causes(scale, seed=seed, progress=told),
-        "guidance": lambda told: prove_guidance(scale, seed=seed, progress=told),
-        "hostile": lambda told: prove_hostile(
-            min(scale, HOSTILE_SCALE), cases=cases, splined=not quick, seed=seed, progress=told
+        "accuracy": lambda report: prove_accuracy(scale, seed=seed, progress=report),
+        "causes": lambda report: prove_causes(scale, seed=seed, progress=report),
+        "guidance": lambda report: prove_guidance(scale, seed=seed, progress=report),
+        "hostile": lambda report: prove_hostile(
+            min(scale, HOSTILE_SCALE), cases=cases, splined=not quick, seed=seed, progress=report
         ),
-        "registration": lambda told: prove_registration(scale, seed=seed, progress=told),
-        "uncertainty": lambda told: prove_uncertainty(scale, seed=seed, progress=told),
+        "registration": lambda report: prove_registration(scale, seed=seed, progress=report),
+        "uncertainty": lambda report: prove_uncertainty(scale, seed=seed, progress=report),
     }
     chosen = [claim for claim in CLAIMS if not only or claim in only]
     found: dict[Claim, Proof] = {}

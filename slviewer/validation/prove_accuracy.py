@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from slviewer.evaluation.render import Row, render
-from slviewer.pipeline.feedback import Progress, part, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.validation.prove_rigs import FLOOR, RigCase, RigFigures, cases, measure_rig
 
 POSES = 25
@@ -123,7 +123,7 @@ def prove_accuracy(
     rigs: Sequence[RigCase] | None = None,
     poses: int = POSES,
     seed: int = 0,
-    progress: Progress = unheard,
+    progress: Progress = ignore_progress,
 ) -> AccuracyProof:
     """Calibrate and measure one rig after another; by default the six of ``prove_rigs.cases``."""
     chosen = cases(seed) if rigs is None else rigs

@@ -8,7 +8,7 @@ from typing import Any
 from slviewer.calibration.diagnosis.attempt import Attempt
 from slviewer.calibration.diagnosis.verdict import Cause
 from slviewer.evaluation.render import render
-from slviewer.pipeline.feedback import Progress, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.simulation.boards import BoardShape
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
@@ -98,7 +98,7 @@ def prove_causes(
     poses: int = POSES,
     steps: int = 18,
     seed: int = 0,
-    progress: Progress = unheard,
+    progress: Progress = ignore_progress,
 ) -> CauseProof:
     """Every fault in turn, then ``clean`` calibrations of different rigs, poses and boards.
 

@@ -17,7 +17,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.shapes import fit_plane
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, part, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.records import to_plain
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.plans import planes, rotation, target_poses
@@ -57,7 +57,7 @@ class Outcome:
 
     @property
     def share(self) -> float:
-        """Of the lit pixels that are supported, in the mean over the planes."""
+        """Of the illuminated pixels that are supported, in the mean over the planes."""
         return float(np.mean(self.supported))
 
 
@@ -119,7 +119,7 @@ def prove_guidance(
     steps: int = 18,
     seed: int = 0,
     ways: Sequence[str] = ("guided", "random"),
-    progress: Progress = unheard,
+    progress: Progress = ignore_progress,
 ) -> GuidanceProof:
     """``rigs`` simulated rigs, each calibrated from so many guided ``poses``, and from as many that are drawn at random
     as the Letter's were; measured on the Letter's ten planes.
@@ -201,20 +201,20 @@ def _held(rig: SimulatedRig, board: Board, T: np.ndarray, rng: np.random.Generat
         R = rotation(np.radians(steady * rng.normal(0, HAND_DEG, 3))) @ T[:3, :3]
         pose = Pose(R, centre + steady * rng.normal(0, HAND_MM, 3) - R @ middle)
         points = pose.to_camera(board.points)
-        seen, lit = rig.camera.project(points), rig.project(points)
+        seen, illuminated = rig.camera.project(points), rig.project(points)
         room = board.pitch_mm / 4 * rig.camera.focal_px[0] * rig.camera.scale / points[:, 2:] + 2
         inside = ((seen > room) & (seen < np.array(rig.camera.size) - 1 - room)).all()
-        if inside and ((lit > 0) & (lit < np.array(rig.projector.size) - 1)).all():
+        if inside and ((illuminated > 0) & (illuminated < np.array(rig.projector.size) - 1)).all():
             break
     return pose
 
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """A plane's phase, lit pixels (h, w), and the points (h, w, 3) that the true rig measures there."""
+    """A plane's phase, illuminated pixels (h, w), and the points (h, w, 3) that the true rig measures there."""
 
     phase: PhaseMap
-    lit: np.ndarray
+    illuminated: np.ndarray
     exact: np.ndarray
 
 
@@ -239,11 +239,13 @@ def _measured(
     unmeasured = 0
     for target in targets:
         points = model.points(target.phase, supported=False)
-        known = target.lit & np.isfinite(points[..., 2])
-        unmeasured += int(np.count_nonzero(target.lit & ~known))
+        known = target.illuminated & np.isfinite(points[..., 2])
+        unmeasured += int(np.count_nonzero(target.illuminated & ~known))
         rms.append(_flatness(points[known]))
         floor.append(_flatness(target.exact[known]))
-        supported.append(np.count_nonzero(model.support(target.phase) & target.lit) / np.count_nonzero(target.lit))
+        supported.append(
+            np.count_nonzero(model.support(target.phase) & target.illuminated) / np.count_nonzero(target.illuminated)
+        )
     return tuple(rms), tuple(floor), tuple(supported), unmeasured
 
 

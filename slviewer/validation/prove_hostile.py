@@ -19,7 +19,7 @@ import numpy as np
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.evaluation.render import render
 from slviewer.geometry.rigid import fit_rigid
-from slviewer.pipeline.feedback import Progress, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.simulation.hostile import FAULTS, SEVERITIES, Direction, Fault, Severity
 from slviewer.simulation.rig import letter
 from slviewer.validation.hostile_captures import SCANS, CaseReport, HostileBench, MeasuredScan, run_case
@@ -65,7 +65,7 @@ _OPEN: tuple[tuple[str, frozenset[str]], ...] = (
 @dataclass(frozen=True)
 class Figures:
     """``rms_mm``: of z over the best 99 % of the target's points; ``predicted_mm`` of the same; ``gross``: share of all
-    measured points beyond 3 sigma; ``coverage``: share of the target's lit pixels that were measured.
+    measured points beyond 3 sigma; ``coverage``: share of the target's illuminated pixels that were measured.
     """
 
     rms_mm: float
@@ -162,7 +162,7 @@ def prove_hostile(
     cases: Sequence[str] = (),
     splined: bool = True,
     seed: int = 0,
-    progress: Progress = unheard,
+    progress: Progress = ignore_progress,
 ) -> HostileProof:
     """Put every fault at every severity into scans, and into target poses, and judge what the program makes of them.
 

@@ -22,7 +22,7 @@ from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.rigid import fit_rigid
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, part, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct
@@ -171,7 +171,7 @@ class RegistrationProof:
 
 
 def prove_registration(
-    scale: float = 1.0, *, poses: int = POSES, seed: int = 0, progress: Progress = unheard
+    scale: float = 1.0, *, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
 ) -> RegistrationProof:
     """Calibrate a rendered rig, scan and register three depths and a turn, and try what must be refused."""
     rig = letter(scale, seed)

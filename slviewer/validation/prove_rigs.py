@@ -25,7 +25,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
@@ -110,7 +110,7 @@ class RigFigures:
         return float(np.mean([p.predicted_mm for p in self.planes.values()]))
 
 
-def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = unheard) -> RigFigures:
+def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = ignore_progress) -> RigFigures:
     """Calibrate a rig from ``poses`` rendered captures of its board, and measure ten planes and six spheres with it."""
     rig = case.rig(scale)
     board = Board.parse(TARGET)
@@ -179,7 +179,7 @@ def scored(
     comparison = compare(
         "sphere" if is_round else "plane",
         judged,
-        phase.lit,
+        phase.illuminated,
         depth_range=DEPTH_RANGE_MM,
         radius=SPHERE_RADIUS_MM if is_round else None,
     )

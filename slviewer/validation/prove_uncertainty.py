@@ -13,7 +13,7 @@ from slviewer.calibration.splined.volume import Volume, depth_axis, motion_free,
 from slviewer.errors import CalibrationRejected
 from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.feedback import Progress, part, unheard
+from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.validation.faulty_captures import FaultBench
 from slviewer.validation.prove_rigs import RigCase, cases
@@ -103,7 +103,7 @@ class UncertaintyProof:
 
 
 def prove_uncertainty(
-    scale: float = 0.5, *, rigs: int = 6, poses: int = POSES, seed: int = 0, progress: Progress = unheard
+    scale: float = 0.5, *, rigs: int = 6, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
 ) -> UncertaintyProof:
     """Calibrate so many rigs of different lenses and boards from rendered captures, and compare what each predicts of
     its errors with these. ``scale``: resolution of the camera, as a share of the Letter's.
@@ -120,7 +120,7 @@ def prove_uncertainty(
     return UncertaintyProof(tuple(found), scale, poses)
 
 
-def calibrated(case: RigCase, rig: SimulatedRig, poses: int, progress: Progress = unheard) -> SplinedModel:
+def calibrated(case: RigCase, rig: SimulatedRig, poses: int, progress: Progress = ignore_progress) -> SplinedModel:
     """The splined model from rendered target poses."""
     bench = FaultBench(rig, count=poses, shape=case.shape)
     captures = []

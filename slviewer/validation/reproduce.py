@@ -11,7 +11,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.evaluation import letter
 from slviewer.pipeline.calibrate import calibrate
-from slviewer.pipeline.feedback import Progress, Warn, part, unheard, unwarned
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
@@ -31,8 +31,8 @@ def reproduce(
     *,
     quick: bool = False,
     seed: int = 0,
-    progress: Progress = unheard,
-    warn: Warn = unwarned,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> Reproduction:
     """Repeat the Letter's experiments on the simulated rig, and put its figures beside ours.
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from slviewer.devices.capture import Taken, take
+from slviewer.devices.capture import CapturedFrames, take
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import Cancelled, DeviceError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
@@ -46,7 +46,7 @@ class CaptureRequest:
 
     name: str
     sequence: PatternSequence
-    save: Callable[[Taken], None]
+    save: Callable[[CapturedFrames], None]
     saved: Callable[[], None]
     exposures_ms: tuple[float, ...] = ()
 

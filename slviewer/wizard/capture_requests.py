@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from slviewer.devices.capture import Taken
+from slviewer.devices.capture import CapturedFrames
 from slviewer.errors import DeviceError, InputError, SessionError
 from slviewer.fringe.sequence import Axis, PatternSequence, one_axis
 from slviewer.geometry.rig import StereoRig
@@ -63,7 +63,7 @@ class CaptureRequests(ResultRequests):
             raise InputError("choose the target first: a pose is judged by it")
         sequence, source = pose_sequence(engine), engine.acquisition.view().name
 
-        def save(taken: Taken) -> None:
+        def save(taken: CapturedFrames) -> None:
             keep(store, name, "calibration", sequence, taken, source=source, purpose="pose", board=target, force=retake)
             if retake and name in store.excluded():
                 store.include(name)
@@ -81,7 +81,7 @@ class CaptureRequests(ResultRequests):
             sequence = one_axis(sequence, depth_axis(calibration.stereo.rig))  # half of the frames
         name, source = self._next_name(purpose), engine.acquisition.view().name
 
-        def save(taken: Taken) -> None:
+        def save(taken: CapturedFrames) -> None:
             keep(store, name, "scan", sequence, taken, source=source, purpose=purpose)
             self._set_label(name, label)
 
@@ -91,7 +91,7 @@ class CaptureRequests(ResultRequests):
         self,
         name: str,
         sequence: PatternSequence,
-        save: Callable[[Taken], None],
+        save: Callable[[CapturedFrames], None],
         follow: Callable[[], object] = lambda: None,
     ) -> None:
         engine, bench = self._engine, self._engine.bench

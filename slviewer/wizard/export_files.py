@@ -7,7 +7,7 @@ from pathlib import Path
 
 from slviewer.pipeline.export import What, export, file_name
 from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.models import insisted
+from slviewer.pipeline.models import accepts_rejected
 from slviewer.session import atomic
 from slviewer.session.names import safe_name
 from slviewer.session.store import Session
@@ -32,8 +32,8 @@ def export_file(
 ) -> str:
     """Write one file, as `pipeline.export.export` does; returns a sentence that begins with its name."""
     with staged_export(session, file_name(what, name, file_format), report) as path:
-        insist, progress = insisted(session), report.within(0, 0.98)
-        found = export(session, what, name, out=path, plan=plan, accept_rejected=insist, progress=progress, warn=warn)
+        accepts, progress = accepts_rejected(session), report.within(0, 0.98)
+        found = export(session, what, name, out=path, plan=plan, accept_rejected=accepts, progress=progress, warn=warn)
     report(1.0, "exported")
     return f"{path.name} is ready to download: {found.words}"
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from slviewer.devices.capture import Taken
+from slviewer.devices.capture import CapturedFrames
 from slviewer.errors import InputError
 from slviewer.fringe.presets import short
 from slviewer.pipeline.capture import keep
@@ -51,7 +51,7 @@ class LiveRequests(CaptureRequests):
             raise InputError("no live scan runs: start one, and wait for a cloud")
         name = self._next_name("scan")
         self._check_space(name, len(shot.frames))
-        taken = Taken(shot.frames, shot.settings)
+        taken = CapturedFrames(shot.frames, shot.settings)
         source = engine.acquisition.view().name
         keep(store, name, "scan", live.stream.sequence, taken, source=source, purpose="scan")
         self._set_label(name, label)

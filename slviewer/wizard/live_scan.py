@@ -16,7 +16,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.models import check_accepted, insisted, load_model, load_stereo, preferred
+from slviewer.pipeline.models import accepts_rejected, check_accepted, load_model, load_stereo, preferred
 from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.onepass import OnePass, PassResult
@@ -198,10 +198,10 @@ class LiveCalibration:
         self._loaded = time.monotonic()
         name = preferred(store)
         factor = scale_factor(store, name)
-        key = (name, factor, insisted(store), *sorted(store.input_hashes(f"calibration/{name}").items()))
+        key = (name, factor, accepts_rejected(store), *sorted(store.input_hashes(f"calibration/{name}").items()))
         if key == self._key:
             return self._current
-        check_accepted(store, insisted(store))
+        check_accepted(store, accepts_rejected(store))
         model = load_model(store, name)
         if self._axis not in model.axes:
             raise InputError(

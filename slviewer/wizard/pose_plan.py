@@ -169,7 +169,7 @@ def _spread_poses(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarray])
         reached = projector_reach(points, projected, given.projector)
     placed = list(poses.values())
     try:
-        suggestion = suggest(given.board, lens, placed, lit=reached, skip=given.refused)
+        suggestion = suggest(given.board, lens, placed, illuminated=reached, skip=given.refused)
     except InputError:  # nothing fits into the view
         suggestion = None
     usual_mm = USUAL_SIGMA * float(np.mean(depth_range(given.board, lens)))

@@ -6,7 +6,7 @@ from functools import partial
 from slviewer.errors import InputError
 from slviewer.pipeline.calibrate import CalibrationResult
 from slviewer.pipeline.export import FORMATS, What, check_export
-from slviewer.pipeline.models import available, check_accepted, insist, insisted
+from slviewer.pipeline.models import accept_rejected_calibration, accepts_rejected, available, check_accepted
 from slviewer.pipeline.verify import Shape
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard import diagnostics, tasks
@@ -84,7 +84,7 @@ class ResultRequests(RequestHandler):
     @request("Using the rejected calibration")
     def accept_rejected_calibration(self, on: bool) -> None:
         """Use the current calibration although it was rejected, or no longer do."""
-        insist(self._engine.store, on)
+        accept_rejected_calibration(self._engine.store, on)
 
     @request("Verifying")
     def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
@@ -112,7 +112,7 @@ class ResultRequests(RequestHandler):
         chosen = file_format or FORMATS.get(what, ("",))[0]
         check_export(what, chosen)
         if what not in ("report", "table"):
-            check_accepted(store, insisted(store))
+            check_accepted(store, accepts_rejected(store))
         if what in ("cloud", "mesh"):
             store.load_capture(name)
         if what in ("merge", "merged-mesh"):

@@ -18,8 +18,8 @@ from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.calibration_verdict import last_verdict
 from slviewer.pipeline.capture import PATTERNS
 from slviewer.pipeline.models import (
+    accepts_rejected,
     available,
-    insisted,
     load_model,
     load_stereo_if_complete,
     preferred,
@@ -298,7 +298,7 @@ class SessionReader:
             recommended=recommended(session),
             chosen=str(decided) if (decided := session.decision("model")) in models else "",
             rejected=rejection(session),
-            is_pinned=insisted(session),
+            is_pinned=accepts_rejected(session),
             splined=splined,
             comparison=validation(session),
             scales={model: words for model in models if (words := describe_scale(session, model))},

@@ -18,7 +18,7 @@ from slviewer.evaluation.sphere import SphereResult
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record
-from slviewer.pipeline.models import POSES_FOR_PIXELWISE, available, best, insisted
+from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available, best
 from slviewer.pipeline.open_session import next_number
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.scale import scale_factor
@@ -78,11 +78,11 @@ def describe_comparison(compared: CrossValidation) -> str:
 
 def reconstruct_capture(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
     """Reconstruct a capture, save its cloud, and write its PLY into the exports; returns the number of points."""
-    insist = insisted(session)
-    model = model or best(session, insist)
+    accepts = accepts_rejected(session)
+    model = model or best(session, accepts)
     with staged_export(session, f"{name}_{model}.ply", report) as ply:
         progress = report.within(0, 0.9)
-        made = reconstruct(session, name, model=model, out=ply, accept_rejected=insist, progress=progress, warn=warn)
+        made = reconstruct(session, name, model=model, out=ply, accept_rejected=accepts, progress=progress, warn=warn)
         cloud, phase = made.cloud, made.phases[made.cloud.axis]
         z = cloud.points[..., 2][cloud.mask]
         near, far = np.percentile(z, [1, 99])
@@ -130,7 +130,7 @@ def verify_captures(
             [name],
             shape,
             radius=radius,
-            accept_rejected=insisted(session),
+            accept_rejected=accepts_rejected(session),
             progress=span.within(0, 0.5),
             warn=warn,
         )
@@ -172,12 +172,12 @@ def merge_scans(
 ) -> Merge:
     """Register scans to a reference, save the alignment, and write the merged PLY into the exports."""
     number = next_number(session, "merge")
-    insist = insisted(session)
-    model = best(session, insist)
+    accepts = accepts_rejected(session)
+    model = best(session, accepts)
     with staged_export(session, f"merged_{number}.ply", report) as ply:
         result = merge(
             session, names, reference, ply, model=model, start=start, angle=angle, picked=picked,
-            accept_rejected=insist, progress=report.within(0, 0.97), warn=warn,
+            accept_rejected=accepts, progress=report.within(0, 0.97), warn=warn,
         )  # fmt: skip
         session.guarded(report.saving).save_result(f"merge/{number}", merge_record(session, result, model), {})
     report(1.0, "merged")

@@ -55,10 +55,10 @@ def observation(
     pixels = rng.uniform(low, high, (3 * samples, 2))
     seen = on_board(later, true.camera.undistort(pixels))
     projector = true.project(seen)
-    lit = (
+    illuminated = (
         np.isfinite(projector).all(1) & (projector > 0).all(1) & (projector < np.array(true.projector.size) - 1).all(1)
     )
-    pixels, projector = pixels[lit][:samples], projector[lit][:samples]
+    pixels, projector = pixels[illuminated][:samples], projector[illuminated][:samples]
     box = (low[0], low[1], high[0], high[1])
     surfaces = {a: fit_polynomial(*pixels.T, projector[:, i], None, box, 3) for i, a in enumerate("xy") if a in axes}
     absent = [a not in axes for a in "xy"]

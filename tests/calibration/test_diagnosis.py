@@ -178,7 +178,7 @@ def test_evidence_and_verdicts_survive_saving() -> None:
     assert np.isnan(again.moved_px)
     assert dataclasses.replace(again, moved_px=0.0) == dataclasses.replace(kept, moved_px=0.0)
     verdict = Verdict.of(
-        [Finding("gamma", "doubtful", "curved", "mend it"), Finding("moved", "rejected", "it", "hold it")]
+        [Finding("gamma", "doubtful", "curved", "correct it"), Finding("moved", "rejected", "it", "hold it")]
     )
     assert verdict.causes == ("moved", "gamma") and verdict.level == "rejected"
     assert from_plain(json.loads(json.dumps(verdict.to_json())), Verdict) == verdict

@@ -25,10 +25,10 @@ def everywhere(points: np.ndarray) -> np.ndarray:
     return np.ones(len(points), bool)
 
 
-def follow(n: int, lit=everywhere) -> list[np.ndarray]:
+def follow(n: int, illuminated=everywhere) -> list[np.ndarray]:
     poses: list[np.ndarray] = []
     for _ in range(n):
-        poses.append(suggest(BOARD, LENS, poses, lit=lit).T_camera_board)
+        poses.append(suggest(BOARD, LENS, poses, illuminated=illuminated).T_camera_board)
     return poses
 
 
@@ -53,7 +53,7 @@ def test_words_say_what_the_pose_is():
     seen = set()
     poses: list[np.ndarray] = []
     for _ in range(14):
-        next_one = suggest(BOARD, LENS, poses, lit=everywhere)
+        next_one = suggest(BOARD, LENS, poses, illuminated=everywhere)
         poses.append(next_one.T_camera_board)
         tilts = coverage(BOARD, LENS, poses[-1:]).tilts
         tilt = TILTS[int(np.argmax(tilts))]
@@ -86,7 +86,7 @@ def test_the_projectors_reach_is_learnt_from_two_planes():
         h = np.column_stack([points, np.ones(len(points))]) @ P.T
         return h[:, :2] / h[:, 2:]
 
-    planes = [BOARD.points @ T[:3, :3].T + T[:3, 3] for T in follow(2, lit=None)]
+    planes = [BOARD.points @ T[:3, :3].T + T[:3, 3] for T in follow(2, illuminated=None)]
     points = np.concatenate(planes)
     reach = projector_reach(points, project(points), (912, 1140))
     assert reach is not None
@@ -95,12 +95,12 @@ def test_the_projectors_reach_is_learnt_from_two_planes():
     clearly = (np.abs(u - 0.5) < 0.47).all(1) | (np.abs(u - 0.5) > 0.5).any(1)
     np.testing.assert_array_equal(reach(trial)[clearly], (np.abs(u - 0.5) < 0.48).all(1)[clearly])
     assert projector_reach(planes[0], project(planes[0]), (912, 1140)) is None
-    for T in follow(6, lit=reach):
+    for T in follow(6, illuminated=reach):
         assert reach(BOARD.outline() @ T[:3, :3].T + T[:3, 3]).all()
 
 
 def test_refused_suggestions_are_passed_over_and_large_boards_refused():
-    first, second = (suggest(BOARD, LENS, [], lit=everywhere, skip=k).T_camera_board for k in (0, 1))
+    first, second = (suggest(BOARD, LENS, [], illuminated=everywhere, skip=k).T_camera_board for k in (0, 1))
     assert not np.allclose(first, second)
     with pytest.raises(InputError, match="board"):
-        suggest(BOARD, LENS, [], lit=lambda points: np.zeros(len(points), bool))
+        suggest(BOARD, LENS, [], illuminated=lambda points: np.zeros(len(points), bool))

@@ -47,7 +47,7 @@ def model(stereo_and_model) -> SplinedModel:
     return stereo_and_model[1]
 
 
-def lit(model: SplinedModel) -> tuple[np.ndarray, np.ndarray]:
+def illuminated(model: SplinedModel) -> tuple[np.ndarray, np.ndarray]:
     return model.bundle.camera_poses > 0, model.bundle.projector_poses > 0
 
 
@@ -60,7 +60,7 @@ def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_c
     assert {0.0, width - 1} <= set(volume.pixels[:, 0]) and {0.0, height - 1} <= set(volume.pixels[:, 1])
     assert (volume.projector > -0.51).all() and (volume.projector < model.rig.projector.size).all()
     assert depth_axis(model.rig, volume) == "x"
-    supported = volume.supported(model.rig, *lit(model))
+    supported = volume.supported(model.rig, *illuminated(model))
     assert 0.5 < supported.mean() <= 1
     with pytest.raises(InputError):
         working_volume(model.rig, (700.0, 500.0))
@@ -98,7 +98,7 @@ def test_it_is_as_wrong_as_it_says(model, true) -> None:
 def test_the_frame_would_overstate_it(model) -> None:
     volume = working_volume(model.rig, model.bundle.depth_range_mm)
     whitened = model.bundle.whiten(model.bundle.point_jacobian("x", volume.pixels, volume.z))
-    shape = sigma_3d(motion_free(whitened, volume.points, volume.supported(model.rig, *lit(model))))
+    shape = sigma_3d(motion_free(whitened, volume.points, volume.supported(model.rig, *illuminated(model))))
     assert np.median(sigma_3d(whitened)) > 10 * np.median(shape)
 
 
@@ -112,13 +112,13 @@ def test_the_volume_is_summed_up_before_anything_is_scanned(model) -> None:
 
 def test_a_smooth_field_goes_on_farther_than_independent_differences_do() -> None:
     rng = np.random.default_rng(0)
-    lit = np.ones((20, 26), bool)
-    lit[:, 22:] = False
+    illuminated = np.ones((20, 26), bool)
+    illuminated[:, 22:] = False
     size = np.array([400.0, 300.0])
     rough = rng.normal(size=(2, 23, 29))
     waves = np.sin(2 * np.pi * np.arange(29) / 14)[None, None, :] * np.ones((2, 23, 1))
-    assert persistence_ratio(Device(np.zeros(10), rough, size), lit) == 1
-    assert 2 < persistence_ratio(Device(np.zeros(10), waves, size), lit) < 3
+    assert persistence_ratio(Device(np.zeros(10), rough, size), illuminated) == 1
+    assert 2 < persistence_ratio(Device(np.zeros(10), waves, size), illuminated) < 3
     assert persistence_ratio(Device(np.zeros(10), waves, size), np.zeros((20, 26), bool)) == 1
 
 
@@ -130,7 +130,7 @@ def test_the_map_says_at_each_pixel_what_the_covariance_says_there(model) -> Non
     pixels = np.column_stack([rng.integers(0, width, 200), rng.integers(0, height, 200)]).astype(float)
     volume = select_visible(model.rig, pixels, rng.uniform(0.9, 1.1, 200) * 600)
     reference = working_volume(model.rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
-    motion = BestMotion.fit(reference.points, reference.supported(model.rig, *lit(model)))
+    motion = BestMotion.fit(reference.points, reference.supported(model.rig, *illuminated(model)))
     fitted = bundle.whiten(bundle.point_jacobian("x", reference.pixels, reference.z)) @ motion.weights
     exact = bundle.whiten(bundle.point_jacobian("x", volume.pixels, volume.z)[2::3])
     exact = np.linalg.norm(exact - fitted @ motion.displace(volume.points)[2::3].T, axis=0) * extrapolation_factor(
@@ -182,7 +182,7 @@ def test_a_proof_pools_its_rigs_and_says_whether_it_holds() -> None:
 def test_what_is_fitted_is_as_sure_as_the_calibrations_covariance_says(model) -> None:
     bundle = model.bundle
     volume = working_volume(model.rig, bundle.depth_range_mm, columns=5, rows=4, depths=3)
-    supported = volume.supported(model.rig, *lit(model))
+    supported = volume.supported(model.rig, *illuminated(model))
     inside = np.argsort(np.linalg.norm(volume.points - volume.points.mean(axis=0), axis=1))
     two = inside[supported[inside]][:2]  # well inside: at the rim, rounding decides on which side a place lies
     pixels, z, points = (each[two] for each in (volume.pixels, volume.z, volume.points))

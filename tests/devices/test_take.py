@@ -91,8 +91,8 @@ def test_a_colour_camera_brings_its_colours_home():
         assert isinstance(one.camera, ColourCamera)
         taken = take(one, SEQUENCE)
         assert taken.texture is not None and taken.texture.shape == (120, 160, 3)
-        lit = taken.texture[..., 1] > 60
-        ratio = taken.texture[lit].astype(float) / taken.texture[lit][:, 1:2]
+        illuminated = taken.texture[..., 1] > 60
+        ratio = taken.texture[illuminated].astype(float) / taken.texture[illuminated][:, 1:2]
         np.testing.assert_allclose(ratio.mean(axis=0), [ColouredCamera.RED, 1, ColouredCamera.BLUE], atol=0.02)
     with coloured(rig()).opened() as one:
 

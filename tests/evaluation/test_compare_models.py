@@ -25,10 +25,10 @@ def two() -> tuple[dict[str, Cloud], np.ndarray, Comparison]:
     second, _ = board_before_a_wall(0.05, 2)
     second[..., 2] += 1.0  # a plane of its own, which its own fit forgives
     second[:, :150] = np.nan
-    lit = board.copy()
-    lit[:, 300:] = False
+    illuminated = board.copy()
+    illuminated[:, 300:] = False
     clouds = {"stereo": seen(first, "stereo", 0.10), "pixelwise": seen(second, "pixelwise")}
-    return clouds, board, compare("plane", clouds, lit, depth_range=(590.0, 610.0))
+    return clouds, board, compare("plane", clouds, illuminated, depth_range=(590.0, 610.0))
 
 
 def test_every_model_is_measured_over_the_common_pixels(two: tuple[dict[str, Cloud], np.ndarray, Comparison]) -> None:

@@ -55,5 +55,5 @@ def wrong(phase: PhaseMap, coordinate, part=0.4):
 
 
 def coverage(phase: PhaseMap, region=...):
-    """Valid pixels over lit ones."""
-    return np.count_nonzero(phase.mask[region]) / np.count_nonzero(phase.lit[region])
+    """Valid pixels over illuminated ones."""
+    return np.count_nonzero(phase.mask[region]) / np.count_nonzero(phase.illuminated[region])

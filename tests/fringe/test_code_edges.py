@@ -34,7 +34,7 @@ def test_no_wrong_period_survives_blur_and_noise(sequence, per_px, defocus, psf,
     phase = decode(sequence, frames, "x")
     assert wrong(phase, truth) == 0
     assert coverage(phase) > 0.99
-    assert phase.lit.mean() > 0.9
+    assert phase.illuminated.mean() > 0.9
 
 
 @pytest.mark.parametrize("sequence", [p18(PROJECTOR), complementary(PROJECTOR, 8, 18.0)], ids=["p18", "complementary"])

@@ -35,7 +35,7 @@ def test_the_coordinate_comes_back(name, axis):
     assert phase.axis == axis and phase.phase.dtype == np.float32 and phase.phase.shape == truth.shape
     assert wrong(phase, truth, part=0.4 if phase.steps else 3) == 0
     assert coverage(phase) > 0.995
-    assert phase.lit.all()
+    assert phase.illuminated.all()
     if name == "gray":
         assert phase.steps == 0 and np.isnan(phase.wrapped).all()
         assert 0.15 < rms(phase, truth) < 0.32  # 0.29 for columns, less where an edge was recognised
@@ -108,7 +108,7 @@ def test_clipped_pixels_are_saturated_and_noise_at_white_is_not(dtype, times):
     )
     phase = decode(sequence, frames, "x")
     assert (phase.reason[:, :76] == Reason.SATURATED).all()
-    assert phase.lit.all()
+    assert phase.illuminated.all()
     assert (phase.reason[:, 84:] != Reason.SATURATED).mean() > 0.99
     assert np.isnan(phase.phase[:, :76]).all() and np.isfinite(phase.wrapped).all()
 
@@ -129,7 +129,7 @@ def test_shadow_is_dark_and_the_lit_part_is_kept_to_its_border():
     gain[:, :70] = 0
     phase = decode(sequence, capture(sequence, truth, gain=gain, read=2.0, psf=0.3), "x")
     assert (phase.reason[:, :69] == Reason.DARK).mean() > 0.999
-    assert not phase.lit[:, :69].any() or phase.lit[:, :69].mean() < 0.001
+    assert not phase.illuminated[:, :69].any() or phase.illuminated[:, :69].mean() < 0.001
     assert phase.mask[:, 71:].mean() > 0.999
     assert wrong(phase, truth) == 0
 
@@ -155,7 +155,7 @@ def test_scattered_light_without_stripes_is_dark_in_gray_code():
     frames[:, :, :60] = scattered[:, :, :60]
     phase = decode(sequence, frames.clip(0, 255).astype(np.uint8), "x")
     assert phase.mask[:, :60].mean() < 0.002
-    assert phase.lit[:, :60].mean() < 0.5
+    assert phase.illuminated[:, :60].mean() < 0.5
     assert phase.mask[:, 62:].mean() > 0.99
 
 

@@ -86,11 +86,11 @@ def test_mains_flicker_under_a_rolling_shutter():
 def test_room_light_that_is_switched_on(first):
     sequence = SEQUENCES["p18"]
     stack = capture(sequence, TRUTH, shot=0.02, gain=140)
-    lit = relit(stack, 1, np.where(np.arange(len(stack)) >= first, 40, 0)[:, None, None])
-    light = estimate_frame_light(sequence, lit)
+    illuminated = relit(stack, 1, np.where(np.arange(len(stack)) >= first, 40, 0)[:, None, None])
+    light = estimate_frame_light(sequence, illuminated)
     (suspect,) = detect_light_faults(sequence, light)
     assert (suspect.fault, suspect.frame) == ("room-light", first)
-    phase = decode(sequence, lit, "x")
+    phase = decode(sequence, illuminated, "x")
     assert coverage(phase) > 0.99 and rms_px(phase) < 1.15 * rms_px(decode(sequence, stack, "x"))
 
 

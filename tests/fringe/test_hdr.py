@@ -45,7 +45,7 @@ class Shot:
         rig = letter(0.2)
         self.sequence = make(rig.projector.size)
         renderer = Renderer(rig, Patchy(blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0])))))
-        self.lit, self.truth = renderer.truth().mask, renderer.truth().projector[..., 0]
+        self.illuminated, self.truth = renderer.truth().mask, renderer.truth().projector[..., 0]
         rng = np.random.default_rng(7)
         width, height = rig.camera.size
         self.stacks = np.empty((len(EXPOSURES), len(self.sequence.frames), height, width), np.uint8)
@@ -56,10 +56,14 @@ class Shot:
         self.frames, self.choice = merge_exposures(self.stacks, EXPOSURES)
 
     def measured(self, frames: np.ndarray):
-        """Phase map, coverage of what is lit, and the errors in their own standard deviations, (h, w)."""
+        """Phase map, coverage of what is illuminated, and the errors in their own standard deviations, (h, w)."""
         phase = decode(self.sequence, frames, "x")
         error = (phase.coordinate - self.truth) * (2 * np.pi / phase.period_px)
-        return phase, np.count_nonzero(phase.mask & self.lit) / np.count_nonzero(self.lit), error / phase.sigma_phase
+        return (
+            phase,
+            np.count_nonzero(phase.mask & self.illuminated) / np.count_nonzero(self.illuminated),
+            error / phase.sigma_phase,
+        )
 
 
 @pytest.fixture(scope="module")
@@ -105,11 +109,11 @@ def test_coverage_rises_and_every_error_stays_at_its_noise(shot):
     assert max(single) < 0.6  # 0.54 at best: the black half, or the paper and the spot
     phase, coverage, normalised = shot.measured(shot.frames)
     assert 0.99 < coverage <= 1
-    valid = phase.mask & shot.lit
+    valid = phase.mask & shot.illuminated
     assert np.abs(normalised[valid] * phase.sigma_phase[valid]).max() < 1.0  # no fringe order is wrong
     for index in range(len(EXPOSURES)):
         part = valid & (shot.choice == index)
-        assert np.count_nonzero(part) > 0.02 * np.count_nonzero(shot.lit)
+        assert np.count_nonzero(part) > 0.02 * np.count_nonzero(shot.illuminated)
         assert 0.9 < np.median(np.abs(normalised[part])) / 0.6745 < 1.15
     dark = shot.choice == 2
     assert np.median(phase.sigma_phase[valid & dark]) < 0.06  # 0.3 at the shortest exposure, were it not masked
@@ -127,7 +131,7 @@ def test_at_the_borders_of_the_choice_the_phase_is_that_of_the_exposure_chosen(s
         np.testing.assert_array_equal(merged.wrapped[here], alone.wrapped[here])
         both = here & beside & merged.mask & alone.mask
         np.testing.assert_array_equal(merged.phase[both], alone.phase[both])
-    edge = beside & merged.mask & shot.lit
+    edge = beside & merged.mask & shot.illuminated
     assert np.count_nonzero(edge) > 300
     # the lens mixes bright and dark light there, in one exposure too: above the noise, far below a period
     assert np.sqrt(np.mean(normalised[edge] ** 2)) < 2.5
@@ -153,7 +157,7 @@ def test_radiance_is_smooth_where_the_choice_is_not(shot):
     texture = shot.sequence.frames.index(next(f for f in shot.sequence.frames if f.kind == "texture"))
     light = radiance(shot.frames[texture], shot.choice, EXPOSURES)
     once = shot.stacks[0][texture].astype(float)
-    clear = shot.lit & (once < 255) & (once > 20)
+    clear = shot.illuminated & (once < 255) & (once > 20)
     assert np.median(np.abs(light - once)[clear]) < 3  # the dark level and the noise of one frame
     assert light.max() == once.max() > 200
 

@@ -61,8 +61,8 @@ def test_a_real_scene_of_another_tool(david):
     origin = estimate_gray_origin(sequence, frames, "x")
     assert origin == pytest.approx(-9.0, abs=0.5)  # its code begins half a period before its phase
     phase = decode(replace(sequence, gray_origin_px=origin), frames, "x")
-    assert phase.mask.sum() / phase.lit.sum() > 0.97
-    assert 0.6 < phase.lit.mean() < 0.85
+    assert phase.mask.sum() / phase.illuminated.sum() > 0.97
+    assert 0.6 < phase.illuminated.mean() < 0.85
     # Smooth over flat parts: the carton's lid, the wall behind, the front of the case.
     for rows, columns in (
         (np.s_[40:200], np.s_[800:1350]),
@@ -89,7 +89,7 @@ def test_real_gray_code_with_inverses(real_data):
         board = np.s_[200:750, 220:1050]  # white paper and black squares
         white = frames[40][board] > 80
         assert phase.mask[board][white].mean() > 0.99
-        assert phase.mask.sum() / phase.lit.sum() > 0.93
+        assert phase.mask.sum() / phase.illuminated.sum() > 0.93
         coordinate = phase.coordinate[board]
         assert low - 1 <= np.nanmin(coordinate) and np.nanmax(coordinate) <= high + 1
         across = np.abs(np.diff(coordinate, axis=1))

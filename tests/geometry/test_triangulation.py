@@ -33,10 +33,10 @@ def truth(rig: StereoRig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     z = wavy_depths(rig)
     points = np.dstack([rig.camera.rays() * z[..., None], z])
     pixels = rig.project(points)
-    lit = ((pixels > -0.5) & (pixels < np.array(rig.projector.size) - 0.5)).all(axis=-1)
-    pixels[~lit] = np.nan
-    assert lit.mean() > 0.5
-    return np.where(lit, z, np.nan), points, pixels
+    illuminated = ((pixels > -0.5) & (pixels < np.array(rig.projector.size) - 0.5)).all(axis=-1)
+    pixels[~illuminated] = np.nan
+    assert illuminated.mean() > 0.5
+    return np.where(illuminated, z, np.nan), points, pixels
 
 
 @pytest.mark.parametrize(("axis", "vertical"), [("x", False), ("y", True)])

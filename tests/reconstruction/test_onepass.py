@@ -58,7 +58,7 @@ def pixelwise(period_px=18.0):
 
 
 def splined():
-    """A made-up compiled form: what a joint adjustment would leave, with cells that no pose lit."""
+    """A made-up compiled form: what a joint adjustment would leave, with cells that no pose illuminated."""
     rng = np.random.default_rng(2)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     shape, step = (HEIGHT, WIDTH), 6
@@ -107,7 +107,7 @@ def test_misread_edges_are_moved_and_measured_again():
     one = OnePass(sequence, model, "x")
     before = one.sweep(frames)
     swept = before.phase.copy()
-    one.mend(before)
+    one.repair_spikes(before)
     moved = np.abs(before.phase - swept) > 1
     lost = np.isnan(before.phase) & np.isfinite(swept)
     phase = decode_reference(sequence, frames, "x")

@@ -58,7 +58,7 @@ def pixelwise():
 
 
 def splined():
-    """A made-up compiled form: what a joint adjustment would leave, with cells that no pose lit."""
+    """A made-up compiled form: what a joint adjustment would leave, with cells that no pose illuminated."""
     c = np.stack([560 + 0.02 * U, np.full(U.shape, 0.5), np.full(U.shape, -4e-4)]).astype(np.float32)
     grid = np.random.default_rng(2).normal(0, 0.1, (4, 5, 17)).astype(np.float32)
     held = grid.copy()

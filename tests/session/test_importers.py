@@ -177,8 +177,8 @@ def test_procam_calibration_of_a_real_rig(real_data):
     pattern, inverse = capture.frames[2].astype(int), capture.frames[3].astype(int)
     assert white > black + 10
     # what the pattern lights its inverse leaves dark: together they are white and black together
-    lit = capture.frames[40].astype(int) - capture.frames[41] > 40
-    together = (pattern + inverse - capture.frames[40] - capture.frames[41])[lit]
+    illuminated = capture.frames[40].astype(int) - capture.frames[41] > 40
+    together = (pattern + inverse - capture.frames[40] - capture.frames[41])[illuminated]
     assert abs(np.median(together)) < 6
 
 

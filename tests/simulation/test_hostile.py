@@ -57,9 +57,9 @@ def test_flicker_is_bands_of_rows_that_differ_from_frame_to_frame():
 
 
 def test_a_lamp_adds_light_and_no_modulation():
-    lit = faults.switch_lamp_on(LIGHT, 0.15, shot())
-    assert np.array_equal(lit[:4], LIGHT[:4])
-    more = (lit - LIGHT)[4:]
+    illuminated = faults.switch_lamp_on(LIGHT, 0.15, shot())
+    assert np.array_equal(illuminated[:4], LIGHT[:4])
+    more = (illuminated - LIGHT)[4:]
     assert np.allclose(more, more[0], atol=1e-4)
     white = LIGHT.max() / (1 + RIG.light.ambient)
     assert np.median(more[0][RENDERER.truth().mask]) / white == pytest.approx(0.15, rel=0.1)

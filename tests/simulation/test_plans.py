@@ -1,4 +1,4 @@
-"""The preset's captures: in view, lit, spread, and where the Letter had them."""
+"""The preset's captures: in view, illuminated, spread, and where the Letter had them."""
 
 import importlib.util
 import json

@@ -105,8 +105,8 @@ def test_a_plate_throws_its_shadow_where_geometry_says():
     crossing = truth.points + way * ((540 - truth.points[..., 2]) / way[..., 2])[..., None]
     margin = np.abs(crossing[..., :2]).max(-1) - 15
     assert (~truth.mask[back & (margin < -0.1)]).all() and (back & (margin < -0.1)).sum() > 1000
-    lit = back & (margin > 0.1) & (truth.projector > 0).all(-1) & (truth.projector < [911, 1139]).all(-1)
-    assert truth.mask[lit].all()
+    illuminated = back & (margin > 0.1) & (truth.projector > 0).all(-1) & (truth.projector < [911, 1139]).all(-1)
+    assert truth.mask[illuminated].all()
 
 
 def test_the_demo_object_is_closed_and_its_truth_lies_on_it():

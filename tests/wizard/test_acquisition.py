@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from faulty_rig import Faults, breakable
 
-from slviewer.devices.capture import Taken
+from slviewer.devices.capture import CapturedFrames
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
@@ -142,7 +142,7 @@ def test_devices_that_do_not_open_are_tried_again_and_told_of_once(
 
 
 def test_a_disk_that_refuses_loses_the_capture_but_not_the_rig(bench: Bench) -> None:
-    def save(taken: Taken) -> None:
+    def save(taken: CapturedFrames) -> None:
         raise SessionError("the disk is full: free some space")
 
     bench.open()

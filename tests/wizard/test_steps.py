@@ -66,8 +66,8 @@ def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:
     assert {found[key].state for key in ("verify", "scan", "merge")} == {"blocked"}
     assert "pose_3 moved by 0.9 px" in found["scan"].blocked_by and "accept it" in found["verify"].blocked_by
     assert found["calibrate"].state == "ready" and "rejected" in found["calibrate"].instruction
-    insisted = replace(facts, session=replace(facts.session, calibration=replace(rejected, is_pinned=True)))  # type: ignore[type-var]
-    assert states(insisted)["scan"] == "ready" and states(insisted)["calibrate"] == "done"
+    accepts_rejected = replace(facts, session=replace(facts.session, calibration=replace(rejected, is_pinned=True)))  # type: ignore[type-var]
+    assert states(accepts_rejected)["scan"] == "ready" and states(accepts_rejected)["calibrate"] == "done"
 
 
 def test_a_recorded_session_needs_no_rig() -> None:

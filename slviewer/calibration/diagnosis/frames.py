@@ -29,9 +29,9 @@ def measure_axis(
     """Evidence of one axis' frames. ``board`` (h, w) bool: the detected board's pixels, None for the whole image."""
     valid = phase.reason == Reason.VALID
     where = np.ones(phase.reason.shape, bool) if board is None else board
-    lit = (phase.reason != Reason.DARK) & where
+    illuminated = (phase.reason != Reason.DARK) & where
     saturated = (phase.reason == Reason.SATURATED) & where
-    seen = float(np.count_nonzero(lit))
+    seen = float(np.count_nonzero(illuminated))
     return AxisEvidence(
         period_px=phase.period_px,
         steps=phase.steps,
@@ -95,15 +95,15 @@ def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> flo
     intervals is known better than any of them.
     """
     wrapped, modulation, background, _ = phase_shift(stack, layout.shifts[0].indices, layout.sign, layout.offset_rad)
-    lit = modulation >= dark_limit(background, measure_noise(layout, stack, white), white, dark_sigmas(layout))
-    code, digit = np.zeros(lit.shape, np.int32), np.zeros(lit.shape, np.int32)
+    illuminated = modulation >= dark_limit(background, measure_noise(layout, stack, white), white, dark_sigmas(layout))
+    code, digit = np.zeros(illuminated.shape, np.int32), np.zeros(illuminated.shape, np.int32)
     for i in [*layout.gray] + ([] if layout.complementary is None else [layout.complementary]):
         digit ^= bit_heights(layout, stack, i, background) > 0
         code = 2 * code + digit
     first, second = (np.s_[:, :-1], np.s_[:, 1:]) if layout.axis == "x" else (np.s_[:-1], np.s_[1:])
     begins, lengths = [], []
     for here, there in ((first, second), (second, first)):
-        edge = lit[here] & lit[there] & (code[there] == code[here] + 1)
+        edge = illuminated[here] & illuminated[there] & (code[there] == code[here] + 1)
         below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
         if layout.complementary is not None:  # the cell that begins here is the second half of a period if odd
             below = below - (code[there][edge] & 1) * np.pi
@@ -134,10 +134,10 @@ def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:
     rows = spread_rows(*stack.shape[1:])
     frames = stack[:, rows].reshape(len(stack), -1)
     brightest = frames.max(0)
-    lit = brightest > _ILLUMINATED_LEVEL * float(np.quantile(brightest, 0.98))
-    if np.count_nonzero(lit) < FEWEST:
+    illuminated = brightest > _ILLUMINATED_LEVEL * float(np.quantile(brightest, 0.98))
+    if np.count_nonzero(illuminated) < FEWEST:
         return 0
-    frames, brightest = frames[:, lit], brightest[lit]
+    frames, brightest = frames[:, illuminated], brightest[illuminated]
     white = np.mean(frames >= _WHITE_LEVEL * brightest, axis=1) > _WHITE_SHARE
     shown = [frame.kind in ("white", "texture") for frame in sequence.frames]
     for i, should in enumerate(shown):

@@ -62,32 +62,34 @@ def frame_order(pose: PoseEvidence) -> Cause | None:
 
 def find_faulty_poses(e: Evidence) -> Iterator[Finding]:
     """Poses that are misnumbered, moved, or disagree with the others."""
-    told: dict[Cause, dict[str, str]] = {"board-numbering": {}, "moved": {}, "outlier": {}}
+    sentences: dict[Cause, dict[str, str]] = {"board-numbering": {}, "moved": {}, "outlier": {}}
     most_moved = motion_limit_px(e.poses)
     for pose in e.poses:
         if frame_order(pose):
             continue
         if pose.numbering:
-            told["board-numbering"][pose.name] = f"in {pose.name} the board's features are {pose.numbering}"
+            sentences["board-numbering"][pose.name] = f"in {pose.name} the board's features are {pose.numbering}"
         elif pose.moved_px > most_moved:
-            told["moved"][pose.name] = f"{pose.name}: the board moved by {pose.moved_px:.2f} px while it was captured"
+            sentences["moved"][pose.name] = (
+                f"{pose.name}: the board moved by {pose.moved_px:.2f} px while it was captured"
+            )
     for name, stray in e.solution.strayed.items() if e.solution else ():
-        if name in e.set_aside or any(name in poses for poses in told.values()):
+        if name in e.set_aside or any(name in poses for poses in sentences.values()):
             continue
         camera, projector = (
             (_RESIDUAL_RATIO * max(usual, 0.02) for usual in e.solution.usual_px) if e.solution else (0.0, 0.0)
         )
         if stray.camera_px < camera and stray.projector_px > projector:
-            told["moved"][name] = (
+            sentences["moved"][name] = (
                 f"{name}: what the projector shows lies {min(stray.projector_px, 999):.1f} px from where the camera "
                 "sees the board: it moved while it was captured"
             )
         else:
-            told["outlier"][name] = (
+            sentences["outlier"][name] = (
                 f"{name} disagrees with the other poses by {min(stray.camera_px, 999):.1f} px in the camera and "
                 f"{min(stray.projector_px, 999):.1f} px in the projector"
             )
-    for cause, poses in told.items():
+    for cause, poses in sentences.items():
         if poses:
             names = tuple(poses)
             sentence = "; ".join(list(poses.values())[:3]) + (f"; and {len(poses) - 3} more" if len(poses) > 3 else "")

@@ -73,13 +73,13 @@ def find_empty_corners(observations: Sequence[Observation], stereo: StereoModel)
             for share, size, side in zip(CORNER_SHARE, (width, height), (right, bottom), strict=True)
         ]
         pixels = np.stack(np.meshgrid(*along), axis=-1).reshape(-1, 2)
-        lit = _is_illuminated(pixels, stereo)
-        if lit.mean() < ILLUMINATED_SHARE:
+        illuminated = _is_illuminated(pixels, stereo)
+        if illuminated.mean() < ILLUMINATED_SHARE:
             continue
         covered = np.zeros(len(pixels), bool)
         for o in observations:
             covered |= _is_covered(o, pixels)
-        if covered[lit].mean() < EMPTY_SHARE:
+        if covered[illuminated].mean() < EMPTY_SHARE:
             empty.append(name)
     return tuple(empty)
 

@@ -71,7 +71,11 @@ def pixel_rays(rig: Arrangement) -> np.ndarray:
 
 
 def compile_axis(
-    rig: Arrangement, axis: Axis, rays: np.ndarray, depths: tuple[float, float], lit: tuple[np.ndarray, np.ndarray]
+    rig: Arrangement,
+    axis: Axis,
+    rays: np.ndarray,
+    depths: tuple[float, float],
+    illuminated: tuple[np.ndarray, np.ndarray],
 ) -> CompiledAxis:
     """The fast form of one axis between two ``depths`` mm; ``illuminated``: the camera's and the projector's cells
     (rows, columns) bool that target poses illuminated."""
@@ -84,7 +88,7 @@ def compile_axis(
     step = max(2, -(-width // GRID_CELLS_ACROSS))
     shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
     grid, known = np.full(shape, np.nan, np.float32), np.zeros(shape, np.bool_)
-    _split_rows(shape[0], lambda rows: _tabulate(rig, row, centre, near, far, step, *lit, rows, grid, known))
+    _split_rows(shape[0], lambda rows: _tabulate(rig, row, centre, near, far, step, *illuminated, rows, grid, known))
     # a pixel needs its eight nodes: growing the known by one node gives each pixel about its own answer
     unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
     held = np.where(unknown, np.float32(np.nan), grid)
@@ -194,16 +198,16 @@ def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
 
 
 @kernel()
-def _is_cell_supported(lit, u, v, size):
+def _is_cell_supported(illuminated, u, v, size):
     """Whether the cell of a pixel was illuminated; none is outside the image."""
     if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
         return False
-    column = min(int((u + 0.5) / size[0] * lit.shape[1]), lit.shape[1] - 1)
-    return lit[min(int((v + 0.5) / size[1] * lit.shape[0]), lit.shape[0] - 1), column]
+    column = min(int((u + 0.5) / size[0] * illuminated.shape[1]), illuminated.shape[1] - 1)
+    return illuminated[min(int((v + 0.5) / size[1] * illuminated.shape[0]), illuminated.shape[0] - 1), column]
 
 
 @kernel()
-def _tabulate(rig, row, centre, near, far, step, camera_lit, projector_lit, rows, grid, known):
+def _tabulate(rig, row, centre, near, far, step, camera_illuminated, projector_illuminated, rows, grid, known):
     """What the exact depth has beyond the rational function's at the grid's nodes, and which of them poses support."""
     basis = np.zeros((4, 4))
     for j in rows:
@@ -215,7 +219,7 @@ def _tabulate(rig, row, centre, near, far, step, camera_lit, projector_lit, rows
                 continue
             # the last nodes may lie past the image's edge, and stand for it
             edge_u, edge_v = min(u, rig.camera.size[0] - 1.0), min(v, rig.camera.size[1] - 1.0)
-            seen = _is_cell_supported(camera_lit, edge_u, edge_v, rig.camera.size)
+            seen = _is_cell_supported(camera_illuminated, edge_u, edge_v, rig.camera.size)
             for k in range(grid.shape[2]):
                 target = near + (far - near) * k / (grid.shape[2] - 1.0)
                 z = min(max(target, first), last)
@@ -232,4 +236,4 @@ def _tabulate(rig, row, centre, near, far, step, camera_lit, projector_lit, rows
                 settled = abs(change) < 1e-3 or z in (first, last)
                 if settled and abs(correction) < MAX_CORRECTION * (last - first):
                     grid[j, i, k] = correction
-                    known[j, i, k] = seen and _is_cell_supported(projector_lit, pu, pv, rig.projector.size)
+                    known[j, i, k] = seen and _is_cell_supported(projector_illuminated, pu, pv, rig.projector.size)

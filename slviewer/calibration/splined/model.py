@@ -96,8 +96,8 @@ class SplinedModel:
     def fast_axis(self, axis: Axis) -> CompiledAxis:
         """The fast form of one axis."""
         if axis not in self._compiled:
-            lit = self.bundle.camera_poses > 0, self.bundle.projector_poses > 0
-            self._compiled[axis] = compile_axis(self.rig, axis, self.rays, self.depths_mm, lit)
+            illuminated = self.bundle.camera_poses > 0, self.bundle.projector_poses > 0
+            self._compiled[axis] = compile_axis(self.rig, axis, self.rays, self.depths_mm, illuminated)
         return self._compiled[axis]
 
     def points(self, phase: PhaseMap, supported: bool = True) -> np.ndarray:
@@ -176,7 +176,7 @@ class SplinedModel:
     def text(self) -> str:
         """For people."""
         bundle, s = self.bundle, self.summary()
-        noise, local, lit = s["noise_px"], s["local_distortion_rms_px"], s["cells_lit"]
+        noise, local, illuminated = s["noise_px"], s["local_distortion_rms_px"], s["cells_lit"]
         low, high = s["board_height_mm"]
         sure = s["sigma_volume_mm"]
         near, far = sure["depths_mm"]
@@ -194,8 +194,8 @@ class SplinedModel:
                     [f"  board turned by 180 degrees in {', '.join(bundle.turned)}: numbered as in the others"]
                     * bool(bundle.turned)
                 ),
-                f"  illuminated by target poses: {100 * lit['camera']:.0f} % of the camera's cells, "
-                f"{100 * lit['projector']:.0f} % of the projector's",
+                f"  illuminated by target poses: {100 * illuminated['camera']:.0f} % of the camera's cells, "
+                f"{100 * illuminated['projector']:.0f} % of the projector's",
                 f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma): median "
                 f"{sure['median']:.4f} mm and 95 % below {sure['p95']:.4f} mm over the {100 * sure['supported']:.0f} % "
                 f"that the poses support; worst {sure['worst']:.3f} mm, at pixel ({u:.0f}, {v:.0f}) and {z:.0f} mm",

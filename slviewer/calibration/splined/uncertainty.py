@@ -107,11 +107,11 @@ def extrapolation_factor(bundle: Bundle, places: Volume) -> np.ndarray:
     return factor
 
 
-def persistence_ratio(device: Device, lit: np.ndarray) -> float:
+def persistence_ratio(device: Device, illuminated: np.ndarray) -> float:
     """How much farther a field's second differences carry over some cells than if they were independent: the ratio of
     their sums' standard deviations, over the cells (rows, columns) bool that poses illuminated; 1 or more."""
     c = device.coefficients
-    corners = np.pad(lit, 1, mode="edge")
+    corners = np.pad(illuminated, 1, mode="edge")
     known = corners[:-1, :-1] & corners[1:, :-1] & corners[:-1, 1:] & corners[1:, 1:]
     whole = binary_erosion(known, np.ones((EXTRAPOLATED_CELLS, EXTRAPOLATED_CELLS), bool))
     if not whole.any():

@@ -25,10 +25,12 @@ class Volume:
     points: np.ndarray
     projector: np.ndarray
 
-    def supported(self, rig: Arrangement, camera_lit: np.ndarray, projector_lit: np.ndarray) -> np.ndarray:
+    def supported(
+        self, rig: Arrangement, camera_illuminated: np.ndarray, projector_illuminated: np.ndarray
+    ) -> np.ndarray:
         """(n,) bool: those seen through cells (rows, columns) bool that target poses illuminated, in both devices."""
-        return is_supported(rig.camera, self.pixels, camera_lit) & is_supported(
-            rig.projector, self.projector, projector_lit
+        return is_supported(rig.camera, self.pixels, camera_illuminated) & is_supported(
+            rig.projector, self.projector, projector_illuminated
         )
 
 
@@ -77,14 +79,14 @@ def view_pixels(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np
     return points, projector
 
 
-def is_supported(device: Device, pixels: np.ndarray, lit: np.ndarray) -> np.ndarray:
+def is_supported(device: Device, pixels: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
     """(n,) bool: whether the cells of ``pixels`` (n, 2) are among those (rows, columns) bool that target poses
     illuminated; beyond the image, those at its edge. False for NaN."""
-    shape = np.array([lit.shape[1], lit.shape[0]])
+    shape = np.array([illuminated.shape[1], illuminated.shape[0]])
     known = np.isfinite(pixels).all(axis=1)
     place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
     cells = np.clip(place, 0, shape - 1).astype(int)
-    return np.asarray(lit[cells[:, 1], cells[:, 0]] & known)
+    return np.asarray(illuminated[cells[:, 1], cells[:, 0]] & known)
 
 
 def depth_axis(rig: Arrangement, volume: Volume) -> Axis:

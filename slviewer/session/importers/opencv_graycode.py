@@ -79,8 +79,8 @@ def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
     """
     first, second = read_frames(files[-2:]).stack.astype(np.int32)
     difference = first - second
-    lit = np.abs(difference) > _LIT * np.abs(difference).max()
-    brighter = float((difference[lit] > 0).mean()) if lit.any() else 0.5
+    illuminated = np.abs(difference) > _LIT * np.abs(difference).max()
+    brighter = float((difference[illuminated] > 0).mean()) if illuminated.any() else 0.5
     ends_in_white = sequence.frames[-1].kind == "black"
     if ends_in_white != (brighter > _MOSTLY):
         there, expected = ("stripes", "white and black") if ends_in_white else ("white and black", "stripes")
