@@ -87,7 +87,7 @@ class Batch:
 
 
 def batch(
-    sessions: Sequence[Path | str],
+    sessions: Sequence[str | Path],
     do: Do,
     *,
     captures: Sequence[str] = (),

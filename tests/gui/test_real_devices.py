@@ -63,7 +63,7 @@ def test_a_network_camera_and_a_browser_capture_what_is_projected(browser: Brows
             page.wait_for_timeout(500)
             button(page, "Use these devices").click()
             watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
-            expect(page.get_by_text(re.compile("camera 320 × 240 px, projector 320 × 240 px"))).to_be_visible()
+            expect(page.get_by_text(re.compile(r"camera 320\s×\s240\spx, projector 320\s×\s240\spx"))).to_be_visible()
             expect(page.get_by_text("its settings are its own").or_(page.get_by_text("settings")).first).to_be_visible()
 
             operator.choose_target("circles:7x5:10")

@@ -80,7 +80,7 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
     page = opened.page
     try:
         choose(page, "Rig", "Simulated, quarter size")
-        expect(page.get_by_text(re.compile("camera 400 × 300 px"))).to_be_visible()
+        expect(page.get_by_text(re.compile(r"camera 400\s×\s300\spx"))).to_be_visible()
         button(page, "2. Target").click()
         button(page, "Use this board").click()
         expect(page.get_by_text(f"In use: {TARGET}")).to_be_visible()

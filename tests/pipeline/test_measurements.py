@@ -74,6 +74,13 @@ def regions(balls) -> list[np.ndarray]:
     return [region for _, region in find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)]
 
 
+def ball_about(on: MeasuredSurface, region: np.ndarray) -> Region:
+    """The ball that holds the points of some pixels."""
+    points = on.points[region & on.measured]
+    centre = points.mean(axis=0)
+    return Region.ball(centre, 1e-3 + float(np.linalg.norm(points - centre, axis=1).max()))
+
+
 @pytest.fixture(scope="module")
 def tops(balls, regions) -> list[tuple[int, int]]:
     """The pixel of each ball that is nearest to the camera."""
@@ -88,7 +95,8 @@ def tops(balls, regions) -> list[tuple[int, int]]:
 def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_path, regions, tops) -> None:
     a, b = tops
     first, second = (
-        measurements.add_fit(folder, balls, "sphere", Region.of_mask(r), n) for r, n in zip(regions, "LR", strict=True)
+        measurements.add_fit(folder, balls, "sphere", ball_about(balls, r), n)
+        for r, n in zip(regions, "LR", strict=True)
     )
     apart = measurements.add_relation(folder, first.id, second.id)
     width = measurements.add_distance(folder, balls, a, b, "width")
@@ -138,7 +146,7 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
 
 
 def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls, regions) -> None:
-    fits = [measurements.add_fit(folder, balls, "sphere", Region.of_mask(region)) for region in regions]
+    fits = [measurements.add_fit(folder, balls, "sphere", ball_about(balls, region)) for region in regions]
     measurements.add_relation(folder, fits[0].id, fits[1].id)
     measurements.remove(folder, fits[1].id)
     assert [each.stale for each in measurements.measurements(folder)] == [False, True]
@@ -161,7 +169,7 @@ def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls, r
     with pytest.raises(InputError, match="balls"):
         measurements.add_point(folder, balls, 7)
     with pytest.raises(InputError):
-        measurements.add_fit(folder, balls, "plane", Region.of_mask(regions[0]))
+        measurements.add_fit(folder, balls, "plane", ball_about(balls, regions[0]))
     with pytest.raises(InputError, match=r"\b0\b"):
         measurements.add_fit(folder, balls, "sphere", Region.ball([0, 0, 0], 5.0))
     one = measurements.add_distance(folder, balls, *tops)
@@ -240,13 +248,13 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
         store.save_result("merge/1", meta, {})
     on = surface(folder, "merge/1")
     region = regions[0]
-    one = measurements.add_fit(folder, on, "sphere", Region.of_mask(region[chosen]))
+    one = measurements.add_fit(folder, on, "sphere", ball_about(balls, region))
     assert abs(measurements.quantities_of(one)[0].value - RADIUS) < 0.05 and one.source == "merge/1"
     assert measurements.quantities_of(measurements.add_distance(folder, on, 0, 5))[0].sigma > 0
     with pytest.raises(InputError, match="mesh"):
         measurements.add_section(folder, on, 0, 5000)
     with pytest.raises(InputError, match="index"):
         measurements.add_point(folder, on, (3, 4))
-    other = measurements.add_fit(folder, balls, "sphere", Region.of_mask(region))
+    other = measurements.add_fit(folder, balls, "sphere", ball_about(balls, region))
     with pytest.raises(InputError, match="frame"):
         measurements.add_relation(folder, one.id, other.id)

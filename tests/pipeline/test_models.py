@@ -59,4 +59,4 @@ def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recor
         shown = operator.wait_for(lambda s: s.session is not None and s.session.calibration is not None, 20.0)
         assert shown is not None and shown.session is not None and shown.session.calibration is not None
         assert "version" in shown.session.calibration.stale
-        assert shown.session.calibration.reprojection_px
+        assert shown.session.calibration.stereo.reprojection_rms_px

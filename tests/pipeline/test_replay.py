@@ -93,7 +93,7 @@ def test_the_wizard_captures_what_is_played(recorded: Path, tmp_path: Path):
         assert operator.choose_target("circles:11x9:14")
         for _ in range(2):
             assert operator.capture_pose()
-        operator.settle()
+        operator.wait_until_idle()
         assert operator.session is not None
         for number in (1, 2):
             shot = operator.session.load_capture(f"pose_0{number}")

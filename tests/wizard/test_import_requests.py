@@ -105,4 +105,4 @@ def test_an_imported_calibration_without_sizes_waits_for_captures(source: Path, 
         assert view is not None and view.calibration is None
         assert operator.import_folder(source, projector="120x90")
         view = operator.wait_until_idle(60).session
-        assert view is not None and view.calibration is not None and view.calibration.baseline_mm == 100
+        assert view is not None and view.calibration is not None and view.calibration.stereo.baseline_mm == 100
