@@ -104,8 +104,12 @@ def _unsteadiness(sequence: PatternSequence, sample: LineSample, illuminated: np
     return worst
 
 
-def find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
-    """The same of frames as they are, taken to be of equal light."""
+def find_contradictions(
+    sequence: PatternSequence, stack: np.ndarray, *, with_steps: bool = True
+) -> tuple[Contradiction, ...]:  # fmt: skip
+    """The same of frames as they are, taken to be of equal light; without the phase steps' own contradictions where
+    these are known.
+    """
     if not sequence.axes:
         return ()
     sample = sample_lines(sequence, stack)
@@ -117,8 +121,8 @@ def find_contradictions(sequence: PatternSequence, stack: np.ndarray) -> tuple[C
         return repeated
     stated = {axis: measure_agreement(readers[axis], described_frames(sequence, axis)) for axis in sequence.axes}
     failed = {axis: failed_tests(described_frames(sequence, axis), stated[axis]) for axis in sequence.axes}
-    disordered = [c for axis in sequence.axes for c in detect_misplaced_steps(sequence, axis, sample)]
-    strange = set() if disordered else detect_unexplained_steps(sequence, sample)
+    disordered = [c for axis in sequence.axes if with_steps for c in detect_misplaced_steps(sequence, axis, sample)]
+    strange = detect_unexplained_steps(sequence, sample) if with_steps and not disordered else set()
     uneven = [i for i in range(len(stack)) if not likeness.is_even(i, i)]
     if not any(failed.values()) and not disordered and not strange and not uneven:
         return _mirrored(sequence, sample)

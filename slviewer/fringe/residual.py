@@ -109,7 +109,7 @@ def _compare(
 def _detect_code_faults(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> list[Suspect]:
     """What contradicts the order of the frames that are no phase steps; of all frames, if they are late by as many."""
     out = []
-    for c in find_contradictions(sequence, stack):
+    for c in find_contradictions(sequence, stack, with_steps=False):
         if c.cause in _CODE_FAULTS and c.axis in (axis, None) and c.value is not None:
             is_common = c.cause == "frame-lag" and c.axis is None
             frame = 0 if is_common else int(c.value)
