@@ -28,6 +28,7 @@ from slviewer.pipeline.models import (
     validation,
 )
 from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.records import from_plain
 from slviewer.session.capture import Capture
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
@@ -411,7 +412,8 @@ def _differs(used: Mapping[str, object], now: Mapping[str, object]) -> bool:
 
 
 def _is_verdict_of(verdict: Verdict | None, meta: Mapping[str, Any]) -> bool:
-    return verdict is not None and meta.get("verdict") == verdict.to_json()
+    saved = meta.get("verdict")
+    return verdict is not None and saved is not None and from_plain(saved, Verdict) == verdict
 
 
 def _load_fit_rms(session: Session) -> dict[str, Mapping[str, float]] | None:
