@@ -187,10 +187,11 @@ def _evaluate(expression: ast.expr, module: str) -> Any:
 
 
 def _terminal_type(kind: Any) -> Any:
-    """Without the alternatives that a terminal's text cannot be: a path is always a `Path`."""
+    """Without the second of two types that a terminal's text could be: addresses, ``str | Path``, stay text."""
     choices = get_args(kind)
     if Path in choices and str in choices:
-        return Path | None if type(None) in choices else Path
+        first = next(choice for choice in choices if choice in (Path, str))
+        return first | None if type(None) in choices else first
     if getattr(kind, "__origin__", None) is Sequence:
         return GenericAlias(tuple, (_terminal_type(choices[0]), ...))
     return kind
