@@ -126,7 +126,7 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     if fit is not gains and not _needs_correction(sample, fit):
         fit = gains
     if not _explains(sample, fit):
-        return replace(steady, unexplained=fit.terms)
+        return replace(steady, unexplained=fit.terms if _explains_most(sample, fit) else ())
     light = _estimate_fine_stripes(sample, _fill_unknown_frames(sample, fit))
     used = list(fit.informed)
     room = _room_light(sample, light, used)
@@ -379,11 +379,16 @@ def _explains(sample: LightSample, fit: Fit) -> bool:
         most = LEFT if len(fit.terms) < 3 else LEFT_OF_ROOM
         small = most * sample.roughness**2 + LEFT_CONTRAST**2 * float(np.mean(sample.amplitudes) ** 2)
         return fit.variance < small and bool(each.max() < limit)
-    one = np.ones_like(fit.weight)
-    equal = model.eliminate(Light.constant(len(sample.frames)), SHARE_PRIOR[0], one)
-    explained = model.eliminate(fit.light, fit.share, one).variance < EXPLAINED * equal.variance
+    equal = model.eliminate(Light.constant(len(sample.frames)), SHARE_PRIOR[0], np.ones_like(fit.weight))
     unequal = (fit.weight * equal.left**2).sum(axis=1)[judged] / np.maximum(entries[judged], 1)
-    return explained and bool((each < np.maximum(limit, LEFT_OF_FRAME * unequal)).all())
+    return _explains_most(sample, fit) and bool((each < np.maximum(limit, LEFT_OF_FRAME * unequal)).all())
+
+
+def _explains_most(sample: LightSample, fit: Fit) -> bool:
+    """Whether the light removes a large part of what equal light leaves."""
+    model, one = LightModel(sample), np.ones_like(fit.weight)
+    equal = model.eliminate(Light.constant(len(sample.frames)), SHARE_PRIOR[0], one).variance
+    return model.eliminate(fit.light, fit.share, one).variance < EXPLAINED * equal
 
 
 def _fill_unknown_frames(sample: LightSample, fit: Fit) -> Fit:
