@@ -249,7 +249,7 @@ def test_how_good_a_calibration_is() -> None:
     words = "\n".join(texts(section) for section in session_sections(data))
     for word in (
         "What to do: fill it in two more poses",
-        "Mended already",
+        "Already corrected",
         "as the operator has chosen; recommended: splined",
         "0.0200",
         "0.100 mm",
