@@ -150,14 +150,16 @@ class AxisReader:
         self._bits: dict[tuple[int | None, int | None], tuple[np.ndarray, np.ndarray, float, float]] = {}
         self.known: dict[AxisFrames, Agreement] = {}
         self._opposed: dict[tuple[int, int], float] = {}
+        self._in_view: dict[frozenset[int], bool] = {}
 
     def is_in_view(self, frames: AxisFrames) -> bool:
         """Whether enough pixels vary between the images that are taken to be of this axis."""
-        images = {*frames.bits, *frames.inverse, *(i for _, steps in frames.shifts for i in steps)} - {None}
-        if not images or len(self.swing) < FEWEST_PIXELS:
-            return False
-        swing = np.ptp(self.frames[sorted(i for i in images if i is not None)], axis=0)
-        return bool(np.count_nonzero(swing > self._least_swing) >= FEWEST_PIXELS)
+        assumed = (*frames.bits, *frames.inverse, *(i for _, steps in frames.shifts for i in steps))
+        images = frozenset(i for i in assumed if i is not None)
+        if images not in self._in_view:
+            swing = np.ptp(self.frames[sorted(images)], axis=0) if images else np.zeros(0)
+            self._in_view[images] = bool(np.count_nonzero(swing > self._least_swing) >= FEWEST_PIXELS)
+        return self._in_view[images]
 
     def opposed(self, image: int | None, inverse: int | None) -> float:
         """Share of the pixels inside stripes of both images that are bright in one alone; NaN for few pixels."""
