@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable, Hashable
 from typing import Any
 
-import cv2
 import numpy as np
 import viser
 
@@ -82,9 +81,7 @@ class Plot:
         if figure is None:
             self.hide()
             return
-        drawn = cv2.imdecode(np.frombuffer(figure.png, np.uint8), cv2.IMREAD_COLOR)
-        assert drawn is not None
-        self._image.image = np.ascontiguousarray(drawn[..., ::-1])
+        self._image.image = figure.pixels
         self._image.visible = True
         self._caption.set(paragraph(coloured(figure.caption if caption is None else caption, "dim")))
 

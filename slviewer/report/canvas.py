@@ -1,9 +1,8 @@
-"""What all figures share: a canvas without global state, the palette, and images made small enough for a page.
+"""What all figures share: a canvas without global state, the palette, the styles of axes.
 
 matplotlib is used through its objects alone (no pyplot, no rcParams), so that reports may be written by any thread.
 """
 
-import io
 import threading
 from typing import Any
 
@@ -43,58 +42,15 @@ def new_figure(width: int, height: int) -> Any:
     return Drawing(figsize=(width / 100, height / 100), dpi=100 * DENSITY, facecolor="white", layout="constrained")
 
 
-def finish_figure(drawing: Any, caption: str, alt: str, *, shaded: bool = False) -> Figure:
-    """Draw, and make it a report's figure: a PNG of 256 colours, less than half the size of full colour.
-
-    ``shaded`` pictures, which would show bands in 256 colours, keep 64 levels a channel.
-    """
+def finish_figure(drawing: Any, caption: str, alt: str) -> Figure:
+    """Draw a matplotlib figure, and return it as a figure of a report."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
 
     with _drawing:
         canvas = FigureCanvasAgg(drawing)
         canvas.draw()
         rgb = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
-    buffer = io.BytesIO()
-    image = Image.fromarray(rgb & 0xFC | rgb >> 6) if shaded else _indexed(rgb)
-    image.save(buffer, format="PNG", compress_level=5)
-    return Figure(buffer.getvalue(), caption, alt, rgb.shape[1] // DENSITY)
-
-
-def _indexed(rgb: np.ndarray) -> Any:
-    """A picture (h, w, 3) uint8 in 256 colours.
-
-    128 are its most frequent colours as they are, so that legends, titles and colour bars stay true; 128 lie between
-    the rest. Every pixel takes the nearest (Pillow's own search for it is coarse, and turns white to grey).
-    """
-    from PIL import Image
-
-    packed = rgb.astype(np.uint32) @ np.array([65536, 256, 1], np.uint32)
-    sparse = packed[::2, ::2]
-    colours, counts = np.unique(sparse, return_counts=True)
-    frequent = colours[np.argpartition(counts, -min(128, len(counts)))[-128:]]
-    palette = _unpacked(frequent)
-    rest = sparse[~np.isin(sparse, frequent)]
-    if rest.size:
-        image = Image.fromarray(_unpacked(rest)[None]).quantize(128, method=Image.Quantize.MEDIANCUT)
-        between = np.frombuffer(bytes(image.getpalette() or b""), np.uint8).reshape(-1, 3)
-        palette = np.concatenate([palette, between])[:256]
-
-    seen = np.zeros(1 << 24, bool)
-    seen[packed] = True
-    present = np.flatnonzero(seen)
-    index = np.zeros(1 << 24, np.uint8)
-    entries = palette.astype(np.float32)
-    for some in np.array_split(present, 1 + len(present) // 20_000):
-        away = np.sum(entries**2, axis=1) - 2 * _unpacked(some).astype(np.float32) @ entries.T
-        index[some] = away.argmin(axis=1)
-    image = Image.fromarray(index[packed], mode="P")
-    image.putpalette(palette.tobytes())
-    return image
-
-
-def _unpacked(colours: np.ndarray) -> np.ndarray:
-    return np.stack([colours >> 16, colours >> 8 & 255, colours & 255], axis=-1).astype(np.uint8)
+    return Figure(rgb, caption, alt, rgb.shape[1] // DENSITY)
 
 
 def style_axes(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK) -> None:

@@ -61,7 +61,6 @@ def draw_clouds(views: Sequence[CloudView]) -> Figure:
         drawing,
         "Each scan as measured, seen from above and aside, lit by its own surface normals and coloured by depth.",
         "Shaded views of " + ", ".join(f"{view.name} ({_counted(view)})" for view in views),
-        shaded=True,
     )
 
 
@@ -88,7 +87,6 @@ def draw_merged_cloud(view: CloudView) -> Figure:
         "The merged cloud in the reference scan's frame. Right: each square shows the points of one scan alone, so "
         "that a step where squares meet would be a misalignment.",
         f"Shaded views of the merged cloud, {_counted(view)}, as one surface and coloured by scan",
-        shaded=True,
     )
 
 

@@ -226,5 +226,4 @@ def deviation_picture(view: DeviationView) -> Figure:
         f"{view.name}: red lies outside the nominal surface, blue inside it. Right: how many of the points lie how far "
         "off.",
         f"{view.source} coloured by its deviation from {view.nominal}, with a histogram of the deviations",
-        shaded=True,
     )

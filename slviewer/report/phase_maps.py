@@ -72,7 +72,6 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL
         f"{title}: the projector coordinate that each camera pixel sees, in px; masked pixels in the colour of their "
         "reason.",
         f"Maps of the decoded projector coordinates of {title}: {said}",
-        shaded=True,  # in 256 colours the legend of a reason that few pixels have would turn grey
     )
 
 

@@ -4,12 +4,13 @@ import os
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from slviewer.errors import InputError
 from slviewer.report.page import Cell, Column, Figure, Headline, PageNotice, Section, Table, write_page
 
-PNG = b"\x89PNG\r\n\x1a\n" + b"0" * 40
+PIXELS = np.zeros((4, 300, 3), np.uint8)
 EVIL = "<script>alert('x')</script> \"quoted\" & <img src=y onerror=z>"
 
 
@@ -19,7 +20,7 @@ def table(caption: str = "table") -> Table:
 
 
 def write(path: Path, text: str = "words") -> str:
-    figure = Figure(PNG, f"caption {text}", f"alt {text}", 300)
+    figure = Figure(PIXELS, f"caption {text}", f"alt {text}", 300)
     items = [figure, table(text), PageNotice(text), PageNotice(text, "good")]
     write_page(path, text, text, [(text, text, text), Headline("1 mm", "size")], [Section(text, [text, text], items)])
     return path.read_text(encoding="utf-8")
