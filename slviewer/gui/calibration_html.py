@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
-from slviewer.evaluation.crossvalidation import CrossValidation
-from slviewer.gui.widgets import Html, Tone, alert, coloured, paragraph, table, to_html
+from slviewer.gui.widgets import Html, Tone, alert, coloured, paragraph, report_table, to_html
+from slviewer.report.quality import splined_table
 from slviewer.wizard.snapshot import CalibrationView, SplinedView
 
 _LEVELS: dict[str, tuple[Tone, str, str]] = {
@@ -44,7 +44,7 @@ def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) ->
     """Poses that the verdict or the joint adjustment names, each once."""
     names = [name for finding in verdict.findings for name in finding.poses] if verdict else []
     if calibration is not None and calibration.splined is not None:
-        names += calibration.splined.excluded
+        names += calibration.splined.summary["left_out"]
     return tuple(dict.fromkeys(names))
 
 
@@ -57,35 +57,15 @@ def exclusions_html(calibration: CalibrationView) -> Html:
     note = paragraph(coloured(features, "dim")) if features else Html("")
     lines = [f"{name}: {why}" for name, why in calibration.stereo.left_out.items()]
     if calibration.splined is not None:
-        lines += [f"{name}, in the splined model only: it {why}" for name, why in calibration.splined.excluded.items()]
+        lines += [
+            f"{name}, in the splined model only: it {why}"
+            for name, why in calibration.splined.summary["left_out"].items()
+        ]
     if not lines:
         return note
     items = "".join(f'<li style="margin:0.15em 0">{to_html(_capitalise(line))}</li>' for line in lines)
     listed = f'<ul style="margin:0.2em 0 0;padding-left:1.2em">{items}</ul>'
     return Html(alert(Html(f"{coloured('Excluded', 'warning', bold=True)}{listed}"), "warning") + note)
-
-
-def comparison_table(comparison: CrossValidation, best: str) -> Html:
-    """The models on held-out poses; the one in use in bold."""
-    figures = {"plane_mm": 3, "board_mm": 3, "scale_ppm": 0, "camera_px": 3, "projector_px": 3}
-    rms = {model: {figure: comparison.rms(model, figure) for figure in figures} for model in comparison.models}
-    rows: list[list[Html]] = []
-    for model, values in rms.items():
-        row = [coloured(model, "plain", bold=model == best)]
-        for figure, digits in figures.items():
-            least = figure in ("plane_mm", "board_mm", "camera_px") and len(rms) > 1
-            good = least and values[figure] == min(each[figure] for each in rms.values())
-            row.append(coloured(f"{values[figure]:.{digits}f}", "good" if good else "plain", bold=good))
-        rows.append(row)
-    titles = ("Held-out RMS", "Plane, mm", "Board, mm", "Scale, ppm", "Camera, px", "Projector, px")
-    note = (
-        f"{len(next(iter(comparison.poses.values())))} poses, each measured by calibrations without it "
-        f"({len(comparison.folds)} folds). Board: distance of its features from their true positions."
-    )
-    failed = "".join(
-        alert(f"{model} could not be compared: {why}", "warning") for model, why in comparison.failed.items()
-    )
-    return Html(table(titles, rows) + paragraph(coloured(note, "dim")) + failed)
 
 
 def model_choice_html(calibration: CalibrationView) -> Html:
@@ -105,24 +85,16 @@ def model_choice_html(calibration: CalibrationView) -> Html:
     return paragraph(Html(f"{coloured(calibration.best, 'good', bold=True)} is used: {to_html(why)}"))
 
 
-def splined_table(splined: SplinedView) -> Html:
-    """The figures of the joint adjustment."""
-    noise, distortion, covered = splined.noise_px, splined.distortion_px, splined.covered
-    low, high = splined.height_mm
-    rows: list[tuple[object, object]] = [
-        ("Residual noise, camera", f"{noise['camera']:.4f} px"),
-        ("Residual noise, projector x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"),
-        ("Local distortion, camera / projector", f"{distortion['camera']:.3f} / {distortion['projector']:.3f} px"),
-        ("Board height, peak to valley", f"{high - low:.3f} mm"),
-        ("Board feature offsets, RMS", f"{splined.offset_mm:.3f} mm"),
-        ("Covered, camera / projector", f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %"),
-    ]
-    if suspect := [f"{name} {min(pair):.2f}" for name, pair in splined.weights.items() if min(pair) < MIN_WEIGHT]:
-        rows.append((f"Poses with weight below {MIN_WEIGHT:g}", Html("<br>".join(map(to_html, suspect)))))
-    if splined.turned:
-        rows.append(("Board turned by 180°, corrected", Html("<br>".join(map(to_html, splined.turned)))))
-    note = "Pixels outside the calibrated region are masked."
-    return Html(table(("Joint adjustment", ""), rows) + paragraph(coloured(note, "dim")))
+def splined_html(splined: SplinedView) -> Html:
+    """The results of the joint adjustment, and poses with a low weight or turned by 180 degrees."""
+    named = {
+        f"Weights below {MIN_WEIGHT:g}": [
+            f"{name} {min(pair):.2f}" for name, pair in splined.weights.items() if min(pair) < MIN_WEIGHT
+        ],
+        "Board turned by 180°, corrected": splined.turned,
+    }
+    notes = [f"{title}: {', '.join(names)}." for title, names in named.items() if names]
+    return report_table(splined_table(splined.summary)) + "".join(paragraph(note) for note in notes)
 
 
 def _finding(finding: Finding) -> str:

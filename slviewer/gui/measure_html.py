@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.gui.measure_drawing import format_quantity
 from slviewer.gui.pictures import PLOT_PX
-from slviewer.gui.widgets import Html, Tone, alert, coloured, paragraph, table, to_html
+from slviewer.gui.widgets import Html, Tone, alert, colour_bar, coloured, paragraph, table, to_html
 from slviewer.inspection.colours import deviation_colours
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline.measurements import quantities_of
@@ -79,15 +79,8 @@ def verdict_html(data: Mapping[str, Any]) -> Html:
 
 def deviation_bar(limit: float) -> Html:
     """The legend of a surface that is coloured by its deviation."""
-    stops = ",".join(f"rgb{tuple(int(c) for c in rgb)}" for rgb in deviation_colours(np.linspace(-1, 1, 13), 1.0))
-    return paragraph(
-        Html(
-            f'<div style="display:flex;gap:0.6em;align-items:center"><span>−{limit:.3g} mm</span>'
-            f'<div style="flex:1;height:10px;border-radius:3px;background:linear-gradient(90deg,{stops})"></div>'
-            f"<span>+{limit:.3g} mm</span></div>"
-            '<div style="text-align:center">deviation; red: outside, blue: inside, grey: not measured</div>'
-        )
-    )
+    title = "deviation; red: outside, blue: inside, grey: not measured"
+    return colour_bar(f"−{limit:.3g} mm", f"+{limit:.3g} mm", deviation_colours(np.linspace(-1, 1, 13), 1.0), title)
 
 
 def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None) -> Figure:

@@ -9,9 +9,9 @@ import numpy as np
 from slviewer.gui.inputs import Choice, change, display_name
 from slviewer.gui.measure_html import deviation_bar
 from slviewer.gui.panel import PanelContext
-from slviewer.gui.pictures import Painter, colour_range
+from slviewer.gui.pictures import Painter
 from slviewer.gui.steps.scan import sort_scans
-from slviewer.gui.widgets import Html, Text, colour_bar, colours
+from slviewer.gui.widgets import Html, Text, paint
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.session.measurements import Measurement, measurement_arrays
@@ -20,7 +20,6 @@ from slviewer.wizard.surfaces import place_at
 
 COLOURS = ("texture", "depth", "uncertainty")
 DEVIATION = "deviation"
-SHOWN = 150_000
 
 
 class SurfaceView:
@@ -138,25 +137,15 @@ class SurfaceView:
 
 
 def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
-    """(points (..., 3), their colours likewise, the legend) of a surface in one of COLOURS, thinned to be drawn."""
-    step = 1
-    if on.organised:  # thinned in rows and columns alike, so that no stripes appear
-        step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(on.measured) / SHOWN))))
-    part = (slice(None, None, step),) * (2 if on.organised else 1)
-    points = on.points[part]
+    """(points (..., 3), their colours likewise, the legend) of a surface in one of COLOURS."""
     if colour == "texture" and on.texture is not None:
-        texture = on.texture[part]
-        return points, texture if texture.ndim == points.ndim else np.repeat(texture[..., None], 3, axis=-1), Html("")
+        return on.points, on.texture, Html("")
     if colour == "uncertainty":
         sigma = on.sigma_mm if on.left_mm is None else np.hypot(on.sigma_mm, on.left_mm)
-        sigma = np.where(on.measured, sigma, np.nan)
-        low, high = colour_range(sigma)
         title = "uncertainty of z (1 sigma)" if on.organised else "uncertainty along the normal (1 sigma)"
         title += "" if on.left_mm is not None else ", noise only"
-        return points, colours(sigma[part], low, high), colour_bar(f"{low:.3f} mm", f"{high:.3f} mm", "value", title)
-    low, high = colour_range(on.points[..., 2])
-    bar = colour_bar(f"{low:.1f} mm", f"{high:.1f} mm", "value", "depth")
-    return points, colours(points[..., 2], low, high), bar
+        return on.points, *paint(np.where(on.measured, sigma, np.nan), "mm", 3, title)
+    return on.points, *paint(on.points[..., 2], "mm", 1, "depth")
 
 
 def _deviating(arrays: dict[str, np.ndarray], measured: Measurement) -> tuple[np.ndarray, np.ndarray, Html]:

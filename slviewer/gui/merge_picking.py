@@ -298,8 +298,5 @@ def _side_by_side(session: Session, pair: Pair) -> _SideBySide:
     flat = {side: cloud.points[np.isfinite(cloud.points[..., 2])].astype(np.float64) for side, cloud in clouds.items()}
     wide = max(float(np.ptp(np.percentile(points @ TO_THE_RIGHT, [1, 99]))) for points in flat.values())
     shift = np.median(flat["onto"], axis=0) - np.median(flat["scan"], axis=0) - (1 + _APART) * wide * TO_THE_RIGHT
-    painted: dict[Side, np.ndarray] = {}
-    for side, cloud in clouds.items():
-        texture = cloud.texture
-        painted[side] = texture if texture.ndim == 3 else np.repeat(texture[..., None], 3, axis=2)
+    painted = {side: cloud.texture for side, cloud in clouds.items()}
     return _SideBySide(pair, {side: cloud.points for side, cloud in clouds.items()}, painted, shift, wide)

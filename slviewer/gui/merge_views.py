@@ -6,9 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from slviewer.gui.pictures import colour_range
 from slviewer.gui.scene import Colour
-from slviewer.gui.widgets import Html, colour_bar, coloured, colours, paragraph, to_html
+from slviewer.gui.widgets import Html, coloured, paint, paragraph, to_html
 from slviewer.session.ply import Ply
 from slviewer.session.store import Session
 from slviewer.wizard import result_views
@@ -22,12 +21,13 @@ SCAN_COLOURS: tuple[Colour, ...] = (
     (91, 143, 208), (224, 161, 60), (99, 178, 138), (200, 113, 143), (143, 131, 201), (120, 120, 120),
 )  # fmt: skip
 _GREY: Colour = (150, 150, 150)
-_SHOWN = 60_000
+SHOWN = 60_000
+"""Points of each cloud that are drawn."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColouredClouds:
-    """Clouds by name, each its points (n, 3) mm and colours, and the legend; ``view`` changes with their positions."""
+    """Clouds by name, each its points (..., 3) mm and colours; the legend; ``view`` changes with their positions."""
 
     view: str
     clouds: Mapping[str, tuple[np.ndarray, np.ndarray | Colour]]
@@ -36,7 +36,7 @@ class ColouredClouds:
     @cached_property
     def points(self) -> np.ndarray | None:
         """All points; None where there are none."""
-        return np.concatenate([points for points, _ in self.clouds.values()]) if self.clouds else None
+        return np.concatenate([points.reshape(-1, 3) for points, _ in self.clouds.values()]) if self.clouds else None
 
 
 def colour_scans(
@@ -46,10 +46,8 @@ def colour_scans(
     clouds: dict[str, tuple[np.ndarray, np.ndarray | Colour]] = {}
     for i, name in enumerate(names):
         cloud = result_views.scan_cloud(session, name)
-        rows, columns = cloud.thinned(_SHOWN)
-        points = cloud.points[rows, columns].reshape(-1, 3)
         T = places.get(name, np.eye(4))
-        clouds[name] = ((points @ T[:3, :3].T + T[:3, 3]).astype(np.float32), SCAN_COLOURS[i % len(SCAN_COLOURS)])
+        clouds[name] = ((cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32), SCAN_COLOURS[i % len(SCAN_COLOURS)])
     return ColouredClouds("after" if places else "before", clouds, _patches([titles.get(name, name) for name in names]))
 
 
@@ -72,11 +70,11 @@ def _painted(surface: Ply, view: str, titles: Sequence[str]) -> tuple[Html, np.n
         return _patches(titles), palette[source.astype(np.int64) % len(palette)]
     if view == BY_SIGMA and sigma is not None:
         known = np.where(sigma > 0, sigma, np.nan)
-        low, high = colour_range(known)
         title = "uncertainty along the normal (1 sigma)" + ("" if np.isfinite(known).all() else "; grey: unknown")
-        return colour_bar(f"{low:.3f} mm", f"{high:.3f} mm", "value", title), colours(known, low, high)
+        painted, bar = paint(known, "mm", 3, title)
+        return bar, painted
     if view == OWN and own is not None:
-        return Html(""), np.repeat(own[:, None], 3, axis=1) if own.ndim == 1 else own
+        return Html(""), own
     missing = "Not stored with this merge: merge again." if view != OWN else "The scans have no texture."
     return paragraph(coloured(missing, "warning")), _GREY
 

@@ -90,12 +90,3 @@ class Plot:
         if self._image.visible:
             self._image.visible = False
         self._caption.set("")
-
-
-def colour_range(values: np.ndarray, low: float = 1.0, high: float = 99.0) -> tuple[float, float]:
-    """The limits of a colour scale for `values`: percentiles of the finite ones; (0, 1) where there is none."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 1.0
-    ends = np.percentile(finite[:: max(1, finite.size // 300_000)], [low, high])
-    return float(ends[0]), float(ends[1])

@@ -173,20 +173,20 @@ class ViewerScene:
         name: str,
         points: np.ndarray,
         colours: np.ndarray | Colour,
-        *,
-        size_mm: float = 0.0,
+        limit: int = SHOWN_POINTS,
     ) -> int:
-        """A cloud (…, 3) float32 mm with colours (…, 3) uint8 or one; NaN points are skipped. Returns the number of
-        points shown: evenly thinned to SHOWN_POINTS, at full precision. The default of `size_mm`, of a point, closes
-        the gaps between neighbours.
+        """A cloud (h, w, 3) or (n, 3) float32 mm with grey levels of its shape, colours (..., 3) uint8, or one colour;
+        NaN points are skipped. Returns the number of points shown: evenly thinned to about `limit`, an organised
+        cloud by rows and columns, so that no stripes appear.
         """
-        flat = np.asarray(points, np.float32).reshape(-1, 3)
-        index = np.flatnonzero(np.isfinite(flat).all(axis=1))
-        if len(index) > SHOWN_POINTS:
-            index = index[np.linspace(0, len(index) - 1, SHOWN_POINTS).astype(np.int64)]
-        shown = flat[index]
-        if isinstance(colours, np.ndarray) and colours.ndim > 1:
-            colours = np.ascontiguousarray(colours.reshape(-1, 3)[index])
+        valid = np.isfinite(points).all(axis=-1)
+        excess = np.count_nonzero(valid) / limit
+        step = max(1, int(np.ceil(np.sqrt(excess) if points.ndim == 3 else excess)))
+        part = (slice(None, None, step),) * (points.ndim - 1)
+        shown = np.asarray(points[part][valid[part]], np.float32)
+        if (isinstance(colours, np.ndarray) and colours.ndim > 1) or np.shape(colours) == valid.shape:
+            chosen = np.asarray(colours)[part][valid[part]]
+            colours = np.repeat(chosen[:, None], 3, axis=1) if chosen.ndim == 1 else chosen
         if not len(shown):
             self.remove(layer, name)
             return 0
@@ -194,7 +194,7 @@ class ViewerScene:
             self._path(layer, name),
             shown,
             colours,
-            point_size=size_mm or spacing(shown),
+            point_size=spacing(shown),
             point_shape="square",
             point_shading="flat",
             precision="float32",

@@ -14,7 +14,9 @@ from typing import ClassVar, Literal
 import cv2
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
+from slviewer.report.page import Cell, Mark, Table
 from slviewer.server.text import escape
 
 PICTURE_PX = 720
@@ -90,6 +92,20 @@ def table(titles: Sequence[object], rows: Sequence[Sequence[object]]) -> Html:
         Html(f'<div style="overflow-x:auto"><table style="width:100%;border-collapse:collapse">'
              f"<tr>{head}</tr>{body}</table></div>")
     )  # fmt: skip
+
+
+def report_table(shown: Table) -> Html:
+    """A table of the report, with its notes."""
+
+    def cell(value: str | Cell) -> Html:
+        mark = value.mark if isinstance(value, Cell) else ""
+        text = value.text if isinstance(value, Cell) else value
+        tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
+        return coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))
+
+    titles = [shown.caption, *(f"{c.title.capitalize()}, {c.unit}" if c.unit else c.title for c in shown.columns[1:])]
+    html = table(titles, [[cell(value) for value in row] for row in (*shown.rows, *shown.footer)])
+    return html + "".join(paragraph(coloured(note, "dim")) for note in shown.notes)
 
 
 def link(address: str, text: str) -> Html:
@@ -212,24 +228,26 @@ def fitted(image: np.ndarray, width_px: int = PICTURE_PX) -> np.ndarray:
     return cv2.resize(image, (width_px, max(1, round(height * width_px / width))), interpolation=how)
 
 
-_STOPS = {
-    "value": ["440154", "3b528b", "21918c", "5ec962", "fde725"],  # matplotlib's viridis
-    "error": ["053061", "4393c3", "f7f7f7", "d6604d", "67001f"],  # its RdBu, reversed: blue below, red above
-}
+_COLOUR_MAPS = {"value": "viridis", "error": "RdBu_r"}  # an error's: blue below, red above
 
 
-def colours(values: np.ndarray, low: float, high: float, scale: Literal["value", "error"] = "value") -> np.ndarray:
+def colours(
+    values: NDArray[np.floating], low: float, high: float, scale: Literal["value", "error"] = "value"
+) -> NDArray[np.uint8]:
     """(…, 3) uint8 RGB for values (…), spread over low ... high; middle grey where NaN."""
-    share = np.clip((np.asarray(values, float) - low) / max(high - low, 1e-12), 0, 1)
-    step = np.nan_to_num(share * 255).astype(np.uint8)
-    painted = _palette(scale)[step]
-    painted[~np.isfinite(share)] = 128
-    return painted
+    from matplotlib import colormaps
+
+    share = (np.asarray(values, float) - low) / max(high - low, 1e-12)
+    painter = colormaps[_COLOUR_MAPS[scale]].with_extremes(bad=(128 / 255,) * 3)
+    return np.asarray(painter(np.ma.masked_invalid(np.clip(share, 0, 1)), bytes=True)[..., :3])
 
 
-def colour_bar(low: str, high: str, scale: Literal["value", "error"] = "value", title: str = "") -> Html:
-    """The legend of `colours`: its scale from `low` to `high`, both with their units."""
-    stops = ",".join(f"#{stop}" for stop in _STOPS[scale])
+def colour_bar(
+    low: str, high: str, scale: Literal["value", "error"] | NDArray[np.uint8] = "value", title: str = ""
+) -> Html:
+    """The legend of a colour scale, that of `colours` or colours (n, 3), from `low` to `high`, both with units."""
+    palette = colours(np.linspace(0, 1, 9), 0, 1, scale) if isinstance(scale, str) else scale
+    stops = ",".join("rgb({},{},{})".format(*colour) for colour in palette)
     return paragraph(
         Html(
             f'<div style="display:flex;gap:0.6em;align-items:center"><span>{to_html(low)}</span>'
@@ -240,11 +258,17 @@ def colour_bar(low: str, high: str, scale: Literal["value", "error"] = "value", 
     )
 
 
-def _palette(scale: str) -> np.ndarray:
-    stops = np.array([[int(stop[k : k + 2], 16) for k in (0, 2, 4)] for stop in _STOPS[scale]], float)
-    at = np.linspace(0, len(stops) - 1, 256)
-    return (
-        np.stack([np.interp(at, np.arange(len(stops)), channel) for channel in stops.T], axis=1)
-        .round()
-        .astype(np.uint8)
-    )
+def paint(values: NDArray[np.floating], unit: str, digits: int, title: str) -> tuple[NDArray[np.uint8], Html]:
+    """(colours (…, 3) of values (…), their legend), from the 1st to the 99th percentile; middle grey where NaN."""
+    low, high = colour_range(values)
+    bar = colour_bar(f"{low:.{digits}f} {unit}", f"{high:.{digits}f} {unit}", "value", title)
+    return colours(values, low, high), bar
+
+
+def colour_range(values: NDArray[np.floating]) -> tuple[float, float]:
+    """The limits of a colour scale: the 1st and 99th percentile of the finite values; (0, 1) where there is none."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0, 1.0
+    low, high = np.percentile(finite[:: max(1, finite.size // 300_000)], [1, 99])
+    return float(low), float(high)

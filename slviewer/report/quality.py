@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from slviewer.calibration.diagnosis.verdict import Verdict
+from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.report.data import AcceptanceView, DriftRow, ModelsView
 from slviewer.report.page import Cell, Column, Headline, Item, Mark, PageNotice, Section, Table
 from slviewer.report.tables import UNKNOWN, format_number
@@ -51,62 +52,58 @@ def models_section(models: ModelsView) -> Section:
     )
     compared = models.comparison
     if compared is not None:
-        least = {f: min(compared.rms(m, f) for m in compared.models) for f in ("plane_mm", "board_mm")}
-
-        def best(model: str, figure: str) -> str | Cell:
-            value = compared.rms(model, figure)
-            text = f"{value:.4f}"
-            return Cell(text, "better") if len(compared.models) > 1 and value == least[figure] else text
-
-        rows: list[list[str | Cell]] = [
-            [
-                model,
-                best(model, "plane_mm"),
-                best(model, "board_mm"),
-                f"{compared.rms(model, 'scale_ppm'):.0f}",
-                f"{compared.rms(model, 'camera_px'):.3f}",
-                f"{compared.rms(model, 'projector_px'):.3f}",
-                "recommended" if model == compared.recommended else "",
-            ]
-            for model in compared.models
-        ]
-        columns = [Column("model", align="left"), Column("plane RMS", "mm"), Column("board RMS", "mm")]
-        columns += [Column("board's scale", "ppm"), Column("reprojection, camera", "px")]
-        columns += [Column("reprojection, projector", "px"), Column("", align="left")]
-        count = len(next(iter(compared.poses.values())))
-        notes = [
-            f"{count} poses, each measured by calibrations made without it and its fold ({len(compared.folds)} folds). "
-            "Plane: how flat the board comes out; board: how far its features lie from where they are on it."
-        ]
-        notes += [f"{model} is not judged: {why}" for model, why in compared.failed.items()]
-        items.append(Table(columns, rows, "On target poses that were left out, RMS", notes))
+        items.append(comparison_table(compared, compared.recommended))
     if models.splined is not None:
-        items.append(_splined_table(models.splined))
+        items.append(splined_table(models.splined))
         items += [
-            PageNotice(f"{name} is left out of the splined model: it {why}")
+            PageNotice(f"{name} is excluded from the splined model: it {why}")
             for name, why in models.splined["left_out"].items()
         ]
     return Section("Models", used, items)
 
 
-def _splined_table(found: Mapping[str, Any]) -> Table:
-    noise, local, illuminated = found["noise_px"], found["local_distortion_rms_px"], found["cells_lit"]
-    low, high = found["board_height_mm"]
+def comparison_table(compared: CrossValidation, bold: str) -> Table:
+    """The models on held-out poses, RMS; the name of the model ``bold`` in bold, the smallest errors marked."""
+    figures = {
+        "plane_mm": (Column("plane", "mm"), 4),
+        "board_mm": (Column("board", "mm"), 4),
+        "scale_ppm": (Column("scale", "ppm"), 0),
+        "camera_px": (Column("camera", "px"), 3),
+        "projector_px": (Column("projector", "px"), 3),
+    }
+    rms = {figure: {model: compared.rms(model, figure) for model in compared.models} for figure in figures}
+    rows: list[list[str | Cell]] = []
+    for model in compared.models:
+        row: list[str | Cell] = [Cell(model, "strong") if model == bold else model]
+        for figure, (_, digits) in figures.items():
+            text, comparable = f"{rms[figure][model]:.{digits}f}", figure in ("plane_mm", "board_mm", "camera_px")
+            is_least = len(compared.models) > 1 and rms[figure][model] == min(rms[figure].values())
+            row.append(Cell(text, "better") if comparable and is_least else text)
+        rows.append(row)
+    notes = [
+        f"{len(next(iter(compared.poses.values())))} poses, each measured by calibrations without it "
+        f"({len(compared.folds)} folds). Plane: distance of the board's features from their plane; board: from their "
+        "true positions.",
+        *(f"{model} could not be compared: {why}." for model, why in compared.failed.items()),
+    ]
+    columns = [Column("model", align="left"), *(column for column, _ in figures.values())]
+    return Table(columns, rows, "RMS on held-out poses", notes)
+
+
+def splined_table(summary: Mapping[str, Any]) -> Table:
+    """Results of the joint adjustment, as `SplinedModel.summary` gives them."""
+    noise, local, covered = summary["noise_px"], summary["local_distortion_rms_px"], summary["cells_lit"]
+    low, high = summary["board_height_mm"]
     rows = [
-        ["noise left in the camera", f"{noise['camera']:.4f} px"],
-        ["noise left in the projector, x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"],
-        ["local distortion learnt, camera / projector", f"{local['camera']:.3f} / {local['projector']:.3f} px RMS"],
-        ["the board's bow, lowest to highest place", f"{high - low:.3f} mm"],
-        ["the board's features, misplaced by", f"{found['board_offsets_rms_mm']:.4f} mm RMS"],
-        [
-            "field cells that target poses illuminated, camera / projector",
-            f"{100 * illuminated['camera']:.0f} / {100 * illuminated['projector']:.0f} %",
-        ],
+        ["residual noise, camera", f"{noise['camera']:.4f} px"],
+        ["residual noise, projector x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"],
+        ["local distortion, camera / projector", f"{local['camera']:.3f} / {local['projector']:.3f} px RMS"],
+        ["board height, peak to valley", f"{high - low:.3f} mm"],
+        ["board feature offsets", f"{summary['board_offsets_rms_mm']:.4f} mm RMS"],
+        ["covered, camera / projector", f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %"],
     ]
     columns = [Column("quantity", align="left"), Column("value")]
-    return Table(
-        columns, rows, "The joint adjustment (splined)", ["What looks through cells never illuminated is masked."]
-    )
+    return Table(columns, rows, "Joint adjustment (splined)", ["Pixels outside the calibrated region are masked."])
 
 
 def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:

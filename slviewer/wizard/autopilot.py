@@ -11,6 +11,7 @@ from slviewer.devices.world import Thing
 from slviewer.errors import Cancelled, SlviewerError
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import MeasuredSurface, Place
+from slviewer.pipeline.measurements import add_distance, add_fit
 from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
@@ -123,10 +124,10 @@ class Autopilot:
         scans = operator.snapshot().session.scans  # type: ignore[union-attr]
         sphere = next(scan.name for scan in reversed(scans) if scan.purpose == "sphere")
         region = _cap(operator.surface(sphere))
-        self._act("Measuring the sphere", partial(operator.measure_shape, sphere, "sphere", region))
+        self._act("Measuring the sphere", partial(operator.measure, sphere, add_fit, "sphere", region))
         latest = _scans(operator.snapshot())[-1].name
         a, b = _across(operator.surface(latest))
-        self._act("Measuring the width of the object", partial(operator.measure_distance, latest, a, b))
+        self._act("Measuring the width of the object", partial(operator.measure, latest, add_distance, a, b))
 
     def _place(self, thing: Thing, scene: Scene) -> None:
         T = np.eye(4)

@@ -5,13 +5,13 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Concatenate, ParamSpec
 
 from slviewer.errors import InputError
-from slviewer.inspection.regions import Region
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline import measurements
 from slviewer.pipeline.compare import Compared, compare_surface
-from slviewer.pipeline.measured_surface import MeasuredSurface, Place
+from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.session import atomic
 from slviewer.session.measurements import Measurement
 from slviewer.session.names import safe_name
@@ -22,6 +22,7 @@ from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.surfaces import NOMINALS, Surfaces
 
+P = ParamSpec("P")
 TABLE = "measurements.csv"
 MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
@@ -36,24 +37,22 @@ class MeasureRequests(RequestHandler):
         return self._surfaces.load(self._engine.store, name)
 
     @request(MEASURING)
-    def measure_point(self, on: str, at: Place) -> None:
-        """Save a picked point, to be related to other results."""
-        self._measure(on, lambda store, surface: measurements.add_point(store, surface, at))
+    def measure(
+        self,
+        on: str,
+        add: Callable[Concatenate[Session, MeasuredSurface, P], Measurement],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> None:
+        """Measure on a surface by a function of `pipeline.measurements`: `measure("scan_01", add_distance, a, b)`."""
+        store = self._engine.store
 
-    @request(MEASURING)
-    def measure_distance(self, on: str, a: Place, b: Place) -> None:
-        """Measure between two picked points."""
-        self._measure(on, lambda store, surface: measurements.add_distance(store, surface, a, b))
+        def work(report: Reporter) -> Measurement:
+            report(0.0, f"measuring on {on}")
+            surface = self._surfaces.load(store, on)
+            return add(store.guarded(report.saving), surface, *args, **kwargs)
 
-    @request(MEASURING)
-    def measure_shape(self, on: str, shape: measurements.Shape, region: Region) -> None:
-        """Fit a plane, a sphere or a cylinder to a region."""
-        self._measure(on, lambda store, surface: measurements.add_fit(store, surface, shape, region))
-
-    @request(MEASURING)
-    def measure_section(self, on: str, a: Place, b: Place) -> None:
-        """Cut the surface through two picked points and the camera."""
-        self._measure(on, lambda store, surface: measurements.add_section(store, surface, a, b))
+        self._submit(MEASURING, work, describe_measurement)
 
     @request(MEASURING)
     def measure_between(self, a: str, b: str) -> None:
@@ -142,16 +141,6 @@ class MeasureRequests(RequestHandler):
             return f"{TABLE} is ready to download: {count} measurement{'s' * (count != 1)}"
 
         self._submit("Writing the table", work, str)
-
-    def _measure(self, on: str, make: Callable[[Session, MeasuredSurface], Measurement]) -> None:
-        store = self._engine.store
-
-        def work(report: Reporter) -> Measurement:
-            report(0.0, f"measuring on {on}")
-            surface = self._surfaces.load(store, on)
-            return make(store.guarded(report.saving), surface)
-
-        self._submit(MEASURING, work, describe_measurement)
 
 
 @contextmanager

@@ -45,12 +45,6 @@ class ScanCloud:
     sigma_calibration: np.ndarray | None = None
     sigma_edges: np.ndarray | None = None
 
-    def thinned(self, limit: int) -> tuple[slice, slice]:
-        """The part of the grid to draw: every so many rows and columns, at most about `limit` measured points."""
-        measured = int(np.isfinite(self.points[..., 2]).sum())
-        step = max(1, int(np.ceil(np.sqrt(measured / limit))))
-        return slice(None, None, step), slice(None, None, step)
-
     def nearest(self, origin: np.ndarray, direction: np.ndarray) -> tuple[int, int] | None:
         """(u, v) of the measured pixel closest to a ray (camera frame, mm), within 1 % of its depth; None if none."""
         index = nearest(self.points, origin, direction)

@@ -433,15 +433,5 @@ def _load_splined(session: Session) -> SplinedView | None:
     except SessionError:
         return None
     assert isinstance(model, SplinedModel)
-    summary = model.summary()
-    low, high = summary["board_height_mm"]
-    return SplinedView(
-        noise_px=summary["noise_px"],
-        distortion_px=summary["local_distortion_rms_px"],
-        height_mm=(low, high),
-        offset_mm=summary["board_offsets_rms_mm"],
-        covered=summary["cells_lit"],
-        excluded=summary["left_out"],
-        weights={name: (fit.camera_trust, fit.projector_trust) for name, fit in model.bundle.fits.items()},
-        turned=model.bundle.turned,
-    )
+    weights = {name: (fit.camera_trust, fit.projector_trust) for name, fit in model.bundle.fits.items()}
+    return SplinedView(model.summary(), weights, model.bundle.turned)

@@ -98,18 +98,11 @@ class PoseView:
 
 @dataclass(frozen=True)
 class SplinedView:
-    """Results of the joint adjustment: residual noise px of the camera and along the projector's x and y, each device's
-    local distortion px RMS, the board's lowest and highest point and the RMS offset of its features in mm, the share of
-    each device's cells that target poses covered, `excluded` poses that contradict the others, with the reason, the
-    weight 0 ... 1 of each pose in camera and projector, and the `turned` poses, numbered from the board's other end.
+    """Results of the joint adjustment: `SplinedModel.summary`, the weight 0 ... 1 of each pose in camera and projector,
+    and the `turned` poses, numbered from the board's other end.
     """
 
-    noise_px: Mapping[str, float]
-    distortion_px: Mapping[str, float]
-    height_mm: tuple[float, float]
-    offset_mm: float
-    covered: Mapping[str, float]
-    excluded: Mapping[str, str]
+    summary: Mapping[str, Any]
     weights: Mapping[str, tuple[float, float]]
     turned: tuple[str, ...] = ()
 

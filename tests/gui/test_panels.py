@@ -19,13 +19,15 @@ from wizard_page import SIZE, Opened, button, cut_labels, field
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
 from slviewer.gui.app import App
-from slviewer.gui.calibration_html import comparison_table, named_poses, verdict_html
+from slviewer.gui.calibration_html import named_poses, verdict_html
 from slviewer.gui.inputs import display_name
-from slviewer.gui.pictures import Painter, colour_range
+from slviewer.gui.pictures import Painter
 from slviewer.gui.steps.scan import painting, point_html, sort_scans, uncertainty
 from slviewer.gui.steps.verify import distances_table, results_table, shape_of
+from slviewer.gui.widgets import colour_range, report_table
 from slviewer.pipeline.calibration_verdict import save_verdict
 from slviewer.pipeline.measurements import quantities_of
+from slviewer.report.quality import comparison_table
 from slviewer.session.measurements import Measurement
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
@@ -359,7 +361,8 @@ def test_words_of_a_calibration() -> None:
     poses = {
         m: {"pose_1": HeldOutPose(p, 2 * p, 9.0, p, p, 100, 600.0)} for m, p in (("stereo", 0.2), ("splined", 0.02))
     }
-    html = comparison_table(CrossValidation(poses, (("pose_1",),), {"pixelwise": "too <few> poses"}), "splined")
+    compared = CrossValidation(poses, (("pose_1",),), {"pixelwise": "too <few> poses"})
+    html = report_table(comparison_table(compared, "splined"))
     assert re.search(r"font-weight:600\">0&#46;020", html) and "<few>" not in html and html.index("stereo") > 0
     assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_html(REJECTED, True, None)
     assert "gave no calibration" in verdict_html(REJECTED, False, None)
@@ -423,7 +426,7 @@ def test_a_cloud_is_painted_by_what_is_asked() -> None:
     np.testing.assert_allclose(uncertainty(noisy)[1:, 1:], 5.0)
     assert "5&#46;000" in painting(noisy, "uncertainty")[1] and "5&#46;000" in point_html(noisy, 4, 2)
     assert "noise only" in painting(cloud, "uncertainty")[1].replace("&#32;", " ")
-    assert painting(cloud, "texture")[0][0, 0].tolist() == [7, 7, 7]
+    assert painting(cloud, "texture")[0][0, 0] == 7
     assert "measure this capture" in painting(cloud, "error")[1].replace("&#32;", " ")
     assert "600&#46;000" in point_html(cloud, 4, 2)
     assert colour_range(np.array([np.nan])) == (0.0, 1.0)

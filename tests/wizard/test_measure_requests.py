@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measurements import measurements, quantities_of
+from slviewer.pipeline.measurements import add_distance, add_fit, add_point, add_section, measurements, quantities_of
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
@@ -75,9 +75,9 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     np.testing.assert_allclose(point_at(on, a), CENTRES[0] - [0, 0, RADIUS], atol=1.0)
     assert place_at(on, np.zeros(3), np.array([0.0, 1.0, 0.1])) is None
     for place in (a, b):
-        assert operator.measure_shape("balls", "sphere", Region.ball(point_at(on, place), 15.0))
-    assert operator.measure_distance("balls", a, b) and operator.measure_section("balls", a, b)
-    assert operator.measure_point("balls", a)
+        assert operator.measure("balls", add_fit, "sphere", Region.ball(point_at(on, place), 15.0))
+    assert operator.measure("balls", add_distance, a, b) and operator.measure("balls", add_section, a, b)
+    assert operator.measure("balls", add_point, a)
     left, right, width, cut, point = now(operator).measurements
     assert operator.measure_between(left.id, right.id)
     apart = now(operator).measurements[-1]
@@ -101,10 +101,10 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
 
 def test_what_cannot_be_measured_is_said_and_nothing_kept(operator: Operator) -> None:
     before = now(operator).measurements
-    assert operator.measure_shape("balls", "plane", Region.ball(CENTRES[0] - [0, 0, RADIUS], 15.0))
+    assert operator.measure("balls", add_fit, "plane", Region.ball(CENTRES[0] - [0, 0, RADIUS], 15.0))
     assert "bends" in last(operator)
-    assert operator.measure_distance("balls", (0, 0), (1, 1)) and "(0, 0)" in last(operator)
-    assert operator.measure_point("nothing", (0, 0)) and "not reconstructed" in last(operator)
+    assert operator.measure("balls", add_distance, (0, 0), (1, 1)) and "(0, 0)" in last(operator)
+    assert operator.measure("nothing", add_point, (0, 0)) and "not reconstructed" in last(operator)
     assert operator.measure_between("m1", "m1") and "chosen twice" in last(operator)
     assert not operator.delete_measurement("m77") and not operator.compare_nominal("object", "../../etc/passwd")
     assert now(operator).measurements == before

@@ -7,22 +7,22 @@ import viser
 
 from slviewer.fringe.sequence import Axis
 from slviewer.gui.calibration_html import (
-    comparison_table,
     exclusions_html,
     model_choice_html,
     named_poses,
-    splined_table,
+    splined_html,
     verdict_html,
 )
 from slviewer.gui.inputs import Choice, SessionValue, change, display_name
 from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.pictures import PLOT_PX, Plot, colour_range
-from slviewer.gui.widgets import Html, Text, coloured, colours, paragraph, table, to_html
+from slviewer.gui.pictures import PLOT_PX, Plot
+from slviewer.gui.widgets import Html, Text, coloured, paint, paragraph, report_table, table, to_html
 from slviewer.pipeline.report import calibration_view
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationFigures, PixelCurve
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure
+from slviewer.report.quality import comparison_table
 from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.report.session import lens_rows, rig_rows
 from slviewer.target.board import Board
@@ -160,9 +160,9 @@ class Panel(StepPanel):
         compared = calibration.comparison
         label = "Compare models" if compared is None else "Compare again"
         change(self._compare, disabled=busy or bool(calibration.stale), label=label)
-        self._comparison.set("" if compared is None else comparison_table(compared, calibration.best))
+        self._comparison.set("" if compared is None else report_table(comparison_table(compared, calibration.best)))
         if calibration.splined is not None:
-            self._splined.set(splined_table(calibration.splined))
+            self._splined.set(splined_html(calibration.splined))
         else:
             self._splined.write(f"No splined model: {calibration.missing}." if calibration.missing else "", "dim")
 
@@ -330,9 +330,7 @@ class Panel(StepPanel):
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
         self._cloud = cloud
-        rows, columns = cloud.thinned(100_000)
-        z = cloud.points[rows, columns, 2]
-        self._scene.cloud(LAYER, "cloud", cloud.points[rows, columns], colours(z, *colour_range(z)))
+        self._scene.cloud(LAYER, "cloud", cloud.points, paint(cloud.points[..., 2], "mm", 1, "")[0])
         self._scene.show(LAYER, self._visible)
         if self._visible:
             self._context.viewpoints.show(f"{LAYER} {cloud.name}", cloud.points)

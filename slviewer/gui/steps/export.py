@@ -216,16 +216,13 @@ class Panel(StepPanel):
                 whole = result_views.merged_cloud(context.session, merge)
                 return whole.points, whole.colours
             cloud = result_views.scan_cloud(context.session, name)
-            rows, columns = cloud.thinned(120_000)
-            return cloud.points[rows, columns], cloud.texture[rows, columns]
+            return cloud.points, cloud.texture
 
         key: Any = merge if name == MERGED else clouds.get(name)
         self._painter.request("cloud", (name, key), load, self._draw_cloud)
 
     def _draw_cloud(self, made: tuple[np.ndarray, np.ndarray | None]) -> None:
         points, colours = made
-        if colours is not None and colours.shape != points.shape:  # grey
-            colours = np.repeat(colours[..., None], 3, axis=-1)
         self._points = points
         self._scene.cloud(LAYER, "cloud", points, (150, 150, 150) if colours is None else colours)
         self._scene.show(LAYER, self._visible)

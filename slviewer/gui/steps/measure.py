@@ -15,7 +15,7 @@ from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, paragraph, t
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import Place
-from slviewer.pipeline.measurements import Shape
+from slviewer.pipeline.measurements import Shape, add_distance, add_fit, add_point, add_section
 from slviewer.report.canvas import round_up
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import MM
@@ -26,6 +26,7 @@ LAYER = "measure"
 UNKNOWN = "unknown"
 _BALL = "ball"
 _PICKED = ("picked 1", "picked 2")
+_MEASURES: dict[str, Any] = {"Point": add_point, "Distance": add_distance, "Section": add_section}
 
 
 class Panel(StepPanel):
@@ -143,17 +144,11 @@ class Panel(StepPanel):
         with self._lock:
             if not self._tool.clicks:
                 return
-            places, on, operator = self._tool.pick(place), self._surface.name, self._operator
+            places, on = self._tool.pick(place), self._surface.name
             self._draw_tool()
         if places is None:
             return
-        match self._tool.name:
-            case "Point":
-                operator.measure_point(on, *places)
-            case "Distance":
-                operator.measure_distance(on, *places)
-            case "Section":
-                operator.measure_section(on, *places)
+        self._operator.measure(on, _MEASURES[self._tool.name], *places)
 
     def _draw_tool(self) -> None:
         """The instruction and the inputs of the tool, and the points picked with it."""
@@ -245,7 +240,7 @@ class Panel(StepPanel):
         with self._lock:
             region, shape = self._region(), cast(Shape, self._tool.name.lower())
         if region is not None:
-            self._operator.measure_shape(self._surface.name, shape, region)
+            self._operator.measure(self._surface.name, add_fit, shape, region)
 
     def _request_comparison(self) -> None:
         units = None if self._units.value == UNKNOWN else self._units.value

@@ -8,7 +8,7 @@ import viser
 from slviewer.gui.inputs import Choice, change, display_name
 from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_html
 from slviewer.gui.merge_picking import PointPicker
-from slviewer.gui.merge_views import AFTER, BEFORE, MERGED, ColouredClouds, colour_merge, colour_scans
+from slviewer.gui.merge_views import AFTER, BEFORE, MERGED, SHOWN, ColouredClouds, colour_merge, colour_scans
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
@@ -180,7 +180,7 @@ class Panel(StepPanel):
         for name in set(self._scene.names(LAYER)) - set(clouds.clouds):
             self._scene.remove(LAYER, name)
         for name, (points, painted) in clouds.clouds.items():
-            self._scene.cloud(LAYER, name, points, painted)
+            self._scene.cloud(LAYER, name, points, painted, SHOWN)
         with self._lock:
             self._clouds = clouds
             self._show_layers()

@@ -11,7 +11,6 @@ from slviewer.gui.inputs import Choice, RestoreButton, change, display_name
 from slviewer.gui.live import LAYER as LIVE
 from slviewer.gui.live import LiveScreen
 from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.pictures import colour_range
 from slviewer.gui.preview import draw_preview, exposure_html, legend
 from slviewer.gui.simulated_object import SimulatedObject
 from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
@@ -24,6 +23,7 @@ from slviewer.gui.widgets import (
     colour_bar,
     coloured,
     colours,
+    paint,
     paragraph,
     table,
     thumbnail,
@@ -201,9 +201,8 @@ class Panel(StepPanel):
             return
         is_new = cloud is not self._cloud
         self._cloud = cloud
-        rows, columns = cloud.thinned(150_000)
         painted, bar = painting(cloud, colour)
-        shown = self._scene.cloud(LAYER, "cloud", cloud.points[rows, columns], painted[rows, columns])
+        shown = self._scene.cloud(LAYER, "cloud", cloud.points, painted)
         self._scene.show(LAYER, self._visible)
         note = f"{shown:,} points shown; the file has all. Click a point for its values."
         self._legend.set(bar + paragraph(coloured(note, "dim")))
@@ -245,7 +244,7 @@ def live_html(live: LiveView, shown: int) -> Html:
 
 
 def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
-    """((h, w, 3) uint8, the legend) of a cloud in one of COLOURS."""
+    """((h, w) grey levels or (h, w, 3) RGB, uint8; the legend) of a cloud in one of COLOURS."""
     if colour == "error":
         if not cloud.errors:
             grey = np.full(cloud.points.shape, 150, np.uint8)
@@ -255,8 +254,7 @@ def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
         bar = colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", f"error of {model}")
         return colours(cloud.errors[model], -limit, limit, "error"), bar
     if colour == "texture":
-        texture = cloud.texture if cloud.texture.ndim == 3 else np.repeat(cloud.texture[..., None], 3, axis=2)
-        return texture, Html("")
+        return cloud.texture, Html("")
     title = colour
     if colour == "uncertainty":
         title = "uncertainty of z (1 sigma), noise and calibration"
@@ -268,9 +266,7 @@ def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
         "noise": (cloud.sigma_z, "mm", 3),
         "uncertainty": (uncertainty(cloud), "mm", 3),
     }[colour]
-    low, high = colour_range(np.where(np.isfinite(cloud.points[..., 2]), values, np.nan))
-    bar = colour_bar(f"{low:.{digits}f} {unit}", f"{high:.{digits}f} {unit}", "value", title)
-    return colours(values, low, high), bar
+    return paint(np.where(np.isfinite(cloud.points[..., 2]), values, np.nan), unit, digits, title)
 
 
 def uncertainty(cloud: ScanCloud) -> np.ndarray:

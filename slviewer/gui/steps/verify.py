@@ -161,9 +161,7 @@ class Panel(StepPanel):
     def _draw_cloud(self, made: tuple[result_views.ScanCloud, str, Shape]) -> None:
         self._cloud, model, shape = cloud, *_ = made
         limit = error_limit(list(cloud.errors.values()))
-        rows, columns = cloud.thinned(120_000)
-        painted = colours(cloud.errors[model][rows, columns], -limit, limit, "error")
-        self._scene.cloud(LAYER, "cloud", cloud.points[rows, columns], painted)
+        self._scene.cloud(LAYER, "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error"))
         self._scene.show(LAYER, self._visible)
         title = f"error of {model}; {_SIGN[shape]}; grey: not evaluated"
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
