@@ -3,7 +3,7 @@
 import numpy as np
 
 from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
-from slviewer.fringe.frame_light import CLIPPED, equalize_axis
+from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_axis
 from slviewer.fringe.kernels_spikes import spike_rules
 from slviewer.fringe.layout import Layout, Shift, axis_layout, check_stack, white_level
 from slviewer.fringe.levels import cell_misfit, code_cell_px, layout_levels, lowest_coordinate, unambiguous_px
@@ -16,19 +16,21 @@ from slviewer.fringe.threshold import MIDDLE, fringe_mean
 __all__ = ["decode", "decode_reference", "texture"]
 
 
-def decode(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
+def decode(
+    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
+) -> PhaseMap:  # fmt: skip
     """The phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
     A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the frames
     (see `frame_light`), they are decoded as they would be under equal light; what gamma leaves in the phase of three or
-    four steps (see `aliased_harmonics`) is corrected. Raises InputError when the frames are not those of the sequence,
-    or cannot give an absolute phase.
+    four steps (see `aliased_harmonics`) is corrected. ``light``: from `estimate_frame_light`; estimated if None. Raises
+    InputError when the frames are not those of the sequence, or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
     stack = np.ascontiguousarray(stack)
     white = white_level(stack, sequence.select(axis))
-    sequence, stack, factor = equalize_axis(sequence, stack, axis)
+    sequence, stack, factor = equalize_axis(sequence, stack, axis, light)
     if factor != 1:
         layout = axis_layout(sequence, axis)
     clipped = white if factor == 1 else CLIPPED

@@ -179,13 +179,13 @@ def equalize_frames(
 
 
 def equalize_axis(
-    sequence: PatternSequence, stack: np.ndarray, axis: Axis
+    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
 ) -> tuple[PatternSequence, np.ndarray, float]:
     """The frames that an axis needs under equal light, their sequence, and the factor of their grey levels.
 
-    Sequence and stack as they are, and 1, where the light needs no correction.
+    Sequence and stack as they are, and 1, where the light needs no correction. ``light``: estimated if None.
     """
-    light = estimate_frame_light(sequence, stack)
+    light = light or estimate_frame_light(sequence, stack)
     if not light.is_significant:
         return sequence, stack, 1.0
     chosen = sequence.select(axis)

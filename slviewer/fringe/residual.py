@@ -7,14 +7,18 @@ or four steps, it is reported. Frames of a Gray code contradict
 each other too: see `description_check`.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from slviewer.errors import InputError
 from slviewer.fringe.aliased_harmonics import describe_gamma, estimate_aliased_harmonics
+from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_check import find_contradictions
 from slviewer.fringe.frame_light import CLIPPED, FrameLight, detect_light_faults, equalize_frames, estimate_frame_light
-from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
+from slviewer.fringe.layout import Layout, axis_layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps
 from slviewer.fringe.residual_sample import Fringe, fringe
@@ -59,32 +63,66 @@ class FrameResiduals:
 def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> FrameResiduals:
     """How the (n, h, w) frames of one axis fit together. Raises InputError like `decode`.
 
-    About 100,000 pixels of evenly spread rows are looked at. Gamma raises `sigmas` of all frames alike; a suspect is
-    only who contradicts the others.
+    About 100,000 pixels of evenly spread rows are sampled. Gamma raises `sigmas` of all frames alike; a suspect is
+    only a frame that contradicts the others.
     """
-    check_stack(sequence, stack)
+    return _axis_residuals(_Frames(sequence, stack, estimate_frame_light(sequence, stack)), axis)
+
+
+def capture_residuals(sequence: PatternSequence, stack: np.ndarray) -> list[FrameResiduals]:
+    """`frame_residuals` of each axis of a capture (n, h, w); an axis that cannot be decoded is skipped."""
+    frames = _Frames(sequence, stack, estimate_frame_light(sequence, stack))
+    residuals = []
+    for axis in sequence.axes:
+        with suppress(InputError):  # decoding reports it, with the remedy
+            residuals.append(_axis_residuals(frames, axis))
+    return residuals
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """The frames of a capture, their grey levels multiplied by ``factor``, and what all axes share, computed once."""
+
+    sequence: PatternSequence
+    stack: np.ndarray
+    light: FrameLight
+    factor: float = 1.0
+
+    @cached_property
+    def equalized(self) -> "_Frames":
+        """The frames under equal light."""
+        stack, factor = equalize_frames(self.stack, self.light, self.sequence)
+        return _Frames(self.sequence, stack, self.light, factor)
+
+    @cached_property
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """What contradicts the description, phase steps aside."""
+        return find_contradictions(self.sequence, self.stack, with_steps=False)
+
+    def white(self, axis: Axis) -> float:
+        """Grey level at which the frames of an axis are clipped."""
+        return CLIPPED if self.factor != 1 else white_level(self.stack, self.sequence.select(axis))
+
+
+def _axis_residuals(frames: _Frames, axis: Axis) -> FrameResiduals:
+    sequence, light = frames.sequence, frames.light
     layout = axis_layout(sequence, axis)
-    light = estimate_frame_light(sequence, stack)
-    white, factor = white_level(stack, sequence.select(axis)), 1.0
     if not light.is_significant:
-        return _compare(sequence, layout, stack, white, light, factor)
+        return _compare(frames, layout)
     if light.drift < SMALL_DRIFT and light.wave < SMALL_DRIFT:
         # A frame out of its place is a simpler explanation than many frames each in a light of its own.
-        as_seen = _compare(sequence, layout, stack, white, light, factor)
+        as_seen = _compare(frames, layout)
         if any(suspect.fault in ORDER_FAULTS for suspect in as_seen.suspects):
             return as_seen
-    stack, factor = equalize_frames(stack, light, sequence)
-    compared = _compare(sequence, layout, stack, CLIPPED, light, factor)
+    compared = _compare(frames.equalized, layout)
     if any(suspect.fault != "gamma" for suspect in compared.suspects):
         return compared  # a frame out of its place spoils what is known of the light, too
     return replace(compared, suspects=tuple(_deduplicate([*detect_light_faults(sequence, light), *compared.suspects])))
 
 
-def _compare(
-    sequence: PatternSequence, layout: Layout, stack: np.ndarray, white: float, light: FrameLight, factor: float
-) -> FrameResiduals:
-    """The residuals of one axis, from frames whose grey levels were multiplied by ``factor``."""
-    axis = layout.axis
+def _compare(frames: _Frames, layout: Layout) -> FrameResiduals:
+    """The residuals of one axis."""
+    axis, stack, white = layout.axis, frames.stack, frames.white(layout.axis)
     noise = measure_noise(layout, stack, white)
     residuals: list[FrameResidual] = []
     suspects: list[Suspect] = []
@@ -99,21 +137,22 @@ def _compare(
         if len(shift.indices) == 3:
             said.append(f"{what}: three steps fit any three frames, so that only a repeated one can be told")
         suspects += detect_misordered_steps(sampled) or detect_foreign_frames(sampled)
-        residuals += _residuals(sampled, _light(sampled) * light.light.gain[list(shift.indices)], factor)
+        gain = frames.light.light.gain[list(shift.indices)]
+        residuals += _residuals(sampled, _light(sampled) * gain, frames.factor)
     suspects += describe_gamma(estimate_aliased_harmonics(layout, stack, white, noise), layout)
     if layout.gray and not suspects:
-        suspects += _detect_code_faults(sequence, stack, axis)
+        suspects += _detect_code_faults(frames, axis)
     return FrameResiduals(axis, tuple(residuals), tuple(_deduplicate(suspects)), "; ".join(said))
 
 
-def _detect_code_faults(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> list[Suspect]:
+def _detect_code_faults(frames: _Frames, axis: Axis) -> list[Suspect]:
     """What contradicts the order of the frames that are no phase steps; of all frames, if they are late by as many."""
     out = []
-    for c in find_contradictions(sequence, stack, with_steps=False):
+    for c in frames.contradictions:
         if c.cause in _CODE_FAULTS and c.axis in (axis, None) and c.value is not None:
             is_common = c.cause == "frame-lag" and c.axis is None
             frame = 0 if is_common else int(c.value)
-            if is_common or sequence.frames[frame].kind != "phase":
+            if is_common or frames.sequence.frames[frame].kind != "phase":
                 out.append(Suspect(frame, _CODE_FAULTS[c.cause], c.message))
     return out
 

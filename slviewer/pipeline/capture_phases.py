@@ -60,13 +60,11 @@ def decode_capture(
 
 def decode_frames(name: str, sequence: PatternSequence, frames: np.ndarray) -> dict[Axis, PhaseMap]:
     """The phase of every axis, absolute or not; errors name the capture."""
-    phases = {}
-    for axis in sequence.axes:
-        try:
-            phases[axis] = decode(sequence, frames, axis)
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
-    return phases
+    try:
+        light = estimate_frame_light(sequence, frames)
+        return {axis: decode(sequence, frames, axis, light) for axis in sequence.axes}
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
 
 
 def check_capture(

@@ -5,32 +5,20 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.errors import InputError
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_check import check_description
-from slviewer.fringe.residual import FrameResiduals, frame_residuals
+from slviewer.fringe.residual import FrameResiduals, capture_residuals
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.store import Session
 
 _MOST = 4  # warnings about one capture
 
 
-def residuals(sequence: PatternSequence, stack: np.ndarray) -> list[FrameResiduals]:
-    """How the frames of each axis fit together; an axis that cannot be decoded alone is left out."""
-    found = []
-    for axis in sequence.axes:
-        try:
-            found.append(frame_residuals(sequence, stack, axis))
-        except InputError:  # decoding says it, with what to do
-            continue
-    return found
-
-
 def save_residuals(session: Session, name: str) -> list[str]:
     """Check a capture's frames, store the result as `trust/<name>`, and return the warnings for the operator."""
     capture = session.load_capture(name)
     frames = capture.frames
-    found, contradictions = residuals(capture.sequence, frames), check_description(capture.sequence, frames)
+    found, contradictions = capture_residuals(capture.sequence, frames), check_description(capture.sequence, frames)
     meta = {"inputs": session.input_hashes(name), "axes": describe(found), "contradictions": contradictions}
     session.save_result(f"trust/{name}", meta, {})
     return warnings_of(found, contradictions)
@@ -50,11 +38,11 @@ def capture_warnings(sequence: PatternSequence, stack: np.ndarray) -> list[str]:
     """What contradicts the description of a capture (n, h, w), and each frame that contradicts the others; nothing for
     a sound one.
     """
-    return warnings_of(residuals(sequence, stack), check_description(sequence, stack))
+    return warnings_of(capture_residuals(sequence, stack), check_description(sequence, stack))
 
 
 def warnings_of(found: list[FrameResiduals], contradictions: Sequence[Contradiction] = ()) -> list[str]:
-    """The same, from what `residuals` and `check_description` returned."""
+    """The same, from what `capture_residuals` and `check_description` returned."""
     messages = [contradiction.message for contradiction in contradictions]
     return _join(messages, [s.sentence for axis in found for s in axis.suspects])
 

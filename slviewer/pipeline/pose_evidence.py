@@ -10,8 +10,8 @@ from slviewer.calibration.diagnosis.numbering import detect_grid_size
 from slviewer.calibration.observe import Observation, pitch_px
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.residual import capture_residuals
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.frame_residuals import residuals
 from slviewer.records import to_plain
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
@@ -37,7 +37,7 @@ def examine(
     could be read; ``refused``: why not.
     """
     on_board = board_mask(board, found, texture.shape) if found is not None else None
-    suspects = {s.frame: s for axis in residuals(sequence, frames) for s in axis.suspects}
+    suspects = {s.frame: s for axis in capture_residuals(sequence, frames) for s in axis.suspects}
     return PoseEvidence(
         name=name,
         refused=refused,

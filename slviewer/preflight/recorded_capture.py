@@ -11,14 +11,13 @@ from slviewer.errors import InputError
 from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
-from slviewer.fringe.residual import FrameResiduals
+from slviewer.fringe.residual import FrameResiduals, capture_residuals
 from slviewer.fringe.response import harmonic_error_rad, nonlinearity
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.pipeline.frame_residuals import residuals
 from slviewer.preflight.gamma import CURVED
 from slviewer.preflight.order import repeated_images
 from slviewer.session.capture import Capture
@@ -44,7 +43,7 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
         failed = Check("description", "bad", f"The frames cannot be decoded: {error}.", "Correct the description.", {})
         return Preflight((failed,), None, None, None, time.monotonic() - began)
     progress(0.5, "comparing the frames")
-    fits = residuals(sequence, frames)
+    fits = capture_residuals(sequence, frames)
     checks = (
         _description(capture.name, sequence, frames, phases),
         _order(sequence, fits),

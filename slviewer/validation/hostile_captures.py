@@ -13,10 +13,10 @@ from slviewer.errors import SlviewerError
 from slviewer.evaluation.letter import SPHERE_RADIUS_MM
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.presets import gray_bits, phase_steps
+from slviewer.fringe.residual import capture_residuals
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.calibration_verdict import last_verdict
-from slviewer.pipeline.frame_residuals import residuals
 from slviewer.pipeline.import_captures import import_frames
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.verify import verify
@@ -219,7 +219,7 @@ def named_causes(
         about = [message for message in messages if name in message]
         if not about:
             continue
-        suspects = [suspect for axis in residuals(sequence, frames) for suspect in axis.suspects]
+        suspects = [suspect for axis in capture_residuals(sequence, frames) for suspect in axis.suspects]
         known = [(s.sentence, _SUSPECTED.get(s.fault, frozenset({s.fault}))) for s in suspects]
         known += [(c.message, frozenset({c.cause})) for c in check_description(sequence, frames)]
         named |= {causes: None for sentence, causes in known if any(sentence in message for message in about)}

@@ -10,11 +10,11 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
+from slviewer.fringe.residual import capture_residuals
 from slviewer.pipeline.frame_residuals import (
     capture_warnings,
     describe,
     frame_warnings,
-    residuals,
     save_residuals,
     warnings_of,
 )
@@ -64,7 +64,7 @@ def test_frames_that_do_not_fit_are_told(wrong, said):
 
 def test_residuals_are_kept_as_plain_values():
     sequence, stack = taken(late={6})
-    found = residuals(sequence, stack)
+    found = capture_residuals(sequence, stack)
     plain = json.loads(json.dumps(describe(found)))
     assert [axis["axis"] for axis in plain] == ["x", "y"]
     assert len(plain[0]["frames"]) == 18 and plain[0]["suspects"][0]["frame"] == 6
