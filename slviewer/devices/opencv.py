@@ -6,7 +6,6 @@ are when it is opened, as nothing may change by itself during a capture.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import get_args
 
@@ -35,46 +34,57 @@ _IN_USE: dict[int | str, "OpenCVCamera"] = {}
 """Who has which source open in this process: most cannot be opened a second time to ask for their size."""
 
 
-@dataclass(frozen=True)
-class Controls:
-    """What a webcam is set to when it is opened: exposure in ms, gain and focus in the camera's own units, the white
-    balance in K. None: as it is then.
-    """
-
-    exposure_ms: float | None = None
-    gain: float | None = None
-    focus: float | None = None
-    white_balance: float | None = None
-
-
 class OpenCVCamera(Openable):
-    """One `channel` of an OpenCV source. `notes` says in sentences what could not be set, or was set to other values,
-    since it was opened.
+    """One `channel` of an OpenCV source. `notes` lists, in sentences, settings that were refused or changed since it
+    was opened.
 
-    A gain in the camera's own units is no factor on the grey levels, so that `settings` does not tell it and `apply`
-    cannot set it: `controls` do.
+    A gain in the camera's own units is no factor on the grey levels: `settings` does not report it and `apply` does
+    not set it, only the constructor does.
     """
 
     dtype = np.dtype(np.uint8)
 
     def __init__(
         self,
-        source: int | str,
-        size: tuple[int, int] | None = None,
-        controls: Controls | None = None,
+        source: int | str = 0,
+        size: Sequence[int] | None = None,
+        exposure_ms: float | None = None,
+        gain: float | None = None,
+        focus: float | None = None,
+        white_balance: float | None = None,
         channel: Channel = "green",
     ) -> None:
+        """The webcam of that number, or the video at a path or an address.
+
+        `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use, or the source
+        must answer now. The settings are made when it is opened, None leaves one as it is: exposure in ms, gain and
+        focus in the camera's own units, white balance in K.
+
+        Raises InputError for invalid options, DeviceError for a source that does not answer.
+        """
+        if isinstance(source, str) and source.isdecimal():
+            source = int(source)
+        if not isinstance(source, int | str) or isinstance(source, bool) or (isinstance(source, int) and source < 0):
+            raise InputError(f"{source!r} is no camera: give a webcam's number, a video file, or an address")
+        if size is not None and (len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size)):
+            raise InputError(f"{size!r} is no size of a camera: give its width and height in px, such as [1280, 720]")
+        if channel not in get_args(Channel):
+            raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
+        if not all(value is None or math.isfinite(value) for value in (gain, focus, white_balance)):
+            raise InputError("a gain, a focus or a white balance that is no number cannot be set: give one")
         super().__init__(described(source))
         known = _IN_USE.get(source)
-        self._source, size = source, size or (known.size if known is not None else None)
-        self._connect = partial(connect, source, size)
-        self._controls, self._channel = controls or Controls(), channel
+        wanted = (size[0], size[1]) if size is not None else known.size if known is not None else None
+        self._source, self._connect = source, partial(connect, source, wanted)
+        self._exposure_ms = CameraSettings(exposure_ms).exposure_ms
+        self._gain, self._focus, self._white_balance = gain, focus, white_balance
+        self._channel = channel
         self._reader: Reader | None = None
         self._words: Dialect | None = None
         self._next: np.ndarray | None = None  # the video's picture that was read to learn its size
         self._read, self._unsettled = 0, 0
         self._said: dict[str, str] = {}
-        self.size: tuple[int, int] = size or self._probed()
+        self.size: tuple[int, int] = wanted or self._probed()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -143,22 +153,19 @@ class OpenCVCamera(Openable):
     def _prepare(self, capture: cv2.VideoCapture) -> None:
         """Set what is to be set at the start; on the reader's thread."""
         words = self._words = dialect(capture)
-        wanted = self._controls
+        controls = (self._gain, self._focus, self._white_balance)
         if words is None:
-            if self._opened().live or wanted != Controls():
+            if self._opened().live or (self._exposure_ms, *controls) != (None,) * 4:
                 self._said["controls"] = (
                     "its exposure, gain, focus and white balance cannot be set from here: set them at the camera "
                     "itself, and switch off everything automatic"
                 )
             return
         self._said |= switch_automatics_off(capture, words)
-        if wanted.exposure_ms is not None:
-            self._said["exposure"] = set_exposure(capture, words, wanted.exposure_ms)
-        for control, value, what in (
-            (cv2.CAP_PROP_GAIN, wanted.gain, "gain"),
-            (cv2.CAP_PROP_FOCUS, wanted.focus, "focus"),
-            (words.white_balance, wanted.white_balance, "white balance"),
-        ):
+        if self._exposure_ms is not None:
+            self._said["exposure"] = set_exposure(capture, words, self._exposure_ms)
+        properties = (cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FOCUS, words.white_balance)
+        for control, value, what in zip(properties, controls, ("gain", "focus", "white balance"), strict=True):
             if value is not None:
                 self._said[what] = set_value(capture, control, value, what)
         self._unsettled = SETTLING
@@ -201,41 +208,10 @@ class OpenCVCamera(Openable):
             reader.close()
 
 
-def opencv_camera(
-    source: int | str = 0,
-    size: Sequence[int] | None = None,
-    exposure_ms: float | None = None,
-    gain: float | None = None,
-    focus: float | None = None,
-    white_balance: float | None = None,
-    channel: Channel = "green",
-) -> OpenCVCamera:
-    """The webcam of that number, or what is at a path or an address.
-
-    `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use, or the source must
-    answer now to tell its own.
-    Raises InputError for options that are none, DeviceError for a source that does not answer.
-    """
-    if isinstance(source, str) and source.isdecimal():
-        source = int(source)
-    if not isinstance(source, int | str) or isinstance(source, bool) or (isinstance(source, int) and source < 0):
-        raise InputError(f"{source!r} is no camera: give a webcam's number, a video file, or an address")
-    if size is not None and (len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size)):
-        raise InputError(f"{size!r} is no size of a camera: give its width and height in px, such as [1280, 720]")
-    if channel not in get_args(Channel):
-        raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
-    for value in (gain, focus, white_balance):
-        if value is not None and not math.isfinite(value):
-            raise InputError("a gain, a focus or a white balance that is no number cannot be set: give one")
-    CameraSettings(exposure_ms)
-    controls = Controls(exposure_ms, gain, focus, white_balance)
-    return OpenCVCamera(source, None if size is None else (size[0], size[1]), controls, channel)
-
-
 DRIVER = Driver(
     "opencv",
     "a webcam, a video file, or a stream (MJPEG, RTSP)",
     needs="a camera's number, a file, or an address, as `source`",
-    camera=opencv_camera,
+    camera=OpenCVCamera,
     found=found,
 )

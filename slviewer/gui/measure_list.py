@@ -10,13 +10,14 @@ import viser
 from slviewer.gui.inputs import Choice, change
 from slviewer.gui.measure_drawing import drawn, label, lifted
 from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table, verdict_html
-from slviewer.gui.measure_section import CURSORS, SectionPlot, cursor_points, section_figure
+from slviewer.gui.measure_section import CURSORS, SectionPlot, cursor_points
 from slviewer.gui.panel import PanelContext
-from slviewer.gui.pictures import Painter, Plot
+from slviewer.gui.pictures import PLOT_PX, Painter, Plot
 from slviewer.gui.widgets import Text, link, paragraph
 from slviewer.inspection.colours import colour_limit
 from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measurements import section_lines
+from slviewer.report.measurements import section_plot
 from slviewer.session.measurements import Measurement, measurement_arrays
 from slviewer.wizard.measure_requests import TABLE
 from slviewer.wizard.snapshot import SessionView
@@ -177,7 +178,8 @@ class MeasurementList:
 
         def make() -> Any:
             cursors = cursor_points(lines, at)
-            return section_figure(measured.name, lines, cursors), cursors
+            named = dict(zip(CURSORS, cursors, strict=True))
+            return section_plot(measured.name, lines, named, width=PLOT_PX), cursors
 
         def show(made: Any) -> None:
             self._section.show(*made)

@@ -8,22 +8,15 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import PanelContext
-from slviewer.gui.pictures import PLOT_PX, Plot
+from slviewer.gui.pictures import Plot
 from slviewer.gui.widgets import Html, Text, table
 from slviewer.inspection.section import measure_cursors, nearest_on_section, radius_through
-from slviewer.report.canvas import finish_figure, new_figure, style_axes
 from slviewer.report.page import Figure
 
 CURSORS = ("A", "B", "C")
 _AT = (0.15, 0.85, 0.5)
 """Initial positions of the cursors, as shares of the section's length."""
-_COLOURS = ("#b3261e", "#1f9673", "#7b5cc4")
-_LINE = "#2270b8"
 _STEPS = 400
-_MOST_DRAWN = 2000
-_LEAST_HIGH, _MOST_HIGH = 210, 330
-_FLAT = 0.1
-"""Height over length below which heights are drawn larger, to be visible at all."""
 
 
 class SectionPlot:
@@ -95,23 +88,3 @@ def cursor_html(cursors: np.ndarray) -> Html:
     except InputError:
         rows.append(("Radius through A, C, B", "none: straight line"))
     return table(("Cursors", ""), rows)
-
-
-def section_figure(name: str, lines: list[np.ndarray], cursors: np.ndarray) -> Figure:
-    """The section's lines (k, 2) mm, with the cursors (3, 2) on them."""
-    every = np.concatenate(lines)
-    width, height = np.maximum(np.ptp(every, axis=0), 1e-6)
-    drawing = new_figure(PLOT_PX, int(np.clip(1.6 * PLOT_PX * height / width + 90, _LEAST_HIGH, _MOST_HIGH)))
-    axes = drawing.subplots()
-    style_axes(axes, "", "along, mm", "height, mm")
-    for line in lines:
-        axes.plot(*line[:: max(1, len(line) // _MOST_DRAWN)].T, color=_LINE, linewidth=1.3)
-    for cursor, text, colour in zip(cursors, CURSORS, _COLOURS, strict=True):
-        axes.axvline(cursor[0], color=colour, linewidth=0.9, linestyle=":")
-        axes.plot(*cursor, "o", color=colour, markersize=5)
-        axes.annotate(text, cursor, xytext=(4, 5), textcoords="offset points", color=colour, fontsize=10, weight="bold")
-    raised = height < _FLAT * width
-    axes.set_aspect("auto" if raised else "equal", adjustable="datalim")
-    axes.margins(y=0.15)
-    scale = "heights are enlarged" if raised else "equal scales"
-    return finish_figure(drawing, f"Section through both points and the camera; up: towards the camera; {scale}.", name)

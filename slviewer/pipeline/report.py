@@ -1,7 +1,7 @@
 """A session as one self-contained HTML file."""
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.verifications import centre_spacings, read_verification
 from slviewer.records import from_plain
 from slviewer.report.data import (
     AcceptanceView,
@@ -149,10 +150,9 @@ def _drifts(store: Session) -> list[DriftRow]:
 
 
 def _verifications(store: Session) -> tuple[list[VerificationView], list[SpacingRow]]:
-    """What was measured of planes and spheres with the calibrations as they are, as `verify/<capture>` keeps it."""
+    """The planes and spheres that were measured with the present calibrations, the first MOST_MAPS with error maps."""
     labels = store.decision("names") or {}
     views: list[VerificationView] = []
-    centres: dict[str, dict[str, np.ndarray]] = {}
     for result in numbered_results(store, "verify"):
         name = result.removeprefix("verify/")
         if store.state_of(result) != "fresh":
@@ -160,37 +160,13 @@ def _verifications(store: Session) -> tuple[list[VerificationView], list[Spacing
         meta, arrays = store.load_result(result)
         if any(scale_factor(store, model) != used for model, used in meta.get("scales", {}).items()):
             continue  # measured before its scale was corrected, or after a correction that is gone
-        figures = meta["models"]
-
-        def by_model(key: str, of: Mapping[str, Any] = figures) -> dict[str, float]:
-            return {m: np.nan if found[key] is None else float(found[key]) for m, found in of.items()}
-
-        title, rms, floor = str(labels.get(name, name)), by_model("rms_mm"), by_model("noise_floor_mm")
-        maps = {model: arrays[f"error_{model}"] for model in figures if f"error_{model}" in arrays}
-        views.append(
-            VerificationView(
-                name=title,
-                shape=meta["shape"],
-                incidence=meta["incidence"] or {},
-                points=max(int(found["points"]) for found in figures.values()),
-                set_aside={model: int(found["set_aside"]) for model, found in figures.items()},
-                coverage=by_model("coverage"),
-                rms_mm=rms,
-                noise_floor_mm=floor,
-                radius_mm=by_model("radius_mm"),
-                maps=ErrorMaps(title, maps, rms, list(floor.values())[-1]) if len(views) < MOST_MAPS else None,
-                masked=meta.get("masked", {}),
-            )
-        )
-        centres[title] = {model: np.array(centre) for model, centre in meta["centres_mm"].items()}
-    spacings = [
-        SpacingRow(
-            f"{a} to {b}", float("nan"), {m: float(np.linalg.norm(c - other[m])) for m, c in one.items() if m in other}
-        )
-        for (a, one), (b, other) in combinations(centres.items(), 2)
-        if one and other
-    ]
-    return views, spacings
+        view = read_verification(name, meta, str(labels.get(name, name)))
+        if len(views) < MOST_MAPS:
+            maps = {model: arrays[f"error_{model}"] for model in view.rms_mm if f"error_{model}" in arrays}
+            floor = list(view.noise_floor_mm.values())[-1]
+            view = replace(view, maps=ErrorMaps(view.name, maps, view.rms_mm, floor))
+        views.append(view)
+    return views, centre_spacings(views)
 
 
 def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:

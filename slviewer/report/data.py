@@ -205,7 +205,10 @@ class VerificationView:
     radius_mm: ByModel = field(default_factory=dict)
     true_radius_mm: float = float("nan")
     maps: ErrorMaps | None = None
-    masked: ByModel = field(default_factory=dict)  # share, 0 to 1, that looks where no target pose was
+    masked: ByModel = field(default_factory=dict)  # share, 0 to 1, outside the calibrated region
+    capture: str = ""
+    stale: bool = False  # measured with another calibration or scale
+    centres_mm: Mapping[str, np.ndarray] = field(default_factory=dict)  # (3,), of a sphere by model
 
 
 @dataclass(frozen=True, eq=False)

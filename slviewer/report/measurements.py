@@ -1,9 +1,10 @@
 """What was measured on scans, and how far they lie off their nominal models: tables, sections, coloured surfaces."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
 from slviewer.inspection.tolerance import DECIDED, RULE
@@ -30,7 +31,10 @@ PICTURE = (560, 420)
 LINE = "#2270b8"
 TOLERANCE = "#b3261e"
 MARKS: dict[str, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
+CURSOR_COLOURS = ("#b3261e", "#1f9673", "#7b5cc4")
 LEAST_HIGH, MOST_HIGH = 220, 460
+FLAT = 0.1
+"""Height over length of a section below which heights are enlarged, to be visible at all."""
 MOST_DRAWN = 4000
 
 
@@ -65,34 +69,38 @@ def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[Sect
         notes.append("* without the calibration's part, which this calibration does not know.")
     if body:
         items.append(Table(columns, body, "Measured on the scans", notes))
-    items += [section_plot(view) for view in sections]
+    items += [section_plot(view.name, view.lines) for view in sections]
     return Section("Measurements", "Distances, fitted shapes, and what lies between them.", items)
 
 
-def section_plot(view: SectionView) -> Figure:
-    """The lines of a section, to scale."""
-    every = np.concatenate(view.lines)
-    width, height = np.maximum(np.ptp(every, axis=0), 1e-6)
-    high = int(np.clip(FULL * height / width + 90, LEAST_HIGH, MOST_HIGH))
-    drawing = new_figure(FULL, high)
+def section_plot(
+    name: str,
+    lines: Sequence[NDArray[np.floating]],
+    cursors: Mapping[str, NDArray[np.floating]] | None = None,
+    *,
+    width: int = FULL,
+) -> Figure:
+    """The lines (k, 2) mm of a section, along and up, with named ``cursors`` (2,) mm; heights of flat ones enlarged."""
+    length, height = np.maximum(np.ptp(np.concatenate(lines), axis=0), 1e-6)
+    enlarged = height < FLAT * length
+    high = int(np.clip(width * height / length + 90, LEAST_HIGH, MOST_HIGH))
+    drawing = new_figure(width, high)
     axes = drawing.subplots()
-    style_axes(axes, view.name, "along, mm", "height, mm")
-    for line in view.lines:
-        axes.plot(*_thinned(line).T, color=LINE, linewidth=1.3)
-    # flat sections are raised, and it is said: to scale nothing would be seen of them
-    raised = FULL / high * height / width < 0.15
-    axes.set_aspect("auto" if raised else "equal", adjustable="datalim")
-    told = "heights are drawn larger than lengths" if raised else "lengths and heights are drawn alike"
+    style_axes(axes, name if cursors is None else "", "along, mm", "height, mm")
+    for line in lines:
+        axes.plot(*line[:: max(1, len(line) // MOST_DRAWN)].T, color=LINE, linewidth=1.3)
+    for (letter, cursor), colour in zip((cursors or {}).items(), CURSOR_COLOURS, strict=False):
+        axes.axvline(cursor[0], color=colour, linewidth=0.9, linestyle=":")
+        axes.plot(*cursor, "o", color=colour, markersize=5)
+        axes.annotate(letter, cursor, (4, 5), textcoords="offset points", color=colour, fontsize=10, weight="bold")
+    axes.set_aspect("auto" if enlarged else "equal", adjustable="datalim")
+    axes.margins(y=0.15)
     return finish_figure(
         drawing,
-        f"{view.name}: the surface where a plane cuts it; {told}.",
-        f"Section {view.name}, {width:.1f} mm long and {height:.2f} mm high",
+        f"{name}: section through the picked points and the camera; up: towards the camera; "
+        f"{'heights are enlarged' if enlarged else 'equal scales'}.",
+        f"Section {name}, {length:.1f} mm long and {height:.2f} mm high",
     )
-
-
-def _thinned(line: np.ndarray) -> np.ndarray:
-    """A line without the points that a picture of it cannot show."""
-    return line[:: max(1, len(line) // MOST_DRAWN)]
 
 
 def deviations_section(views: Sequence[DeviationView]) -> Section:

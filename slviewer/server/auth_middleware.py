@@ -2,16 +2,18 @@
 
 import logging
 import re
+from collections.abc import Awaitable, Callable
 from http import HTTPStatus
+from typing import NamedTuple
 from urllib.parse import parse_qsl
 
+from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from slviewer.server.access import Access, Refusal, Role
+from slviewer.server.access import Access, Refusal
 from slviewer.server.connection import Connection
 from slviewer.server.downloads import PREFIX, Downloads
 from slviewer.server.responses import harden, page_policy, respond, viser_policy
-from slviewer.server.routes import Routes
 
 logger = logging.getLogger("slviewer.server")
 
@@ -21,13 +23,20 @@ _REDIRECT = """<!doctype html><meta charset="utf-8"><title>slviewer</title><scri
 </script><noscript><a href="{path}">Open slviewer</a></noscript>"""
 
 
+class Route(NamedTuple):
+    """A page beside viser's, for the operator alone, and what talks to the browsers that open a WebSocket there."""
+
+    html: bytes
+    handler: Callable[[ServerConnection], Awaitable[None]]
+
+
 class AuthMiddleware:
     """Answers a server's requests: viser's page, our own pages and files, and who may open a WebSocket."""
 
     def __init__(
-        self, access: Access, routes: Routes, downloads: Downloads, page: bytes, scripts: tuple[str, ...]
+        self, access: Access, routes: dict[str, Route], downloads: Downloads, page: bytes, scripts: tuple[str, ...]
     ) -> None:
-        """`page` is viser's, and `scripts` the hashes of those that it may run."""
+        """`routes` by path; `page` is viser's, and `scripts` the hashes of those that it may run."""
         self._access = access
         self._routes = routes
         self._downloads = downloads
@@ -59,8 +68,11 @@ class AuthMiddleware:
                 raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
             return self._accept_token(path, query, host, "cross-site" in headers.get_all("Sec-Fetch-Site"))
         role = access.role(headers)
+        if path in self._routes and role != "operator":
+            raise Refusal(HTTPStatus.FORBIDDEN, "This link is view-only: the page is for the operator.")
         if websocket:
-            self._check_websocket(path, role)
+            if path != "/" and path not in self._routes:
+                raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
             connection.role = role
             return None
         if path == "/":
@@ -73,7 +85,12 @@ class AuthMiddleware:
             return response
         if path.startswith(PREFIX):
             return await self._download(connection, path)
-        return self._page(path, role, host)
+        if path not in self._routes:
+            raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
+        html = self._routes[path].html
+        response = respond(HTTPStatus.OK, html, "text/html; charset=utf-8")
+        harden(response.headers, page_policy(html, host))
+        return response
 
     def _accept_token(self, path: str, query: str, host: str, from_another_site: bool) -> Response:
         """Answer to the link with the token: a cookie, and the same address without it.
@@ -98,22 +115,6 @@ class AuthMiddleware:
         response.headers["Set-Cookie"] = self._access.set_cookie(role)
         return response
 
-    def _check_websocket(self, path: str, role: Role) -> None:
-        if path != "/":
-            endpoint = self._routes.endpoint_at(path)
-            if endpoint is None:
-                raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
-            _operator_only(endpoint.viewers, role)
-
-    def _page(self, path: str, role: Role, host: str) -> Response:
-        page = self._routes.page_at(path)
-        if page is None:
-            raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
-        _operator_only(page.viewers, role)
-        response = respond(HTTPStatus.OK, page.html, "text/html; charset=utf-8")
-        harden(response.headers, page_policy(page.html, host))
-        return response
-
     async def _download(self, connection: Connection, path: str) -> Response:
         opened = self._downloads.open(path)
         if opened is None:
@@ -123,8 +124,3 @@ class AuthMiddleware:
         headers["Connection"] = "close"
         with file:
             return await connection.stream(headers, file)
-
-
-def _operator_only(viewers: bool, role: Role) -> None:
-    if role != "operator" and not viewers:
-        raise Refusal(HTTPStatus.FORBIDDEN, "This link is view-only: the page is for the operator.")

@@ -9,6 +9,7 @@ from websockets.exceptions import ConnectionClosed
 
 from slviewer.devices.channel import Channel
 from slviewer.errors import InputError
+from slviewer.server.auth_middleware import Route
 from slviewer.server.secure import SafeServer
 
 PATH = "/projector"
@@ -25,8 +26,7 @@ def serve_projector(server: SafeServer, channel: Channel) -> None:
         with contextlib.suppress(ConnectionClosed):
             await _talk(connection, channel)
 
-    server.routes.page(PATH, html)
-    server.routes.websocket(PATH, handle)
+    server.routes[PATH] = Route(html.encode(), handle)
 
 
 async def _talk(connection: ServerConnection, channel: Channel) -> None:

@@ -12,13 +12,12 @@ from websockets.asyncio.server import serve as serve_websockets
 
 from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
-from slviewer.server.auth_middleware import AuthMiddleware
+from slviewer.server.auth_middleware import AuthMiddleware, Route
 from slviewer.server.binding import listen
 from slviewer.server.connection import Connection, quiet_logger
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
 from slviewer.server.responses import script_hash
-from slviewer.server.routes import Routes
 from slviewer.server.uploads import UploadBudget
 
 MESSAGE_LIMIT = 32 * 2**20
@@ -27,10 +26,10 @@ MESSAGE_LIMIT = 32 * 2**20
 
 @dataclass(frozen=True)
 class SafeServer:
-    """A running server: build the page with `viser`, add pages with `routes`, offer files with `downloads`."""
+    """A running server: build the page with `viser`, add pages by path to `routes`, offer files with `downloads`."""
 
     viser: viser.ViserServer
-    routes: Routes
+    routes: dict[str, Route]
     downloads: Downloads
     host: str
     port: int
@@ -97,7 +96,8 @@ def serve(
     address, port = sock.getsockname()[:2]
     try:
         access = Access(port, token, view_token, names)
-        routes, downloads = Routes(), Downloads()
+        routes: dict[str, Route] = {}
+        downloads = Downloads()
         scripts = (*viser_internals.VISER_SCRIPTS, script_hash(viser_internals.ONE_DRAW))
         middleware = AuthMiddleware(access, routes, downloads, viser_internals.client_page(), scripts)
         budget = UploadBudget(upload_limit)
@@ -107,9 +107,8 @@ def serve(
             async def handle(connection: ServerConnection) -> None:
                 assert isinstance(connection, Connection)
                 path = connection.request.path if connection.request else "/"
-                endpoint = routes.endpoint_at(path)
-                if endpoint is not None:
-                    await endpoint.handler(connection)
+                if path in routes:
+                    await routes[path].handler(connection)
                 elif path == "/" and started and connection.role is not None:
                     gate = connection.gate = ViserGate(started[0], connection, connection.role, budget)
                     try:

@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,9 @@ from slviewer.pipeline.models import (
     validation,
 )
 from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.verifications import centre_spacings, read_verification
 from slviewer.records import from_plain
+from slviewer.report.data import VerificationView
 from slviewer.session.capture import Capture
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
@@ -41,7 +42,6 @@ from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
 from slviewer.wizard.result_views import merge_view
 from slviewer.wizard.snapshot import (
     CalibrationView,
-    CentreDistance,
     MergeView,
     PoseState,
     PoseView,
@@ -49,7 +49,6 @@ from slviewer.wizard.snapshot import (
     ScanView,
     SessionView,
     SplinedView,
-    VerificationRow,
 )
 from slviewer.wizard.surfaces import list_nominals
 from slviewer.wizard.tasks import missing_for_splined
@@ -147,7 +146,7 @@ class SessionReader:
         factors = {model: scale_factor(session, model) for model in models}
         inputs = _Inputs(captures, session.decision("names") or {}, hashes, factors)
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
-        rows, distances = self._read_verifications(inputs)
+        verifications = self._read_verifications(inputs)
         verdict = last_verdict(session)
         of_calibration = calibration is not None and _is_verdict_of(verdict, self._meta("calibration/stereo"))
         merges = [name for name in self._results("merge/") if set(self._meta(name)["scans"]) <= set(captures)]
@@ -162,8 +161,8 @@ class SessionReader:
             calibration=calibration,
             verdict=verdict,
             verdict_of_calibration=of_calibration,
-            verifications=rows,
-            distances=distances,
+            verifications=verifications,
+            distances=tuple(centre_spacings(verifications)),
             scans=tuple(self._read_scan(c, inputs) for c in captures.values() if c.role == "scan"),
             merge=self._read_merge(merges[-1], inputs) if merges else None,
             merges=len(merges),
@@ -320,34 +319,13 @@ class SessionReader:
 
     # verifications, scans, merges, measurements
 
-    def _read_verifications(self, inputs: _Inputs) -> tuple[tuple[VerificationRow, ...], tuple[CentreDistance, ...]]:
-        rows, centres = [], {}
-        for result in self._results("verify/"):
-            name, meta = result.removeprefix("verify/"), self._meta(result)
-            if name not in inputs.captures:
-                continue
-            stale = not inputs.is_fresh(meta)
-            rows += [
-                VerificationRow(
-                    capture=name,
-                    label=str(inputs.labels.get(name, name)),
-                    shape=meta["shape"],
-                    model=model,
-                    incidence=meta["incidence"],
-                    stale=stale,
-                    masked=meta.get("masked", {}).get(model),
-                    **figures,
-                )
-                for model, figures in meta["models"].items()
-            ]
-            if not stale:
-                centres.update({(name, model): np.array(c) for model, c in meta["centres_mm"].items()})
-        distances = [
-            CentreDistance((a, b), model, float(np.linalg.norm(one - other)))
-            for ((a, model), one), ((b, same), other) in combinations(centres.items(), 2)
-            if model == same
-        ]
-        return tuple(rows), tuple(distances)
+    def _read_verifications(self, inputs: _Inputs) -> tuple[VerificationView, ...]:
+        return tuple(
+            read_verification(name, meta, str(inputs.labels.get(name, name)), not inputs.is_fresh(meta))
+            for result in self._results("verify/")
+            if (name := result.removeprefix("verify/")) in inputs.captures
+            for meta in (self._meta(result),)
+        )
 
     def _read_scan(self, capture: Capture, inputs: _Inputs) -> ScanView:
         result = f"clouds/{capture.name}"

@@ -13,6 +13,7 @@ from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.pipeline.check_results import Preflight
+from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.session.measurements import Measurement
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 
@@ -136,34 +137,6 @@ class CalibrationView:
     def refused(self) -> str:
         """Why later steps do not use it; empty where they do."""
         return "" if self.is_pinned else self.rejected
-
-
-@dataclass(frozen=True)
-class VerificationRow:
-    """One capture of a plane or a sphere, measured by one model; what is not known is None."""
-
-    capture: str
-    label: str
-    shape: Literal["plane", "sphere"]
-    model: str
-    rms_mm: float
-    noise_floor_mm: float | None
-    radius_mm: float | None
-    points: int
-    set_aside: int  # outliers excluded from the fit
-    coverage: float | None
-    incidence: Mapping[str, float] | None  # percent in R1, R2, R3
-    stale: bool
-    masked: float | None = None  # share of the shape outside the calibrated region; None: the model masks nothing
-
-
-@dataclass(frozen=True)
-class CentreDistance:
-    """The distance of two spheres' centres by one model."""
-
-    captures: tuple[str, str]
-    model: str
-    distance_mm: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,8 +271,8 @@ class SessionView:
     calibration: CalibrationView | None = None
     verdict: Verdict | None = None  # on the last attempt to calibrate, even if it gave no calibration
     verdict_of_calibration: bool = True  # whether that attempt made `calibration`
-    verifications: tuple[VerificationRow, ...] = ()
-    distances: tuple[CentreDistance, ...] = ()
+    verifications: tuple[VerificationView, ...] = ()
+    distances: tuple[SpacingRow, ...] = ()
     scans: tuple[ScanView, ...] = ()
     merge: MergeView | None = None
     merges: int = 0  # how many can be undone

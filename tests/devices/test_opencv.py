@@ -15,7 +15,7 @@ from mjpeg import NetworkCamera, network_camera
 
 from slviewer.devices.capture import take
 from slviewer.devices.drivers import driver
-from slviewer.devices.opencv import OpenCVCamera, opencv_camera
+from slviewer.devices.opencv import OpenCVCamera
 from slviewer.devices.opencv_source import listed
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig, check_index, check_level
@@ -85,12 +85,12 @@ def test_each_channel_of_a_colour_video(tmp_path):
     path = video(tmp_path / "colour.avi", [picture] * 2)
     mean = (red + green + blue) / 3
     for channel, level in (("red", red), ("green", green), ("blue", blue), ("grey", mean)):
-        with opened(opencv_camera(path, channel=channel)) as camera:
+        with opened(OpenCVCamera(path, channel=channel)) as camera:
             assert abs(grabbed(camera).astype(float) - level).max() < 4  # JPEG's own error
             assert isinstance(camera, ColourCamera)
             np.testing.assert_allclose(camera.grab_colour()[60, 80], (red, green, blue), atol=4)
     grey = video(tmp_path / "grey.avi", [coded(5)])
-    with opened(opencv_camera(grey)) as camera:
+    with opened(OpenCVCamera(grey)) as camera:
         colours = camera.grab_colour().astype(int)
         assert colours.shape == (120, 160, 3) and np.ptp(colours, axis=2).max() < 3
 
@@ -101,7 +101,7 @@ def test_each_channel_of_a_colour_video(tmp_path):
 def test_no_grab_returns_an_older_picture():
     rng = np.random.default_rng(1)
     waits = []
-    with network_camera(coded(0), FPS) as seen, opened(opencv_camera(seen.url, SIZE)) as camera:
+    with network_camera(coded(0), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
         for k in range(1, 13):
             time.sleep(0.8 if k == 8 else rng.uniform(0, 0.08))  # a second in which nobody asks
             seen.picture = coded(k)
@@ -113,7 +113,7 @@ def test_no_grab_returns_an_older_picture():
 
 def test_pictures_that_come_in_clumps_are_never_taken_for_new_ones():
     rng = np.random.default_rng(2)
-    with network_camera(coded(0), FPS, clump=3) as seen, opened(opencv_camera(seen.url, SIZE)) as camera:
+    with network_camera(coded(0), FPS, clump=3) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
         for k in range(1, 6):
             time.sleep(rng.uniform(0, 0.1))
             seen.picture = coded(k)
@@ -143,7 +143,7 @@ class Painter(Openable):
 def test_every_frame_of_a_capture_is_of_its_pattern():
     sequence = gray(Painter.size)
     with network_camera(coded(255), FPS) as seen:
-        rig = Rig("painted", opencv_camera(seen.url, SIZE), Painter(seen))
+        rig = Rig("painted", OpenCVCamera(seen.url, SIZE), Painter(seen))
         with rig.opened():
             taken = take(rig, sequence)
             assert [number(frame) for frame in taken.frames] == list(range(len(sequence.frames)))
@@ -151,14 +151,14 @@ def test_every_frame_of_a_capture_is_of_its_pattern():
 
 
 def test_a_stream_says_that_its_settings_are_its_own():
-    with network_camera(coded(1)) as seen, opened(opencv_camera(seen.url, SIZE, exposure_ms=5.0)) as camera:
+    with network_camera(coded(1)) as seen, opened(OpenCVCamera(seen.url, SIZE, exposure_ms=5.0)) as camera:
         (note,) = camera.notes
         assert "secret" not in note + camera.name and camera.name == "the stream 127.0.0.1/video"
         assert "exposure" in note
 
 
 def test_a_stream_that_stalls_is_told_and_comes_back():
-    with network_camera(coded(1), FPS) as seen, opened(opencv_camera(seen.url, SIZE)) as camera:
+    with network_camera(coded(1), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
         seen.going.clear()
         asked = time.monotonic()
         with pytest.raises(DeviceError, match=r"127\.0\.0\.1/video"):
@@ -177,7 +177,7 @@ def test_a_stream_that_stalls_is_told_and_comes_back():
 
 def test_a_camera_that_is_gone_is_told_and_works_once_it_is_back():
     with network_camera(coded(1), FPS) as seen:
-        camera = opencv_camera(seen.url, SIZE)
+        camera = OpenCVCamera(seen.url, SIZE)
         camera.open()
         port = seen.port
     asked = time.monotonic()
@@ -196,7 +196,7 @@ def test_a_camera_that_is_gone_is_told_and_works_once_it_is_back():
 def test_another_size_is_told():
     words = "160 x 120 px instead of 320 x 240: choose 160 x 120"
     with network_camera(coded(1)) as seen, pytest.raises(DeviceError, match=words):
-        opencv_camera(seen.url, (320, 240)).open()
+        OpenCVCamera(seen.url, (320, 240)).open()
 
 
 # what does not answer
@@ -219,9 +219,9 @@ def test_what_does_not_answer_is_told_within_seconds_and_in_one_sentence(tmp_pat
         ):
             begun = time.monotonic()
             with pytest.raises(DeviceError, match=words):
-                opencv_camera(source)
+                OpenCVCamera(source)
             assert time.monotonic() - begun < 3.5, source
-    camera = opencv_camera("63", SIZE)  # with its size given, it may be plugged in later
+    camera = OpenCVCamera("63", SIZE)  # with its size given, it may be plugged in later
     with pytest.raises(DeviceError, match="camera 63"):
         camera.open()
     camera.close()
@@ -229,10 +229,10 @@ def test_what_does_not_answer_is_told_within_seconds_and_in_one_sentence(tmp_pat
 
 def test_the_libraries_keep_quiet(tmp_path):
     script = (
-        "from slviewer.devices.opencv import opencv_camera\n"
+        "from slviewer.devices.opencv import OpenCVCamera\n"
         "from slviewer.errors import DeviceError\n"
         "for source in (63, 'http://127.0.0.1:9/', 'no.avi'):\n"
-        "    try: opencv_camera(source)\n"
+        "    try: OpenCVCamera(source)\n"
         "    except DeviceError as error: print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=30, check=True)
@@ -253,7 +253,7 @@ def test_the_libraries_keep_quiet(tmp_path):
 )
 def test_options_that_cannot_be_are_refused(options):
     with pytest.raises(InputError):
-        opencv_camera(**options)
+        OpenCVCamera(**options)
 
 
 def test_webcams_are_listed_by_their_names(tmp_path):
@@ -285,20 +285,20 @@ class _OneAtATime(NetworkCamera):
 def test_a_camera_in_use_is_chosen_once_more_and_taken_over():
     server = _OneAtATime(np.full(SIZE[::-1], 100, np.uint8), FPS)
     try:
-        first = opencv_camera(server.url)
+        first = OpenCVCamera(server.url)
         assert until(lambda: not server.busy)
         with opened(first):
-            second = opencv_camera(server.url)
+            second = OpenCVCamera(server.url)
             assert second.size == SIZE
             with pytest.raises(DeviceError):
                 second.open()
-            assert opencv_camera(server.url).size == SIZE  # the first one has it still
+            assert OpenCVCamera(server.url).size == SIZE  # the first one has it still
         assert until(lambda: not server.busy)
         with opened(second):
             assert abs(int(grabbed(second).mean()) - 100) < 5
         server.die()
         with pytest.raises(DeviceError):
-            opencv_camera(server.url)
+            OpenCVCamera(server.url)
     finally:
         if not server.dead:
             server.die()

@@ -9,7 +9,7 @@ import pytest
 from mjpeg import network_camera
 
 from slviewer.devices import opencv as opencv_module
-from slviewer.devices.opencv import opencv_camera
+from slviewer.devices.opencv import OpenCVCamera
 from slviewer.devices.opencv_controls import dialect, exposure_ms, set_exposure, switch_automatics_off
 from slviewer.devices.opencv_reader import Connected, Pace
 from slviewer.devices.opencv_source import connect
@@ -101,7 +101,7 @@ def plugged(monkeypatch):
 def test_a_webcam_is_set_and_read_back_and_its_automatics_are_switched_off(plugged):
     controls = dict(V4L2)
     plugged(controls)
-    camera = opencv_camera(0, SIZE, exposure_ms=20.0, gain=32, focus=40)
+    camera = OpenCVCamera(0, SIZE, exposure_ms=20.0, gain=32, focus=40)
     camera.open()
     try:
         assert camera.notes == () and camera.settings() == CameraSettings(20.0)
@@ -128,7 +128,7 @@ def test_a_webcam_is_set_and_read_back_and_its_automatics_are_switched_off(plugg
 
 def test_what_a_webcam_ignores_is_said(plugged):
     plugged(dict(V4L2), stubborn=(cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_EXPOSURE))
-    camera = opencv_camera(0, SIZE, exposure_ms=5.0, focus=40, white_balance=4600)
+    camera = OpenCVCamera(0, SIZE, exposure_ms=5.0, focus=40, white_balance=4600)
     camera.open()
     try:
         said = "; ".join(camera.notes)
@@ -151,7 +151,7 @@ def test_a_camera_without_colour_is_read_as_it_is(monkeypatch):
         monkeypatch.setattr(
             opencv_module, "connect", lambda *_: Connected(Grey(connect(seen.url, None).capture, "V4L2", {}), live=True)
         )
-        camera = opencv_camera(0, SIZE)
+        camera = OpenCVCamera(0, SIZE)
         camera.open()
         try:
             out = np.zeros((120, 160), np.uint8)

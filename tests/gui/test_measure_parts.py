@@ -7,7 +7,7 @@ import pytest
 
 from slviewer.gui.measure_drawing import drawn, format_quantity, label, lifted
 from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table, verdict_html
-from slviewer.gui.measure_section import cursor_html, cursor_points, section_figure
+from slviewer.gui.measure_section import cursor_html, cursor_points
 from slviewer.gui.measure_surface import painting
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
 from slviewer.inspection.features import Feature
@@ -15,6 +15,7 @@ from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.records import to_plain
+from slviewer.report.measurements import section_plot
 from slviewer.session.measurements import Measurement
 from slviewer.wizard.surfaces import place_at
 
@@ -91,9 +92,9 @@ def test_a_section_is_read_off_at_its_cursors() -> None:
     words = text(cursor_html(cursors))
     assert "80.000 mm" in words and "50.000 mm" in words and "0.000 mm" in words
     assert "straight line" in text(cursor_html(np.array([[0.0, 0], [2, 0], [1, 0]])))
-    assert "equal scales" in section_figure("s", [arc], cursors).caption
+    assert "equal scales" in section_plot("s", [arc], dict(zip("ABC", cursors, strict=True))).caption
     flat = arc * [1, 0.01]
-    assert "heights are enlarged" in section_figure("s", [flat], cursor_points([flat], (10.0, 90.0, 50.0))).caption
+    assert "heights are enlarged" in section_plot("s", [flat]).caption
     cut = made("section", [], plane=to_plain(plane))
     segments, place = drawn(cut, {}, [arc])  # type: ignore[misc]
     assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(449)  # the highest point, a little off

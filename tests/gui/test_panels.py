@@ -27,6 +27,7 @@ from slviewer.gui.steps.verify import distances_table, results_table, shape_of
 from slviewer.gui.widgets import colour_range, report_table
 from slviewer.pipeline.calibration_verdict import save_verdict
 from slviewer.pipeline.measurements import quantities_of
+from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.report.quality import comparison_table
 from slviewer.session.measurements import Measurement
 from slviewer.session.ply import read_ply
@@ -34,7 +35,7 @@ from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import ScanCloud
-from slviewer.wizard.snapshot import CentreDistance, ScanView, VerificationRow
+from slviewer.wizard.snapshot import ScanView
 
 REJECTED = Verdict.of(
     [Finding("moved", "rejected", "pose_03 moved by 0.9 px", "hold the <b>board</b> still", ("pose_03",))]
@@ -402,16 +403,17 @@ def test_what_a_capture_was_taken_for() -> None:
 
 
 def test_tables_escape_names_and_mark_the_best() -> None:
-    def row(model: str, rms: float, shape: str = "plane", radius: float | None = None) -> VerificationRow:
-        return VerificationRow(
-            "c1", "<img src=x>", shape, model, rms, 0.03, radius, 100, 1, 0.99, {"R1": 0, "R2": 90, "R3": 10}, False
+    def view(rms: dict[str, float], shape: str = "plane", radius: float = np.nan) -> VerificationView:
+        each = {model: 0.03 for model in rms}
+        return VerificationView(
+            "<img src=x>", shape, {"R1": 0, "R2": 90, "R3": 10}, 100, each, each, rms, each, dict.fromkeys(rms, radius)
         )  # type: ignore[arg-type]
 
-    html = results_table([row("stereo", 0.2), row("pixelwise", 0.1)])
+    html = results_table([view({"stereo": 0.2, "pixelwise": 0.1})])
     assert "<img" not in html and html.index("0&#46;200") < html.index("0&#46;100")
     assert re.search(r"font-weight:600\">0&#46;100", html) and "0&#47;90&#47;10" in html
-    assert "97&#46;90" in results_table([row("stereo", 0.2, "sphere", 97.9)])
-    assert distances_table([CentreDistance(("a", "b"), "stereo", 12.5)]).count("12&#46;500") == 1
+    assert "97&#46;90" in results_table([view({"stereo": 0.2}, "sphere", 97.9)])
+    assert distances_table([SpacingRow("a to b", np.nan, {"stereo": 12.5})]).count("12&#46;500") == 1
     assert distances_table([]) == results_table([]) == ""
 
 

@@ -34,7 +34,7 @@ def channel(server: SafeServer) -> Iterator[Channel]:
     channel = Channel()
     serve_projector(server, channel)
     yield channel
-    server.routes.remove(PATH)
+    del server.routes[PATH]
 
 
 @pytest.fixture

@@ -65,12 +65,11 @@ def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) ->
     assert splined is not None and splined.summary["noise_px"]["x"] < 0.03
     assert splined.summary["cells_lit"]["camera"] > 0.8
     assert set(splined.weights) == set(calibration.stereo.poses) and not splined.summary["left_out"]
-    rows = {(row.capture, row.model): row for row in session.verifications}
-    assert rows["plane_01", "splined"].rms_mm < rows["plane_01", "pixelwise"].rms_mm
-    assert rows["plane_01", "splined"].masked is not None and rows["plane_01", "stereo"].masked is None
-    assert rows["plane_01", "pixelwise"].rms_mm < rows["plane_01", "stereo"].rms_mm < 0.5
-    assert rows["plane_01", "pixelwise"].noise_floor_mm < rows["plane_01", "pixelwise"].rms_mm  # type: ignore[operator]
-    assert rows["sphere_01", "pixelwise"].radius_mm == pytest.approx(98, abs=0.5)
+    plane, sphere = ({v.capture: v for v in session.verifications}[name] for name in ("plane_01", "sphere_01"))
+    assert plane.rms_mm["splined"] < plane.rms_mm["pixelwise"] < plane.rms_mm["stereo"] < 0.5
+    assert "splined" in plane.masked and "stereo" not in plane.masked
+    assert plane.noise_floor_mm["pixelwise"] < plane.rms_mm["pixelwise"]
+    assert sphere.radius_mm["pixelwise"] == pytest.approx(98, abs=0.5)
     merge = session.merge
     assert merge is not None and set(merge.pairs) == {"scan_01", "scan_02"} and merge.reference == "scan_03"
     assert all(0.01 < rms < 0.5 and overlap > 0.5 for rms, overlap, _ in merge.pairs.values())
@@ -192,7 +191,7 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     session = session_of(operator.wait_until_idle())
     assert session.calibration is not None and session.calibration.chosen == "splined"
     assert session.calibration.scales == {"splined": "scale corrected by +1000 ppm, by certificate lab 7"}
-    assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
+    assert {scan.cloud for scan in session.scans} == {"stale"} and all(view.stale for view in session.verifications)
     assert operator.reconstruct("scan_02")
     scan = operator.wait_until_idle().scan("scan_02")
     assert scan is not None and scan.cloud == "fresh" and scan.scale.startswith("scale corrected by +1000 ppm")
@@ -218,7 +217,7 @@ def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     )
     assert session.calibration.models == ("stereo", "pixelwise")  # what was made of other poses is gone
     assert any("it needs 8 target poses" in notice.text for notice in again.notices)
-    assert {scan.cloud for scan in session.scans} == {"stale"} and all(row.stale for row in session.verifications)
+    assert {scan.cloud for scan in session.scans} == {"stale"} and all(view.stale for view in session.verifications)
     assert session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
     assert again.pose("pose_02").state == "excluded"  # type: ignore[union-attr]
     assert operator.reconstruct("scan_01")

@@ -183,8 +183,8 @@ class Panel(StepPanel):
             if scan.cloud == "absent":
                 self._clear_cloud()
                 return
-            rows = session.verifications if session else ()
-            verified = tuple(row.rms_mm for row in rows if row.capture == scan.name)
+            views = session.verifications if session else ()
+            verified = tuple(mm for view in views if view.capture == scan.name for mm in view.rms_mm.values())
             key = (scan.name, scan.model, scan.points, scan.noise_mm, verified)
             colour = self._colour.value
 

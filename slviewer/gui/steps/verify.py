@@ -11,18 +11,18 @@ from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.preview import draw_preview, exposure_html, legend
 from slviewer.gui.simulated_object import SimulatedObject
-from slviewer.gui.widgets import Html, Picture, Text, colour_bar, coloured, colours, link, paragraph, table, to_html
+from slviewer.gui.widgets import Html, Picture, Text, colour_bar, coloured, colours, link, paragraph, table
 from slviewer.pipeline.verify import Shape
+from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.report.maps import error_limit, error_maps
 from slviewer.report.page import Figure
+from slviewer.report.tables import models_of
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import (
-    CentreDistance,
     PreviewView,
     ScanView,
     SessionView,
     Snapshot,
-    VerificationRow,
 )
 
 LAYER = "verify"
@@ -100,7 +100,7 @@ class Panel(StepPanel):
             rows = session.verifications
             for folder in (self._result_folder, self._table_folder):
                 change(folder, visible=bool(rows))
-            labels = {row.capture: row.label for row in rows}
+            labels = {row.capture: row.name for row in rows}
             self._result.offer([(name, display_name(name, label)) for name, label in labels.items()])
             if new := [name for name in labels if name not in self._measured]:
                 if self._measured:  # show what was just measured
@@ -141,20 +141,21 @@ class Panel(StepPanel):
         with self._lock:
             session = self._snapshot.session if self._snapshot else None
             name = self._result.value
-            rows = [row for row in session.verifications if row.capture == name] if session else []
-            if not rows:
+            view = next((each for each in session.verifications if each.capture == name), None) if session else None
+            if view is None:
                 return
-            self._model.offer([(row.model, row.model) for row in rows], rows[-1].model)
-            self._figures.set(verification_html(rows))
-            context, key = self._context, (name, tuple((row.model, row.rms_mm) for row in rows))
+            models = list(view.rms_mm)
+            self._model.offer([(model, model) for model in models], models[-1])
+            self._figures.set(verification_html(view))
+            context, key = self._context, (name, tuple(view.rms_mm.items()))
             self._painter.request(
-                "maps", key, lambda: _maps(result_views.error_maps(context.session, name), rows), self._maps.set
+                "maps", key, lambda: _maps(result_views.error_maps(context.session, name), view), self._maps.set
             )
             model = self._model.value
             self._painter.request(
                 "cloud",
                 (key, model),
-                lambda: (result_views.scan_cloud(context.session, name), model, rows[0].shape),
+                lambda: (result_views.scan_cloud(context.session, name), model, view.shape),
                 self._draw_cloud,
             )
 
@@ -186,7 +187,7 @@ class Panel(StepPanel):
 
 def _not_measured(session: SessionView) -> list[ScanView]:
     """Captures without an up-to-date verification."""
-    measured = {row.capture for row in session.verifications if not row.stale}
+    measured = {view.capture for view in session.verifications if not view.stale}
     return [scan for scan in session.scans if scan.name not in measured]
 
 
@@ -197,96 +198,79 @@ def shape_of(scan: ScanView) -> str:
     return next((shape for shape in ("plane", "sphere") if scan.name.lower().startswith(shape)), "scan")
 
 
-def verification_html(rows: Sequence[VerificationRow]) -> Html:
+def verification_html(view: VerificationView) -> Html:
     """One capture's figures: each model's RMS beside the noise floor."""
-    sphere = rows[0].shape == "sphere"
-    best = min(rows, key=lambda row: row.rms_mm)
+    sphere = view.shape == "sphere"
+    best = min(view.rms_mm, key=lambda model: view.rms_mm[model])
     lines: list[list[object]] = []
-    for row in rows:
-        outliers = row.set_aside / max(row.points, 1)
+    for model, rms_mm in view.rms_mm.items():
+        outliers = view.set_aside[model] / max(view.points, 1)
         lines.append(
             [
-                row.model,
-                coloured(f"{row.rms_mm:.3f}", "good" if row is best else "plain", bold=row is best),
-                _mm(row.noise_floor_mm),
-                *([_mm(row.radius_mm)] if sphere else []),
+                model,
+                coloured(f"{rms_mm:.3f}", "good" if model == best else "plain", bold=model == best),
+                _format(view.noise_floor_mm[model]),
+                *([_format(view.radius_mm[model])] if sphere else []),
                 coloured(f"{100 * outliers:.1f}", "warning" if outliers > MANY_OUTLIERS else "plain"),
-                "–" if row.coverage is None else f"{100 * row.coverage:.1f}",
+                _format(100 * view.coverage[model], 1),
             ]
         )
     titles = ["Model", "RMS, mm", "Noise floor, mm", *(["Radius, mm"] if sphere else []), "Outliers, %", "Coverage, %"]
     html = table(titles, lines)
-    if rows[0].incidence is not None:
-        shares = ", ".join(f"{region} {share:.0f} %" for region, share in rows[0].incidence.items())
+    if view.incidence:
+        shares = ", ".join(f"{region} {share:.0f} %" for region, share in view.incidence.items())
         html += paragraph(f"Depth ranges: {shares}")
-    for row in rows:
-        if row.masked and row.masked > 0.0005:
-            text = f"{row.model}: {100 * row.masked:.1f} % masked, outside the calibrated region."
-            html += paragraph(coloured(text, "warning" if row.masked > MUCH_MASKED else "dim"))
-    if any(row.stale for row in rows):
+    for model, masked in view.masked.items():
+        if masked and masked > 0.0005:
+            text = f"{model}: {100 * masked:.1f} % masked, outside the calibrated region."
+            html += paragraph(coloured(text, "warning" if masked > MUCH_MASKED else "dim"))
+    if view.stale:
         html += paragraph(coloured("Measured with an older calibration: measure it again.", "warning"))
     return Html(html)
 
 
-def results_table(rows: Sequence[VerificationRow]) -> str:
+def results_table(views: Sequence[VerificationView]) -> str:
     """Planes, then spheres: one line per capture, one column per model, the best in bold."""
     html = ""
     for shape in ("plane", "sphere"):
-        of_shape = [row for row in rows if row.shape == shape]
+        of_shape = [view for view in views if view.shape == shape]
         if not of_shape:
             continue
-        models = tuple(dict.fromkeys(row.model for row in of_shape))
-        by_capture: dict[str, dict[str, VerificationRow]] = {}
-        for row in of_shape:
-            by_capture.setdefault(row.capture, {})[row.model] = row
+        models = models_of([view.rms_mm for view in of_shape])
         lines: list[list[object]] = []
-        for results in by_capture.values():
-            first, best = next(iter(results.values())), min(results.values(), key=lambda row: row.rms_mm)
-            title = coloured(first.label + " (stale)" * first.stale, "warning" if first.stale else "plain")
-            cells = [
-                coloured(_mm(row.rms_mm if row else None), "good" if row is best else "plain", bold=row is best)
-                for row in map(results.get, models)
-            ]
-            lines.append([title, _shares(first.incidence), *cells, _mm(first.noise_floor_mm)])
+        for view in of_shape:
+            least = min(view.rms_mm.values())
+            title = coloured(view.name + " (stale)" * view.stale, "warning" if view.stale else "plain")
+            rms = [view.rms_mm.get(model, np.nan) for model in models]
+            cells = [coloured(_format(mm), "good" if mm == least else "plain", bold=mm == least) for mm in rms]
+            shares = "/".join(f"{view.incidence.get(r, 0.0):.0f}" for r in ("R1", "R2", "R3"))
+            lines.append(
+                [title, shares if view.incidence else "–", *cells, _format(next(iter(view.noise_floor_mm.values())))]
+            )
         html += table([f"{shape.capitalize()} RMS, mm", "R1/R2/R3, %", *models, "Noise floor"], lines)
         if shape == "sphere":
-            radii = [
-                [
-                    next(iter(results.values())).label,
-                    *(_mm(row.radius_mm if row else None) for row in map(results.get, models)),
-                ]
-                for results in by_capture.values()
-            ]
-            html += table(["Radius, mm", *models], radii)
+            html += _table_by_model("Radius, mm", models, {view.name: view.radius_mm for view in of_shape})
     return html
 
 
-def distances_table(distances: Sequence[CentreDistance]) -> str:
+def distances_table(distances: Sequence[SpacingRow]) -> str:
     """The distances of the spheres' centres by each model."""
-    if not distances:
-        return ""
-    models = tuple(dict.fromkeys(each.model for each in distances))
-    pairs: dict[tuple[str, str], dict[str, float]] = {}
-    for each in distances:
-        pairs.setdefault(each.captures, {})[each.model] = each.distance_mm
-    lines = [[f"{a} – {b}", *(_mm(by_model.get(model)) for model in models)] for (a, b), by_model in pairs.items()]
-    return table(["Centre distance, mm", *models], lines)
+    measured = {each.name: each.measured_mm for each in distances}
+    return _table_by_model("Centre distance, mm", models_of(list(measured.values())), measured) if measured else ""
 
 
-def _maps(maps: Mapping[str, np.ndarray], rows: Sequence[VerificationRow]) -> Figure:
-    rms = {row.model: row.rms_mm for row in rows}
-    floors = [row.noise_floor_mm for row in rows if row.noise_floor_mm is not None]
-    shown = {model: maps[model] for model in rms if model in maps}
-    title = display_name(rows[0].capture, rows[0].label)
-    floor = floors[-1] if floors else float("nan")
-    return error_maps(title, shown, rms, floor, width=PLOT_PX, sign=_SIGN[rows[0].shape])
+def _table_by_model(title: str, models: Sequence[str], values: Mapping[str, Mapping[str, float]]) -> Html:
+    """A line per name with a value of each model."""
+    rows = [[name, *(_format(each.get(model, np.nan)) for model in models)] for name, each in values.items()]
+    return table([title, *models], rows)
 
 
-def _mm(value: float | None) -> str:
-    return "–" if value is None or not np.isfinite(value) else f"{value:.3f}"
+def _maps(maps: Mapping[str, np.ndarray], view: VerificationView) -> Figure:
+    shown = {model: maps[model] for model in view.rms_mm if model in maps}
+    floor = list(view.noise_floor_mm.values())[-1]
+    title = display_name(view.capture, view.name)
+    return error_maps(title, shown, view.rms_mm, floor, width=PLOT_PX, sign=_SIGN[view.shape])
 
 
-def _shares(incidence: Mapping[str, float] | None) -> Html:
-    if incidence is None:
-        return to_html("–")
-    return to_html("/".join(f"{incidence.get(region, 0.0):.0f}" for region in ("R1", "R2", "R3")))
+def _format(value: float, digits: int = 3) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
