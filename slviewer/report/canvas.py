@@ -6,10 +6,9 @@ matplotlib is used through its objects alone (no pyplot, no rcParams), so that r
 import threading
 from typing import Any
 
-import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from slviewer.errors import InputError
 from slviewer.report.page import Figure
 
 FULL = 1080
@@ -91,25 +90,21 @@ def colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) 
     bar.outline.set_visible(False)
 
 
-def shrink_map(image: np.ndarray, width: int) -> np.ndarray:
-    """(h, w) float averaged over squares of whole pixels until it is at most ``width`` wide.
+def draw_map(axes: Any, image: NDArray[np.floating], colours: str, levels: int, low: float, high: float) -> Any:
+    """Draw a map (h, w), grey where NaN, in so many levels of a colour map from ``low`` to ``high``; returns the image.
 
-    A square is NaN where fewer than half of its pixels are finite.
+    Maps that are finer than the figure are averaged.
     """
-    if image.ndim != 2:
-        raise InputError(f"an image of shape {image.shape} cannot be drawn as a map: (h, w) is needed")
-    factor = -(-image.shape[1] // width)
-    if factor <= 1:
-        return image
-    h, w = (-(-size // factor) for size in image.shape)
-    padded = np.full((h * factor, w * factor), np.nan, np.float32)
-    padded[: image.shape[0], : image.shape[1]] = image
-    finite = np.isfinite(padded)
-    share = cv2.resize(finite.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
-    mean = cv2.resize(np.where(finite, padded, np.float32(0)), (w, h), interpolation=cv2.INTER_AREA)
-    out = np.full((h, w), np.nan, np.float32)
-    np.divide(mean, share, out=out, where=share > 0.499)
-    return out
+    from matplotlib import colormaps
+
+    return axes.imshow(
+        np.ma.masked_invalid(image),
+        cmap=colormaps[colours].resampled(levels).with_extremes(bad=EMPTY),
+        vmin=low,
+        vmax=high,
+        interpolation="auto",
+        interpolation_stage="rgba",
+    )
 
 
 def round_up(value: float) -> float:

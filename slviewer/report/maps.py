@@ -7,21 +7,19 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.report.canvas import (
-    DENSITY,
-    EMPTY,
     FULL,
     HALF,
     INK,
     SOFT,
     TITLE_PT,
     colour_bar,
+    draw_map,
     finish_figure,
     legend,
     model_colour,
     new_figure,
     percentile,
     round_up,
-    shrink_map,
     style_axes,
     style_image_axes,
 )
@@ -53,14 +51,7 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
     for axes, name, rms, median in zip(places, "zxy", rms_mm, medians, strict=True):
         top = round_up(percentile(rms, 99))
         style_image_axes(axes, f"{name}: {_median(median)}")
-        image = axes.imshow(
-            _shown(rms, width if narrow else width // 3),
-            cmap=_map("viridis", 100),
-            vmin=0,
-            vmax=top,
-            aspect="equal",
-            interpolation="nearest",
-        )
+        image = draw_map(axes, rms, "viridis", 100, 0, top)
         colour_bar(drawing, image, axes, "" if narrow and name != "z" else "RMS of the fit, mm", extend="max")
     named = f" along axis {axis}" if axis else ""
     return finish_figure(
@@ -100,14 +91,7 @@ def error_maps(
         style_image_axes(
             ax, f"{model}: {'RMS ' if map_width > WIDE_PX else ''}{rms_mm[model]:.3f} mm", model_colour(model)
         )
-        image = ax.imshow(
-            _shown(errors, map_width),
-            cmap=_map("RdBu_r", 101),
-            vmin=-limit,
-            vmax=limit,
-            aspect="equal",
-            interpolation="nearest",
-        )
+        image = draw_map(ax, errors, "RdBu_r", 101, -limit, limit)
     colour_bar(drawing, image, axes, "error, mm", extend="both")
     _histogram(histogram, cropped, rms_mm, floor_mm, limit)
     said = ", ".join(f"{model} {rms_mm[model]:.3f} mm" for model in maps)
@@ -188,17 +172,6 @@ def _box(maps: list[np.ndarray]) -> tuple[slice, slice]:
         margin = max(2, (hit[-1] - hit[0]) // 50)
         spans.append(slice(max(hit[0] - margin, 0), hit[-1] + margin + 1))
     return spans[0], spans[1]
-
-
-def _shown(image: np.ndarray, width: int) -> np.ma.MaskedArray:
-    """As fine as it will be drawn, invalid pixels masked."""
-    return np.ma.masked_invalid(shrink_map(image, DENSITY * width))
-
-
-def _map(name: str, levels: int) -> Any:
-    from matplotlib import colormaps
-
-    return colormaps[name].resampled(levels).with_extremes(bad=EMPTY)
 
 
 def _median(value: float) -> str:

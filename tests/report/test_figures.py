@@ -12,7 +12,7 @@ from PIL import Image
 from slviewer.errors import InputError
 from slviewer.report import maps
 from slviewer.report.bars import rms_bars
-from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up, shrink_map
+from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up
 from slviewer.report.clouds import draw_clouds, draw_merged_cloud
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CloudView, PixelCurve
@@ -105,14 +105,7 @@ def test_nothing_measured_is_drawn_as_nothing() -> None:
     opened(draw_merged_cloud(CloudView("nothing", np.zeros((0, 3), np.float32))))
 
 
-def test_shrinking_keeps_means_and_holes() -> None:
-    image = np.random.default_rng(1).normal(size=(300, 401)).astype(np.float32)
-    image[:, :30] = np.nan
-    small = shrink_map(image, 101)
-    assert small.shape == (75, 101)
-    assert np.isnan(small[:, :7]).all() and np.isfinite(small[:, 8:100]).all()
-    assert small[10, 50] == pytest.approx(image[40:44, 200:204].mean(), abs=1e-6)
-    assert shrink_map(image, 401) is image
+def test_scales_end_at_round_values() -> None:
     assert [round_up(v) for v in (0.011, 0.4, 7, 0.95, float("nan"))] == pytest.approx([0.015, 0.4, 8, 1, 1])
 
 
@@ -165,7 +158,6 @@ def test_clouds_are_counted() -> None:
         lambda: residual_arrows("t", np.zeros((3, 2)), np.zeros((4, 2)), (10, 10)),
         lambda: pose_bars({}, {}),
         lambda: rms_bars([]),
-        lambda: shrink_map(np.zeros((2, 2, 3)), 1),
         lambda: pixel_curves(PixelCurve((0, 0), "x", *(np.zeros(n) for n in (3, 4, 3, 3, 5, 3)))),
     ],
 )
