@@ -17,7 +17,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibration_verdict import last_verdict
 from slviewer.pipeline.check import history
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.measurements import measurements, quantities_of, section_lines
+from slviewer.pipeline.measurements import measurements, section_lines
 from slviewer.pipeline.models import (
     available,
     load_model,
@@ -37,15 +37,12 @@ from slviewer.report.data import (
     AcceptanceView,
     CalibrationFigures,
     CaptureRow,
-    DeviationView,
     DriftRow,
     ErrorMaps,
-    MeasurementRow,
     ModelsView,
     PixelCurve,
     PixelFitView,
     PoseResiduals,
-    SectionView,
     SessionData,
     SpacingRow,
     VerificationView,
@@ -53,7 +50,7 @@ from slviewer.report.data import (
 from slviewer.report.page import write_page
 from slviewer.report.session import session_headlines, session_sections, session_title
 from slviewer.session.capture import Capture
-from slviewer.session.measurements import Measurement, measurement_arrays
+from slviewer.session.measurements import measurement_arrays
 from slviewer.session.store import Session
 
 MOST_MAPS = 8
@@ -240,29 +237,7 @@ def measured_views(store: Session) -> dict[str, Any]:
     sections = [each for each in every if each.kind == "section"]
     deviations = [each for each in every if each.kind == "deviation"]
     return {
-        "measurements": [_row(each) for each in every if each.kind != "deviation"],
-        "sections": [SectionView(each.name, section_lines(store, each.id)[1]) for each in sections[-MOST_DRAWN:]],
-        "deviations": [_deviation(store, each) for each in deviations[-MOST_DRAWN:]],
+        "measurements": [each for each in every if each.kind != "deviation"],
+        "sections": [(each.name, section_lines(store, each.id)[1]) for each in sections[-MOST_DRAWN:]],
+        "deviations": [(each, measurement_arrays(store, each.id)) for each in deviations[-MOST_DRAWN:]],
     }
-
-
-def _row(measured: Measurement) -> MeasurementRow:
-    data = measured.data
-    where = data.get("where", "")
-    if "between" in data:
-        where = " and ".join(data["between"])
-    notes = tuple(data["fit"]["warnings"]) if "fit" in data else ()
-    quantities = quantities_of(measured)
-    return MeasurementRow(measured.name, measured.kind, measured.source, quantities, where, notes, measured.stale)
-
-
-def _deviation(store: Session, measured: Measurement) -> DeviationView:
-    arrays = measurement_arrays(store, measured.id)
-    return DeviationView(
-        name=measured.name,
-        source=measured.source,
-        nominal=measured.data["nominal"]["name"],
-        found=measured.data,
-        stale=measured.stale,
-        **arrays,
-    )

@@ -14,7 +14,7 @@ from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.drift.check import Drift
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation
-from slviewer.inspection.quantities import Quantity
+from slviewer.session.measurements import Measurement
 
 ByModel = Mapping[str, float]
 """One value a model, such as ``{"stereo": 0.198, "pixelwise": 0.076}``."""
@@ -242,52 +242,12 @@ class DriftRow:
     current: bool = True
 
 
-@dataclass(frozen=True)
-class MeasurementRow:
-    """A distance, a fit, an angle, … on the scan ``source``; ``where``: the region or what it lies between; ``notes``
-    are sentences."""
-
-    name: str
-    kind: str
-    source: str
-    quantities: Sequence[Quantity]
-    where: str = ""
-    notes: Sequence[str] = ()
-    stale: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class SectionView:
-    """A surface cut by a plane: ``lines`` (k, 2) mm, along and up."""
-
-    name: str
-    lines: Sequence[np.ndarray]
-
-
-@dataclass(frozen=True, eq=False)
-class DeviationView:
-    """A scan against a nominal model: some of its ``points`` (n, 3) with the nominal's ``normals`` there and how far
-    they lie off it, ``signed`` (n,) mm; ``uncovered`` (k, 3): places of the nominal that were not measured; a histogram
-    of all points, ``edges`` (m + 1,) mm and ``counts`` (m,); ``found`` as ``compare --json`` gives it."""
-
-    name: str
-    source: str
-    nominal: str
-    points: np.ndarray
-    normals: np.ndarray
-    signed: np.ndarray
-    uncovered: np.ndarray
-    edges: np.ndarray
-    counts: np.ndarray
-    found: Mapping[str, Any]
-    stale: bool = False
-
-
 @dataclass(frozen=True, eq=False)
 class SessionData:
     """A session's captures, its calibrations, and what was measured with them.
 
     ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that made ``calibration``.
+    ``sections``: names, and lines (k, 2) mm, along and up; ``deviations`` from nominal models, with their arrays.
     """
 
     name: str
@@ -302,6 +262,6 @@ class SessionData:
     models: ModelsView | None = None
     acceptances: Sequence[AcceptanceView] = ()
     drifts: Sequence[DriftRow] = ()
-    measurements: Sequence[MeasurementRow] = ()
-    sections: Sequence[SectionView] = ()
-    deviations: Sequence[DeviationView] = ()
+    measurements: Sequence[Measurement] = ()  # but deviations
+    sections: Sequence[tuple[str, Sequence[np.ndarray]]] = ()
+    deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]] = ()

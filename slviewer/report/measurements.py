@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
+from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import DECIDED, RULE
+from slviewer.records import from_plain
 from slviewer.report.canvas import (
     DENSITY,
     FULL,
@@ -21,11 +23,12 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.data import DeviationView, MeasurementRow, SectionView
 from slviewer.report.page import Cell, Column, Figure, Item, Mark, PageNotice, Section, Table
 from slviewer.report.shaded import render_points, view_rotation
 from slviewer.report.tables import UNKNOWN, format_number
+from slviewer.session.measurements import Measurement
 
+Lines = Sequence[NDArray[np.floating]]
 YAW_DEG, PITCH_DEG = 12.0, 10.0
 PICTURE = (560, 420)
 LINE = "#2270b8"
@@ -38,12 +41,15 @@ FLAT = 0.1
 MOST_DRAWN = 4000
 
 
-def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[SectionView]) -> Section:
+def measurements_section(rows: Sequence[Measurement], sections: Sequence[tuple[str, Lines]]) -> Section:
     """Every measurement with its units and uncertainties, and each section as it was cut."""
     items: list[Item] = [
         PageNotice(f"{row.name} was measured on what has since changed: measure it again.") for row in rows if row.stale
     ]
-    items += [PageNotice(f"{row.name}: {note}.") for row in rows for note in row.notes]
+    items += [
+        PageNotice(f"{row.name}: {note}.") for row in rows for note in row.data.get("fit", {}).get("warnings", ())
+    ]
+    quantities = {row.id: from_plain(row.data["quantities"], list[Quantity]) for row in rows}
     body: list[list[str | Cell]] = []
     for row in rows:
         named: list[str | Cell] = [
@@ -51,8 +57,8 @@ def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[Sect
             row.kind,
             row.source,
         ]
-        where = row.where
-        for q in row.quantities:
+        where = " and ".join(row.data["between"]) if "between" in row.data else row.data.get("where", "")
+        for q in quantities[row.id]:
             digits = 1 if q.unit == "%" else 4
             U = UNKNOWN if q.U is None else f"{q.U:.{digits}f}{'' if q.whole else ' *'}"
             unit = "°" if q.unit == "deg" else q.unit
@@ -65,17 +71,17 @@ def measurements_section(rows: Sequence[MeasurementRow], sections: Sequence[Sect
         "U is the expanded uncertainty: the scatter of the points, and what the calibration leaves uncertain. –: a "
         "residual or a plain reading, which has none."
     ]
-    if any(q.U is not None and not q.whole for row in rows for q in row.quantities):
+    if any(q.U is not None and not q.whole for each in quantities.values() for q in each):
         notes.append("* without the calibration's part, which this calibration does not know.")
     if body:
         items.append(Table(columns, body, "Measured on the scans", notes))
-    items += [section_plot(view.name, view.lines) for view in sections]
+    items += [section_plot(name, lines) for name, lines in sections]
     return Section("Measurements", "Distances, fitted shapes, and what lies between them.", items)
 
 
 def section_plot(
     name: str,
-    lines: Sequence[NDArray[np.floating]],
+    lines: Lines,
     cursors: Mapping[str, NDArray[np.floating]] | None = None,
     *,
     width: int = FULL,
@@ -103,11 +109,11 @@ def section_plot(
     )
 
 
-def deviations_section(views: Sequence[DeviationView]) -> Section:
+def deviations_section(deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]]) -> Section:
     """Each comparison with a nominal model: verdict, picture and figures."""
     items: list[Item] = []
-    for view in views:
-        items += _deviation(view)
+    for measured, arrays in deviations:
+        items += _deviation(measured, arrays)
     text = (
         "Scans against nominal models, after the best fit of the one to the other: distances from the nominal surface, "
         "positive outside it. The tolerance is " + RULE + "."
@@ -115,8 +121,8 @@ def deviations_section(views: Sequence[DeviationView]) -> Section:
     return Section("Deviation from nominal", text, items)
 
 
-def _deviation(view: DeviationView) -> list[Item]:
-    verdict = view.found["verdict"]
+def _deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> list[Item]:
+    verdict = view.data["verdict"]
     items: list[Item] = []
     if verdict is not None:
         words = DECIDED[verdict["decision"]]
@@ -126,12 +132,12 @@ def _deviation(view: DeviationView) -> list[Item]:
         )
     if view.stale:
         items.append(PageNotice(f"{view.name}: the scan or its calibration has changed since; compare it again."))
-    items += [deviation_picture(view), _table(view)]
+    items += [deviation_picture(view, arrays), _table(view)]
     return items
 
 
-def _table(view: DeviationView) -> Table:
-    found, verdict = view.found, view.found["verdict"]
+def _table(view: Measurement) -> Table:
+    found, verdict = view.data, view.data["verdict"]
     numbers = found["statistics_mm"]
     columns = [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns.append(Column("decision", align="left"))
@@ -173,7 +179,7 @@ def _table(view: DeviationView) -> Table:
         f"{found['reach_mm']:.3g} mm from the nominal or face another way, and are left out. The best fit adds "
         f"{found['alignment_mm']:.4f} mm (1 sigma)."
     ]
-    return Table(columns, rows, f"{view.source} against {view.nominal}", notes)
+    return Table(columns, rows, f"{view.source} against {view.data['nominal']['name']}", notes)
 
 
 def _decided(decision: str) -> Cell:
@@ -199,33 +205,37 @@ def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: flo
         legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
 
 
-def deviation_picture(view: DeviationView) -> Figure:
-    """The scan coloured by its deviation, what of the nominal was not measured in grey, and the histogram."""
+def deviation_picture(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figure:
+    """The scan coloured by its deviation, what of the nominal was not measured in grey, and the histogram.
+
+    ``arrays``: some ``points`` (n, 3) mm of the scan with the nominal's ``normals`` there and ``signed`` (n,) mm
+    deviations; ``uncovered`` (k, 3) mm; ``counts`` (m,) of all points between ``edges`` (m + 1,) mm.
+    """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 
-    verdict = view.found["verdict"]
+    verdict = view.data["verdict"]
     tolerance = None if verdict is None else float(verdict["tolerance_mm"])
-    limit = colour_limit(view.signed, tolerance)
+    limit = colour_limit(arrays["signed"], tolerance)
     limit = round_up(limit) if tolerance is None else limit
     palette = ListedColormap(deviation_colours(np.linspace(-1, 1, 255), 1.0) / 255)
     drawing = new_figure(FULL, 480)
     left, right = drawing.subplots(1, 2, width_ratios=(1.35, 1))
     width, height = PICTURE
-    points = np.concatenate([view.points, view.uncovered]).astype(np.float64)
-    normals = np.concatenate([view.normals, np.full(view.uncovered.shape, np.nan)])
-    grey = np.broadcast_to(np.array(LEFT_OUT, np.uint8), view.uncovered.shape)
-    colours = np.concatenate([deviation_colours(view.signed, limit), grey]) / 255.0
-    style_image_axes(left, f"{view.source} against {view.nominal}")
+    points = np.concatenate([arrays["points"], arrays["uncovered"]]).astype(np.float64)
+    normals = np.concatenate([arrays["normals"], np.full(arrays["uncovered"].shape, np.nan)])
+    grey = np.broadcast_to(np.array(LEFT_OUT, np.uint8), arrays["uncovered"].shape)
+    colours = np.concatenate([deviation_colours(arrays["signed"], limit), grey]) / 255.0
+    style_image_axes(left, f"{view.source} against {view.data['nominal']['name']}")
     left.imshow(
         render_points(points, normals, colours, (DENSITY * width, DENSITY * height), view_rotation(YAW_DEG, PITCH_DEG))
     )
     mapped = ScalarMappable(Normalize(-limit, limit), palette)
     colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
-    numbers = view.found["statistics_mm"]
+    numbers = view.data["statistics_mm"]
     style_axes(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
-    edges = view.edges
-    draw_deviations(right, edges, view.counts, limit, tolerance)
+    edges = arrays["edges"]
+    draw_deviations(right, edges, arrays["counts"], limit, tolerance)
     far = max(edges[-1], 0.0 if tolerance is None else 1.15 * tolerance)
     right.set_xlim(-far, far)
     left.set_xlabel("grey: parts of the nominal that were not measured", fontsize=TEXT_PT, color=SOFT, loc="left")
@@ -233,5 +243,5 @@ def deviation_picture(view: DeviationView) -> Figure:
         drawing,
         f"{view.name}: red lies outside the nominal surface, blue inside it. Right: how many of the points lie how far "
         "off.",
-        f"{view.source} coloured by its deviation from {view.nominal}, with a histogram of the deviations",
+        f"{view.source} coloured by its deviation from {view.data['nominal']['name']}, with their histogram",
     )
