@@ -91,4 +91,4 @@ def _connect(port: int, ended: ExitStack) -> "Channel":
             return channel
         if standing.words != reported:
             terminal.say(f"projector page: {(reported := standing.words)}")
-    raise DeviceError(f"the projector page was not ready within {PAGE_PATIENCE_S:g} s: {channel.standing().words}")
+    raise DeviceError(f"the projector page was not ready within {PAGE_PATIENCE_S:g} s: {channel.page_state().words}")

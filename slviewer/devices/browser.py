@@ -39,7 +39,7 @@ class BrowserProjector(Openable):
         super().open()
         try:
             self._forget()
-            self._channel.expect(self.size)
+            self._channel.set_pattern_size(self.size)
             self._channel.page()
             self.show_level(None)
         except BaseException:
@@ -49,7 +49,7 @@ class BrowserProjector(Openable):
     def close(self) -> None:
         """Leave the page to its marker."""
         if self._open:
-            self._channel.keep(None)
+            self._channel.set_light(None)
         self._forget()
         super().close()
 
@@ -63,7 +63,7 @@ class BrowserProjector(Openable):
         sent = axes, b"".join(levels.tobytes() for _, levels in profiles)
         if page is not self._page or sent != self._sent:
             self._forget()
-            page.ask("load", sent[1], size=self.size, axes=axes)
+            page.request("load", sent[1], size=self.size, axes=axes)
         self._sequence, self._sent, self._page, self._changes = sequence, sent, page, page.changes
 
     def show(self, index: int) -> None:
@@ -73,7 +73,7 @@ class BrowserProjector(Openable):
         page = self._page
         try:
             assert page is not None
-            page.ask("show", index=index)
+            page.request("show", index=index)
             if page.changes != self._changes:
                 raise DeviceError("the projector page's window changed while patterns were shown: capture again")
         except BaseException:
@@ -85,8 +85,8 @@ class BrowserProjector(Openable):
         self.check_open()
         level = check_level(grey)
         page = self._channel.page()
-        self._channel.keep(level)
-        page.ask("level", grey=level)
+        self._channel.set_light(level)
+        page.request("level", grey=level)
 
     def _forget(self) -> None:
         self._sequence = self._sent = self._page = None
@@ -102,7 +102,7 @@ def browser_projector(size: Sequence[int] | None = None, channel: Channel | None
             "the browser projector's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
         )
     if size is None:
-        found = channel.standing().size
+        found = channel.page_state().size
         if found is None:
             raise DeviceError("open the projector page first, or say the projector's size")
         return BrowserProjector(channel, found)

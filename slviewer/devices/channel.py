@@ -49,7 +49,7 @@ class Done(msgspec.Struct, tag_field="op", tag="done"):
 
 
 @dataclass(frozen=True)
-class Standing:
+class PageState:
     """Where the projector page stands: "waiting" for one to be opened, "refused" or "ready", and the same in words.
 
     `size` is the (width, height) px of the page's screen, None while there is none.
@@ -68,17 +68,17 @@ class PageConnection:
         self.send = send
         self.changes = 0  # of its screen since it connected
         self.refused, self.gone = "", ""
-        self.told: tuple | None = None
+        self.published: tuple | None = None
         self._condition = condition
         self._number = 0
         self._answer: Done | None = None
 
-    def ask(self, op: str, payload: bytes = b"", **fields: Any) -> None:
+    def request(self, op: str, payload: bytes = b"", **fields: Any) -> None:
         """Have the page do it, and wait until it says that it has. Raises DeviceError within two seconds."""
         with self._condition:
             self._number += 1
             self.check()
-            self.send(_packed({"op": op, "number": self._number, **fields}, payload))
+            self.send(_encode({"op": op, "number": self._number, **fields}, payload))
             end = time.monotonic() + ANSWER_S
             while self._answer is None or self._answer.number != self._number:
                 self.check()
@@ -97,7 +97,7 @@ class PageConnection:
         if self.gone or self.refused:
             raise DeviceError(self.gone or self.refused)
 
-    def answered(self, done: Done) -> None:
+    def store_answer(self, done: Done) -> None:
         """Keep an answer for whoever waits for it."""
         self._answer = done
 
@@ -113,36 +113,36 @@ class Channel:
 
     # for whoever shows where it stands
 
-    def standing(self) -> Standing:
+    def page_state(self) -> PageState:
         """Where the page stands now."""
         with self._condition:
             page = self._page
             if page is None:
-                return Standing("waiting", "waiting for the page")
+                return PageState("waiting", "waiting for the page")
             size = page.screen.pixels
             if page.refused:
-                return Standing("refused", page.refused, size)
-            return Standing("ready", f"ready {size[0]} x {size[1]}", size)
+                return PageState("refused", page.refused, size)
+            return PageState("ready", f"ready {size[0]} x {size[1]}", size)
 
-    def wait_ready(self, timeout_s: float) -> Standing:
+    def wait_ready(self, timeout_s: float) -> PageState:
         """Where it stands as soon as it is ready, or when the time is up."""
         with self._condition:
-            self._condition.wait_for(lambda: self.standing().state == "ready", timeout_s)
-            return self.standing()
+            self._condition.wait_for(lambda: self.page_state().state == "ready", timeout_s)
+            return self.page_state()
 
     # the projector's side
 
-    def expect(self, size: tuple[int, int]) -> None:
+    def set_pattern_size(self, size: tuple[int, int]) -> None:
         """Judge pages by patterns of this size (width, height) from now on."""
         with self._condition:
             self._size = size
-            self._tell()
+            self._publish_state()
 
-    def keep(self, grey: int | None) -> None:
+    def set_light(self, grey: int | None) -> None:
         """The light that a page shows after it was reloaded; None: no projector is open, it shows its marker."""
         with self._condition:
             self._light = grey
-            self._tell()
+            self._publish_state()
 
     def page(self) -> PageConnection:
         """The page, connected and able to show the patterns. Raises DeviceError with what to change."""
@@ -156,33 +156,33 @@ class Channel:
 
     def connect(self, hello: str | bytes, send: Send) -> PageConnection | None:
         """The page that says hello; None where another window is the projector. Raises InputError for nonsense."""
-        said: Hello = _said(hello, Hello)
+        message_in: Hello = _decode(hello, Hello)
         with self._condition:
             before = self._page
             if before is not None:
-                if said.window != before.window and not said.take:
+                if message_in.window != before.window and not message_in.take:
                     return None
                 self._end(
                     before,
                     "the projector page was reloaded, or connected anew"
-                    if said.window == before.window
+                    if message_in.window == before.window
                     else "another window was made the projector",
                 )
                 before.send(None)
-            page = self._page = PageConnection(self._condition, said, send)
-            self._tell()
+            page = self._page = PageConnection(self._condition, message_in, send)
+            self._publish_state()
             return page
 
-    def received(self, page: PageConnection, message: str | bytes) -> None:
+    def handle_message(self, page: PageConnection, message: str | bytes) -> None:
         """What a connected page says. Raises InputError for nonsense."""
-        said = _said(message, Report | Done)
+        message_in = _decode(message, Report | Done)
         with self._condition:
-            if isinstance(said, Done):
-                page.answered(said)
-            elif said.screen != page.screen:
-                page.screen = said.screen
+            if isinstance(message_in, Done):
+                page.store_answer(message_in)
+            elif message_in.screen != page.screen:
+                page.screen = message_in.screen
                 page.changes += 1
-                self._tell()
+                self._publish_state()
             self._condition.notify_all()
 
     def disconnect(self, page: PageConnection) -> None:
@@ -196,7 +196,7 @@ class Channel:
         page.gone = f"{why}: capture again once it is ready"
         self._condition.notify_all()
 
-    def _tell(self) -> None:
+    def _publish_state(self) -> None:
         """Judge the page, and let it say where it stands if that is news to it."""
         page = self._page
         if page is None:
@@ -204,20 +204,20 @@ class Channel:
         page.refused = refusal(page.screen, self._size)
         self._condition.notify_all()
         size = self._size or page.screen.pixels
-        told = (page.refused, size, self._light is None)
-        if told != page.told:
-            page.told = told
+        state = (page.refused, size, self._light is None)
+        if state != page.published:
+            page.published = state
             fields = {"refused": page.refused, "full": page.screen.full_screen, "size": size, "light": self._light}
-            page.send(_packed({"op": "stand", **fields}))
+            page.send(_encode({"op": "stand", **fields}))
 
 
-def _packed(header: dict[str, Any], payload: bytes = b"") -> bytes:
+def _encode(header: dict[str, Any], payload: bytes = b"") -> bytes:
     """The length of the header as 4 bytes, little endian, then the header as JSON, then the payload."""
     text = msgspec.json.encode(header)
     return struct.pack("<I", len(text)) + text + payload
 
 
-def _said(message: str | bytes, kind: Any) -> Any:
+def _decode(message: str | bytes, kind: Any) -> Any:
     try:
         return msgspec.json.decode(message, type=kind)
     except (msgspec.MsgspecError, UnicodeError) as error:

@@ -19,7 +19,7 @@ class Driver:
     `what`: in a few words, what it drives. `packages`: how to install each package that must be importable, such as
     ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, whole rigs (where both
     devices share something), or several of these. `channel`: its factories also take the keyword `channel`, the wire to
-    the projector page. `found`: looks for what is connected, a line each.
+    the projector page. `list_connected` returns a line per connected device.
     """
 
     name: str
@@ -30,7 +30,7 @@ class Driver:
     projector: Callable[..., Projector] | None = None
     rig: Callable[..., Rig] | None = None
     channel: bool = False
-    found: Callable[[], Sequence[str]] | None = None
+    list_connected: Callable[[], Sequence[str]] | None = None
 
     @property
     def missing(self) -> str:

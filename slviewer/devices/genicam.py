@@ -191,7 +191,7 @@ def _choose(cameras: list[Found], serial: str | None, model: str | None) -> Foun
     raise DeviceError("no camera is connected: plug one in, wait until it has started, and close other programs")
 
 
-def found() -> list[str]:
+def list_connected() -> list[str]:
     """One line for each camera that is connected: maker, model, serial number. Raises DeviceError without producers."""
     return [str(camera) for camera in connected()]
 
@@ -203,5 +203,5 @@ DRIVER = Driver(
     needs="the software of the camera's maker, which brings a GenTL producer (a .cti file)",
     packages={"harvesters": _INSTALL, "genicam": _INSTALL},
     camera=genicam_camera,
-    found=found,
+    list_connected=list_connected,
 )

@@ -15,14 +15,14 @@ import numpy as np
 from slviewer.devices.drivers import Driver
 from slviewer.devices.opencv_controls import (
     Dialect,
-    dialect,
+    dialect_of,
     exposure_ms,
     set_exposure,
     set_value,
     switch_automatics_off,
 )
 from slviewer.devices.opencv_reader import OPENING_S, Reader
-from slviewer.devices.opencv_source import connect, described, found
+from slviewer.devices.opencv_source import connect, described, list_connected
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, Channel, check_frame, one_channel
 from slviewer.errors import DeviceError, InputError
@@ -80,16 +80,16 @@ class OpenCVCamera(Openable):
         self._gain, self._focus, self._white_balance = gain, focus, white_balance
         self._channel = channel
         self._reader: Reader | None = None
-        self._words: Dialect | None = None
+        self._dialect: Dialect | None = None
         self._next: np.ndarray | None = None  # the video's picture that was read to learn its size
         self._read, self._unsettled = 0, 0
-        self._said: dict[str, str] = {}
+        self._notices: dict[str, str] = {}
         self.size: tuple[int, int] = wanted or self._probed()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What an operator should know of its settings, a sentence each."""
-        return tuple(f"{self.name}: {sentence}" for sentence in self._said.values() if sentence)
+        return tuple(f"{self.name}: {sentence}" for sentence in self._notices.values() if sentence)
 
     def open(self) -> None:
         """Start reading. Raises DeviceError where it does not answer, or its frames have not the size they should."""
@@ -99,7 +99,7 @@ class OpenCVCamera(Openable):
                 self._reader.join(OPENING_S)  # it may hang in a call, the device still in its hands
             self._reader = Reader(self.name, self._connect)
             self._next, self._read = self._checked(self._reader.first()), 0
-            self._said = {}
+            self._notices = {}
             self._reader.do(self._prepare)
             _IN_USE[self._source] = self
         except BaseException:
@@ -130,19 +130,19 @@ class OpenCVCamera(Openable):
 
     def settings(self) -> CameraSettings:
         """The exposure, where the camera tells it."""
-        words = self._words
+        dialect = self._dialect
         reader = self._opened()
-        return CameraSettings(None if words is None else reader.do(lambda capture: exposure_ms(capture, words)))
+        return CameraSettings(None if dialect is None else reader.do(lambda capture: exposure_ms(capture, dialect)))
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Set the exposure; what could not be set is in `notes`."""
-        words, ms = self._words, settings.exposure_ms
+        dialect, ms = self._dialect, settings.exposure_ms
         reader = self._opened()
-        if words is not None and ms is not None:
-            self._said["exposure"] = reader.do(lambda capture: set_exposure(capture, words, ms))
+        if dialect is not None and ms is not None:
+            self._notices["exposure"] = reader.do(lambda capture: set_exposure(capture, dialect, ms))
             self._unsettled = SETTLING
-        if words is not None and settings.gain is not None:
-            self._said["gain"] = "its gain counts in units of its own: set it in the rig's file, as the camera's gain"
+        if dialect is not None and settings.gain is not None:
+            self._notices["gain"] = "its gain has units of its own: set it in the rig's file, as the camera's gain"
         return self.settings()
 
     def _opened(self) -> Reader:
@@ -152,22 +152,22 @@ class OpenCVCamera(Openable):
 
     def _prepare(self, capture: cv2.VideoCapture) -> None:
         """Set what is to be set at the start; on the reader's thread."""
-        words = self._words = dialect(capture)
+        dialect = self._dialect = dialect_of(capture)
         controls = (self._gain, self._focus, self._white_balance)
-        if words is None:
+        if dialect is None:
             if self._opened().live or (self._exposure_ms, *controls) != (None,) * 4:
-                self._said["controls"] = (
+                self._notices["controls"] = (
                     "its exposure, gain, focus and white balance cannot be set from here: set them at the camera "
                     "itself, and switch off everything automatic"
                 )
             return
-        self._said |= switch_automatics_off(capture, words)
+        self._notices |= switch_automatics_off(capture, dialect)
         if self._exposure_ms is not None:
-            self._said["exposure"] = set_exposure(capture, words, self._exposure_ms)
-        properties = (cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FOCUS, words.white_balance)
+            self._notices["exposure"] = set_exposure(capture, dialect, self._exposure_ms)
+        properties = (cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FOCUS, dialect.white_balance)
         for control, value, what in zip(properties, controls, ("gain", "focus", "white balance"), strict=True):
             if value is not None:
-                self._said[what] = set_value(capture, control, value, what)
+                self._notices[what] = set_value(capture, control, value, what)
         self._unsettled = SETTLING
 
     def _picture(self) -> np.ndarray:
@@ -213,5 +213,5 @@ DRIVER = Driver(
     "a webcam, a video file, or a stream (MJPEG, RTSP)",
     needs="a camera's number, a file, or an address, as `source`",
     camera=OpenCVCamera,
-    found=found,
+    list_connected=list_connected,
 )

@@ -53,7 +53,7 @@ _DIALECTS = {
 }
 
 
-def dialect(capture: cv2.VideoCapture) -> Dialect | None:
+def dialect_of(capture: cv2.VideoCapture) -> Dialect | None:
     """How the open `capture` is spoken to; None where its controls are out of reach: those of a stream, and on macOS
     those of any camera (cap_avfoundation_mac.mm sets a size and a frame rate only).
     """

@@ -58,7 +58,7 @@ def connect(source: int | str, size: tuple[int, int] | None) -> Connected:
     return Connected(capture, live=False)
 
 
-def found() -> list[str]:
+def list_connected() -> list[str]:
     """Webcams that are connected, a line each. Where the system lists them, none is opened for it."""
     if sys.platform == "linux":
         return listed(_SYSFS)

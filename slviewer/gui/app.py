@@ -12,7 +12,7 @@ from typing import Any
 
 import viser
 
-from slviewer.devices.channel import Channel, Standing
+from slviewer.devices.channel import Channel, PageState
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.scene import ViewerScene
@@ -166,8 +166,8 @@ class App:
             self._offers[path] = self.server.downloads.offer(path, within=folder)
         return self._offers[path]
 
-    def _projector_page(self) -> Standing | None:
-        return None if self.channel is None else self.channel.standing()
+    def _projector_page(self) -> PageState | None:
+        return None if self.channel is None else self.channel.page_state()
 
     def _greet(self, client: viser.ClientHandle) -> None:
         if self.server.role(client.client_id) == "viewer":

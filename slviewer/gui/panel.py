@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import viser
 
-from slviewer.devices.channel import Standing
+from slviewer.devices.channel import PageState
 from slviewer.errors import InputError
 from slviewer.gui.pictures import Painter
 from slviewer.gui.scene import ViewerScene
@@ -45,7 +45,7 @@ class PanelContext:
     failed: Callable[[BaseException], None]
     executor: Executor
     viewers: Callable[[Callable[[], None]], Viewers]
-    projector_page: Callable[[], Standing | None] = lambda: None
+    projector_page: Callable[[], PageState | None] = lambda: None
 
     @property
     def session(self) -> Session:

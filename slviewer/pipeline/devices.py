@@ -47,9 +47,9 @@ def devices() -> str:
 def _view(driver: Driver) -> DriverView:
     offers = tuple(part for part in ("camera", "projector", "rig") if getattr(driver, part) is not None)
     connected, trouble = None, ""
-    if driver.found is not None and not driver.missing:
+    if driver.list_connected is not None and not driver.missing:
         try:
-            connected = tuple(driver.found())
+            connected = tuple(driver.list_connected())
         except SlviewerError as error:
             trouble = str(error)
         except Exception as error:  # a maker's library that is broken must not hide the other drivers' devices

@@ -46,37 +46,37 @@ def draw_clouds(views: Sequence[CloudView]) -> Figure:
     size = (DENSITY * across, DENSITY * down)
     palette = ListedColormap(colormaps["YlGnBu_r"](np.linspace(0.18, 0.92, 256)))
     for ax, view in zip(axes, views, strict=False):
-        points, normals, _ = _sampled(view)
+        points, normals, _ = _sample_points(view)
         z = points[:, 2]
         near, far = (np.percentile(z, [1, 99]) if len(z) else (0.0, 1.0)) + np.array([-1e-3, 1e-3])
         shades = palette(np.clip((z - near) / (far - near), 0, 1))[:, :3]
         picture = render_points(points, normals, shades, size, view_rotation(YAW_DEG, PITCH_DEG))
         style_image_axes(ax, view.name)
         ax.imshow(picture)
-        ax.set_xlabel(_counted(view), fontsize=TEXT_PT, color=INK, loc="left")
+        ax.set_xlabel(_format_count(view), fontsize=TEXT_PT, color=INK, loc="left")
         colour_bar(drawing, ScalarMappable(Normalize(near, far), palette), ax, "z, mm", shrink=0.7, aspect=20)
     for ax in axes[len(views) :]:
         ax.set_axis_off()
     return finish_figure(
         drawing,
         "Each scan as measured, seen from above and aside, lit by its own surface normals and coloured by depth.",
-        "Shaded views of " + ", ".join(f"{view.name} ({_counted(view)})" for view in views),
+        "Shaded views of " + ", ".join(f"{view.name} ({_format_count(view)})" for view in views),
     )
 
 
 def draw_merged_cloud(view: CloudView) -> Figure:
     """The merged cloud: illuminated as one surface, and coloured by the scan that each point comes from."""
-    points, normals, source = _sampled(view)
+    points, normals, source = _sample_points(view)
     size = (2 * HALF - 40, 2 * HALF - 240)
     rotation = view_rotation(YAW_DEG, PITCH_DEG)
     drawing = new_figure(FULL, HALF - 40)
     left, right = drawing.subplots(1, 2)
     style_image_axes(left, "as one surface")
     left.imshow(render_points(points, normals, np.broadcast_to(CLAY, points.shape), size, rotation))
-    left.set_xlabel(_counted(view), fontsize=TEXT_PT, color=INK, loc="left")
+    left.set_xlabel(_format_count(view), fontsize=TEXT_PT, color=INK, loc="left")
     style_image_axes(right, "by scan, in turns")
     palette = np.array([_rgb(colour) for colour in SCANS])
-    shown = _mosaic(points, source) if len(points) else np.arange(0)
+    shown = _select_mosaic(points, source) if len(points) else np.arange(0)
     points, normals, source = points[shown], normals[shown], source[shown]
     right.imshow(render_points(points, normals, palette[source % len(SCANS)], size, rotation))
     for i, name in enumerate(view.names):
@@ -86,11 +86,11 @@ def draw_merged_cloud(view: CloudView) -> Figure:
         drawing,
         "The merged cloud in the reference scan's frame. Right: each square shows the points of one scan alone, so "
         "that a step where squares meet would be a misalignment.",
-        f"Shaded views of the merged cloud, {_counted(view)}, as one surface and coloured by scan",
+        f"Shaded views of the merged cloud, {_format_count(view)}, as one surface and coloured by scan",
     )
 
 
-def _sampled(view: CloudView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sample_points(view: CloudView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, normals and source (n,) of at most MOST_POINTS measured points, evenly thinned."""
     from slviewer.reconstruction.reconstruct import normals as grid_normals
 
@@ -110,7 +110,7 @@ def _sampled(view: CloudView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return points[known], normals[known], source[known]
 
 
-def _mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
+def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
     """Indices of the points that a chequered view shows: in each square of x and y those of one scan alone.
 
     The scans take turns from square to square, among those that measured there (told in finer squares).
@@ -127,7 +127,7 @@ def _mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
     return np.flatnonzero(rank[place, source] == turn)
 
 
-def _counted(view: CloudView) -> str:
+def _format_count(view: CloudView) -> str:
     count = int(np.isfinite(view.points[..., 2]).sum())
     return f"{count:,} points" + (f"; {view.note}" if view.note else "")
 

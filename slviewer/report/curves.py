@@ -1,4 +1,4 @@
-"""The Letter's picture of one pixel: z over phase, x and y over z, and what the fits leave over."""
+"""The Letter's picture of one pixel: z over phase, x and y over z, and the residuals of the fits."""
 
 import numpy as np
 
@@ -64,12 +64,12 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
                 legend(upper, loc="best")
         lower.axhline(0, color=SOFT, linewidth=0.8)
     u, v = curve.pixel
-    said = ", ".join(f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True))
+    listed = ", ".join(f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True))
     return finish_figure(
         drawing,
         f"What camera pixel ({u}, {v}) learnt from {at.size} target poses: z as a rational function of the absolute "
         f"phase of axis {curve.axis}, x and y as lines through the camera's centre. "
-        f"{'Beside' if narrow else 'Below'}: what the fits leave over "
-        f"(RMS {said}).",
-        f"Curves of z over phase, x over z and y over z at camera pixel ({u}, {v}) with data and residuals; RMS {said}",
+        f"{'Beside' if narrow else 'Below'}: the residuals "
+        f"(RMS {listed}).",
+        f"Curves of z over phase, x over z and y over z at camera pixel ({u}, {v}) with residuals; RMS {listed}",
     )

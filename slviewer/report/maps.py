@@ -50,7 +50,7 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
     medians = [percentile(rms, 50) for rms in rms_mm]
     for axes, name, rms, median in zip(places, "zxy", rms_mm, medians, strict=True):
         top = round_up(percentile(rms, 99))
-        style_image_axes(axes, f"{name}: {_median(median)}")
+        style_image_axes(axes, f"{name}: {_format_median(median)}")
         image = draw_map(axes, rms, "viridis", 100, 0, top)
         colour_bar(drawing, image, axes, "" if narrow and name != "z" else "RMS of the fit, mm", extend="max")
     named = f" along axis {axis}" if axis else ""
@@ -59,7 +59,7 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
         f"RMS of each camera pixel's fit over the target poses{named}, in z, x and y. Each colour scale ends at the "
         "99th percentile; grey pixels saw the board too rarely to be fitted.",
         "Three maps of the fit's RMS in z, x and y; "
-        + ", ".join(f"{name} {_median(median)}" for name, median in zip("zxy", medians, strict=True)),
+        + ", ".join(f"{name} {_format_median(median)}" for name, median in zip("zxy", medians, strict=True)),
     )
 
 
@@ -80,11 +80,11 @@ def error_maps(
     """
     if not maps or len({m.shape for m in maps.values()}) != 1:
         raise InputError(f"the error maps of '{title}' differ in size, or there are none: give each model's, one size")
-    rows, columns = _box(list(maps.values()))
+    rows, columns = _data_slices(list(maps.values()))
     cropped = {model: errors[rows, columns] for model, errors in maps.items()}
     limit = limit_mm or error_limit(list(cropped.values()))
     h, w = next(iter(cropped.values())).shape
-    drawing, axes, histogram, map_width = _layout(width, len(maps), h / w)
+    drawing, axes, histogram, map_width = _arrange_axes(width, len(maps), h / w)
     drawing.suptitle(title, x=0.004, ha="left", fontsize=TITLE_PT + 1.5, color=INK, fontweight="bold")
     image = None
     for ax, (model, errors) in zip(axes, cropped.items(), strict=True):
@@ -93,13 +93,13 @@ def error_maps(
         )
         image = draw_map(ax, errors, "RdBu_r", 101, -limit, limit)
     colour_bar(drawing, image, axes, "error, mm", extend="both")
-    _histogram(histogram, cropped, rms_mm, floor_mm, limit)
-    said = ", ".join(f"{model} {rms_mm[model]:.3f} mm" for model in maps)
+    _draw_histogram(histogram, cropped, rms_mm, floor_mm, limit)
+    listed = ", ".join(f"{model} {rms_mm[model]:.3f} mm" for model in maps)
     return finish_figure(
         drawing,
         f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus the RMS"
-        f"{_floor_words(floor_mm)}.",
-        f"Error maps and histograms of {title}; RMS {said}",
+        f"{_describe_floor(floor_mm)}.",
+        f"Error maps and histograms of {title}; RMS {listed}",
     )
 
 
@@ -109,7 +109,7 @@ def error_limit(maps: list[np.ndarray]) -> float:
     return round_up(percentile(np.abs(np.concatenate(samples)), 99))
 
 
-def _layout(width: int, count: int, aspect: float) -> tuple[Any, Any, Any, int]:
+def _arrange_axes(width: int, count: int, aspect: float) -> tuple[Any, Any, Any, int]:
     """Figure, the maps' axes, the histogram's, and the width of one map in CSS px."""
     if width < 800:  # more than two maps in a row would be too small to read
         across = min(count, 2)
@@ -136,7 +136,7 @@ def _layout(width: int, count: int, aspect: float) -> tuple[Any, Any, Any, int]:
     )
 
 
-def _histogram(
+def _draw_histogram(
     axes: Any, maps: Mapping[str, np.ndarray], rms_mm: Mapping[str, float], floor_mm: float, limit: float
 ) -> None:
     reach = 1.25 * limit
@@ -161,7 +161,7 @@ def _histogram(
     legend(axes, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.3, ncols=4, columnspacing=1.1)
 
 
-def _box(maps: list[np.ndarray]) -> tuple[slice, slice]:
+def _data_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
     """Rows and columns around the finite pixels of any map, with a small margin; everything where there is none."""
     finite = np.logical_or.reduce([np.isfinite(m) for m in maps])
     if not finite.any():
@@ -174,9 +174,9 @@ def _box(maps: list[np.ndarray]) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def _median(value: float) -> str:
+def _format_median(value: float) -> str:
     return f"median {value:.3f} mm" if np.isfinite(value) else "no pixel fitted"
 
 
-def _floor_words(floor_mm: float) -> str:
+def _describe_floor(floor_mm: float) -> str:
     return f"; dotted: noise alone ({floor_mm:.3f} mm)" if np.isfinite(floor_mm) else ""

@@ -113,7 +113,7 @@ def deviations_section(deviations: Sequence[tuple[Measurement, Mapping[str, np.n
     """Each comparison with a nominal model: verdict, picture and figures."""
     items: list[Item] = []
     for measured, arrays in deviations:
-        items += _deviation(measured, arrays)
+        items += _deviation_items(measured, arrays)
     text = (
         "Scans against nominal models, after the best fit of the one to the other: distances from the nominal surface, "
         "positive outside it. The tolerance is " + RULE + "."
@@ -121,7 +121,7 @@ def deviations_section(deviations: Sequence[tuple[Measurement, Mapping[str, np.n
     return Section("Deviation from nominal", text, items)
 
 
-def _deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> list[Item]:
+def _deviation_items(view: Measurement, arrays: Mapping[str, np.ndarray]) -> list[Item]:
     verdict = view.data["verdict"]
     items: list[Item] = []
     if verdict is not None:
@@ -132,18 +132,18 @@ def _deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> list[Item
         )
     if view.stale:
         items.append(PageNotice(f"{view.name}: the scan or its calibration has changed since; compare it again."))
-    items += [deviation_picture(view, arrays), _table(view)]
+    items += [draw_deviation(view, arrays), _deviation_table(view)]
     return items
 
 
-def _table(view: Measurement) -> Table:
+def _deviation_table(view: Measurement) -> Table:
     found, verdict = view.data, view.data["verdict"]
     numbers = found["statistics_mm"]
     columns = [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns.append(Column("decision", align="left"))
 
     def end(key: str) -> str | Cell:
-        return "" if verdict is None else _decided(verdict[key][1])
+        return "" if verdict is None else _decision_cell(verdict[key][1])
 
     rows: list[list[str | Cell]] = [
         ["mean", format_number(numbers["mean"], 4, signed=True), "mm", ""],
@@ -182,7 +182,7 @@ def _table(view: Measurement) -> Table:
     return Table(columns, rows, f"{view.source} against {view.data['nominal']['name']}", notes)
 
 
-def _decided(decision: str) -> Cell:
+def _decision_cell(decision: str) -> Cell:
     return Cell(DECIDED[decision], MARKS[decision])  # type: ignore[index]
 
 
@@ -205,7 +205,7 @@ def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: flo
         legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
 
 
-def deviation_picture(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figure:
+def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figure:
     """The scan coloured by its deviation, what of the nominal was not measured in grey, and the histogram.
 
     ``arrays``: some ``points`` (n, 3) mm of the scan with the nominal's ``normals`` there and ``signed`` (n,) mm

@@ -48,7 +48,7 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL
         shares = reason_shares(phase)
         style_image_axes(axes, f"axis {axis}: {100 * shares[Reason.VALID]:.1f} % of the pixels valid")
         coordinate, reason = phase.coordinate[::step, ::step], phase.reason[::step, ::step]
-        image = axes.imshow(_masked(coordinate), cmap="viridis", aspect="equal", interpolation="nearest")
+        image = axes.imshow(_mask_invalid(coordinate), cmap="viridis", aspect="equal", interpolation="nearest")
         cover = np.zeros((*reason.shape, 4), np.float32)
         for code, colour in REASON_COLOURS.items():
             cover[reason == code] = (*to_rgb(colour), 1.0)
@@ -66,16 +66,16 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL
         axes.legend(
             handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=2, fontsize=SMALL_PT, frameon=False
         )
-    said = ", ".join(f"axis {axis} {100 * float(phase.mask.mean()):.1f} % valid" for axis, phase in phases.items())
+    listed = ", ".join(f"axis {axis} {100 * float(phase.mask.mean()):.1f} % valid" for axis, phase in phases.items())
     return finish_figure(
         drawing,
         f"{title}: the projector coordinate that each camera pixel sees, in px; masked pixels in the colour of their "
         "reason.",
-        f"Maps of the decoded projector coordinates of {title}: {said}",
+        f"Maps of the decoded projector coordinates of {title}: {listed}",
     )
 
 
-def _masked(values: np.ndarray) -> Any:
+def _mask_invalid(values: np.ndarray) -> Any:
     """Invalid pixels masked; where all are, one value keeps the colour scale finite."""
     if not np.isfinite(values).any():
         values = np.zeros_like(values)

@@ -110,7 +110,7 @@ def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:
     """Every acceptance test: decisions, scale, budget, repeatability; the last one first."""
     items: list[Item] = []
     for view in reversed(acceptances):
-        items += _acceptance(view)
+        items += _acceptance_items(view)
     text = (
         "Artefacts with known lengths, measured in several places. A property passes where its error and the test's "
         "own uncertainty together stay within the limit, fails where the error exceeds it by more than that, "
@@ -120,7 +120,7 @@ def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:
     return Section("Acceptance", text, items)
 
 
-def _acceptance(view: AcceptanceView) -> list[Item]:
+def _acceptance_items(view: AcceptanceView) -> list[Item]:
     found = view.found
     artefact = found["artefact"]
     named = (

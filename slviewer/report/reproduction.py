@@ -33,12 +33,12 @@ LETTER = (
 
 def reproduction_title(data: ReproductionData) -> tuple[str, str]:
     """The page's title and the sentence below it."""
-    size = f"camera {_size(data.camera)}, projector {_size(data.projector)} px"
+    size = f"camera {_format_size(data.camera)}, projector {_format_size(data.projector)} px"
     quick = "Quick run at reduced resolution: its figures are its own. " if data.quick else ""
     return (
         "The Letter's experiments, repeated on a simulated rig",
         f"{quick}A rig of the Letter's geometry with local lens distortion and camera noise, seed {data.seed}: {size}, "
-        f"calibrated by {data.poses} target poses at {_range(data)}. {LETTER}.",
+        f"calibrated by {data.poses} target poses at {_format_depths(data)}. {LETTER}.",
     )
 
 
@@ -55,10 +55,10 @@ def reproduction_headlines(data: ReproductionData) -> list[Headline]:
     }
     spacing = {m: spacing_error(data.spacings, m) for m in (BASE, OURS)}
     headlines = [
-        _duel(
+        _pair_headline(
             "mean plane RMS, all poses",
             mean,
-            f"stereo → pixelwise; noise floor {_mm(floor)}. The Letter: {_arrow(letter)}",
+            f"stereo → pixelwise; noise floor {_format_mm(floor)}. The Letter: {_format_pair(letter)}",
         ),
         Headline(
             f"{ratio:.2f} ×" if np.isfinite(ratio) else "–",
@@ -70,16 +70,18 @@ def reproduction_headlines(data: ReproductionData) -> list[Headline]:
     ]
     if data.spheres:
         headlines.append(
-            _duel("error of the sphere's radius", radius, "stereo → pixelwise; mean size over the spheres")
+            _pair_headline("error of the sphere's radius", radius, "stereo → pixelwise; mean size over the spheres")
         )
     if data.spacings:
-        headlines.append(_duel("error of spheres' spacing", spacing, "stereo → pixelwise; mean size over the pairs"))
+        headlines.append(
+            _pair_headline("error of spheres' spacing", spacing, "stereo → pixelwise; mean size over the pairs")
+        )
     return headlines
 
 
 def reproduction_sections(data: ReproductionData) -> list[Section]:
     """The calibration, the planes, the spheres and the merged object, in the Letter's order."""
-    return [_calibration(data), _planes(data), _spheres(data), _merged(data)]
+    return [_calibration_section(data), _planes_section(data), _spheres_section(data), _merged_section(data)]
 
 
 def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
@@ -89,7 +91,7 @@ def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
     return (base / ours if ours > 0 else float("nan")), len(inside)
 
 
-def _calibration(data: ReproductionData) -> Section:
+def _calibration_section(data: ReproductionData) -> Section:
     items: list[Item] = [PageNotice(note) for note in data.notes]
     items += [PageNotice(f"{name} was left out: {why}") for name, why in data.poses_left_out.items()]
     rows: list[list[str | Cell]] = [
@@ -129,7 +131,7 @@ def _calibration(data: ReproductionData) -> Section:
     )
 
 
-def _planes(data: ReproductionData) -> Section:
+def _planes_section(data: ReproductionData) -> Section:
     near, far = data.depth_range_mm
     lost = [row.name for row in data.planes if row.rms_mm.get(OURS, 0.0) > row.rms_mm.get(BASE, np.inf)]
     text = [
@@ -161,7 +163,7 @@ def _planes(data: ReproductionData) -> Section:
     return Section("Experiment 2a: planes", text, items)
 
 
-def _spheres(data: ReproductionData) -> Section:
+def _spheres_section(data: ReproductionData) -> Section:
     items: list[Item] = []
     if data.spheres:
         items.append(sphere_table(data.spheres, "Table 2: RMS distance from the best sphere, and its radius"))
@@ -182,7 +184,7 @@ def _spheres(data: ReproductionData) -> Section:
     )
 
 
-def _merged(data: ReproductionData) -> Section:
+def _merged_section(data: ReproductionData) -> Section:
     items: list[Item] = []
     if data.pairs:
         items.append(merge_table(data.pairs, "Alignment of the scans by point-to-plane ICP"))
@@ -202,24 +204,24 @@ def _merged(data: ReproductionData) -> Section:
     )
 
 
-def _duel(label: str, values: dict[str, float], note: str) -> Headline:
+def _pair_headline(label: str, values: dict[str, float], note: str) -> Headline:
     better = values[OURS] < values[BASE]
     known = np.isfinite(list(values.values())).all()
-    return Headline(_arrow(values), label, note, ("better" if better else "worse") if known else "")
+    return Headline(_format_pair(values), label, note, ("better" if better else "worse") if known else "")
 
 
-def _arrow(values: dict[str, float]) -> str:
+def _format_pair(values: dict[str, float]) -> str:
     base, ours = (format_number(values[model]) for model in (BASE, OURS))
     return f"{base if isinstance(base, str) else base.text} → {ours if isinstance(ours, str) else ours.text} mm"
 
 
-def _mm(value: float) -> str:
+def _format_mm(value: float) -> str:
     return f"{value:.3f} mm" if np.isfinite(value) else "unknown"
 
 
-def _size(size: tuple[int, int]) -> str:
+def _format_size(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
 
 
-def _range(data: ReproductionData) -> str:
+def _format_depths(data: ReproductionData) -> str:
     return f"{data.depth_range_mm[0]:.0f} to {data.depth_range_mm[1]:.0f} mm"

@@ -23,8 +23,8 @@ from slviewer.report.tables import (
     UNKNOWN,
     better_worse,
     compare_errors,
+    format_incidence,
     format_number,
-    incidence_text,
     known_mean,
     models_of,
     spacing_table,
@@ -41,8 +41,8 @@ def session_title(data: SessionData) -> tuple[str, str]:
     poses = sum(row.state == "used" for row in data.captures)
     scans = sum(row.role == "scan" for row in data.captures)
     return data.name, (
-        f"{_counted(len(data.captures), 'capture')}: {_counted(poses, 'target pose')} used to calibrate, "
-        f"{_counted(scans, 'scan')}."
+        f"{_format_count(len(data.captures), 'capture')}: {_format_count(poses, 'target pose')} used to calibrate, "
+        f"{_format_count(scans, 'scan')}."
     )
 
 
@@ -53,7 +53,7 @@ def session_headlines(data: SessionData) -> list[Headline]:
     if calibration is not None:
         used = sum(row.state == "used" for row in data.captures)
         wanted = sum(row.role == "calibration" for row in data.captures)
-        note = f"boards at {_depths(calibration.stereo)}"
+        note = f"boards at {_format_depths(calibration.stereo)}"
         headlines.append(Headline(f"{used} of {wanted}", "target poses used", note))
         rms = calibration.stereo.reprojection_rms_px
         if rms:
@@ -71,10 +71,10 @@ def session_headlines(data: SessionData) -> list[Headline]:
         headlines.append(
             Headline(f"{rms_z:.3f} mm", "pixel-wise fit, RMS in z", f"median over the pixels, axis {axis}")
         )
-    return headlines + _proof(data)
+    return headlines + _plane_headline(data)
 
 
-def _proof(data: SessionData) -> list[Headline]:
+def _plane_headline(data: SessionData) -> list[Headline]:
     """The flattest model's mean plane RMS, beside its noise floor and the other models'."""
     planes = [v for v in data.verifications if v.shape == "plane"]
     means = {m: known_mean([v.rms_mm.get(m, np.nan) for v in planes]) for m in models_of([v.rms_mm for v in planes])}
@@ -91,17 +91,17 @@ def _proof(data: SessionData) -> list[Headline]:
 
 def session_sections(data: SessionData) -> list[Section]:
     """What to look at first, whatever of calibration, proofs and clouds the session holds, and its captures."""
-    sections = _notices(data)
+    sections = _notice_section(data)
     if data.verdict is not None:
         sections.append(verdict_section(data.verdict, data.verdict_of_calibration))
     if data.calibration is not None:
-        sections += [_reprojection(data.calibration), _parameters(data.calibration.stereo)]
+        sections += [_reprojection_section(data.calibration), _parameters_section(data.calibration.stereo)]
     if data.models is not None:
         sections.append(models_section(data.models))
     if data.pixel_fits:
-        sections.append(_pixel_fits(data))
+        sections.append(_pixel_fits_section(data))
     if data.verifications or data.spacings:
-        sections.append(_verifications(data))
+        sections.append(_verifications_section(data))
     if data.acceptances:
         sections.append(acceptance_section(data.acceptances))
     if data.drifts:
@@ -110,17 +110,17 @@ def session_sections(data: SessionData) -> list[Section]:
         sections.append(measurements_section(data.measurements, data.sections))
     if data.deviations:
         sections.append(deviations_section(data.deviations))
-    return [*sections, _captures(data)]
+    return [*sections, _captures_section(data)]
 
 
-def _notices(data: SessionData) -> list[Section]:
+def _notice_section(data: SessionData) -> list[Section]:
     unused = [row for row in data.captures if row.state in ("left out", "excluded")]
     items: list[Item] = [PageNotice(warning) for warning in data.warnings]
     items += [PageNotice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
     return [Section("To notice", "", items)] if items else []
 
 
-def _captures(data: SessionData) -> Section:
+def _captures_section(data: SessionData) -> Section:
     marks: dict[str, Mark] = {"used": "better", "left out": "worse", "excluded": "worse"}
     columns = [Column("capture", align="left"), Column("role", align="left"), Column("state", align="left")]
     columns += [
@@ -149,7 +149,7 @@ def _captures(data: SessionData) -> Section:
     return Section("Captures", "" if rows else "The session holds no captures yet.", [table] if rows else [])
 
 
-def _reprojection(calibration: CalibrationFigures) -> Section:
+def _reprojection_section(calibration: CalibrationFigures) -> Section:
     stereo, residuals = calibration.stereo, calibration.residuals
     rms, cameras, projectors = stereo.reprojection_rms_px, stereo.rig.camera.size, stereo.rig.projector.size
     items: list[Item] = []
@@ -175,7 +175,7 @@ def _reprojection(calibration: CalibrationFigures) -> Section:
         else "This calibration was made elsewhere, without a reprojection error."
     ]
     if aside:
-        text.append(f"{_counted(aside, 'feature')} beyond 6 robust sigma {'were' if aside > 1 else 'was'} excluded.")
+        text.append(f"Excluded: {_format_count(aside, 'feature')} beyond 6 robust sigma.")
     return Section("Reprojection", text, items)
 
 
@@ -222,17 +222,17 @@ def rig_rows(stereo: StereoModel) -> list[tuple[str, str]]:
         ("t, camera to projector (x, y, z)", " / ".join(f"{v:.2f}" for v in t).replace("-", "−") + " mm"),
         ("angle between the optical axes", f"{axes:.2f}°"),
         ("rotation, camera to projector", f"{angle:.2f}°"),
-        ("depths of the boards", _depths(stereo)),
+        ("depths of the boards", _format_depths(stereo)),
     ]
 
 
-def _depths(stereo: StereoModel) -> str:
+def _format_depths(stereo: StereoModel) -> str:
     if stereo.depth_range_mm is None:
         return "unknown"
     return "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm)
 
 
-def _parameters(stereo: StereoModel) -> Section:
+def _parameters_section(stereo: StereoModel) -> Section:
     columns = [Column("parameter", align="left"), Column("unit", align="centre"), Column("camera"), Column("projector")]
     note = "± is one standard deviation, from the lens's own calibration."
     return Section(
@@ -245,7 +245,7 @@ def _parameters(stereo: StereoModel) -> Section:
     )
 
 
-def _pixel_fits(data: SessionData) -> Section:
+def _pixel_fits_section(data: SessionData) -> Section:
     columns = [Column("axis", align="left"), Column("pixels fitted", "%"), Column("poses a pixel, median")]
     columns += [Column(f"RMS in {name}", "mm") for name in "zxy"]
     rows: list[list[str | Cell]] = []
@@ -269,7 +269,7 @@ def _pixel_fits(data: SessionData) -> Section:
     )
 
 
-def _verifications(data: SessionData) -> Section:
+def _verifications_section(data: SessionData) -> Section:
     items: list[Item] = []
     for shape, caption in (
         ("plane", "Planes: RMS distance from the best plane"),
@@ -329,7 +329,7 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
                 row += [format_number(radius), format_number(radius - v.true_radius_mm, signed=True)]
             aside = 100 * v.set_aside.get(model, 0) / max(v.points, 1)
             share = f"{aside:.1f}"
-            row += [incidence_text(v.incidence) if not i else "", f"{v.points:,}" if not i else ""]
+            row += [format_incidence(v.incidence) if not i else "", f"{v.points:,}" if not i else ""]
             row.append(Cell(share, "worse") if aside > SET_ASIDE_PERCENT else share)
             row.append(format_number(100 * v.coverage[model], 1) if model in v.coverage else UNKNOWN)
             if masked:
@@ -344,5 +344,5 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
     return Table(columns, rows, caption, notes)
 
 
-def _counted(count: int, word: str) -> str:
+def _format_count(count: int, word: str) -> str:
     return f"{count} {word}{'s' * (count != 1)}"

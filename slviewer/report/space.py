@@ -28,10 +28,10 @@ def planes_in_space(outlines: Mapping[str, np.ndarray], depth_range_mm: tuple[fl
 
     ``outlines``: by name, three or more points (n, 3) mm of a plane; their hull within the plane is drawn.
     """
-    hulls = {name: _hull(name, points) for name, points in outlines.items()}
+    hulls = {name: _convex_hull(name, points) for name, points in outlines.items()}
     if not hulls:
         raise InputError("no plane was given: their positions cannot be drawn")
-    short = _short(list(hulls))
+    short = _shorten_names(list(hulls))
     near, far = depth_range_mm
     every = np.concatenate(list(hulls.values()))
     low, high = every.min(axis=0), every.max(axis=0)
@@ -40,12 +40,12 @@ def planes_in_space(outlines: Mapping[str, np.ndarray], depth_range_mm: tuple[fl
     drawing = new_figure(FULL, 450)
     grid = drawing.add_gridspec(2, 2, width_ratios=(1.05, 1))
     space = drawing.add_subplot(grid[:, 0], projection="3d")
-    _space(space, hulls, short, depth_range_mm, low, high)
+    _draw_perspective(space, hulls, short, depth_range_mm, low, high)
     for row, (axis, title) in enumerate(((1, "from the side"), (0, "from above"))):
         axes = drawing.add_subplot(grid[row, 1])
         style_axes(axes, "", "z, mm" if row else "", f"{'xy'[axis]}, mm")
         axes.set_title(title, fontsize=TITLE_PT, color=INK, loc="left", fontweight="bold", pad=18)
-        _profile(axes, axis, hulls, short, depth_range_mm, low, high)
+        _draw_profile(axes, axis, hulls, short, depth_range_mm, low, high)
         if not row:
             legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.08), borderaxespad=0.2)
     return finish_figure(
@@ -57,7 +57,7 @@ def planes_in_space(outlines: Mapping[str, np.ndarray], depth_range_mm: tuple[fl
     )
 
 
-def _profile(
+def _draw_profile(
     axes: Any,
     axis: int,
     hulls: Mapping[str, np.ndarray],
@@ -75,9 +75,9 @@ def _profile(
     edge = 0.03 * (high[2] - low[2])
     left, right = low[2] - edge, high[2] + edge
     ends = {name: hull[np.argmin(np.abs(hull[:, axis] - top))] for name, hull in hulls.items()}
-    places = _apart({name: float(end[2]) for name, end in ends.items()}, 0.032 * (right - left), right)
+    places = _spread_labels({name: float(end[2]) for name, end in ends.items()}, 0.032 * (right - left), right)
     for name, hull in hulls.items():
-        colour = REGIONS[_region(hull, depth_range_mm)]
+        colour = REGIONS[_depth_region(hull, depth_range_mm)]
         axes.fill(hull[:, 2], hull[:, axis], facecolor=(colour, 0.14), edgecolor=(colour, 0.9), linewidth=1.3)
         axes.plot([ends[name][2], places[name]], [ends[name][axis], top], color=colour, linewidth=0.5, alpha=0.6)
         axes.annotate(
@@ -95,7 +95,7 @@ def _profile(
     axes.set_ylim(bottom, top)
 
 
-def _apart(wanted: Mapping[str, float], gap: float, end: float) -> dict[str, float]:
+def _spread_labels(wanted: Mapping[str, float], gap: float, end: float) -> dict[str, float]:
     """Places near the wanted ones, at least ``gap`` apart and none beyond ``end``."""
     names = sorted(wanted, key=lambda name: wanted[name])
     places = np.array([wanted[name] for name in names])
@@ -108,7 +108,7 @@ def _apart(wanted: Mapping[str, float], gap: float, end: float) -> dict[str, flo
     return dict(zip(names, places.tolist(), strict=True))
 
 
-def _space(
+def _draw_perspective(
     axes: Any,
     hulls: Mapping[str, np.ndarray],
     short: Mapping[str, str],
@@ -121,7 +121,7 @@ def _space(
 
     style_image_axes(axes)
     for i, (name, hull) in enumerate(hulls.items()):
-        colour = REGIONS[_region(hull, depth_range_mm)]
+        colour = REGIONS[_depth_region(hull, depth_range_mm)]
         shown = np.stack([hull[:, 2], hull[:, 0], -hull[:, 1]], axis=1)
         axes.add_collection3d(
             Poly3DCollection(
@@ -132,7 +132,7 @@ def _space(
         end = shown[corner(shown[:, 2])]
         axes.text(*end, short[name], fontsize=SMALL_PT, color=colour, fontweight="bold", ha="center", va=side)
     for z in depth_range_mm:
-        wall = np.array([[z, x, -y] for x, y in _rectangle(low, high)])
+        wall = np.array([[z, x, -y] for x, y in _rectangle_corners(low, high)])
         axes.add_collection3d(
             Poly3DCollection(
                 [wall], facecolors=["#9fb4c6"], alpha=0.14, edgecolors=["#7f97ab"], linewidths=0.8, clip_on=False
@@ -151,7 +151,7 @@ def _space(
     )
 
 
-def _hull(name: str, points: np.ndarray) -> np.ndarray:
+def _convex_hull(name: str, points: np.ndarray) -> np.ndarray:
     """The corners (m, 3), in order, of the convex hull of points that lie about in one plane."""
     from scipy.spatial import ConvexHull
 
@@ -164,16 +164,16 @@ def _hull(name: str, points: np.ndarray) -> np.ndarray:
     return points[ConvexHull(centred @ directions[:2].T).vertices]
 
 
-def _rectangle(low: np.ndarray, high: np.ndarray) -> list[tuple[float, float]]:
+def _rectangle_corners(low: np.ndarray, high: np.ndarray) -> list[tuple[float, float]]:
     return [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
 
 
-def _region(hull: np.ndarray, depth_range_mm: tuple[float, float]) -> str:
+def _depth_region(hull: np.ndarray, depth_range_mm: tuple[float, float]) -> str:
     z = float(hull[:, 2].mean())
     return "R1" if z < depth_range_mm[0] else "R3" if z > depth_range_mm[1] else "R2"
 
 
-def _short(names: list[str]) -> dict[str, str]:
+def _shorten_names(names: list[str]) -> dict[str, str]:
     """Names without what all of them begin with (and its zeros): plane_01 is 1."""
     common = 0
     while len(names) > 1 and len({name[: common + 1] for name in names}) == 1 and common < len(names[0]):

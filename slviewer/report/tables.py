@@ -52,26 +52,26 @@ def models_of(rows: Sequence[Mapping[str, float]]) -> list[str]:
 
 def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
     """Incidence, RMS and floor by model, who wins, and, where rows have them, the Letter's own figures."""
-    rms, floor = _by_model(rows, "rms_mm"), _by_model(rows, "noise_floor_mm")
-    letter = _by_model(rows, "letter_rms_mm")
-    columns: list[_Filled] = [
+    rms, floor = _values_by_model(rows, "rms_mm"), _values_by_model(rows, "noise_floor_mm")
+    letter = _values_by_model(rows, "letter_rms_mm")
+    columns: list[_CellColumn] = [
         (Column("plane", align="left"), [*(row.name for row in rows), "mean"]),
-        (Column("R1 / R2 / R3", "%", align="centre"), [*(incidence_text(row.incidence) for row in rows), ""]),
+        (Column("R1 / R2 / R3", "%", align="centre"), [*(format_incidence(row.incidence) for row in rows), ""]),
     ]
     for model in rms:
-        columns.append((Column("RMS", "mm", model), _won(model, rms)))
-        columns.append((Column("floor", "mm", model), _muted(floor.get(model, []), len(rows))))
-    columns += _against(rms, "against")
+        columns.append((Column("RMS", "mm", model), _error_cells(model, rms)))
+        columns.append((Column("floor", "mm", model), _muted_cells(floor.get(model, []), len(rows))))
+    columns += _comparison_columns(rms, "against")
     if letter:
         group = "the Letter's rig"
-        shares = [*(incidence_text(row.letter_incidence) for row in rows), ""]
+        shares = [*(format_incidence(row.letter_incidence) for row in rows), ""]
         columns.append((Column("R1 / R2 / R3", "%", group, "centre"), shares))
         columns += [
             (Column(model, "mm", group), [format_number(v) for v in values]) for model, values in letter.items()
         ]
         columns += [
-            (replace(column, group=group), [_plain(cell) for cell in cells])
-            for column, cells in _against(letter, "against")
+            (replace(column, group=group), [_remove_mark(cell) for cell in cells])
+            for column, cells in _comparison_columns(letter, "against")
         ]
     note = "RMS over the pixels that every model measures; floor: what the capture's noise alone would give."
     return _filled_table(columns, caption, [note])
@@ -79,23 +79,23 @@ def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
 
 def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
     """RMS, floor and fitted radius by model, who wins in the radius, and the Letter's own figures where known."""
-    rms, floor = _by_model(rows, "rms_mm"), _by_model(rows, "noise_floor_mm")
-    radius, letter = _by_model(rows, "radius_mm"), _by_model(rows, "letter_rms_mm")
-    errors = _errors(rms, radius, [row.true_radius_mm for row in rows])
-    columns: list[_Filled] = [
+    rms, floor = _values_by_model(rows, "rms_mm"), _values_by_model(rows, "noise_floor_mm")
+    radius, letter = _values_by_model(rows, "radius_mm"), _values_by_model(rows, "letter_rms_mm")
+    errors = _signed_errors(rms, radius, [row.true_radius_mm for row in rows])
+    columns: list[_CellColumn] = [
         (Column("sphere", align="left"), [*(row.name for row in rows), "mean"]),
         (Column("range", align="centre"), [*(row.region for row in rows), ""]),
     ]
     for model in rms:
-        columns.append((Column("RMS", "mm", model), _won(model, rms)))
-        columns.append((Column("floor", "mm", model), _muted(floor.get(model, []), len(rows))))
+        columns.append((Column("RMS", "mm", model), _error_cells(model, rms)))
+        columns.append((Column("floor", "mm", model), _muted_cells(floor.get(model, []), len(rows))))
         columns.append(
             (Column("radius", "mm", model), [format_number(r) for r in radius.get(model, [np.nan] * (len(rows) + 1))])
         )
-        columns.append((Column("error", "mm", model), _won(model, errors, signed=True)))
-    columns += _against(errors, "radius against")
+        columns.append((Column("error", "mm", model), _error_cells(model, errors, signed=True)))
+    columns += _comparison_columns(errors, "radius against")
     for model, values in letter.items():
-        *radii, mean = _by_model(rows, "letter_radius_mm")[model]
+        *radii, mean = _values_by_model(rows, "letter_radius_mm")[model]
         group = f"the Letter's rig, {model}"
         columns.append((Column("RMS", "mm", group), [format_number(v) for v in values]))
         columns.append((Column("radius", "mm", group), [*(format_number(r, 2) for r in radii), format_number(mean)]))
@@ -107,18 +107,21 @@ def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
 def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
     """Distances between spheres, known (where they are) and measured; flatness is blind to scale and shear, these are
     not."""
-    measured = _by_model(rows, "measured_mm")
-    names: _Filled = (Column("spheres", align="left"), [*(row.name for row in rows), "mean size of the error"])
+    measured = _values_by_model(rows, "measured_mm")
+    names: _CellColumn = (Column("spheres", align="left"), [*(row.name for row in rows), "mean size of the error"])
     if not any(np.isfinite(row.known_mm) for row in rows):
         plain = [(Column(model, "mm"), [format_number(v) for v in values]) for model, values in measured.items()]
         table = _filled_table([names, *plain], caption)
         return replace(table, footer=())
-    errors = _errors(measured, measured, [row.known_mm for row in rows])
-    columns: list[_Filled] = [names, (Column("known", "mm"), [*(format_number(row.known_mm) for row in rows), ""])]
+    errors = _signed_errors(measured, measured, [row.known_mm for row in rows])
+    columns: list[_CellColumn] = [
+        names,
+        (Column("known", "mm"), [*(format_number(row.known_mm) for row in rows), ""]),
+    ]
     for model, values in measured.items():
         columns.append((Column("measured", "mm", model), [*(format_number(v) for v in values[:-1]), ""]))
-        columns.append((Column("error", "mm", model), _won(model, errors, signed=True)))
-    return _filled_table(columns + _against(errors, "against"), caption)
+        columns.append((Column("error", "mm", model), _error_cells(model, errors, signed=True)))
+    return _filled_table(columns + _comparison_columns(errors, "against"), caption)
 
 
 def spacing_error(rows: Sequence[SpacingRow], model: str) -> float:
@@ -139,31 +142,31 @@ def merge_table(pairs: Sequence[MergePair], caption: str) -> Table:
     return Table(columns, rows, caption)
 
 
-def incidence_text(incidence: Mapping[str, float]) -> str | Cell:
+def format_incidence(incidence: Mapping[str, float]) -> str | Cell:
     """``9 / 91 / 0``; a dash where it is unknown."""
     if not incidence:
         return UNKNOWN
     return " / ".join(f"{abs(incidence.get(region, 0.0)):.1f}".removesuffix(".0") for region in ("R1", "R2", "R3"))
 
 
-_Filled = tuple[Column, list[str | Cell]]
+_CellColumn = tuple[Column, list[str | Cell]]
 """A column with its cells, the last of which is that of the means."""
 
 
-def _filled_table(columns: Sequence[_Filled], caption: str, notes: Sequence[str] = ()) -> Table:
+def _filled_table(columns: Sequence[_CellColumn], caption: str, notes: Sequence[str] = ()) -> Table:
     """The columns side by side; the means are a footer where there is more than one row."""
     *rows, means = zip(*(cells for _, cells in columns), strict=True)
     return Table([column for column, _ in columns], rows, caption, notes, [means] if len(rows) > 1 else [])
 
 
-def _by_model(rows: Sequence[object], figure: str) -> dict[str, list[float]]:
+def _values_by_model(rows: Sequence[object], figure: str) -> dict[str, list[float]]:
     """{model: its figure in every row (NaN where unknown), then their mean}."""
     figures: list[ByModel] = [getattr(row, figure) for row in rows]
     values = {model: [each.get(model, np.nan) for each in figures] for model in models_of(figures)}
     return {model: [*of_rows, known_mean(of_rows)] for model, of_rows in values.items()}
 
 
-def _errors(
+def _signed_errors(
     models: Iterable[str], measured: Mapping[str, Sequence[float]], true: Sequence[float]
 ) -> dict[str, list[float]]:
     """{model: measured less true value in every row, then the mean of their sizes}."""
@@ -172,7 +175,7 @@ def _errors(
     return {model: [*each, known_mean([abs(error) for error in each])] for model, each in errors.items()}
 
 
-def _against(errors: Mapping[str, Sequence[float]], words: str) -> list[_Filled]:
+def _comparison_columns(errors: Mapping[str, Sequence[float]], words: str) -> list[_CellColumn]:
     """Each further model's errors against the first model's, in words."""
     first, *others = errors
     return [
@@ -181,7 +184,7 @@ def _against(errors: Mapping[str, Sequence[float]], words: str) -> list[_Filled]
     ]
 
 
-def _won(model: str, errors: Mapping[str, Sequence[float]], signed: bool = False) -> list[str | Cell]:
+def _error_cells(model: str, errors: Mapping[str, Sequence[float]], signed: bool = False) -> list[str | Cell]:
     """A model's errors; marked better where one beats every other model's, worse where the first model beats it. The
     last, a mean, is ``signed`` in no case."""
     cells: list[str | Cell] = []
@@ -196,10 +199,10 @@ def _won(model: str, errors: Mapping[str, Sequence[float]], signed: bool = False
     return cells
 
 
-def _muted(values: Sequence[float], rows: int) -> list[str | Cell]:
+def _muted_cells(values: Sequence[float], rows: int) -> list[str | Cell]:
     texts = [format_number(value) for value in values or [np.nan] * (rows + 1)]
     return [text if isinstance(text, Cell) else Cell(text, "muted") for text in texts]
 
 
-def _plain(cell: str | Cell) -> str | Cell:
+def _remove_mark(cell: str | Cell) -> str | Cell:
     return cell if isinstance(cell, str) or cell.mark == "muted" else Cell(cell.text)

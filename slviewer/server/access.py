@@ -46,8 +46,8 @@ class Access:
 
     def __init__(self, port: int, token: str | None, view_token: str | None, names: tuple[str, ...] = ()) -> None:
         self.port = port
-        self.token = _checked(token)
-        self.view_token = _checked(view_token)
+        self.token = _check_token(token)
+        self.view_token = _check_token(view_token)
         if hmac.compare_digest(self.token, self.view_token):
             raise UsageError("The token for watching is the operator's: choose two different ones.")
         self.names = frozenset(name.lower() for name in names)
@@ -113,7 +113,7 @@ class Access:
         return {f"{name}:{self.port}" for name in bare} | self.names | (bare if self.port == 80 else set())
 
 
-def _checked(token: str | None) -> str:
+def _check_token(token: str | None) -> str:
     if token is None:
         return secrets.token_urlsafe(24)
     if not _TOKEN.fullmatch(token):

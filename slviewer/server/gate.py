@@ -43,10 +43,10 @@ class ViserGate:
             logger.debug("client %s: dropped a message that is none", self._client)
             return None
         try:
-            return self._passed(message, raw)
+            return self._check_message(message, raw)
         except MessageRefused as refused:
             logger.debug("client %s: dropped %s: %s", self._client, type(message).__name__, refused)
-            self._answer(message, refused)
+            self._send_refusal(message, refused)
         except Exception:  # what the check stumbles over, viser would too
             logger.exception("client %s: dropped %s", self._client, type(message).__name__)
         return None
@@ -55,7 +55,7 @@ class ViserGate:
         """The connection has ended."""
         self._uploads.close()
 
-    def _passed(self, message: Any, raw: bytes) -> bytes:
+    def _check_message(self, message: Any, raw: bytes) -> bytes:
         """The bytes that viser gets to see for this message; Refused where it may not."""
         server, client = self._server, self._client
         assert client is not None
@@ -63,48 +63,48 @@ class ViserGate:
         watching = messages.ViewerCameraMessage | messages.LocalStorageGetItemResponseMessage
         if self._role != "operator" and not isinstance(message, watching):
             raise MessageRefused("this link only watches", correct=True)
-        if not _finite(vars(message)):
+        if not _is_finite(vars(message)):
             raise MessageRefused("numbers that are none")
         match message:
             case messages.ViewerCameraMessage():
-                _camera(message)
+                _check_camera(message)
             case messages.GuiUpdateMessage():
                 if message.updates.keys() != {"value"}:
                     raise MessageRefused("only an input's value can be set")
-                check_value(self._enabled(message.uuid), message.updates["value"])
+                check_value(self._enabled_input(message.uuid), message.updates["value"])
             case messages.CommandTriggerMessage():
                 _check(inside.command(server, client, message.uuid) is not None)
             case messages.FileTransferStartUpload():
-                button = self._enabled(message.source_component_uuid)
+                button = self._enabled_input(message.source_component_uuid)
                 _check(isinstance(button, viser.GuiUploadButtonHandle))
                 return inside.encode(self._uploads.start(message))
             case messages.FileTransferPart():
                 self._uploads.part(message)
             case messages.ScenePointerMessage():
-                _check(inside.pointer_listens(server, client, message.event_type))
+                _check(inside.listens_to_pointer(server, client, message.event_type))
                 click = message.event_type == "click"
                 _check(len(message.screen_pos) == (1 if click else 2))
                 _check(not click or None not in (message.ray_origin, message.ray_direction))
             case messages.LocalStorageGetItemResponseMessage():
-                _check(inside.awaited(server, client, type(message)))
+                _check(inside.is_awaited(server, client, type(message)))
             case _:
-                self._scene(message, client)
+                self._check_scene_message(message, client)
         return raw
 
-    def _scene(self, message: Any, client: int) -> None:
+    def _check_scene_message(self, message: Any, client: int) -> None:
         scene = inside.scene_api(self._server, client, message.owner)
         _check(scene is not None)
         match message:
             case messages.TransformControlsUpdateMessage():
-                _check(inside.gizmo(scene, client, message.name) and math.hypot(*message.wxyz) > 1e-6)
+                _check(inside.listens_to_gizmo(scene, client, message.name) and math.hypot(*message.wxyz) > 1e-6)
             case messages.TransformControlsDragStartMessage() | messages.TransformControlsDragEndMessage():
-                _check(inside.gizmo(scene, client, message.name))
+                _check(inside.listens_to_gizmo(scene, client, message.name))
             case messages.SceneNodeClickMessage():
-                _check(inside.node_clicks(scene, message.name))
+                _check(inside.listens_to_clicks(scene, message.name))
             case _:
                 raise MessageRefused("no message of clients")
 
-    def _enabled(self, uuid: str) -> Any:
+    def _enabled_input(self, uuid: str) -> Any:
         assert self._client is not None
         handle = inside.gui_input(self._server, self._client, uuid)
         if handle is None:
@@ -113,7 +113,7 @@ class ViserGate:
             raise MessageRefused("disabled", correct=True)
         return handle
 
-    def _answer(self, message: Any, refused: MessageRefused) -> None:
+    def _send_refusal(self, message: Any, refused: MessageRefused) -> None:
         assert self._client is not None
         if isinstance(message, messages.FileTransferStartUpload):
             inside.refuse_upload(
@@ -130,20 +130,20 @@ class ViserGate:
         asyncio.get_running_loop().call_soon(inside.forget_upload, self._server, self._client, transfer)
 
 
-def _camera(message: messages.ViewerCameraMessage) -> None:
+def _check_camera(message: messages.ViewerCameraMessage) -> None:
     usable = 0 < message.image_height < 2**15 and 0 < message.image_width < 2**15 and math.hypot(*message.wxyz) > 1e-6
     if not usable:
         raise MessageRefused("no camera")
 
 
-def _finite(value: Any) -> bool:
+def _is_finite(value: Any) -> bool:
     """Whether no number in this message is NaN or infinite."""
     if isinstance(value, float):
         return math.isfinite(value)
     if isinstance(value, dict):
-        return all(map(_finite, value.values()))
+        return all(map(_is_finite, value.values()))
     if isinstance(value, list | tuple):
-        return all(map(_finite, value))
+        return all(map(_is_finite, value))
     return True
 
 
@@ -157,9 +157,9 @@ def check_value(handle: Any, value: Any) -> None:
         case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
             _check(isinstance(value, str) and value in handle.options, "not an option", correct=True)
         case viser.GuiTextHandle():
-            _check(isinstance(value, str) and _plain(value, handle.multiline), "not plain text")
+            _check(isinstance(value, str) and _is_plain_text(value, handle.multiline), "not plain text")
         case viser.GuiNumberHandle() | viser.GuiSliderHandle():
-            _number(value, handle.value, handle.min, handle.max)
+            _check_number(value, handle.value, handle.min, handle.max)
         case _:  # uploads have messages of their own, and the wizard has no other inputs
             raise MessageRefused("this input takes no value")
 
@@ -169,7 +169,7 @@ def _check(condition: bool, reason: str = "nothing listens to that", correct: bo
         raise MessageRefused(reason, correct)
 
 
-def _number(value: Any, current: float, low: float | None, high: float | None) -> None:
+def _check_number(value: Any, current: float, low: float | None, high: float | None) -> None:
     _check(isinstance(value, int | float) and not isinstance(value, bool), "not a number", correct=True)
     _check(abs(value) < 2**53 and math.isfinite(value), "not a finite number", correct=True)
     # viser would cut the fraction off in silence.
@@ -177,6 +177,6 @@ def _number(value: Any, current: float, low: float | None, high: float | None) -
     _check((low is None or value >= low) and (high is None or value <= high), "outside its range")
 
 
-def _plain(text: str, multiline: bool) -> bool:
+def _is_plain_text(text: str, multiline: bool) -> bool:
     allowed = "\n\r\t" if multiline else "\t"
     return len(text) <= TEXT_LIMIT and all(c.isprintable() or c in allowed or ord(c) > 159 for c in text)

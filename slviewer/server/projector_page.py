@@ -53,7 +53,7 @@ async def _talk(connection: ServerConnection, channel: Channel) -> None:
     writer = asyncio.create_task(write())
     try:
         async for message in connection:
-            channel.received(page, message)
+            channel.handle_message(page, message)
     except InputError:
         await connection.close(NOT_UNDERSTOOD, "not understood")
     finally:

@@ -24,17 +24,17 @@ class Viewers:
     def __init__(self, server: viser.ViserServer, answered: Callable[[], None]) -> None:
         self._server, self._answered = server, answered
         self._lock = threading.Lock()
-        self._asked: dict[int, float] = {}
-        self._took: dict[int, float] = {}
+        self._request_times: dict[int, float] = {}
+        self._durations: dict[int, float] = {}
 
     def ready(self) -> list[viser.ClientHandle]:
         """Those that have drawn everything that was marked by `sent`."""
         clients = self._server.get_clients()
         with self._lock:
-            for known in (self._asked, self._took):
+            for known in (self._request_times, self._durations):
                 for gone in known.keys() - clients.keys():
                     del known[gone]
-            return [client for number, client in clients.items() if number not in self._asked]
+            return [client for number, client in clients.items() if number not in self._request_times]
 
     def here(self) -> set[int]:
         """The numbers of all that are connected."""
@@ -44,19 +44,19 @@ class Viewers:
         """Something was sent to this one: it is not ready until it has drawn it."""
         number = client.client_id
         with self._lock:
-            self._asked[number] = time.monotonic()
-        viser_internals.ask_back(client, lambda: self._heard(number))
+            self._request_times[number] = time.monotonic()
+        viser_internals.request_answer(client, lambda: self._record_answer(number))
 
     def slowest_s(self) -> float:
         """How long the slowest of them took for what it was sent last, those apart that have stalled; 0: none did."""
         now = time.monotonic()
         with self._lock:
-            waiting = [now - asked for asked in self._asked.values() if now - asked < STALLED_S]
-            return max([*self._took.values(), *waiting], default=0.0)
+            waiting = [now - asked for asked in self._request_times.values() if now - asked < STALLED_S]
+            return max([*self._durations.values(), *waiting], default=0.0)
 
-    def _heard(self, number: int) -> None:
+    def _record_answer(self, number: int) -> None:
         with self._lock:
-            asked = self._asked.pop(number, None)
+            asked = self._request_times.pop(number, None)
             if asked is not None:
-                self._took[number] = min(time.monotonic() - asked, STALLED_S)
+                self._durations[number] = min(time.monotonic() - asked, STALLED_S)
         self._answered()

@@ -165,7 +165,7 @@ def gui_apis(server: viser.ViserServer, client_id: int | None) -> list[viser.Gui
 def gui_input(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
     """The input with this id that the client can see, or None."""
     found = (api._gui_input_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
-    return next((handle for handle in found if handle is not None and shown(handle)), None)
+    return next((handle for handle in found if handle is not None and is_shown(handle)), None)
 
 
 def command(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
@@ -174,7 +174,7 @@ def command(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
     return next((one for one in found if one is not None and not (one._impl.removed or one.disabled)), None)
 
 
-def shown(handle: Any) -> bool:
+def is_shown(handle: Any) -> bool:
     """Whether this element, and every folder, tab, panel or modal that holds it, exists and is visible."""
     while True:
         impl = handle._impl
@@ -205,21 +205,21 @@ def scene_api(server: viser.ViserServer, client_id: int, owner: str) -> Any:
     return client.scene if client is not None and client.scene._owner_id == owner else None
 
 
-def gizmo(scene: Any, client_id: int, name: str) -> bool:
+def listens_to_gizmo(scene: Any, client_id: int, name: str) -> bool:
     """Whether this gizmo is there to be moved, and someone listens to it; also while one removed is still held."""
     if (client_id, name) in scene._active_transform_drag_handles:
         return True
     handle = scene._handle_from_transform_controls_name.get(name)
-    return handle is not None and bool(handle._impl_aux.update_cb) and _visible(scene, name)
+    return handle is not None and bool(handle._impl_aux.update_cb) and _is_visible(scene, name)
 
 
-def node_clicks(scene: Any, name: str) -> bool:
+def listens_to_clicks(scene: Any, name: str) -> bool:
     """Whether someone listens to clicks on this node."""
     handle = scene._handle_from_node_name.get(name)
-    return handle is not None and bool(handle._impl.click_cb) and _visible(scene, name)
+    return handle is not None and bool(handle._impl.click_cb) and _is_visible(scene, name)
 
 
-def _visible(scene: Any, name: str) -> bool:
+def _is_visible(scene: Any, name: str) -> bool:
     """Whether the node and all that it hangs from are visible."""
     parts = name.split("/")
     chain = ("/".join(parts[: n + 1]) for n in range(1, len(parts)))
@@ -227,30 +227,30 @@ def _visible(scene: Any, name: str) -> bool:
     return all(handle is None or handle._impl.visible for handle in handles)
 
 
-def pointer_listens(server: viser.ViserServer, client_id: int, event: str) -> bool:
+def listens_to_pointer(server: viser.ViserServer, client_id: int, event: str) -> bool:
     """Whether someone listens to this event of the pointer over the whole scene."""
     client = server._connected_clients.get(client_id)
     scenes = [server.scene] if client is None else [server.scene, client.scene]
     return any(entry.event_type == event for scene in scenes for entry in scene._scene_pointer_cb)
 
 
-def awaited(server: viser.ViserServer, client_id: int, kind: type[Message]) -> bool:
+def is_awaited(server: viser.ViserServer, client_id: int, kind: type[Message]) -> bool:
     """Whether the server asked this client a question that is answered by this kind of message."""
     client = server._connected_clients.get(client_id)
     return client is not None and bool(client._websock_connection._incoming_handlers.get(kind))
 
 
-def ask_back(client: viser.ClientHandle, answered: Callable[[], None]) -> None:
+def request_answer(client: viser.ClientHandle, answered: Callable[[], None]) -> None:
     """Call `answered()`, on the server's thread, once this client has handled all that was queued for it alone."""
     connection, kind = client._websock_connection, _messages.LocalStorageGetItemResponseMessage
     question = secrets.token_hex(8)
 
-    def heard(_: int, message: _messages.LocalStorageGetItemResponseMessage) -> None:
+    def handle_answer(_: int, message: _messages.LocalStorageGetItemResponseMessage) -> None:
         if message.request_uuid == question:
-            connection.unregister_handler(kind, heard)
+            connection.unregister_handler(kind, handle_answer)
             answered()
 
-    connection.register_handler(kind, heard)
+    connection.register_handler(kind, handle_answer)
     connection.queue_message(_messages.LocalStorageGetItemRequestMessage("slviewer", question))
 
 

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from slviewer.devices.browser import browser_projector
-from slviewer.devices.channel import Channel, Standing
+from slviewer.devices.channel import Channel, PageState
 from slviewer.devices.drivers import driver
 from slviewer.devices.screen import Screen, refusal
 from slviewer.errors import DeviceError, InputError
@@ -89,9 +89,9 @@ def test_no_page_is_said_at_once():
 
 def test_one_window_is_the_projector_until_another_is_asked_for():
     channel, sent = Channel(), {"first": [], "again": [], "other": []}
-    assert channel.standing() == Standing("waiting", "waiting for the page")
+    assert channel.page_state() == PageState("waiting", "waiting for the page")
     first = channel.connect(hello("a"), sent["first"].append)
-    assert channel.standing() == Standing("ready", "ready 1920 x 1080", (1920, 1080))
+    assert channel.page_state() == PageState("ready", "ready 1920 x 1080", (1920, 1080))
     assert channel.connect(hello("b"), sent["other"].append) is None and sent["other"] == []
     again = channel.connect(hello("a"), sent["again"].append)  # reloaded, its old connection not yet gone
     assert sent["first"][-1] is None and "reloaded" in first.gone
@@ -100,22 +100,22 @@ def test_one_window_is_the_projector_until_another_is_asked_for():
     other = channel.connect(hello("b", take=True), sent["other"].append)
     assert sent["again"][-1] is None and "another window" in again.gone and channel.page() is other
     channel.disconnect(other)
-    assert channel.standing().state == "waiting" and channel.wait_ready(0.01).state == "waiting"
+    assert channel.page_state().state == "waiting" and channel.wait_ready(0.01).state == "waiting"
 
 
 def test_what_the_page_says_is_judged_by_what_is_expected():
     channel, sent = Channel(), []
     page = channel.connect(hello(), sent.append)
-    channel.expect((912, 1140))
-    assert channel.standing().state == "refused" and "912 x 1140" in channel.standing().words
+    channel.set_pattern_size((912, 1140))
+    assert channel.page_state().state == "refused" and "912 x 1140" in channel.page_state().words
     with pytest.raises(DeviceError, match="1920 x 1080"):
         channel.page()
     told = len(sent)
-    channel.expect((912, 1140))
+    channel.set_pattern_size((912, 1140))
     assert len(sent) == told, "what is no news is not sent again"
     small = screen(inner=(912, 1140), whole=(912, 1140), box=None)
-    channel.received(page, msgspec.json.encode({"op": "screen", "screen": small}))
-    assert channel.standing().words == "ready 912 x 1140" and len(sent) == told + 1 and page.changes == 1
+    channel.handle_message(page, msgspec.json.encode({"op": "screen", "screen": small}))
+    assert channel.page_state().words == "ready 912 x 1140" and len(sent) == told + 1 and page.changes == 1
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_nonsense_is_refused(message):
     channel = Channel()
     page = channel.connect(hello(), lambda message: None)
     with pytest.raises(InputError):
-        channel.received(page, message)
+        channel.handle_message(page, message)
     if message != hello():
         with pytest.raises(InputError):
             channel.connect(message, lambda message: None)

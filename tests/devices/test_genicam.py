@@ -20,7 +20,7 @@ pytest.importorskip("harvesters", reason="the optional package harvesters is not
 from slviewer.devices import genicam as driver_module  # noqa: E402
 from slviewer.devices.capture import capture, colour_texture  # noqa: E402
 from slviewer.devices.drivers import driver  # noqa: E402
-from slviewer.devices.genicam import IN_FLIGHT, GenicamCamera, found, genicam_camera  # noqa: E402
+from slviewer.devices.genicam import IN_FLIGHT, GenicamCamera, genicam_camera, list_connected  # noqa: E402
 from slviewer.devices.genicam_features import Features  # noqa: E402
 from slviewer.devices.gentl import PRODUCERS_VARIABLE  # noqa: E402
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig  # noqa: E402
@@ -64,8 +64,8 @@ def column(frame: np.ndarray) -> float:
 
 
 def test_cameras_are_found_and_chosen():
-    assert found() == [f"Machine Vision Games Ltd. Viky, serial {k}" for k in range(3)]
-    assert driver("genicam").found is found and driver("genicam").camera is genicam_camera
+    assert list_connected() == [f"Machine Vision Games Ltd. Viky, serial {k}" for k in range(3)]
+    assert driver("genicam").list_connected is list_connected and driver("genicam").camera is genicam_camera
     with pytest.raises(InputError, match=r"3 .*serial 0; .*serial 2"):
         genicam_camera()
     with pytest.raises(InputError, match="3 "):
@@ -85,11 +85,11 @@ def test_producers_that_are_missing_or_broken_are_named(monkeypatch, tmp_path):
     with pytest.raises(DeviceError, match=r"broken\.cti"):
         genicam_camera(producer=str(broken))
     monkeypatch.setenv(PRODUCERS_VARIABLE, f"{tmp_path}:{VIKY.parent}:{tmp_path}")
-    assert len(found()) == 3
+    assert len(list_connected()) == 3
     for folders in (str(tmp_path / "nothing"), ""):
         monkeypatch.setenv(PRODUCERS_VARIABLE, folders)
         with pytest.raises(DeviceError):
-            found()
+            list_connected()
 
 
 @pytest.mark.slow
@@ -192,7 +192,7 @@ def test_cameras_of_one_producer_are_used_side_by_side(camera):
         again.open()
     second = genicam_camera(serial=2)
     second.open()
-    assert len(found()) == 3
+    assert len(list_connected()) == 3
     column(grabbed(first))
     column(grabbed(fast(second)))
     second.close()

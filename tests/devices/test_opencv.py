@@ -263,7 +263,7 @@ def test_webcams_are_listed_by_their_names(tmp_path):
         (tmp_path / node / "name").write_text(f"{name}\n")
     lines = listed(tmp_path)
     assert [line.split(",")[0] for line in lines] == ["source 0: HD Webcam", "source 10: Arducam"]
-    assert listed(tmp_path / "none") == [] and isinstance(driver("opencv").found(), list)
+    assert listed(tmp_path / "none") == [] and isinstance(driver("opencv").list_connected(), list)
 
 
 class _OneAtATime(NetworkCamera):

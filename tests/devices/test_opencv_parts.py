@@ -10,7 +10,7 @@ from mjpeg import network_camera
 
 from slviewer.devices import opencv as opencv_module
 from slviewer.devices.opencv import OpenCVCamera
-from slviewer.devices.opencv_controls import dialect, exposure_ms, set_exposure, switch_automatics_off
+from slviewer.devices.opencv_controls import dialect_of, exposure_ms, set_exposure, switch_automatics_off
 from slviewer.devices.opencv_reader import Connected, Pace
 from slviewer.devices.opencv_source import connect
 from slviewer.devices.protocols import CameraSettings
@@ -58,16 +58,16 @@ def test_exposures_are_told_in_milliseconds_whatever_the_camera_counts_in():
         ("MSMF", -7, 7.8125, 31.0, 31.25),
     ):
         webcam = Webcam(None, backend, {cv2.CAP_PROP_EXPOSURE: float(raw)})
-        words = dialect(webcam)
+        words = dialect_of(webcam)
         assert exposure_ms(webcam, words) == pytest.approx(ms)
         said = set_exposure(webcam, words, asked)
         assert exposure_ms(webcam, words) == pytest.approx(taken)
         assert bool(said) == (abs(taken - asked) > 0.01 * asked)
-    assert dialect(Webcam(None, "AVFOUNDATION", {})) is None
+    assert dialect_of(Webcam(None, "AVFOUNDATION", {})) is None
     bare = Webcam(None, "V4L2", {})
-    assert exposure_ms(bare, dialect(bare)) is None
-    assert "cannot be set" in set_exposure(bare, dialect(bare), 5.0)
-    assert switch_automatics_off(bare, dialect(bare)) == {}
+    assert exposure_ms(bare, dialect_of(bare)) is None
+    assert "cannot be set" in set_exposure(bare, dialect_of(bare), 5.0)
+    assert switch_automatics_off(bare, dialect_of(bare)) == {}
 
 
 def test_windows_is_told_the_values_it_has_so_that_they_stay():
@@ -79,7 +79,7 @@ def test_windows_is_told_the_values_it_has_so_that_they_stay():
             return control != cv2.CAP_PROP_FOCUS
 
     webcam = Windows(None, "DSHOW", {cv2.CAP_PROP_EXPOSURE: -6.0, cv2.CAP_PROP_FOCUS: 20.0})
-    said = switch_automatics_off(webcam, dialect(webcam))
+    said = switch_automatics_off(webcam, dialect_of(webcam))
     assert written == [(cv2.CAP_PROP_EXPOSURE, -6.0), (cv2.CAP_PROP_FOCUS, 20.0)]
     assert list(said) == ["automatic focus"]
 

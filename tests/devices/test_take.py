@@ -121,7 +121,7 @@ class _Page:
         header = msgspec.json.decode(message[4 : 4 + int.from_bytes(message[:4], "little")])
         self.asked.append(header["op"])
         if "number" in header and self._page is not None:
-            self._channel.received(self._page, msgspec.json.encode({"op": "done", "number": header["number"]}))
+            self._channel.handle_message(self._page, msgspec.json.encode({"op": "done", "number": header["number"]}))
 
 
 def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():

@@ -162,11 +162,15 @@ def test_devices_says_what_is_connected_and_what_is_missing(run: Run, monkeypatc
 
     for added in (
         Driver(
-            "far", "nothing", packages={"no_such_package": "pip install it"}, camera=camera, found=lambda: ["never"]
+            "far",
+            "nothing",
+            packages={"no_such_package": "pip install it"},
+            camera=camera,
+            list_connected=lambda: ["never"],
         ),
-        Driver("near", "nothing", camera=camera, found=lambda: ["the camera A", "the camera B"]),
-        Driver("empty", "nothing", camera=camera, found=list),
-        Driver("blind", "nothing", camera=camera, found=none_to_ask),
+        Driver("near", "nothing", camera=camera, list_connected=lambda: ["the camera A", "the camera B"]),
+        Driver("empty", "nothing", camera=camera, list_connected=list),
+        Driver("blind", "nothing", camera=camera, list_connected=none_to_ask),
     ):
         monkeypatch.setitem(drivers(), added.name, added)
     text = run("devices")[1]
@@ -206,7 +210,10 @@ def test_a_driver_that_fails_in_its_own_way_hides_no_other(monkeypatch: pytest.M
     def broken() -> list[str]:
         raise ImportError("libGenApi.so cannot be opened")
 
-    there = [Driver("broken", "a camera", found=broken), Driver("whole", "a camera", found=lambda: ["source 0: one"])]
+    there = [
+        Driver("broken", "a camera", list_connected=broken),
+        Driver("whole", "a camera", list_connected=lambda: ["source 0: one"]),
+    ]
     monkeypatch.setattr(devices, "available", lambda: there)
     first, second = devices.list_drivers()
     assert "libGenApi.so" in first.trouble and first.connected is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slviewer.errors import InputError
-from slviewer.report.clouds import _mosaic
+from slviewer.report.clouds import _select_mosaic
 from slviewer.report.shaded import BACKGROUND, render_points, view_rotation
 
 SIZE = (120, 90)
@@ -59,7 +59,7 @@ def test_a_mosaic_shows_one_scan_in_each_square_and_leaves_no_hole() -> None:
     whole, part = rng.uniform(0, 100, (40000, 2)), rng.uniform(0, 50, (20000, 2))
     points = np.column_stack([np.concatenate([whole, part]), np.zeros(60000)])
     source = np.repeat([0, 1], [40000, 20000])
-    shown = _mosaic(points, source)
+    shown = _select_mosaic(points, source)
     assert set(source[shown]) == {0, 1}
     cells = (points[shown, :2] // 2).astype(int)
     assert len(np.unique(cells, axis=0)) > 0.95 * 50 * 50

@@ -78,7 +78,7 @@ def shows(page: Page, picture: np.ndarray) -> bool:
 
 def ready(channel: Channel, projector: BrowserProjector) -> None:
     """Open, with the sequence loaded."""
-    assert channel.wait_ready(10.0).state == "ready", channel.standing()
+    assert channel.wait_ready(10.0).state == "ready", channel.page_state()
     projector.open()
     projector.load(SEQUENCE)
 
@@ -171,11 +171,11 @@ def test_a_window_that_would_resample_is_refused_in_words(opens, channel):
     size = (402, 300)
     page = opens(size, ratio=1.25)
     projector = browser_projector(size, channel)
-    assert until(lambda: channel.standing().state == "refused")
+    assert until(lambda: channel.page_state().state == "refused")
     fails("its window is 402.5 x 300 px at 1.25 px per page pixel: set the scaling", projector.open)
     expect(page.locator("main")).to_contain_text("its window is 402.5 x 300 px at 1.25 px per page pixel")
     page.close()
-    assert until(lambda: channel.standing().state == "waiting")
+    assert until(lambda: channel.page_state().state == "waiting")
 
 
 def test_a_screen_of_another_size_is_refused_in_words(opens, channel, projector):
@@ -193,14 +193,14 @@ def test_a_screen_of_another_size_is_refused_in_words(opens, channel, projector)
 
 def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel, projector):
     page = opens(screen=(1280, 800))
-    assert until(lambda: channel.standing().state == "refused")
+    assert until(lambda: channel.page_state().state == "refused")
     fails("does not fill its screen", projector.open)
     page.get_by_role("button", name="Fill this screen").click()
-    assert until(lambda: "1280 x 800" in channel.standing().words)
+    assert until(lambda: "1280 x 800" in channel.page_state().words)
     grown = {"width": SIZE[0], "height": SIZE[1], "screenWidth": SIZE[0], "screenHeight": SIZE[1]}
     session = page.context.new_cdp_session(page)  # without a display the window does not grow by itself
     session.send("Emulation.setDeviceMetricsOverride", {**grown, "deviceScaleFactor": 1, "mobile": False})
-    assert until(lambda: "still shows a notice" in channel.standing().words)
+    assert until(lambda: "still shows a notice" in channel.page_state().words)
     assert 5000 < page.evaluate("settlesAt - performance.now()") < 6000
     settle(page)
     ready(channel, projector)
@@ -210,7 +210,7 @@ def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel
         "Emulation.setDeviceMetricsOverride", {**grown, "height": 200, "deviceScaleFactor": 1, "mobile": False}
     )
     page.evaluate("document.exitFullscreen()")
-    assert until(lambda: "does not fill" in channel.standing().words)
+    assert until(lambda: "does not fill" in channel.page_state().words)
     fails("does not fill its screen", projector.show, 1)
     fails("does not fill its screen", projector.load, SEQUENCE)
     expect(page.get_by_role("button", name="Fill this screen")).to_be_visible()
@@ -219,7 +219,7 @@ def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel
 def test_the_marker_tells_the_screen_and_its_sides(opens, channel, projector):
     page = opens()
     ready(channel, projector)
-    channel.page().ask("marker")
+    channel.page().request("marker")
     side = SIZE[1] / 16
 
     def square(turned: np.ndarray) -> float:
@@ -255,7 +255,7 @@ def test_a_lost_connection_is_made_again_by_the_page(opens, channel, projector):
     page = opens()
     ready(channel, projector)
     page.evaluate("socket.close()")
-    assert until(lambda: channel.standing().state == "waiting")
+    assert until(lambda: channel.page_state().state == "waiting")
     fails("connection was lost", projector.show, 0)
     assert channel.wait_ready(5.0).state == "ready"
     projector.close()
@@ -272,7 +272,7 @@ def test_a_server_that_starts_again_finds_its_page(browser, channel):
     assert channel.wait_ready(5.0).state == "ready"
     server.stop()
     expect(page.locator("h1")).to_have_text("slviewer does not answer")
-    assert channel.standing().state == "waiting"
+    assert channel.page_state().state == "waiting"
     again = serve(port=server.port, token=server.access.token, view_token=server.access.view_token)
     serve_projector(again, channel)
     assert channel.wait_ready(8.0).state == "ready"
@@ -286,7 +286,7 @@ def test_a_page_that_is_closed_in_the_middle_is_missed_at_once(opens, channel, p
     projector.show(0)
     page.close()
     fails("closed|hidden", projector.show, 1)  # hidden is the last thing that some browsers say
-    assert until(lambda: channel.standing().state == "waiting", 2.0)
+    assert until(lambda: channel.page_state().state == "waiting", 2.0)
     fails("no projector page is connected", projector.load, SEQUENCE)
     projector.close()
     fails("no projector page is connected", projector.open)
@@ -311,7 +311,7 @@ def test_a_window_that_changes_and_changes_back_still_ends_the_capture(opens, ch
     projector.show(0)
     for width in (380, 360):
         page.set_viewport_size({"width": width, "height": 270})
-        assert until(lambda width=width: channel.standing().size == (width, 270))
+        assert until(lambda width=width: channel.page_state().size == (width, 270))
     fails("window changed while patterns were shown", projector.show, 1)
     projector.load(SEQUENCE)
     projector.show(1)
@@ -325,7 +325,7 @@ def test_a_hidden_page_is_no_projector(opens, channel, projector):
         """Object.defineProperty(document, "visibilityState", { value: "hidden" });
         document.dispatchEvent(new Event("visibilitychange"))"""
     )
-    assert until(lambda: channel.standing().state == "refused")
+    assert until(lambda: channel.page_state().state == "refused")
     fails("page is hidden: bring its window to the front", projector.show, 1)
 
 
@@ -359,7 +359,7 @@ def test_the_page_is_the_operators_alone(browser, server, channel, operator, wat
     page = browser.new_page()
     assert page.goto(f"http://127.0.0.1:{server.port}{PATH}").status == 403
     page.close()
-    assert channel.standing().state == "waiting"
+    assert channel.page_state().state == "waiting"
 
 
 def test_nonsense_ends_its_own_connection_only(opens, channel, projector, operator):
