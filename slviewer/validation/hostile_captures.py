@@ -1,7 +1,7 @@
 """Captures of a hostile rig, put through the program's own path: files, import, calibration, clouds, fitted shapes."""
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,9 +12,9 @@ import numpy as np
 from slviewer.errors import SlviewerError
 from slviewer.evaluation.letter import SPHERE_RADIUS_MM
 from slviewer.fringe.description_check import check_description
-from slviewer.fringe.presets import gray_bits, phase_steps
+from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.residual import capture_residuals
-from slviewer.fringe.sequence import Axis, Frame, PatternSequence
+from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.calibration_verdict import last_verdict
 from slviewer.pipeline.import_captures import import_frames
@@ -80,10 +80,11 @@ class HostileBench:
     @cached_property
     def sequence(self) -> PatternSequence:
         """Phase steps, Gray code and complementary bit: as many frames along x as along y; white at the end."""
-        frames: list[Frame] = []
-        axes: tuple[Axis, ...] = ("x", "y")
-        for axis in axes:
-            frames += [*phase_steps(axis, STEPS, PERIOD_PX), *gray_bits(axis, BITS), Frame("complementary", axis)]
+        frames = [
+            frame
+            for axis in AXES
+            for frame in (*phase_steps(axis, STEPS, PERIOD_PX), *gray_bits(axis, BITS), Frame("complementary", axis))
+        ]
         return PatternSequence(self.rig.projector.size, (*frames, Frame("texture")))
 
     @cached_property
@@ -224,13 +225,3 @@ def named_causes(
         known += [(c.message, frozenset({c.cause})) for c in check_description(sequence, frames)]
         named |= {causes: None for sentence, causes in known if any(sentence in message for message in about)}
     return list(named)
-
-
-def run_case(work: Callable[[CaseReport], Sequence[MeasuredScan]]) -> tuple[CaseReport, Sequence[MeasuredScan]]:
-    """Do it, and say what came of it: an error ends the case and goes into the report."""
-    report = CaseReport()
-    try:
-        return report, work(report)
-    except Exception as error:  # a crash is a result here, and others still have to run
-        report.error = error
-        return report, ()

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.validation.proof import Proof
 from slviewer.validation.prove_accuracy import prove_accuracy
 from slviewer.validation.prove_causes import prove_causes
 from slviewer.validation.prove_guidance import prove_guidance
@@ -13,60 +14,41 @@ from slviewer.validation.prove_registration import prove_registration
 from slviewer.validation.prove_uncertainty import prove_uncertainty
 
 Claim = Literal["accuracy", "causes", "guidance", "hostile", "registration", "uncertainty"]
-CLAIMS: tuple[Claim, ...] = get_args(Claim)
-TITLES: Mapping[Claim, str] = {
-    "accuracy": "accuracy at the noise floor",
-    "causes": "faults called by their names",
-    "guidance": "guided poses",
-    "hostile": "captures of a hostile rig",
-    "registration": "scans in one frame",
-    "uncertainty": "predicted uncertainty",
+CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
+    "accuracy": ("accuracy at the noise floor", prove_accuracy),
+    "causes": ("faults called by their names", prove_causes),
+    "guidance": ("guided poses", prove_guidance),
+    "hostile": ("captures of a hostile rig", prove_hostile),
+    "registration": ("scans in one frame", prove_registration),
+    "uncertainty": ("predicted uncertainty", prove_uncertainty),
 }
+"""Of each claim its title and what proves it."""
+assert tuple(CLAIMS) == get_args(Claim)
 QUICK_SCALE = 0.25
 HOSTILE_SCALE = 0.5
-"""Beyond it the captures of the many hostile cases take hours, and say the same."""
-
-
-class Proof(Protocol):
-    """What came of one claim."""
-
-    @property
-    def holds(self) -> bool:
-        """Whether every figure lies where it must."""
-
-    def text(self) -> str:
-        """The table, for people."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+"""Beyond it the captures of the many hostile cases take hours, and show the same."""
 
 
 @dataclass(frozen=True)
 class Proofs:
-    """Each claim's own proof."""
+    """The proof of each claim."""
 
     proofs: Mapping[Claim, Proof]
 
     @property
-    def failed(self) -> tuple[Claim, ...]:
-        """The claims that do not hold."""
-        return tuple(claim for claim, proof in self.proofs.items() if not proof.holds)
-
-    @property
     def failure(self) -> str:
         """Which claims do not hold; empty where all do."""
-        if not self.failed:
-            return ""
-        return f"not proven: {', '.join(self.failed)}: the tables say which figures miss their bounds"
+        failed = [claim for claim, proof in self.proofs.items() if not proof.holds]
+        return f"not proven: {', '.join(failed)}: the tables show which figures miss their bounds" if failed else ""
 
     def text(self) -> str:
-        """For people: each table under its title, and what holds in the end."""
-        blocks = [f"{TITLES[claim]}\n\n{proof.text()}\n" for claim, proof in self.proofs.items()]
-        lines = [f"{'pass' if proof.holds else 'FAIL'}  {TITLES[claim]}" for claim, proof in self.proofs.items()]
+        """Each table under its title, then whether each claim holds."""
+        blocks = [f"{CLAIMS[claim][0]}\n\n{proof.text()}\n" for claim, proof in self.proofs.items()]
+        lines = [f"{'pass' if proof.holds else 'FAIL'}  {CLAIMS[claim][0]}" for claim, proof in self.proofs.items()]
         return "\n".join([*blocks, *lines])
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Plain values by claim."""
         return {claim: proof.to_json() for claim, proof in self.proofs.items()}
 
 
@@ -91,18 +73,12 @@ def prove(
         seed: Another seed proves it on other rigs of the same kinds.
     """
     scale = QUICK_SCALE if quick else 1.0
-    work: Mapping[Claim, Callable[[Progress], Proof]] = {
-        "accuracy": lambda report: prove_accuracy(scale, seed=seed, progress=report),
-        "causes": lambda report: prove_causes(scale, seed=seed, progress=report),
-        "guidance": lambda report: prove_guidance(scale, seed=seed, progress=report),
-        "hostile": lambda report: prove_hostile(
-            min(scale, HOSTILE_SCALE), cases=cases, splined=not quick, seed=seed, progress=report
-        ),
-        "registration": lambda report: prove_registration(scale, seed=seed, progress=report),
-        "uncertainty": lambda report: prove_uncertainty(scale, seed=seed, progress=report),
-    }
     chosen = [claim for claim in CLAIMS if not only or claim in only]
-    found: dict[Claim, Proof] = {}
+    proofs: dict[Claim, Proof] = {}
     for i, claim in enumerate(chosen):
-        found[claim] = work[claim](part(progress, i / len(chosen), (i + 1) / len(chosen)))
-    return Proofs(found)
+        report = part(progress, i / len(chosen), (i + 1) / len(chosen))
+        hostile = claim == "hostile"
+        options: dict[str, Any] = {"cases": cases, "splined": not quick} if hostile else {}
+        size = min(scale, HOSTILE_SCALE) if hostile else scale
+        proofs[claim] = CLAIMS[claim][1](size, seed=seed, progress=report, **options)
+    return Proofs(proofs)

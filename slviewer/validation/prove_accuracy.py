@@ -1,17 +1,49 @@
-"""Whether the splined calibration measures as well as the camera's noise allows, on simulated rigs with known truth."""
+"""Whether the splined calibration measures as well as the camera's noise allows, on simulated rigs with known truth.
+
+Each rig is calibrated with every model, which then measures the Letter's planes and spheres. All of it happens in
+memory, one capture after another: a full-size session of so many would fill a disk.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from itertools import combinations
+from time import perf_counter
+from typing import Literal
 
-from slviewer.evaluation.render import Row, render
+import numpy as np
+
+from slviewer.calibration.observe import Observation
+from slviewer.calibration.pixelwise import calibrate_pixelwise
+from slviewer.errors import InputError
+from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.letter import DEPTH_RANGE_MM, SPHERE_RADIUS_MM
+from slviewer.evaluation.plane import evaluate_plane
+from slviewer.evaluation.render import Row
+from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
+from slviewer.fringe.phase import PhaseMap
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
-from slviewer.validation.prove_rigs import FLOOR, RigCase, RigFigures, cases, measure_rig
+from slviewer.pipeline.simulate import TARGET
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import Model
+from slviewer.simulation.boards import BoardShape
+from slviewer.simulation.plans import letter_plan
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.scenes import Spheres
+from slviewer.simulation.truth import PerfectModel
+from slviewer.target.board import Board
+from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
 
 POSES = 25
+COVERED = 6
+"""Poses in which a pixel must have seen the board to be scored."""
+FLOOR = PerfectModel.name
+JUDGED = ("stereo", "splined", FLOOR)
+"""Scored over the pixels that all three measure; other models over those of them that they measure too."""
 OVER_FLOOR = {"R1": 1.4, "R2": 1.1, "R3": 1.1}
-"""At most so many times the floor, in the mean over the planes of a region."""
+"""Largest ratio of splined's RMS to the floor, in the mean over the planes of a region."""
 BELOW_FLOOR = 0.9
 """No model beats the noise: what seems to is scored wrongly."""
 OF_STEREO = 0.9
@@ -20,101 +52,92 @@ PREDICTED = 0.1
 RADIUS_MM, SPACING_MM = 0.015, 0.04
 OVER_STEREO = 1.03
 """Of lenses without local distortion, where stereo lacks nothing."""
-LEAST_KEPT = 0.9
-"""Of the pixels to be scored: a model that masks what it measures badly would look better than it is."""
+MIN_MEASURED = 0.9
+"""Share of the pixels to be scored: a model that masks what it measures badly would look better than it is."""
 
 
 @dataclass(frozen=True)
-class BandCheck:
-    """One figure of one rig, and the band in which it must lie."""
+class RigCase:
+    """A simulated rig of the Letter's kind, and the shape of the board that it is calibrated with."""
+
+    name: str
+    seed: int = 0
+    texture: Literal["coarse", "fine"] = "coarse"
+    local_distortion_px: float | None = None
+    shape: BoardShape = field(default_factory=BoardShape)
+
+    def rig(self, scale: float) -> SimulatedRig:
+        """The rig, its camera at ``scale`` times the Letter's resolution."""
+        return letter(scale, self.seed, local_distortion_px=self.local_distortion_px, texture=self.texture)
+
+
+BENT = BoardShape(bow_x_mm=0.1, bow_y_mm=0.1, twist_mm=0.05, misplaced_mm=0.02)
+
+
+def rig_cases(seed: int = 0) -> tuple[RigCase, ...]:
+    """The default rig and five others; another seed makes six others of the same kinds."""
+    return (
+        RigCase("coarse", seed),
+        RigCase("fine", seed + 1, "fine"),
+        RigCase("coarse, bent board", seed + 2, shape=BENT),
+        RigCase("fine and strong, bent board", seed + 3, "fine", 0.2, BENT),
+        RigCase("coarse again", seed + 4),
+        RigCase("none", seed + 5, local_distortion_px=0.0),
+    )
+
+
+@dataclass(frozen=True)
+class PlaneFigures:
+    """``region``: the depth range of most of the plane. ``rms_mm`` by model, the floor included; ``predicted_mm``: the
+    floor as the splined model predicts it. ``measured``: share of the pixels to be scored that the splined model
+    measures."""
+
+    region: str
+    rms_mm: Mapping[str, float]
+    predicted_mm: float
+    pixels: int
+    measured: float
+
+
+@dataclass(frozen=True)
+class RigFigures:
+    """The figures of one rig: planes by name, and errors in mm by model, of the spheres' radii and of the spacings of
+    their centres. ``seconds``: of rendering, calibrating and measuring."""
 
     rig: str
-    what: str
-    value: float
-    least: float
-    most: float
+    seed: int
+    has_local_distortion: bool
+    planes: Mapping[str, PlaneFigures]
+    radius_error_mm: Mapping[str, Mapping[str, float]]
+    spacing_error_mm: Mapping[str, Mapping[str, float]]
+    seconds: float
+
+    def mean_mm(self, model: str, region: str | None = None) -> float:
+        """Mean plane RMS of a model, of one region or of all; NaN where no plane lies there."""
+        chosen = [p.rms_mm[model] for p in self.planes.values() if region in (None, p.region)]
+        return float(np.mean(chosen)) if chosen else float("nan")
+
+    def over_floor(self, region: str) -> float:
+        """Splined's mean plane RMS over the floor in a region; NaN where no plane lies there."""
+        return self.mean_mm("splined", region) / self.mean_mm(FLOOR, region)
 
     @property
-    def holds(self) -> bool:
-        """Whether it lies there; what could not be measured does not."""
-        return self.least <= self.value <= self.most
-
-    def text(self) -> str:
-        """In one line."""
-        band = f"at most {self.most:g}" if self.least <= 0 else f"{self.least:.3g} to {self.most:.3g}"
-        return f"{self.rig}: {self.what} is {self.value:.4g}, wanted {band}"
-
-
-def checks(figures: RigFigures) -> tuple[BandCheck, ...]:
-    """What is demanded of one rig."""
-    floor, splined = figures.mean_mm(FLOOR), figures.mean_mm("splined")
-    rig = figures.case.name
-    regions = {plane.region for plane in figures.planes.values()}
-    predicted = _predicted_over_floor(figures)
-    found = [
-        BandCheck(rig, "stereo over splined, of stereo over the floor,", floor / splined, OF_STEREO, 1 / BELOW_FLOOR),
-        *(
-            BandCheck(rig, f"splined over the floor in {region}", _over_floor(figures, region), BELOW_FLOOR, most)
-            for region, most in OVER_FLOOR.items()
-            if region in regions
-        ),
-        BandCheck(rig, "predicted floor over the floor, of the worst plane,", predicted, 1 - PREDICTED, 1 + PREDICTED),
-        BandCheck(rig, "share of the pixels that splined measures", _kept(figures), LEAST_KEPT, 1.0),
-        BandCheck(
-            rig, "largest error of a sphere's radius in mm", _largest(figures.radius_mm["splined"]), 0.0, RADIUS_MM
-        ),
-        BandCheck(rig, "largest error of a spacing in mm", _largest(figures.spacing_mm["splined"]), 0.0, SPACING_MM),
-    ]
-    if figures.case.local_distortion_px == 0:
-        found.append(
-            BandCheck(rig, "splined over stereo", splined / figures.mean_mm("stereo"), BELOW_FLOOR, OVER_STEREO)
-        )
-    return tuple(found)
-
-
-@dataclass(frozen=True)
-class AccuracyProof:
-    """What came of all rigs."""
-
-    rigs: tuple[RigFigures, ...]
-    scale: float
+    def predicted_over_floor(self) -> float:
+        """Of the plane where it is farthest from 1; NaN where one is not known."""
+        ratios = [plane.predicted_mm / plane.rms_mm[FLOOR] for plane in self.planes.values()]
+        return max(ratios, key=lambda ratio: math.inf if math.isnan(ratio) else abs(math.log(ratio)))
 
     @property
-    def checks(self) -> tuple[BandCheck, ...]:
-        """Of all rigs, in order."""
-        return tuple(check for rig in self.rigs for check in checks(rig))
+    def measured(self) -> float:
+        """Mean share of the planes' pixels that the splined model measures."""
+        return float(np.mean([plane.measured for plane in self.planes.values()]))
 
     @property
-    def holds(self) -> bool:
-        """Whether every figure of every rig lies where it must."""
-        return all(check.holds for check in self.checks)
-
-    def text(self) -> str:
-        """For people: a line a rig, and a line for each figure that misses."""
-        missed = [check.text() for check in self.checks if not check.holds]
-        table = [_row(rig) for rig in self.rigs]
-        title = f"mean plane RMS in mm over pixels seen in 6 poses or more, at scale {self.scale:g}"
-        done = f"{len(self.checks) - len(missed)} of {len(self.checks)} figures hold"
-        return "\n".join([title, render(table), done, *missed])
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "scale": self.scale,
-            "holds": self.holds,
-            "checks": [{**vars(check), "holds": check.holds} for check in self.checks],
-            "rigs": [
-                {
-                    "rig": rig.case.name,
-                    "seed": rig.case.seed,
-                    "planes": {name: {**vars(p), "rms_mm": dict(p.rms_mm)} for name, p in rig.planes.items()},
-                    "radius_error_mm": {model: dict(errors) for model, errors in rig.radius_mm.items()},
-                    "spacing_error_mm": {model: dict(errors) for model, errors in rig.spacing_mm.items()},
-                    "seconds": dict(rig.seconds),
-                }
-                for rig in self.rigs
-            ],
-        }
+    def largest_errors_mm(self) -> tuple[float, float]:
+        """Splined's largest errors of a radius and of a spacing; NaN where one is not known."""
+        errors = self.radius_error_mm["splined"], self.spacing_error_mm["splined"]
+        radius, spacing = (float(np.max(np.abs(list(each.values())))) for each in errors)
+        return radius, spacing
 
 
 def prove_accuracy(
@@ -124,46 +147,162 @@ def prove_accuracy(
     poses: int = POSES,
     seed: int = 0,
     progress: Progress = ignore_progress,
-) -> AccuracyProof:
-    """Calibrate and measure one rig after another; by default the six of ``prove_rigs.cases``."""
-    chosen = cases(seed) if rigs is None else rigs
-    found = [
-        measure_rig(case, scale, poses, part(progress, i / len(chosen), (i + 1) / len(chosen)))
+) -> Proof:
+    """Calibrate and measure one rig after another; by default the six of ``rig_cases``."""
+    chosen = rig_cases(seed) if rigs is None else rigs
+    figures = [
+        measure_rig(case, scale, poses, part(progress, i / len(chosen), (i + 1) / len(chosen), case.name))
         for i, case in enumerate(chosen)
     ]
     progress(1.0, "proven")
-    return AccuracyProof(tuple(found), scale)
+    return judge_accuracy(figures, scale)
+
+
+def judge_accuracy(rigs: Sequence[RigFigures], scale: float) -> Proof:
+    """The proof from the figures of all rigs."""
+    title = f"mean plane RMS in mm over pixels seen in {COVERED} poses or more, at scale {scale:g}"
+    checks = [check for rig in rigs for check in check_rig(rig)]
+    return prove_checks(checks, scale, [_row(rig) for rig in rigs], {"rigs": rigs}, [title])
+
+
+def check_rig(rig: RigFigures) -> tuple[BandCheck, ...]:
+    """The bounds that one rig's figures have to keep."""
+    floor, splined = rig.mean_mm(FLOOR), rig.mean_mm("splined")
+    regions = {plane.region for plane in rig.planes.values()}
+    radius, spacing = rig.largest_errors_mm
+    bounds: list[tuple[str, float, float, float]] = [
+        ("stereo over splined, of stereo over the floor,", floor / splined, OF_STEREO, 1 / BELOW_FLOOR),
+        *(
+            (f"splined over the floor in {region}", rig.over_floor(region), BELOW_FLOOR, most)
+            for region, most in OVER_FLOOR.items()
+            if region in regions
+        ),
+        ("predicted floor over the floor, of the worst plane,", rig.predicted_over_floor, 1 - PREDICTED, 1 + PREDICTED),
+        ("share of the pixels that splined measures", rig.measured, MIN_MEASURED, 1.0),
+        ("largest error of a sphere's radius in mm", radius, 0.0, RADIUS_MM),
+        ("largest error of a spacing in mm", spacing, 0.0, SPACING_MM),
+    ]
+    if not rig.has_local_distortion:
+        bounds.append(("splined over stereo", splined / rig.mean_mm("stereo"), BELOW_FLOOR, OVER_STEREO))
+    return tuple(BandCheck(rig.rig, *bound) for bound in bounds)
 
 
 def _row(rig: RigFigures) -> Row:
-    row: Row = {"rig": rig.case.name, "seed": rig.case.seed}
-    row |= {model: rig.mean_mm(model) for model in ("stereo", "pixelwise", "splined", FLOOR)}
-    row |= {f"ratio {region}": _over_floor(rig, region) for region in OVER_FLOOR}
-    row |= {
-        "predicted ratio": _predicted_over_floor(rig),
-        "worst radius": _largest(rig.radius_mm["splined"]),
-        "worst spacing": _largest(rig.spacing_mm["splined"]),
-        "kept %": 100 * _kept(rig),
-        "holds": "yes" if all(check.holds for check in checks(rig)) else "NO",
-        "s": f"{rig.seconds['in all']:.0f}",
+    radius, spacing = rig.largest_errors_mm
+    return {
+        "rig": rig.rig,
+        "seed": rig.seed,
+        **{model: rig.mean_mm(model) for model in ("stereo", "pixelwise", "splined", FLOOR)},
+        **{f"ratio {region}": rig.over_floor(region) for region in OVER_FLOOR},
+        "predicted ratio": rig.predicted_over_floor,
+        "worst radius": radius,
+        "worst spacing": spacing,
+        "measured %": 100 * rig.measured,
+        "holds": "yes" if all(check.holds for check in check_rig(rig)) else "NO",
+        "s": f"{rig.seconds:.0f}",
     }
-    return row
 
 
-def _over_floor(rig: RigFigures, region: str) -> float:
-    return rig.mean_mm("splined", region) / rig.mean_mm(FLOOR, region)
+def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = ignore_progress) -> RigFigures:
+    """Calibrate a rig from ``poses`` rendered captures of its board, and measure ten planes and six spheres with it."""
+    begin = perf_counter()
+    rig = case.rig(scale)
+    plan = letter_plan(rig, Board.parse(TARGET), poses, case.shape)
+    targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
+    shapes = {name: scene for name, scene in plan.items() if name.startswith(("plane_", "sphere_"))}
+    stereo, splined, observations = calibrate_rendered(rig, targets, progress=part(progress, 0.0, 0.6))
+    pixelwise = calibrate_pixelwise(observations, stereo)
+    models: dict[str, Model] = {
+        "stereo": stereo,
+        "pixelwise": pixelwise,
+        "splined": splined,
+        FLOOR: PerfectModel(rig),
+    }
+    covered = covered_pixels(observations)
+    planes: dict[str, PlaneFigures] = {}
+    spheres: dict[str, Spheres] = {}
+    fits: dict[str, dict[str, SphereResult]] = {}
+    for i, (name, scene) in enumerate(shapes.items()):
+        progress(0.6 + 0.4 * i / len(shapes), name)
+        phase = render_phase(Renderer(rig, scene), name, list(plan).index(name))
+        comparison, measured = compare_models(models, phase, covered, isinstance(scene, Spheres))
+        if isinstance(scene, Spheres):
+            spheres[name] = scene
+            for model, result in comparison.results.items():
+                assert isinstance(result, SphereResult)
+                fits.setdefault(model, {})[name] = result
+        else:
+            planes[name] = _plane_figures(comparison, measured)
+    spacings = {
+        f"{a} - {b}": (a, b, float(np.linalg.norm(spheres[a].centres[0] - spheres[b].centres[0])))
+        for a, b in combinations(spheres, 2)
+    }
+    return RigFigures(
+        case.name,
+        case.seed,
+        case.local_distortion_px != 0,
+        planes,
+        {m: {n: fit.radius_mm - spheres[n].radius_mm for n, fit in each.items()} for m, each in fits.items()},
+        {
+            model: {
+                pair: float(np.linalg.norm(each[a].sphere.centre - each[b].sphere.centre)) - true
+                for pair, (a, b, true) in spacings.items()
+                if a in each and b in each
+            }
+            for model, each in fits.items()
+        },
+        perf_counter() - begin,
+    )
 
 
-def _kept(rig: RigFigures) -> float:
-    return sum(plane.kept for plane in rig.planes.values()) / len(rig.planes)
+def covered_pixels(observations: Sequence[Observation]) -> np.ndarray:
+    """(h, w) bool: the camera pixels that saw the board in at least ``COVERED`` poses."""
+    width, height = observations[0].size
+    poses = np.zeros((height, width), int)
+    for o in observations:
+        u0, v0, u1, v1 = o.box
+        poses[v0:v1, u0:u1] += o.region
+    return np.asarray(poses >= COVERED)
 
 
-def _predicted_over_floor(rig: RigFigures) -> float:
-    """Of the plane where it is farthest from 1; NaN where one is not known."""
-    ratios = [plane.predicted_mm / plane.rms_mm[FLOOR] for plane in rig.planes.values()]
-    return max(ratios, key=lambda ratio: math.inf if math.isnan(ratio) else abs(math.log(ratio)))
+def compare_models(
+    models: Mapping[str, Model], phase: PhaseMap, covered: np.ndarray, is_sphere: bool
+) -> tuple[Comparison, float]:
+    """Every model's fit to one capture over the covered pixels, and the share of these that splined measures."""
+    clouds = {}
+    for name, model in models.items():
+        points = model.points(phase)
+        sigma = model.sigma_z(phase, points)
+        clouds[name] = Cloud(np.where(covered[..., None], points, np.float32(np.nan)), phase.axis, name, sigma)
+    comparison = compare(
+        "sphere" if is_sphere else "plane",
+        {name: clouds[name] for name in JUDGED},
+        phase.illuminated,
+        depth_range=DEPTH_RANGE_MM,
+        radius=SPHERE_RADIUS_MM if is_sphere else None,
+    )
+    splined = comparison.results["splined"]
+    for name in clouds.keys() - set(JUDGED):
+        points, sigma = clouds[name].points, clouds[name].sigma_z
+        try:
+            comparison.results[name] = (
+                evaluate_sphere(points, comparison.common, sigma, SPHERE_RADIUS_MM, splined.sphere)
+                if isinstance(splined, SphereResult)
+                else evaluate_plane(points, comparison.common, sigma, splined.plane)
+            )
+        except InputError:
+            continue  # it measures nothing there
+    to_score = int(np.count_nonzero(comparison.region & clouds["stereo"].mask & clouds[FLOOR].mask))
+    return comparison, int(np.count_nonzero(comparison.common)) / max(to_score, 1)
 
 
-def _largest(errors: Mapping[str, float]) -> float:
-    """The largest magnitude; NaN where one is not known."""
-    return max((abs(error) for error in errors.values()), key=lambda error: math.inf if math.isnan(error) else error)
+def _plane_figures(comparison: Comparison, measured: float) -> PlaneFigures:
+    shares = comparison.incidence or {}
+    splined = comparison.results["splined"]
+    return PlaneFigures(
+        max(shares, key=lambda region: shares[region]),
+        {name: result.rms_mm for name, result in comparison.results.items()},
+        splined.noise_floor_mm,
+        splined.points,
+        measured,
+    )

@@ -1,93 +1,20 @@
-"""Whether every fault of a calibration is called by its name, and clean ones by none."""
+"""Whether every fault of a calibration is named as its cause, and sound calibrations raise no alarm."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from time import perf_counter
-from typing import Any
 
 from slviewer.calibration.diagnosis.attempt import Attempt
 from slviewer.calibration.diagnosis.verdict import Cause
-from slviewer.evaluation.render import render
+from slviewer.evaluation.render import Row
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.simulation.boards import BoardShape
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 from slviewer.validation.faulty_captures import BOARD, FAULTS, POSES, FaultBench
+from slviewer.validation.proof import Proof
 
 BOARDS = (BOARD, Board.parse("circles:14x11:13"), Board.parse("circles:17x13:11"), Board.parse("chessboard:10x7:18"))
-"""That clean calibrations are made from in turn."""
-
-
-@dataclass(frozen=True)
-class CauseCase:
-    """One fault: the ``cause`` that must be named first (None: none must be), and the ``attempt`` that it spoilt."""
-
-    name: str
-    cause: Cause | None
-    attempt: Attempt
-    seconds: float
-
-    @property
-    def named(self) -> bool:
-        """Whether the first finding is the true cause; of a clean calibration, whether there is none."""
-        causes = self.attempt.verdict.causes
-        return causes[:1] == (self.cause,) if self.cause else not causes
-
-
-@dataclass(frozen=True)
-class CauseProof:
-    """What came of all faults."""
-
-    cases: tuple[CauseCase, ...]
-    scale: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether every cause was named, and no clean calibration alarmed."""
-        return all(case.named for case in self.cases)
-
-    def confusion(self) -> dict[str, dict[str, int]]:
-        """{true cause: {cause named first: how often}}; 'none' stands for no finding."""
-        table: dict[str, dict[str, int]] = {}
-        for case in self.cases:
-            row = table.setdefault(case.cause or "none", {})
-            named = next(iter(case.attempt.verdict.causes), "none")
-            row[named] = row.get(named, 0) + 1
-        return table
-
-    def text(self) -> str:
-        """For people: a line a case."""
-        table: list[dict[str, Any]] = [
-            {
-                "fault": case.name,
-                "cause": case.cause or "none",
-                "named": ", ".join(case.attempt.verdict.causes) or "none",
-                "verdict": case.attempt.verdict.level,
-                "right": "yes" if case.named else "NO",
-                "s": round(case.seconds, 1),
-            }
-            for case in self.cases
-        ]
-        right = sum(case.named for case in self.cases)
-        return f"{render(table)}\n{right} of {len(self.cases)} named rightly, at scale {self.scale:g}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "scale": self.scale,
-            "holds": self.holds,
-            "confusion": self.confusion(),
-            "cases": [
-                {
-                    "fault": case.name,
-                    "cause": case.cause,
-                    "causes": list(case.attempt.verdict.causes),
-                    "level": case.attempt.verdict.level,
-                    "reason": case.attempt.verdict.reason,
-                }
-                for case in self.cases
-            ],
-        }
+"""That calibrations without a fault are made from in turn."""
 
 
 def prove_causes(
@@ -99,37 +26,53 @@ def prove_causes(
     steps: int = 18,
     seed: int = 0,
     progress: Progress = ignore_progress,
-) -> CauseProof:
+) -> Proof:
     """Every fault in turn, then ``clean`` calibrations of different rigs, poses and boards.
 
     ``scale``: resolution of the camera, as a share of the Letter's. ``poses`` of each rig, captured in so many phase
-    ``steps``.
+    ``steps``. A fault passes where the first finding is its cause, a clean calibration where there is none.
     """
-    cases: list[CauseCase] = []
-    total = len(faults) + clean
     bench = FaultBench(letter(scale, seed), count=poses, steps=steps)
-    for name in faults:
-        progress(len(cases) / total, name)
-        cause, fault = FAULTS[name]
-        begun = perf_counter()
-        attempt = fault(bench)
-        cases.append(CauseCase(name, cause, attempt, perf_counter() - begun))
-    for name, attempt, seconds in _clean(scale, clean, poses, steps, seed):
-        cases.append(CauseCase(name, None, attempt, seconds))
-        progress(len(cases) / total, name)
+    cases: list[tuple[str, Cause | None, Callable[[], Attempt]]] = [
+        (name, FAULTS[name][0], lambda name=name: FAULTS[name][1](bench))  # type: ignore[misc]
+        for name in faults
+    ]
+    for k in range(clean):
+        board, count, rig_seed = BOARDS[k % len(BOARDS)], poses + k % 5, seed + 1 + k
+        shape = BoardShape(misplaced_mm=0.01 * (k % 3))
+        cases.append((
+            f"clean, seed {rig_seed}, {board}, {count} poses",
+            None,
+            lambda board=board, count=count, rig_seed=rig_seed, shape=shape: _attempt_clean(  # type: ignore[misc]
+                FaultBench(letter(scale, rig_seed), board, count, shape, steps)
+            ),
+        ))  # fmt: skip
+    rows: list[Row] = []
+    record = []
+    confusion: dict[str, dict[str, int]] = {}
+    for name, cause, attempt in cases:
+        progress(len(rows) / len(cases), name)
+        begin = perf_counter()
+        verdict = attempt().verdict
+        first = next(iter(verdict.causes), "none")
+        counts = confusion.setdefault(cause or "none", {})
+        counts[first] = counts.get(first, 0) + 1
+        row = {"fault": name, "cause": cause or "none"}
+        rows.append(row | {
+            "named": ", ".join(verdict.causes) or "none",
+            "verdict": verdict.level,
+            "right": "yes" if first == (cause or "none") else "NO",
+            "s": round(perf_counter() - begin, 1),
+        })  # fmt: skip
+        record.append({
+            "fault": name, "cause": cause, "causes": list(verdict.causes), "level": verdict.level,
+            "reason": verdict.reason, "findings": [finding.sentence for finding in verdict.findings],
+        })  # fmt: skip
     progress(1.0, "proven")
-    return CauseProof(tuple(cases), scale)
+    right = sum(row["right"] == "yes" for row in rows)
+    line = f"{right} of {len(rows)} named rightly, at scale {scale:g}"
+    return Proof(right == len(rows), scale, rows, {"confusion": confusion, "cases": record}, below=[line])
 
 
-def _clean(scale: float, count: int, poses: int, steps: int, seed: int) -> Iterator[tuple[str, Attempt, float]]:
-    for k in range(count):
-        begun = perf_counter()
-        board = BOARDS[k % len(BOARDS)]
-        bench = FaultBench(
-            letter(scale, seed + 1 + k), board, poses + k % 5, BoardShape(misplaced_mm=0.01 * (k % 3)), steps
-        )
-        yield (
-            f"clean, seed {seed + 1 + k}, {board}, {bench.count} poses",
-            bench.attempt(bench.examine_all()),
-            perf_counter() - begun,
-        )
+def _attempt_clean(bench: FaultBench) -> Attempt:
+    return bench.attempt(bench.examine_clean())

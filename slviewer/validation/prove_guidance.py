@@ -1,44 +1,42 @@
-"""Whether a newcomer who follows the suggestions ends at the noise floor: in simulated rigs, held as a hand would."""
+"""Whether suggested poses, followed with a hand-held board, lead to the noise floor, on simulated rigs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
 
 import cv2
 import numpy as np
 
-from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
+from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
-from slviewer.evaluation.render import render
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.shapes import fit_plane
-from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
-from slviewer.records import to_plain
-from slviewer.simulation.boards import Pose
+from slviewer.pipeline.simulate import TARGET
+from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.plans import planes, rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.faulty_captures import BOARD, FaultBench
+from slviewer.validation.proof import Proof
+from slviewer.validation.rendered_calibration import calibrate_observed, observe_rendered, render_phase
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, plan
 
+BOARD = Board.parse(TARGET)
 POSES, RIGS = 12, 5
 MOST_OVER_FLOOR, LEAST_SUPPORTED = 1.3, 0.85
 HAND_MM, HAND_DEG = 3.0, 2.0
-"""How far from a suggestion a hand holds a board: standard deviations along and about each axis."""
+"""Unsteadiness of a hand that holds a board: standard deviations along and about each axis."""
 _TRIES = 50
+_WAYS = ("guided", "random")
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Of one rig and one way to choose poses: mean plane RMS over all lit pixels of the ten planes and of the true rig
-    mm, and the share of those pixels that poses support; then each plane's."""
+class WayFigures:
+    """One rig calibrated from ``poses`` chosen in one ``way``, by plane: RMS of the model and of the true rig over the
+    same illuminated pixels, mm, and the share of these that poses support; ``unmeasured`` pixels of all planes."""
 
     way: str
     seed: int
@@ -47,68 +45,9 @@ class Outcome:
     floor_mm: tuple[float, ...]
     supported: tuple[float, ...]
     unmeasured: int
-    predicted_sigma_mm: float
+    predicted_sigma_mm: float | None
+    over_floor: float
     seconds: float
-
-    @property
-    def over_floor(self) -> float:
-        """Mean RMS of the planes over their mean floor."""
-        return float(np.mean(self.rms_mm) / np.mean(self.floor_mm))
-
-    @property
-    def share(self) -> float:
-        """Of the illuminated pixels that are supported, in the mean over the planes."""
-        return float(np.mean(self.supported))
-
-
-@dataclass(frozen=True)
-class GuidanceProof:
-    """What came of all rigs."""
-
-    outcomes: tuple[Outcome, ...]
-    scale: float
-
-    def mean(self, way: str) -> tuple[float, float]:
-        """(RMS over the floor, share supported), in the mean over the rigs."""
-        chosen = [o for o in self.outcomes if o.way == way]
-        return float(np.mean([o.over_floor for o in chosen])), float(np.mean([o.share for o in chosen]))
-
-    @property
-    def holds(self) -> bool:
-        """Whether guided poses reach the target."""
-        over, share = self.mean("guided")
-        return over <= MOST_OVER_FLOOR and share >= LEAST_SUPPORTED
-
-    def text(self) -> str:
-        """For people: a line a rig and way."""
-        table: list[dict[str, Any]] = [
-            {
-                "poses": f"{o.poses} {o.way}",
-                "seed": o.seed,
-                "RMS mm": float(np.mean(o.rms_mm)),
-                "floor mm": float(np.mean(o.floor_mm)),
-                "over floor": o.over_floor,
-                "worst plane": float(np.max(np.divide(o.rms_mm, o.floor_mm))),
-                "supported %": 100 * o.share,
-                "not measured": o.unmeasured,
-                "s": round(o.seconds, 1),
-            }
-            for o in self.outcomes
-        ]
-        lines = []
-        for way in dict.fromkeys(o.way for o in self.outcomes):
-            over, share = self.mean(way)
-            lines.append(f"{way}: {over:.2f} times the floor, {100 * share:.0f} % supported")
-        wanted = f"wanted of guided poses: at most {MOST_OVER_FLOOR:g} times, at least {100 * LEAST_SUPPORTED:g} %"
-        return "\n".join([render(table), *lines, f"{wanted}: {'reached' if self.holds else 'NOT reached'}"])
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "scale": self.scale,
-            "holds": self.holds,
-            "outcomes": [to_plain(o) | {"over_floor": o.over_floor} for o in self.outcomes],
-        }
 
 
 def prove_guidance(
@@ -116,140 +55,171 @@ def prove_guidance(
     *,
     rigs: int = RIGS,
     poses: int = POSES,
-    steps: int = 18,
     seed: int = 0,
-    ways: Sequence[str] = ("guided", "random"),
     progress: Progress = ignore_progress,
-) -> GuidanceProof:
-    """``rigs`` simulated rigs, each calibrated from so many guided ``poses``, and from as many that are drawn at random
-    as the Letter's were; measured on the Letter's ten planes.
+) -> Proof:
+    """Calibrate each of ``rigs`` simulated rigs from ``poses`` guided poses, and from as many drawn at random as the
+    Letter's were; measure the Letter's ten planes with both.
     """
-    outcomes: list[Outcome] = []
-    total = rigs * len(ways)
+    figures: list[WayFigures] = []
+    total = rigs * len(_WAYS)
     for k in range(rigs):
-        bench = FaultBench(letter(scale, seed + k), BOARD, poses, steps=steps)
-        targets = _targets(bench)
-        for way in ways:
+        rig = letter(scale, seed + k)
+        targets = [_target_plane(rig, name, 100 + i) for i, name in enumerate(planes())]
+        for way in _WAYS:
             label = f"rig {k + 1} of {rigs}, {way}"
-            report = part(progress, len(outcomes) / total, (len(outcomes) + 1) / total, label)
-            begun = perf_counter()
-            observations, predicted = _guided(bench, report) if way == "guided" else (_drawn(bench, report), np.nan)
+            report = part(progress, len(figures) / total, (len(figures) + 1) / total, label)
+            begin, predicted = perf_counter(), None
+            if way == "guided":
+                observations, predicted = _observe_guided(rig, poses, report)
+            else:
+                observations = _observe_random(rig, poses, report)
             report(0.9, "calibrating")
-            stereo, centred = calibrate_centres(observations, bench.rig.projector.size, str(BOARD))
-            figures = _measured(calibrate_splined(centred, stereo), targets)
-            outcomes.append(
-                Outcome(way, bench.rig.seed, len(observations), *figures, predicted, perf_counter() - begun)
-            )
+            model = calibrate_observed(rig, observations)[1]
+            rms, floor, supported, unmeasured = zip(*(_measure_plane(model, t) for t in targets), strict=True)
+            over_floor = float(np.mean(rms) / np.mean(floor))
+            seconds = perf_counter() - begin
+            figures.append(
+                WayFigures(way, rig.seed, len(observations), rms, floor, supported, sum(unmeasured), predicted,
+                           over_floor, seconds)
+            )  # fmt: skip
     progress(1.0, "proven")
-    return GuidanceProof(tuple(outcomes), scale)
+    return judge_guidance(figures, scale)
 
 
-def _drawn(bench: FaultBench, report: Progress) -> list[Observation]:
-    seen = []
-    for i, pose in enumerate(target_poses(bench.rig, BOARD, bench.count)):
-        report(0.9 * i / bench.count, f"pose {i + 1}")
-        observation = bench.examine(i, bench.render(pose, i)).observation
-        if observation is not None:
-            seen.append(observation)
-    return seen
+def judge_guidance(figures: Sequence[WayFigures], scale: float) -> Proof:
+    """The proof: whether guided poses reach the floor and support the planes, in the mean over the rigs."""
+    rows = [
+        {
+            "poses": f"{each.poses} {each.way}",
+            "seed": each.seed,
+            "RMS mm": float(np.mean(each.rms_mm)),
+            "floor mm": float(np.mean(each.floor_mm)),
+            "over floor": each.over_floor,
+            "worst plane": float(np.max(np.divide(each.rms_mm, each.floor_mm))),
+            "supported %": 100 * float(np.mean(each.supported)),
+            "not measured": each.unmeasured,
+            "s": round(each.seconds, 1),
+        }
+        for each in figures
+    ]
+    means = {
+        way: (
+            float(np.mean([each.over_floor for each in figures if each.way == way])),
+            float(np.mean([np.mean(each.supported) for each in figures if each.way == way])),
+        )
+        for way in _WAYS
+    }
+    lines = [
+        f"{way}: {over:.2f} times the floor, {100 * share:.0f} % supported" for way, (over, share) in means.items()
+    ]
+    holds = means["guided"][0] <= MOST_OVER_FLOOR and means["guided"][1] >= LEAST_SUPPORTED
+    wanted = f"wanted of guided poses: at most {MOST_OVER_FLOOR:g} times, at least {100 * LEAST_SUPPORTED:g} %"
+    lines.append(f"{wanted}: {'reached' if holds else 'NOT reached'}")
+    return Proof(holds, scale, rows, {"outcomes": figures}, below=lines)
 
 
-def _guided(bench: FaultBench, report: Progress) -> tuple[list[Observation], float]:
-    """Poses where the wizard asks for them, and the sigma that it predicts in the end."""
-    rig, board = bench.rig, bench.board
+def _observe_random(rig: SimulatedRig, count: int, report: Progress) -> list[Observation]:
+    """The observations of poses drawn as the Letter's were; unreadable ones are skipped."""
+    observations = [
+        _observe(rig, pose, i, part(report, 0.9 * i / count, 0.9))
+        for i, pose in enumerate(target_poses(rig, BOARD, count))
+    ]
+    return [each for each in observations if each is not None]
+
+
+def _observe_guided(rig: SimulatedRig, count: int, report: Progress) -> tuple[list[Observation], float | None]:
+    """The observations of poses that the wizard suggests, and the sigma in mm that it predicts at the end."""
     rng = np.random.default_rng([rig.seed, 0x6D])
-    seen: list[Observation] = []
+    observations: list[Observation] = []
     refused = 0
     while True:
-        features = {o.name: _features(o) for o in seen}
-        planned = plan(PlanInput(board, rig.camera.size, rig.projector.size, features, refused=refused))
-        if len(seen) == bench.count:
-            return seen, np.nan if planned.sigma_mm is None else planned.sigma_mm
-        i = len(seen) + refused
-        report(0.9 * len(seen) / bench.count, f"pose {len(seen) + 1}")
-        if planned.suggestion is None or refused > bench.count:
+        features = {o.name: _pose_features(o) for o in observations}
+        planned = plan(PlanInput(BOARD, rig.camera.size, rig.projector.size, features, refused=refused))
+        if len(observations) == count:
+            return observations, planned.sigma_mm
+        i = len(observations) + refused
+        if planned.suggestion is None or refused > count:
             raise InputError(f"{refused} of {i} suggested poses could not be read, at {rig.camera.size} px")
-        pose = _held(rig, board, _asked(rig, board, planned.suggestion.outline_px), rng)
-        observation = bench.examine(i, bench.render(pose, i)).observation
+        pose = _hand_held(rig, _suggested_pose(rig, planned.suggestion.outline_px), rng)
+        observation = _observe(rig, pose, i, part(report, 0.9 * len(observations) / count, 0.9))
         if observation is None:
             refused += 1
         else:
-            seen.append(observation)
+            observations.append(observation)
 
 
-def _features(seen: Observation) -> PoseFeatures:
+def _observe(rig: SimulatedRig, pose: Pose, number: int, report: Progress) -> Observation | None:
+    report(0.0, f"pose {number + 1}")
+    try:
+        return observe_rendered(rig, printed_board(BOARD, pose, seed=rig.seed), f"pose_{number + 1:02d}", number)
+    except InputError:
+        return None
+
+
+def _pose_features(seen: Observation) -> PoseFeatures:
     noise = np.nan if seen.samples is None else float(np.nanmedian(seen.samples.sigma))
     return PoseFeatures(seen.points, seen.camera, seen.projector, noise)
 
 
-def _asked(rig: SimulatedRig, board: Board, outline_px: np.ndarray) -> np.ndarray:
+def _suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarray:
     """T_camera_board (4, 4) at which the board fills an outline (4, 2) px that is drawn into the picture: what a hand
     follows, whatever the program believes of the lens."""
     rays = rig.camera.undistort(outline_px)
-    _, turn, t = cv2.solvePnP(board.outline(), rays, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE)
+    _, turn, t = cv2.solvePnP(BOARD.outline(), rays, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], t.ravel()
     return T
 
 
-def _held(rig: SimulatedRig, board: Board, T: np.ndarray, rng: np.random.Generator) -> Pose:
-    """About there, with every feature in view: a hand moves the board until the program says that it sees it."""
-    middle = (board.points.min(0) + board.points.max(0)) / 2
-    centre = T[:3, :3] @ middle + T[:3, 3]
+def _hand_held(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Generator) -> Pose:
+    """A pose near the given one with every feature in view, as a hand moves the board until it is detected."""
+    middle = (BOARD.points.min(0) + BOARD.points.max(0)) / 2
+    centre = T_camera_board[:3, :3] @ middle + T_camera_board[:3, 3]
     for k in range(_TRIES):
         steady = 1 - k / _TRIES
-        R = rotation(np.radians(steady * rng.normal(0, HAND_DEG, 3))) @ T[:3, :3]
+        R = rotation(np.radians(steady * rng.normal(0, HAND_DEG, 3))) @ T_camera_board[:3, :3]
         pose = Pose(R, centre + steady * rng.normal(0, HAND_MM, 3) - R @ middle)
-        points = pose.to_camera(board.points)
+        points = pose.to_camera(BOARD.points)
         seen, illuminated = rig.camera.project(points), rig.project(points)
-        room = board.pitch_mm / 4 * rig.camera.focal_px[0] * rig.camera.scale / points[:, 2:] + 2
-        inside = ((seen > room) & (seen < np.array(rig.camera.size) - 1 - room)).all()
+        margin = BOARD.pitch_mm / 4 * rig.camera.focal_px[0] * rig.camera.scale / points[:, 2:] + 2
+        inside = ((seen > margin) & (seen < np.array(rig.camera.size) - 1 - margin)).all()
         if inside and ((illuminated > 0) & (illuminated < np.array(rig.projector.size) - 1)).all():
             break
     return pose
 
 
 @dataclass(frozen=True, eq=False)
-class _Target:
-    """A plane's phase, illuminated pixels (h, w), and the points (h, w, 3) that the true rig measures there."""
+class _TargetPlane:
+    """A plane's phase, illuminated pixels (h, w), and the points (h, w, 3) mm that the true rig measures there."""
 
     phase: PhaseMap
     illuminated: np.ndarray
     exact: np.ndarray
 
 
-def _targets(bench: FaultBench) -> list[_Target]:
-    rig, found = bench.rig, []
-    sequence = one_axis(bench.sequence, "x")
-    for i, (name, scene) in enumerate(planes().items()):
-        renderer = Renderer(rig, scene)
-        truth = renderer.truth()
-        phase = decode_frames(name, sequence, renderer.capture(sequence, 100 + i))["x"]
-        exact = PerfectModel(rig).points(phase)
-        found.append(_Target(phase, truth.mask & phase.mask & np.isfinite(exact[..., 2]), exact))
-    return found
+def _target_plane(rig: SimulatedRig, name: str, number: int) -> _TargetPlane:
+    renderer = Renderer(rig, planes()[name])
+    phase = render_phase(renderer, name, number)
+    exact = PerfectModel(rig).points(phase)
+    return _TargetPlane(phase, renderer.truth().mask & phase.mask & np.isfinite(exact[..., 2]), exact)
 
 
-def _measured(
-    model: SplinedModel, targets: Sequence[_Target]
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], int]:
-    """Plane RMS by the model and by the true rig, over the same lit pixels, the share that poses support, and the
-    pixels that the model does not measure at all."""
-    rms, floor, supported = [], [], []
-    unmeasured = 0
-    for target in targets:
-        points = model.points(target.phase, supported=False)
-        known = target.illuminated & np.isfinite(points[..., 2])
-        unmeasured += int(np.count_nonzero(target.illuminated & ~known))
-        rms.append(_flatness(points[known]))
-        floor.append(_flatness(target.exact[known]))
-        supported.append(
-            np.count_nonzero(model.support(target.phase) & target.illuminated) / np.count_nonzero(target.illuminated)
-        )
-    return tuple(rms), tuple(floor), tuple(supported), unmeasured
+def _measure_plane(model: SplinedModel, target: _TargetPlane) -> tuple[float, float, float, int]:
+    """Plane RMS in mm by the model and by the true rig over the same illuminated pixels, the share that poses support,
+    and the number of pixels that the model does not measure at all."""
+    points = model.points(target.phase, supported=False)
+    known = target.illuminated & np.isfinite(points[..., 2])
+    supported = model.support(target.phase) & target.illuminated
+    return (
+        _plane_rms(points[known]),
+        _plane_rms(target.exact[known]),
+        float(np.count_nonzero(supported) / np.count_nonzero(target.illuminated)),
+        int(np.count_nonzero(target.illuminated & ~known)),
+    )
 
 
-def _flatness(points: np.ndarray) -> float:
-    """Plane RMS mm over all points, outliers included but for errors of whole fringes."""
+def _plane_rms(points: np.ndarray) -> float:
+    """Plane RMS in mm over all points (n, 3), outliers included."""
     plane = fit_plane(points.astype(float))
     return float(np.sqrt(np.mean(plane.distance(points.astype(float)) ** 2)))

@@ -12,26 +12,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from slviewer.errors import SlviewerError, UsageError
-from slviewer.evaluation.render import render
+from slviewer.evaluation.render import Row
 from slviewer.geometry.rigid import fit_rigid
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.simulation.hostile import FAULTS, SEVERITIES, Direction, Fault, Severity
 from slviewer.simulation.rig import letter
-from slviewer.validation.hostile_captures import SCANS, CaseReport, HostileBench, MeasuredScan, run_case
+from slviewer.validation.hostile_captures import SCANS, CaseReport, HostileBench, MeasuredScan
+from slviewer.validation.proof import Proof
 
-WITHIN = 1.5
+MOST_OVER_FLOOR = 1.5
 """Times the undisturbed RMS, within which a case is measured."""
 SIGMAS = 3.0
 GROSS = 0.01
 """Share of points beyond `SIGMAS`, more than of the undisturbed scans, that makes a result wrong."""
-KEPT = 0.9
+LEAST_COVERAGE = 0.9
 """Share of the undisturbed coverage that a measured case has."""
-LEAST = 0.7
+EXPLAINED_LOSS = 0.7
 """Share of it below which the loss has to be explained."""
 _TRIMMED = 0.99  # of the points count in an RMS; those beyond are counted one by one, by `GROSS`
 
@@ -76,84 +77,37 @@ class Figures:
 
 @dataclass(frozen=True)
 class HostileCase:
-    """One fault at one severity, and what came of it."""
+    """One fault at one severity, and the outcome; ``figures``: None where nothing was measured. ``named``: the causes
+    that the messages name."""
 
     fault: str
     severity: Severity
     direction: Direction
     outcome: Outcome
+    passed: bool
     figures: Figures | None
     floor: Figures
     named: tuple[str, ...]
     messages: tuple[str, ...]
     seconds: float
 
-    @property
-    def passed(self) -> bool:
-        """Whether the program may be proud of it."""
-        return self.outcome in PASSED
-
-
-@dataclass(frozen=True)
-class HostileProof:
-    """What came of all cases."""
-
-    cases: tuple[HostileCase, ...]
-    scale: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether no case was silently wrong, and none was refused or warned of for a wrong reason."""
-        return all(case.passed for case in self.cases)
-
-    def text(self) -> str:
-        """For people: a line a case, and what was said in those that failed."""
-        table: list[dict[str, Any]] = [_row(case) for case in self.cases]
-        failed = [case for case in self.cases if not case.passed]
-        lines = [render(table), f"{len(self.cases) - len(failed)} of {len(self.cases)} hold, at scale {self.scale:g}"]
-        for case in failed:
-            lines.append(f"\n{case.fault}, {case.severity}, {case.direction}: {case.outcome}")
-            lines += [f"  {message}" for message in case.messages] or ["  (no message)"]
-        return "\n".join(lines)
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+    def row(self) -> Row:
+        """The case as a row of the table."""
+        nan = float("nan")
+        figures = self.figures or Figures(nan, nan, nan, nan)
         return {
-            "scale": self.scale,
-            "holds": self.holds,
-            "cases": [
-                {
-                    "fault": case.fault,
-                    "severity": case.severity,
-                    "direction": case.direction,
-                    "outcome": case.outcome,
-                    "passed": case.passed,
-                    "figures": None if case.figures is None else vars(case.figures),
-                    "floor": vars(case.floor),
-                    "named": list(case.named),
-                    "messages": list(case.messages),
-                }
-                for case in self.cases
-            ],
+            "fault": self.fault,
+            "severity": self.severity,
+            "in": self.direction,
+            "RMS mm": round(figures.rms_mm, 3),
+            "predicted": round(figures.predicted_mm, 3),
+            "floor": round(self.floor.rms_mm, 3),
+            ">3 sigma %": round(100 * figures.gross, 1),
+            "coverage %": round(100 * figures.coverage, 1),
+            "named": ", ".join(self.named) or "-",
+            "outcome": self.outcome,
+            "s": round(self.seconds, 1),
         }
-
-
-def _row(case: HostileCase) -> dict[str, Any]:
-    figures = case.figures
-    nan = float("nan")
-    return {
-        "fault": case.fault,
-        "severity": case.severity,
-        "in": case.direction,
-        "RMS mm": round(figures.rms_mm, 3) if figures else nan,
-        "predicted": round(figures.predicted_mm, 3) if figures else nan,
-        "floor": round(case.floor.rms_mm, 3),
-        ">3 sigma %": round(100 * figures.gross, 1) if figures else nan,
-        "coverage %": round(100 * figures.coverage, 1) if figures else nan,
-        "named": ", ".join(case.named) or "-",
-        "outcome": case.outcome,
-        "s": round(case.seconds, 1),
-    }
 
 
 def prove_hostile(
@@ -163,8 +117,8 @@ def prove_hostile(
     splined: bool = True,
     seed: int = 0,
     progress: Progress = ignore_progress,
-) -> HostileProof:
-    """Put every fault at every severity into scans, and into target poses, and judge what the program makes of them.
+) -> Proof:
+    """Put every fault at every severity into scans, and into target poses, and judge the program's reaction.
 
     ``cases``: some of them, as "flicker", "flicker:mild" or "flicker:mild:scan". ``splined``: measure with the splined
     model on a rig with local distortion; otherwise with stereo on one without, which takes a fifth of the time.
@@ -174,14 +128,18 @@ def prove_hostile(
     done: list[HostileCase] = []
     with tempfile.TemporaryDirectory(prefix="slviewer-hostile-") as folder:
         models = ("stereo", "splined") if splined else ("stereo",)
-        bench = HostileBench(rig, Path(folder), poses=8 if splined else 7, models=models, seed=seed)
         progress(0.0, "the undisturbed rig")
-        trial = _Trial(bench)
+        trial = _Trial(HostileBench(rig, Path(folder), poses=8 if splined else 7, models=models, seed=seed))
         for i, (name, severity, direction) in enumerate(chosen):
             progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
             done.append(trial.run(name, severity, direction))
     progress(1.0, "proven")
-    return HostileProof(tuple(done), scale)
+    failed = [case for case in done if not case.passed]
+    lines = [f"{len(done) - len(failed)} of {len(done)} hold, at scale {scale:g}"]
+    for case in failed:
+        lines.append(f"\n{case.fault}, {case.severity}, {case.direction}: {case.outcome}")
+        lines += [f"  {message}" for message in case.messages] or ["  (no message)"]
+    return Proof(not failed, scale, [case.row() for case in done], {"cases": done}, below=lines)
 
 
 def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direction]]:
@@ -206,7 +164,7 @@ def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direct
 
 
 class _Trial:
-    """The sound session, and each case against it."""
+    """The undisturbed session, and each case against it."""
 
     def __init__(self, bench: HostileBench) -> None:
         self._bench = bench
@@ -215,24 +173,25 @@ class _Trial:
         bench.store(self._session, {name: bench.capture(name)[0] for name in bench.scenes}, report)
         bench.calibrate(self._session, report)
         measured = [bench.measure(self._session, name, bench.capture(name)[1:], report) for name in SCANS]
-        self.gauge = fit_gauge(measured)
-        self.floor = score(measured, self.gauge)
-        self.said = report
+        self._gauge = fit_gauge(measured)
+        self._floor = score(measured, self._gauge)
 
     def run(self, name: str, severity: Severity, direction: Direction) -> HostileCase:
-        """One case."""
-        fault, begun = FAULTS[name], perf_counter()
-        if direction == "scan":
-            report, measured = run_case(lambda report: self._scan(fault, severity, report))
-            gauge = self.gauge
-        else:
-            report, measured = run_case(lambda report: self._calibrate(fault, severity, report))
-            gauge = fit_gauge(measured) if measured else self.gauge
+        """Run one case; an error, a crash too, is its result."""
+        begin, report = perf_counter(), CaseReport()
+        measured: Sequence[MeasuredScan] = ()
+        try:
+            measured = (self._scan if direction == "scan" else self._calibrate)(FAULTS[name], severity, report)
+        except Exception as error:  # the other cases still have to run
+            report.error = error
+        gauge = self._gauge if direction == "scan" or not measured else fit_gauge(measured)
         figures = score(measured, gauge) if measured else None
-        outcome, named = judge(fault, severity, report, figures, self.floor)
+        outcome, named = judge(FAULTS[name], severity, report, figures, self._floor)
         messages = [*report.warnings, *([f"{type(report.error).__name__}: {report.error}"] if report.error else [])]
-        seconds = perf_counter() - begun
-        return HostileCase(name, severity, direction, outcome, figures, self.floor, named, tuple(messages), seconds)
+        seconds = perf_counter() - begin
+        return HostileCase(
+            name, severity, direction, outcome, outcome in PASSED, figures, self._floor, named, tuple(messages), seconds
+        )
 
     def _scan(self, fault: Fault, severity: Severity, report: CaseReport) -> Sequence[MeasuredScan]:
         shots = {name: self._bench.capture(name, fault, severity) for name in SCANS}
@@ -266,11 +225,11 @@ def judge(
         return "CRASH", words
     if figures is None or report.error is not None:
         return ("WRONG REASON" if not right else "TURNED AWAY" if must else "refused"), words
-    good = figures.rms_mm <= WITHIN * floor.rms_mm and figures.gross <= floor.gross + GROSS
+    good = figures.rms_mm <= MOST_OVER_FLOOR * floor.rms_mm and figures.gross <= floor.gross + GROSS
     wrong = figures.rms_mm > SIGMAS * figures.predicted_mm or figures.gross > floor.gross + GROSS
     if named and not right:
         return "WRONG REASON", words
-    if good and figures.coverage >= KEPT * floor.coverage:
+    if good and figures.coverage >= LEAST_COVERAGE * floor.coverage:
         return "measured", words
     if must:
         return ("SILENTLY WRONG" if wrong and not right else "TURNED AWAY"), words
@@ -278,7 +237,9 @@ def judge(
         return "degraded, warned", words
     if wrong:
         return "SILENTLY WRONG", words
-    return ("noisier as predicted" if figures.coverage >= LEAST * floor.coverage else "UNEXPLAINED LOSS"), words
+    return (
+        "noisier as predicted" if figures.coverage >= EXPLAINED_LOSS * floor.coverage else "UNEXPLAINED LOSS"
+    ), words
 
 
 def fit_gauge(measured: Sequence[MeasuredScan]) -> tuple[np.ndarray, np.ndarray]:

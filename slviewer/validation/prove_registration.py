@@ -1,27 +1,22 @@
-"""Whether scans are registered as well as is claimed, on a simulated rig whose truth is known.
+"""Whether scans are registered and meshed as well as is claimed, on a simulated rig whose truth is known.
 
-Three depths and a full turn of an object, measured with the splined calibration of rendered target poses, what their
-fused surfaces are worth, and pairs that must be refused.
+Three depths and a full turn of an object are measured with the splined calibration of rendered target poses, registered
+and fused; pairs that do not determine a pose must be refused.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slviewer.calibration.centres import calibrate_centres
-from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.errors import InputError
 from slviewer.evaluation import letter as the_letter
-from slviewer.evaluation.render import Row, render
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import one_axis
+from slviewer.evaluation.render import Row
 from slviewer.geometry.rigid import fit_rigid
-from slviewer.pipeline.capture_phases import decode_frames
+from slviewer.inspection.deviation import deviation
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
@@ -33,14 +28,15 @@ from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
-from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Scene, sphere
 from slviewer.simulation.turning import STEP_DEG, stone
-from slviewer.surface.shapes import Mesh
+from slviewer.surface.fuse import fuse
+from slviewer.surface.meshing import MeshingPlan, build_mesh
+from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board
-from slviewer.validation.prove_accuracy import BandCheck
-from slviewer.validation.prove_rigs import observe_scene
-from slviewer.validation.prove_surface import SurfaceProof, prove_surface
+from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
 
 POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01
@@ -49,20 +45,23 @@ SECONDS = 5.0
 HONEST = (0.7, 1.5)
 """Predicted over true error, pooled over all pairs."""
 GOOD_PAIRS = 10
-_EVERY = 37  # of the pixels, to find the calibrated camera's frame from
+OVER_SINGLE = (0.3, 1.3)
+"""A fused surface's deviation over that of the best single scan."""
+MESH_MM = (0.005, 0.08)
+_EVERY = 37  # of the pixels, from which the calibrated camera's frame is estimated
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredScans:
-    """Scans of one object: their clouds, how they were registered, the true poses T_camera_object (4, 4) in the
-    calibrated camera's frame, and the seconds that registering took."""
+    """Scans of one object: their clouds, their registration, the true poses T_camera_object (4, 4) in the calibrated
+    camera's frame, and the seconds that registering took."""
 
     clouds: Mapping[str, Cloud]
     alignment: Alignment
     poses: Mapping[str, np.ndarray]
     seconds: float
 
-    def round_all(self) -> tuple[float, float]:
+    def loop_error(self) -> tuple[float, float]:
         """Loop error of the pairs that follow one another, from the first scan to the last and back to the first, mm at
         the object's middle and degrees; NaN where one of them did not register."""
         names, pairs = list(self.clouds), self.alignment.pairs
@@ -71,181 +70,146 @@ class RegisteredScans:
             return float("nan"), float("nan")
         T = np.linalg.multi_dot([np.eye(4), *(pairs[step].T_reference_scan for step in steps)])
         D = T @ np.linalg.inv(pairs[names[-1], names[0]].T_reference_scan)
-        middle = self.poses[names[0]][:3, 3]
-        return _size_of(D, middle)
+        return _motion_size(D, self.poses[names[0]][:3, 3])
 
-    def error(self, scan: str, onto: str, found: Registration | np.ndarray) -> tuple[float, float]:
-        """mm, at the object's middle or where a pair overlaps, and degrees."""
-        if isinstance(found, Registration):
-            T, centre = found.T_reference_scan, found.uncertainty.centre
-        else:
-            T, centre = found, self.poses[onto][:3, 3]
-        return _size_of(T @ self.poses[scan] @ np.linalg.inv(self.poses[onto]), centre)
+    def error(self, scan: str, onto: str, T_onto_scan: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
+        """Error of a registration (4, 4): mm at ``centre`` (3,) mm, and degrees."""
+        return _motion_size(T_onto_scan @ self.poses[scan] @ np.linalg.inv(self.poses[onto]), centre)
+
+    def rows(self) -> list[Row]:
+        """A table row for each registered pair, true and predicted errors beside each other."""
+        rows = []
+        for (scan, onto), pair in self.alignment.pairs.items():
+            shift, turn = self.error(scan, onto, pair.T_reference_scan, pair.uncertainty.centre)
+            rows.append(_row(scan, onto, pair, shift, turn))
+        return rows
 
 
-@dataclass(frozen=True, eq=False)
-class RegistrationProof:
-    """What came of the three depths, of the turn, of the surfaces made from them, and of what had to be refused: the
-    reason by pair, or "accepted"."""
-
-    depths: RegisteredScans
-    turn: RegisteredScans
-    surface: SurfaceProof
-    refusals: Mapping[str, tuple[str, str]]
-    scale: float
-
-    @property
-    def checks(self) -> tuple[BandCheck, ...]:
-        """All that is demanded."""
-        found = []
-        for name in self.depths.clouds:
-            if name != self.depths.alignment.reference:
-                onto = self.depths.alignment.reference
-                shift, turn = self.depths.error(name, onto, self.depths.alignment.T_reference_scan[name])
-                found.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
-                found.append(BandCheck(name, "error of its turn in degrees", turn, 0.0, TURN_DEG))
-        loops = self.turn.alignment.loops
-        found.append(BandCheck("three depths", "seconds to register", self.depths.seconds, 0.0, SECONDS))
-        left = max((loop.after.shift_mm for loop in loops), default=float("nan"))
-        found.append(BandCheck("turn", "largest loop error in mm once adjusted", left, 0.0, LOOP_MM))
-        found.append(BandCheck("turn", "loop error in mm round all scans", self.turn.round_all()[0], 0.0, LOOP_MM))
-        good = len(self.depths.alignment.pairs) + len(self.turn.alignment.pairs)
-        found.append(BandCheck("good pairs", "number accepted", float(good), GOOD_PAIRS, float("inf")))
-        for what, ratio in zip(("shift", "turn"), self.honesty, strict=True):
-            found.append(BandCheck("all pairs", f"predicted over true error of the {what}", ratio, *HONEST))
-        found += self.surface.checks
-        for name, (wanted, got) in self.refusals.items():
-            found.append(
-                BandCheck(name, f"refused as {wanted} (it was: {got})", float(got in wanted.split("/")), 1.0, 1.0)
-            )
-        return tuple(found)
-
-    @property
-    def honesty(self) -> tuple[float, float]:
-        """Predicted over true error, shift and turn: root mean squares over all pairs."""
-        told, true = [], []
-        for measured in (self.depths, self.turn):
-            for (scan, onto), found in measured.alignment.pairs.items():
-                told.append((found.uncertainty.shift_mm, found.uncertainty.turn_deg))
-                true.append(measured.error(scan, onto, found))
-        shift, turn = np.sqrt(np.sum(np.square(told), axis=0) / np.sum(np.square(true), axis=0))
-        return float(shift), float(turn)
-
-    @property
-    def holds(self) -> bool:
-        """Whether every figure lies where it must."""
-        return all(check.holds for check in self.checks)
-
-    def text(self) -> str:
-        """For people: a line a pair, the loops, the refusals, and what misses."""
-        rows: list[Row] = []
-        for measured in (self.depths, self.turn):
-            for (scan, onto), found in measured.alignment.pairs.items():
-                shift, turn = measured.error(scan, onto, found)
-                rows.append(_row(scan, onto, found, shift, turn))
-        missed = [check.text() for check in self.checks if not check.holds]
-        r1, r2 = the_letter.EXPERIMENT_3_ICP_RMS_MM.values()
-        said = [
-            f"errors of pairs at scale {self.scale:g}; the Letter's point-to-point RMS: {r1:.2f} and {r2:.2f} mm",
-            render(rows),
-            self.surface.text(),
-            *(check.text() for check in self.checks if check.holds),
-            f"{len(self.checks) - len(missed)} of {len(self.checks)} figures hold",
-        ]
-        return "\n".join([*said, *missed])
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "scale": self.scale,
-            "holds": self.holds,
-            "surface": self.surface.to_json(),
-            "checks": [{**vars(check), "holds": check.holds} for check in self.checks],
-            "refusals": {name: {"wanted": wanted, "got": got} for name, (wanted, got) in self.refusals.items()},
-            "pairs": [
-                _row(scan, onto, found, *measured.error(scan, onto, found))
-                for measured in (self.depths, self.turn)
-                for (scan, onto), found in measured.alignment.pairs.items()
-            ],
-        }
+def _row(scan: str, onto: str, pair: Registration, shift: float, turn: float) -> Row:
+    return {
+        "scan": scan,
+        "onto": onto,
+        "error um": 1000 * shift,
+        "error mdeg": 1000 * turn,
+        "predicted um": 1000 * pair.uncertainty.shift_mm,
+        "predicted mdeg": 1000 * pair.uncertainty.turn_deg,
+        "RMS mm": pair.rms_mm,
+        "point to point mm": pair.inlier_rmse_mm,
+        "overlap %": 100 * pair.overlap,
+        "start": pair.start,
+    }
 
 
 def prove_registration(
     scale: float = 1.0, *, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
-) -> RegistrationProof:
-    """Calibrate a rendered rig, scan and register three depths and a turn, and try what must be refused."""
+) -> Proof:
+    """Calibrate a rendered rig, scan and register three depths and a turn, mesh them, and try what must be refused."""
     rig = letter(scale, seed)
-    board = Board.parse(TARGET)
-    plan = turn_plan(rig, board, poses)
+    plan = turn_plan(rig, Board.parse(TARGET), poses)
     targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
-    model = _calibrated(rig, board, targets, part(progress, 0.0, 0.5))
+    model: Model = calibrate_rendered(rig, targets, part(progress, 0.0, 0.5))[1]
     scans = {name: scene for name, scene in plan.items() if isinstance(scene, MeshScene)}
     clouds, measured, true = {}, [], []
     for i, (name, scene) in enumerate(scans.items()):
         progress(0.5 + 0.25 * i / len(scans), name)
         renderer = Renderer(rig, scene)
-        clouds[name] = _scanned(renderer, model, name, len(targets) + i)
+        clouds[name] = reconstruct(model, {"x": render_phase(renderer, name, len(targets) + i)})
         known = np.flatnonzero(clouds[name].mask & renderer.truth().mask)[::_EVERY]
         measured.append(clouds[name].points.reshape(-1, 3)[known].astype(float))
         true.append(renderer.truth().points.reshape(-1, 3)[known])
     # A calibration's camera frame is a gauge: turned by a part of a milliradian it measures every distance the same.
     T_calibrated_camera = fit_rigid(np.concatenate(true), np.concatenate(measured))
-    depths, turn = (
-        {name: cloud for name, cloud in clouds.items() if name.startswith(kind)} for kind in ("object_", "turn_")
-    )
     truth = {name: T_calibrated_camera @ _matrix(scene.pose) for name, scene in scans.items()}
-    first = _registered(depths, "object_r3", truth, None, part(progress, 0.75, 0.8))
-    around = _registered(turn, "turn_01", truth, Starts(step_deg=STEP_DEG), part(progress, 0.8, 0.88))
+
+    def register(kind: str, reference: str, starts: Starts | None, done: Progress) -> RegisteredScans:
+        chosen = {name: cloud for name, cloud in clouds.items() if name.startswith(kind)}
+        begin = perf_counter()
+        alignment = register_all(chosen, reference, starts, lambda share: done(share, "registering"))
+        return RegisteredScans(chosen, alignment, truth, perf_counter() - begin)
+
+    depths = register("object_", "object_r3", None, part(progress, 0.75, 0.8))
+    turn = register("turn_", "turn_01", Starts(step_deg=STEP_DEG), part(progress, 0.8, 0.88))
+    checks = check_registration(depths, turn)
     progress(0.88, "fusing and meshing")
-    surface = prove_surface(
-        depths,
-        first.alignment.T_reference_scan,
-        (Mesh(scans["object_r3"].vertices, scans["object_r3"].triangles), truth),
-        turn,
-        around.alignment.T_reference_scan,
-        (Mesh(scans["turn_01"].vertices, scans["turn_01"].triangles), truth["turn_01"]),
-    )
+    surfaces, lines, surface_record = _check_surfaces(depths, turn, scans)
     refusals = {}
-    for k, (what, (wanted, one, other)) in enumerate(_doubtful().items()):
+    for k, (what, (wanted, *pair)) in enumerate(_ambiguous_pairs().items()):
         progress(0.95 + 0.01 * k, what)
-        pair = {
-            name: _scanned(Renderer(rig, scene), model, name, 900 + k) for name, scene in (("a", one), ("b", other))
+        both = {
+            name: reconstruct(model, {"x": render_phase(Renderer(rig, scene), name, 900 + k)})
+            for name, scene in zip("ab", pair, strict=True)
         }
-        refusals[what] = wanted, _reason(pair)
+        reason = _refusal(both)
+        refusals[what] = {"wanted": wanted, "got": reason}
+        is_right = float(reason in wanted.split("/"))
+        surfaces.append(BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0))
     progress(1.0, "proven")
-    return RegistrationProof(first, around, surface, refusals, scale)
+    rows = depths.rows() + turn.rows()
+    checks += surfaces
+    r1, r2 = the_letter.EXPERIMENT_3_ICP_RMS_MM.values()
+    return prove_checks(
+        checks,
+        scale,
+        rows,
+        {"surface": surface_record, "refusals": refusals, "pairs": rows},
+        [f"errors of pairs at scale {scale:g}; the Letter's point-to-point RMS: {r1:.2f} and {r2:.2f} mm"],
+        [*lines, *(check.text() for check in checks if check.holds)],
+    )
 
 
-def _calibrated(rig: SimulatedRig, board: Board, targets: Mapping[str, Scene], progress: Progress) -> Model:
-    both = p18(rig.projector.size)
-    observations = []
-    for i, (name, scene) in enumerate(targets.items()):
-        progress(0.8 * i / len(targets), name)
-        observations.append(observe_scene(name, rig, scene, board, both, i))
-    progress(0.8, "calibrating")
-    stereo, observations = calibrate_centres(observations, rig.projector.size, TARGET)
-    return calibrate_splined(observations, stereo)
+def check_registration(depths: RegisteredScans, turn: RegisteredScans) -> list[BandCheck]:
+    """Errors of the poses against their bounds, loops, duration, and predicted against true errors."""
+    checks = []
+    onto = depths.alignment.reference
+    for name in depths.clouds:
+        if name != onto:
+            shift, angle = depths.error(name, onto, depths.alignment.T_reference_scan[name], depths.poses[onto][:3, 3])
+            checks.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
+            checks.append(BandCheck(name, "error of its turn in degrees", angle, 0.0, TURN_DEG))
+    adjusted = max((loop.after.shift_mm for loop in turn.alignment.loops), default=float("nan"))
+    rows = depths.rows() + turn.rows()
+    checks += [
+        BandCheck("three depths", "seconds to register", depths.seconds, 0.0, SECONDS),
+        BandCheck("turn", "largest loop error in mm once adjusted", adjusted, 0.0, LOOP_MM),
+        BandCheck("turn", "loop error in mm round all scans", turn.loop_error()[0], 0.0, LOOP_MM),
+        BandCheck("good pairs", "number accepted", float(len(rows)), GOOD_PAIRS, float("inf")),
+    ]
+    for what, unit in (("shift", "um"), ("turn", "mdeg")):
+        predicted, true = (np.linalg.norm([row[f"{kind} {unit}"] for row in rows]) for kind in ("predicted", "error"))
+        ratio = float(predicted / true)
+        checks.append(BandCheck("all pairs", f"predicted over true error of the {what}", ratio, *HONEST))
+    return checks
 
 
-def _scanned(renderer: Renderer, model: Model, name: str, number: int) -> Cloud:
-    only_x = one_axis(p18(renderer.rig.projector.size), "x")
-    return reconstruct(model, decode_frames(name, only_x, renderer.capture(only_x, number)))
+def _check_surfaces(
+    depths: RegisteredScans, turn: RegisteredScans, scenes: Mapping[str, MeshScene]
+) -> tuple[list[BandCheck], list[str], dict[str, object]]:
+    """Fuse both groups of scans where they were registered and mesh the turn: checks of the deviations from the true
+    surface, lines of text, and figures for JSON."""
+
+    def rms(surface: PointSet, name: str) -> float:
+        """RMS deviation in mm from the object, after a best fit that begins at the true pose."""
+        nominal, T = Mesh(scenes[name].vertices, scenes[name].triangles), np.linalg.inv(depths.poses[name])
+        return deviation(surface.points, nominal, normals=surface.normals, initial=T).statistics()["rms"]
+
+    single = {name: rms(fuse({name: cloud}, {name: np.eye(4)}).surface, name) for name, cloud in depths.clouds.items()}
+    fused = rms(fuse(depths.clouds, depths.alignment.T_reference_scan).surface, depths.alignment.reference)
+    meshed = build_mesh(fuse(turn.clouds, turn.alignment.T_reference_scan).surface, MeshingPlan(watertight=True))
+    turned = rms(PointSet(meshed.mesh.vertices), turn.alignment.reference)
+    ratio = fused / min(single.values())
+    checks = [
+        BandCheck("three depths, fused", "RMS deviation over the best single scan's", ratio, *OVER_SINGLE),
+        BandCheck("turn, mesh", "RMS deviation from the true mesh in mm", turned, *MESH_MM),
+        BandCheck("turn, mesh", "watertight", float(meshed.topology.watertight), 1.0, 1.0),
+    ]
+    scans = ", ".join(f"{name} {each:.4f}" for name, each in single.items())
+    line = f"RMS deviation from the true surface in mm: {scans}; fused {fused:.4f}; the turn's mesh {turned:.4f}"
+    record = {"single_mm": single, "fused_mm": fused, "turned_mm": turned, "mesh": meshed.to_json()}
+    return checks, [line, meshed.text()], record
 
 
-def _registered(
-    clouds: Mapping[str, Cloud],
-    reference: str,
-    truth: Mapping[str, np.ndarray],
-    starts: Starts | None,
-    progress: Progress,
-) -> RegisteredScans:
-    begun = perf_counter()
-    found = register_all(clouds, reference, starts, lambda done: progress(done, "registering"))
-    taken = perf_counter() - begun
-    return RegisteredScans(clouds, found, {name: truth[name] for name in clouds}, taken)
-
-
-def _reason(pair: Mapping[str, Cloud]) -> str:
+def _refusal(pair: Mapping[str, Cloud]) -> str:
+    """Why two clouds "a" and "b" are not registered, or "accepted"."""
     try:
         register_all(pair, "b")
     except Refused as refusal:
@@ -255,20 +219,17 @@ def _reason(pair: Mapping[str, Cloud]) -> str:
     return "accepted"
 
 
-def _doubtful() -> dict[str, tuple[str, Scene, Scene]]:
+def _ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
     """Two scans each that must not be registered, and the reason."""
     near, far = np.array([0.0, 0.0, 560.0]), np.array([6.0, -4.0, 620.0])
-    tilts = [np.radians(turns) for turns in ((4.0, -6.0, 2.0), (-5.0, 3.0, 6.0))]
-    vertices, triangles = _cylinder(40.0, 150.0)
-    first, second = Pose(rotation(tilts[0]), near), Pose(rotation(tilts[1]), far)
+    first, second = (
+        Pose(rotation(np.radians(turns)), place) for turns, place in (((4.0, -6.0, 2.0), near), ((-5.0, 3.0, 6.0), far))
+    )
+    cylinder = _cylinder_mesh(40.0, 150.0)
     return {
         "two scans of a plane": ("plane", blank_board(first), blank_board(second)),
         "two scans of a sphere": ("sphere", sphere((4.0, -3.0, 640.0)), sphere((-8.0, 6.0, 690.0))),
-        "two scans of a cylinder": (
-            "cylinder",
-            MeshScene(vertices, triangles, first),
-            MeshScene(vertices, triangles, second),
-        ),
+        "two scans of a cylinder": ("cylinder", MeshScene(*cylinder, first), MeshScene(*cylinder, second)),
         "scans of unrelated objects": (
             "disagree/overlap",
             demo_object(first),
@@ -277,35 +238,20 @@ def _doubtful() -> dict[str, tuple[str, Scene, Scene]]:
     }
 
 
-def _cylinder(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """An open one along y, so fine that its facets are lost in the noise: vertices (n, 3) mm, triangles (m, 3)."""
-    around, along = 720, 2
+def _cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """An open cylinder along y with facets smaller than the noise: vertices (n, 3) mm, triangles (m, 3)."""
+    around = 720
     angles = np.arange(around) * 2 * np.pi / around
     ring = np.stack([radius * np.cos(angles), np.zeros(around), radius * np.sin(angles)], axis=1)
-    vertices = np.concatenate([ring + np.array([0, y, 0]) for y in np.linspace(-length / 2, length / 2, along)])
+    vertices = np.concatenate([ring + np.array([0, y, 0]) for y in (-length / 2, length / 2)])
     i, j = np.arange(around), (np.arange(around) + 1) % around
     return vertices, np.concatenate([np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)])
 
 
-def _size_of(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
+def _motion_size(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
     """How far a motion (4, 4) shifts a point (3,), mm, and its angle, degrees."""
     shift = np.linalg.norm(D[:3, :3] @ centre + D[:3, 3] - centre)
     return float(shift), float(np.degrees(Rotation.from_matrix(D[:3, :3]).magnitude()))
-
-
-def _row(scan: str, onto: str, found: Registration, shift: float, turn: float) -> Row:
-    return {
-        "scan": scan,
-        "onto": onto,
-        "error um": 1000 * shift,
-        "error mdeg": 1000 * turn,
-        "told um": 1000 * found.uncertainty.shift_mm,
-        "told mdeg": 1000 * found.uncertainty.turn_deg,
-        "RMS mm": found.rms_mm,
-        "point to point mm": found.inlier_rmse_mm,
-        "overlap %": 100 * found.overlap,
-        "start": found.start,
-    }
 
 
 def _matrix(pose: Pose) -> np.ndarray:

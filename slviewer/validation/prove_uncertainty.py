@@ -1,22 +1,24 @@
-"""Whether the splined calibration is as wrong as it says: simulated rigs, whose true space is known."""
+"""Whether the splined calibration predicts its own errors, on simulated rigs with known truth."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
+from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.uncertainty import volume_sigmas
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.calibration.splined.volume import Volume, depth_axis, motion_free, sigma_3d, view_pixels, working_volume
-from slviewer.errors import CalibrationRejected
-from slviewer.evaluation.render import render
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.simulate import TARGET
+from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.validation.faulty_captures import FaultBench
-from slviewer.validation.prove_rigs import RigCase, cases
+from slviewer.target.board import Board
+from slviewer.validation.proof import Proof
+from slviewer.validation.prove_accuracy import rig_cases
+from slviewer.validation.rendered_calibration import calibrate_rendered
 
 POSES = 25
 BAND = (0.7, 1.5)
@@ -26,116 +28,81 @@ GRID = (13, 10, 5)
 
 
 @dataclass(frozen=True, eq=False)
-class Honesty:
-    """One calibration: at each place of its working volume, what it ``predicted`` (n,) mm and by how much it ``missed``
-    (n,) mm, both in 3D without the rigid motion that fits the supported places best; ``supported`` (n,) bool."""
+class PredictedErrors:
+    """One calibration: ``predicted`` (n,) mm and ``true`` (n,) mm errors over its working volume, in 3D without the
+    rigid motion that fits the supported places best; ``supported`` (n,) bool."""
 
-    name: str
     predicted: np.ndarray
-    missed: np.ndarray
+    true: np.ndarray
     supported: np.ndarray
 
-    @property
-    def below_two(self) -> float:
-        """Share of the supported places that are off by less than two predicted standard deviations."""
-        return float(np.mean((self.missed < 2 * self.predicted)[self.supported]))
-
-
-@dataclass(frozen=True)
-class UncertaintyProof:
-    """What came of all rigs."""
-
-    rigs: tuple[Honesty, ...]
-    scale: float
-    poses: int
-
-    def ratio(self, supported: bool = True) -> float:
-        """RMS predicted over RMS true error, pooled over the rigs: over supported places, or over all others."""
-        return _ratio(self.rigs, supported)
-
-    @property
-    def holds(self) -> bool:
-        """Whether the ratio over supported places lies in the band."""
-        return BAND[0] <= self.ratio() <= BAND[1]
-
-    def rows(self) -> list[dict[str, Any]]:
-        """A row a rig, then the pooled one; mm."""
-        pooled = {"pooled": self.rigs} if len(self.rigs) > 1 else {}
-        groups: Mapping[str, tuple[Honesty, ...]] = {rig.name: (rig,) for rig in self.rigs} | pooled
-        return [
-            {
-                "rig": name,
-                "supported": float(np.mean(_joined(rigs, "supported"))),
-                "predicted": _rms(rigs, "predicted", True),
-                "true": _rms(rigs, "missed", True),
-                "ratio": _ratio(rigs, True),
-                "below_2_sigma": float(np.average([r.below_two for r in rigs], weights=[_count(r) for r in rigs])),
-                "ratio_elsewhere": _ratio(rigs, False),
-            }
-            for name, rigs in groups.items()
-        ]
-
-    def text(self) -> str:
-        """For people."""
-        table = [
-            {
-                "rig": row["rig"],
-                "supported %": round(100 * row["supported"], 1),
-                "predicted um": round(1000 * row["predicted"], 1),
-                "true um": round(1000 * row["true"], 1),
-                "predicted / true": round(row["ratio"], 2),
-                "below 2 sigma %": round(100 * row["below_2_sigma"], 1),
-                "where no pose captures": round(row["ratio_elsewhere"], 2),
-            }
-            for row in self.rows()
-        ]
-        verdict = "lies" if self.holds else "does NOT lie"
-        return (
-            f"{render(table)}\npredicted over true 3D error, pooled over {len(self.rigs)} rigs of {self.poses} poses "
-            f"at scale {self.scale:g}: {self.ratio():.2f} {verdict} between {BAND[0]} and {BAND[1]}; "
-            f"where no pose captures {self.ratio(supported=False):.2f}"
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values; ``ratio_elsewhere`` is None where poses support everything."""
-        rows = [{key: None if value != value else value for key, value in row.items()} for row in self.rows()]
-        return {"scale": self.scale, "poses": self.poses, "holds": self.holds, "ratio": self.ratio(), "rigs": rows}
+    def row(self, rig: str) -> dict[str, Any]:
+        """The figures in mm; NaN where target poses support everything."""
+        rms = {
+            (what, where): float(np.sqrt(np.mean(errors[self.supported == where] ** 2)))
+            if (self.supported == where).any()
+            else float("nan")
+            for what, errors in (("predicted", self.predicted), ("true", self.true))
+            for where in (True, False)
+        }
+        return {
+            "rig": rig,
+            "supported": float(np.mean(self.supported)),
+            "predicted": rms["predicted", True],
+            "true": rms["true", True],
+            "ratio": rms["predicted", True] / rms["true", True],
+            "below_2_sigma": float(np.mean((self.true < 2 * self.predicted)[self.supported])),
+            "ratio_elsewhere": rms["predicted", False] / rms["true", False],
+        }
 
 
 def prove_uncertainty(
-    scale: float = 0.5, *, rigs: int = 6, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
-) -> UncertaintyProof:
-    """Calibrate so many rigs of different lenses and boards from rendered captures, and compare what each predicts of
-    its errors with these. ``scale``: resolution of the camera, as a share of the Letter's.
+    scale: float = 0.5, *, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
+) -> Proof:
+    """Calibrate rigs of different lenses and boards from rendered captures, and compare what each predicts of its
+    errors with these. ``scale``: resolution of the camera, as a share of the Letter's.
 
     Raises CalibrationRejected where one cannot be calibrated.
     """
-    chosen = [case for first in range(seed, seed + rigs, 6) for case in cases(first)][:rigs]
-    found = []
-    for k, case in enumerate(chosen):
-        doing = part(progress, k / rigs, (k + 1) / rigs)
+    rigs = {}
+    for k, case in enumerate(chosen := rig_cases(seed)):
+        report = part(progress, k / len(chosen), (k + 1) / len(chosen), case.name)
         rig = case.rig(scale)
-        found.append(compare_with_truth(case.name, calibrated(case, rig, poses, doing), rig))
+        plan = letter_plan(rig, Board.parse(TARGET), poses, case.shape)
+        targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
+        rigs[case.name] = compare_with_truth(calibrate_rendered(rig, targets, report)[1], rig)
     progress(1.0, "proven")
-    return UncertaintyProof(tuple(found), scale, poses)
+    return judge_uncertainty(rigs, scale, poses)
 
 
-def calibrated(case: RigCase, rig: SimulatedRig, poses: int, progress: Progress = ignore_progress) -> SplinedModel:
-    """The splined model from rendered target poses."""
-    bench = FaultBench(rig, count=poses, shape=case.shape)
-    captures = []
-    for i in range(poses):
-        progress(0.7 * i / poses, f"{case.name}: pose {i + 1} of {poses}")
-        captures.append(bench.examine_clean(i))
-    attempt = bench.attempt(captures)
-    if attempt.stereo is None:
-        raise CalibrationRejected(f"{case.name}: {attempt.verdict.reason}")
-    progress(0.7, f"{case.name}: calibrating")
-    return calibrate_splined(attempt.observations, attempt.stereo)
+def judge_uncertainty(rigs: Mapping[str, PredictedErrors], scale: float, poses: int) -> Proof:
+    """The proof: whether the ratio of predicted to true errors, pooled over the rigs, lies in ``BAND``."""
+    every = list(rigs.values())
+    pooled = PredictedErrors(*(_joined(every, what) for what in ("predicted", "true", "supported"))).row("pooled")
+    rows = [each.row(name) for name, each in rigs.items()] + ([pooled] if len(every) > 1 else [])
+    table = [
+        {
+            "rig": row["rig"],
+            "supported %": round(100 * row["supported"], 1),
+            "predicted um": round(1000 * row["predicted"], 1),
+            "true um": round(1000 * row["true"], 1),
+            "predicted / true": round(row["ratio"], 2),
+            "below 2 sigma %": round(100 * row["below_2_sigma"], 1),
+            "where no pose captures": round(row["ratio_elsewhere"], 2),
+        }
+        for row in rows
+    ]
+    holds = BAND[0] <= pooled["ratio"] <= BAND[1]
+    line = (
+        f"predicted over true 3D error, pooled over {len(every)} rigs of {poses} poses at scale {scale:g}: "
+        f"{pooled['ratio']:.2f} {'lies' if holds else 'does NOT lie'} between {BAND[0]} and {BAND[1]}; "
+        f"where no pose captures {pooled['ratio_elsewhere']:.2f}"
+    )
+    return Proof(holds, scale, table, {"poses": poses, "ratio": pooled["ratio"], "rigs": rows}, below=[line])
 
 
-def compare_with_truth(name: str, model: SplinedModel, true: SimulatedRig) -> Honesty:
-    """What a calibration of a simulated rig predicts of its errors over the working volume, and what they are."""
+def compare_with_truth(model: SplinedModel, true: SimulatedRig) -> PredictedErrors:
+    """The errors that a calibration of a simulated rig predicts over the working volume, and its true ones."""
     bundle, rig = model.bundle, model.rig
     columns, rows, depths = GRID
     volume = working_volume(rig, bundle.depth_range_mm, columns=columns, rows=rows, depths=depths)
@@ -145,36 +112,24 @@ def compare_with_truth(name: str, model: SplinedModel, true: SimulatedRig) -> Ho
     volume = Volume(*(each[known] for each in (volume.pixels, volume.z, volume.points, volume.projector)))
     supported = volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
     predicted = volume_sigmas(bundle, axis, volume)
-    missed = sigma_3d(motion_free(errors[known].reshape(1, -1), volume.points, supported))
-    return Honesty(name, predicted, missed, supported)
+    return PredictedErrors(
+        predicted, sigma_3d(motion_free(errors[known].reshape(1, -1), volume.points, supported)), supported
+    )
 
 
 def true_errors(true: SimulatedRig, rig: Arrangement, volume: Volume, axis: Axis) -> np.ndarray:
-    """(n, 3) mm: where the calibrated ``rig`` puts what camera pixels really see at the volume's depths, less where
-    that is. NaN where a lens has no answer."""
+    """(n, 3) mm: the point that the calibrated ``rig`` measures for camera pixels at the volume's depths, less the true
+    one; NaN where a lens has no answer."""
     row = 0 if axis == "x" else 1
     rays = np.column_stack([true.camera.undistort(volume.pixels), np.ones(len(volume.z))])
-    really = rays * volume.z[:, None]
-    measured = true.project(really)[:, row]
+    points = rays * volume.z[:, None]
+    measured = true.project(points)[:, row]
     z = volume.z.copy()
     for _ in range(6):  # Newton, the slope from a step of a ten-thousandth
         here, there = (view_pixels(rig, volume.pixels, depths)[1][:, row] for depths in (z, 1.0001 * z))
         z = z + 1e-4 * z * (measured - here) / (there - here)
-    return view_pixels(rig, volume.pixels, z)[0] - really
+    return view_pixels(rig, volume.pixels, z)[0] - points
 
 
-def _joined(rigs: tuple[Honesty, ...], what: str) -> np.ndarray:
+def _joined(rigs: Sequence[PredictedErrors], what: str) -> np.ndarray:
     return np.concatenate([getattr(rig, what) for rig in rigs])
-
-
-def _rms(rigs: tuple[Honesty, ...], what: str, supported: bool) -> float:
-    chosen = _joined(rigs, what)[_joined(rigs, "supported") == supported]
-    return float(np.sqrt(np.mean(chosen**2))) if chosen.size else float("nan")
-
-
-def _ratio(rigs: tuple[Honesty, ...], supported: bool) -> float:
-    return _rms(rigs, "predicted", supported) / _rms(rigs, "missed", supported)
-
-
-def _count(rig: Honesty) -> int:
-    return int(np.count_nonzero(rig.supported))

@@ -27,7 +27,7 @@ from slviewer.inspection.uncertainty import Spread, splined_shared
 from slviewer.reconstruction.reconstruct import reconstruct
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.validation.prove_uncertainty import Honesty, UncertaintyProof, compare_with_truth
+from slviewer.validation.prove_uncertainty import PredictedErrors, compare_with_truth, judge_uncertainty
 
 
 @pytest.fixture(scope="module")
@@ -88,10 +88,10 @@ def test_a_rigid_motion_is_taken_away_and_nothing_else() -> None:
 
 
 def test_it_is_as_wrong_as_it_says(model, true) -> None:
-    found = compare_with_truth("analytic", model, true)
-    proof = UncertaintyProof((found, found), 0.25, 10)
-    assert 0.6 < proof.ratio() < 1.7
-    assert found.below_two > 0.8
+    found = compare_with_truth(model, true)
+    row = found.row("analytic")
+    assert 0.6 < row["ratio"] < 1.7
+    assert row["below_2_sigma"] > 0.8
     assert found.predicted[~found.supported].mean() > 3 * found.predicted[found.supported].mean()
 
 
@@ -169,14 +169,15 @@ def test_a_cloud_knows_its_noise_and_its_calibration_apart_and_its_file_holds_th
 
 def test_a_proof_pools_its_rigs_and_says_whether_it_holds() -> None:
     supported = np.array([True, True, False])
-    cautious = Honesty("cautious", np.array([2.0, 2.0, 9.0]), np.array([1.0, 1.0, 3.0]), supported)
-    bold = Honesty("bold", np.array([1.0, 1.0, 1.0]), np.array([2.0, 2.0, 3.0]), supported)
-    assert not UncertaintyProof((cautious,), 0.5, 25).holds and not UncertaintyProof((bold,), 0.5, 25).holds
-    both = UncertaintyProof((cautious, bold), 0.5, 25)
-    assert both.ratio() == pytest.approx(1) and both.holds
+    cautious = PredictedErrors(np.array([2.0, 2.0, 9.0]), np.array([1.0, 1.0, 3.0]), supported)
+    bold = PredictedErrors(np.array([1.0, 1.0, 1.0]), np.array([2.0, 2.0, 3.0]), supported)
+    too_bold = judge_uncertainty({"bold": bold}, 0.5, 25)
+    assert not judge_uncertainty({"cautious": cautious}, 0.5, 25).holds and not too_bold.holds
+    both = judge_uncertainty({"cautious": cautious, "bold": bold}, 0.5, 25)
     record = both.to_json()
-    assert [row["rig"] for row in record["rigs"]] == ["cautious", "bold", "pooled"] and record["holds"]
-    assert "1.00 lies between" in both.text() and "does NOT lie" in UncertaintyProof((bold,), 0.5, 25).text()
+    assert both.holds and record["holds"] and record["ratio"] == pytest.approx(1)
+    assert [row["rig"] for row in record["rigs"]] == ["cautious", "bold", "pooled"]
+    assert "1.00 lies between" in both.text() and "does NOT lie" in too_bold.text()
 
 
 def test_what_is_fitted_is_as_sure_as_the_calibrations_covariance_says(model) -> None:

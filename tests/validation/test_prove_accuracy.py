@@ -17,9 +17,17 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Scene
 from slviewer.simulation.truth import PerfectModel
-from slviewer.validation import prove_rigs
-from slviewer.validation.prove_accuracy import AccuracyProof, prove_accuracy
-from slviewer.validation.prove_rigs import FLOOR, PlaneFigures, RigFigures, cases
+from slviewer.validation import prove_accuracy as accuracy
+from slviewer.validation import rendered_calibration
+from slviewer.validation.proof import Proof
+from slviewer.validation.prove_accuracy import (
+    FLOOR,
+    PlaneFigures,
+    RigFigures,
+    judge_accuracy,
+    prove_accuracy,
+    rig_cases,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -40,27 +48,28 @@ def quick(projector: tuple[int, int]) -> PatternSequence:
 
 
 @pytest.fixture(scope="module")
-def proof() -> Iterator[AccuracyProof]:
+def proof() -> Iterator[Proof]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fields, "CELLS_ACROSS", 8)
-        patch.setattr(prove_rigs, "TARGET", "circles:14x11:13")
-        patch.setattr(prove_rigs, "letter_plan", few)
-        patch.setattr(prove_rigs, "p18", quick)
-        yield prove_accuracy(0.15, rigs=cases()[:1], poses=8)
+        for module in (accuracy, rendered_calibration):
+            patch.setattr(module, "TARGET", "circles:14x11:13")
+        patch.setattr(accuracy, "letter_plan", few)
+        patch.setattr(rendered_calibration, "p18", quick)
+        yield prove_accuracy(0.15, rigs=rig_cases()[:1], poses=8)
 
 
-def test_a_rig_is_measured_from_its_images(proof: AccuracyProof) -> None:
-    (rig,) = proof.rigs
+def test_a_rig_is_measured_from_its_images(proof: Proof) -> None:
+    (rig,) = proof.record["rigs"]
     (plane,) = rig.planes.values()
-    assert plane.region == "R2" and plane.pixels > 8_000 and 0.9 < plane.kept <= 1
+    assert plane.region == "R2" and plane.pixels > 8_000 and 0.9 < plane.measured <= 1
     assert 0.03 < plane.rms_mm[FLOOR] < 0.09
     assert 0.97 < plane.rms_mm["splined"] / plane.rms_mm[FLOOR] < 1.15
     assert plane.rms_mm["stereo"] > 2 * plane.rms_mm["splined"]
     assert plane.predicted_mm == pytest.approx(plane.rms_mm[FLOOR], rel=0.05)
     assert set(plane.rms_mm) == {"stereo", "pixelwise", "splined", FLOOR}
-    errors = rig.radius_mm[FLOOR]
+    errors = rig.radius_error_mm[FLOOR]
     assert set(errors) == {"sphere_3", "sphere_4"} and 0 < max(map(abs, errors.values())) < 0.05
-    assert 0 < abs(rig.spacing_mm[FLOOR]["sphere_3 - sphere_4"]) < 0.05
+    assert 0 < abs(rig.spacing_error_mm[FLOOR]["sphere_3 - sphere_4"]) < 0.05
     assert json.loads(json.dumps(proof.to_json()))["rigs"][0]["planes"]["plane_03"]["region"] == "R2"
 
 
@@ -85,19 +94,21 @@ def test_the_perfect_instrument_errs_by_noise_alone() -> None:
     assert np.max(np.abs(found - truth.points[inside & exact.mask])) < 0.01
 
 
-def figures(splined=1.0, predicted=1.0, radius=0.004, spacing=0.01, kept=1.0, local=None) -> RigFigures:
+def figures(splined=1.0, predicted=1.0, radius=0.004, spacing=0.01, measured=1.0, distorted=True) -> RigFigures:
     """A rig whose planes come out so many times the floor."""
     rms = {"stereo": 0.2, "pixelwise": 0.08, "splined": 0.04 * splined, FLOOR: 0.04}
     planes = {
-        f"plane_{i}": PlaneFigures(region, rms, 0.04 * predicted, 50_000, kept)
+        f"plane_{i}": PlaneFigures(region, rms, 0.04 * predicted, 50_000, measured)
         for i, region in enumerate(("R1", "R2", "R3"))
     }
     return RigFigures(
-        replace(cases()[0], local_distortion_px=local),
+        "a rig",
+        0,
+        distorted,
         planes,
         {"splined": {"sphere_1": 0.001, "sphere_2": -radius}},
         {"splined": {"sphere_1 - sphere_2": -spacing}},
-        {"in all": 1.0},
+        1.0,
     )
 
 
@@ -111,12 +122,11 @@ def figures(splined=1.0, predicted=1.0, radius=0.004, spacing=0.01, kept=1.0, lo
         ({"radius": 0.02}, "radius"),
         ({"radius": float("nan")}, "radius"),
         ({"spacing": 0.05}, "spacing"),
-        ({"kept": 0.8}, "share of the pixels"),
-        ({"local": 0.0, "splined": 5.3}, "over stereo"),
+        ({"measured": 0.8}, "share of the pixels"),
+        ({"distorted": False, "splined": 5.3}, "over stereo"),
     ],
 )
 def test_what_misses_its_band_is_said(change: dict, missed: str) -> None:
-    proof = AccuracyProof((figures(**change),), 0.25)
+    proof = judge_accuracy([figures(**change)], 0.25)
     assert proof.holds == (not missed) and missed in proof.text()
     assert json.loads(json.dumps(proof.to_json()))["holds"] == proof.holds
-    assert not [check.what for check in proof.checks if not check.holds and not missed]

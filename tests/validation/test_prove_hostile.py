@@ -62,10 +62,11 @@ def test_three_cases_end_to_end():
     proof = prove_hostile(
         0.15, cases=["vignetting:mild:scan", "dropped-frame:medium:scan", "hand:mild:scan"], splined=False
     )
-    by_fault = {case.fault: case for case in proof.cases}
-    assert by_fault["vignetting"].outcome == by_fault["hand"].outcome == "measured", proof.text()
-    assert by_fault["vignetting"].floor.gross < 0.01 and by_fault["vignetting"].floor.coverage > 0.95
-    assert 0.02 < by_fault["vignetting"].figures.rms_mm < 0.12
-    assert by_fault["dropped-frame"].figures is None and by_fault["dropped-frame"].messages
     data = json.loads(json.dumps(proof.to_json()))
+    by_fault = {case["fault"]: case for case in data["cases"]}
+    vignetting, dropped = by_fault["vignetting"], by_fault["dropped-frame"]
+    assert vignetting["outcome"] == by_fault["hand"]["outcome"] == "measured", proof.text()
+    assert vignetting["floor"]["gross"] < 0.01 and vignetting["floor"]["coverage"] > 0.95
+    assert 0.02 < vignetting["figures"]["rms_mm"] < 0.12
+    assert dropped["figures"] is None and dropped["messages"]
     assert data["holds"] == proof.holds and len(data["cases"]) == 3

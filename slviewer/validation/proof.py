@@ -1,0 +1,73 @@
+"""The result of proving one claim: a table, the figures that must lie within bounds, and all of it as JSON."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from slviewer.evaluation.render import Row, render
+from slviewer.records import to_plain
+
+
+@dataclass(frozen=True)
+class BandCheck:
+    """A figure ``what`` of a ``rig`` (or scan, or surface), and the band in which it must lie."""
+
+    rig: str
+    what: str
+    value: float
+    least: float
+    most: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value lies in the band; False for NaN."""
+        return self.least <= self.value <= self.most
+
+    def text(self) -> str:
+        """The figure and its band in one line."""
+        band = f"at most {self.most:g}" if self.least <= 0 else f"{self.least:.3g} to {self.most:.3g}"
+        return f"{self.rig}: {self.what} is {self.value:.4g}, wanted {band}"
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """``rows``: the printed table, with lines ``above`` and ``below``. ``record``: the values for JSON."""
+
+    holds: bool
+    scale: float
+    rows: Sequence[Row]
+    record: Mapping[str, Any] = field(default_factory=dict)
+    above: Sequence[str] = ()
+    below: Sequence[str] = ()
+
+    def text(self) -> str:
+        """The table with its lines."""
+        return "\n".join([*self.above, render(self.rows), *self.below])
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; NaN becomes None."""
+        plain: dict[str, Any] = to_plain({"scale": self.scale, "holds": self.holds, **self.record})
+        return {key: _without_nan(value) for key, value in plain.items()}
+
+
+def prove_checks(
+    checks: Sequence[BandCheck],
+    scale: float,
+    rows: Sequence[Row],
+    record: Mapping[str, Any],
+    above: Sequence[str] = (),
+    below: Sequence[str] = (),
+) -> Proof:
+    """The proof that holds where all ``checks`` do; those that fail are listed at its end."""
+    failed = [check.text() for check in checks if not check.holds]
+    summary = f"{len(checks) - len(failed)} of {len(checks)} figures hold"
+    figures = [{**vars(check), "holds": check.holds} for check in checks]
+    return Proof(not failed, scale, rows, {"checks": figures, **record}, above, [*below, summary, *failed])
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(each) for each in value]
+    return None if isinstance(value, float) and value != value else value

@@ -1,0 +1,59 @@
+"""A simulated rig calibrated in memory from rendered target poses, as the proofs share it."""
+
+from collections.abc import Mapping
+
+from slviewer.calibration.centres import calibrate_centres
+from slviewer.calibration.observe import Observation, observe
+from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
+from slviewer.calibration.stereo import StereoModel
+from slviewer.fringe.decode import texture
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
+from slviewer.pipeline.capture_phases import decode_frames
+from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.simulate import TARGET
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig
+from slviewer.simulation.scenes import Scene
+from slviewer.target.board import Board
+from slviewer.target.detect import detect
+
+
+def calibrate_rendered(
+    rig: SimulatedRig, targets: Mapping[str, Scene], progress: Progress = ignore_progress
+) -> tuple[StereoModel, SplinedModel, list[Observation]]:
+    """Both calibrations from rendered target poses, numbered in their order, and the observations, circles at their
+    centres.
+
+    Raises CalibrationRejected where the poses do not determine the rig.
+    """
+    observations = []
+    for i, (name, scene) in enumerate(targets.items()):
+        progress(0.8 * i / len(targets), name)
+        observations.append(observe_rendered(rig, scene, name, i))
+    progress(0.8, "calibrating")
+    return calibrate_observed(rig, observations)
+
+
+def calibrate_observed(
+    rig: SimulatedRig, observations: list[Observation]
+) -> tuple[StereoModel, SplinedModel, list[Observation]]:
+    """As ``calibrate_rendered``, from observations."""
+    stereo, observations = calibrate_centres(observations, rig.projector.size, TARGET)
+    return stereo, calibrate_splined(observations, stereo), observations
+
+
+def observe_rendered(rig: SimulatedRig, scene: Scene, name: str, number: int) -> Observation:
+    """The observation of a rendered target pose, whose noise ``number`` seeds. Raises InputError where no board is
+    detected."""
+    sequence = p18(rig.projector.size)
+    frames = Renderer(rig, scene).capture(sequence, number)
+    board = Board.parse(TARGET)
+    return observe(name, board, detect(board, texture(sequence, frames)), decode_frames(name, sequence, frames))
+
+
+def render_phase(renderer: Renderer, name: str, number: int) -> PhaseMap:
+    """The phase of axis x of a rendered scan, whose noise ``number`` seeds."""
+    only_x = one_axis(p18(renderer.rig.projector.size), "x")
+    return decode_frames(name, only_x, renderer.capture(only_x, number))["x"]
