@@ -8,19 +8,20 @@
 `.xyz`   text, mm: x y z of a point a line, and its red green blue; no other line, which most readers would not bear
 =======  ===========================================================================================================
 
-Large ones are written piece by piece, and appear whole or not at all.
+Files appear whole or not at all. In glTF y points up and the viewer looks along -z: its node turns the camera's frame,
+whose y points down and whose z points away, by half a turn about x, so that an object stands as the camera saw it.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from slviewer import __version__
 from slviewer.errors import InputError
-from slviewer.session.atomic import arriving_file
-from slviewer.session.glb import write_glb
-from slviewer.session.ply import FACE, check_faces, pieces, replace_nan, to_ascii, write_ply
+from slviewer.session.atomic import arriving_file, replace_file
+from slviewer.session.ply import FACE, check_faces, replace_nan, to_ascii, write_ply
 from slviewer.surface.shapes import Mesh, PointSet
 
 POINT_FORMATS = ("ply", "xyz", "glb")
@@ -33,10 +34,10 @@ IN_WORDS = {
     "xyz": "mm; text, x y z of a point a line, and its colour",
 }
 """Units and content of each format."""
-FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+FACET_BYTES = 50
+_GLB_LIMIT = 2**32 - 1
 DECIMALS = 6
 """Of lengths in text: a nanometre, below what a float32 of some hundred mm resolves."""
-LENGTHS = " ".join([f"%.{DECIMALS}f"] * 3)
 _NUMBER, _SMALL, _GREY = 11, 9, 4
 """Characters that a coordinate, a sigma or a part of a normal, and a grey level take in text, with the blank."""
 
@@ -72,16 +73,15 @@ def write_shape(
     values = dict(scalars or {})
     if shape.sigma_mm is not None:
         values.setdefault("sigma", shape.sigma_mm)
+    if faces is not None:
+        check_faces(faces, len(points))
     if file_format == "ply":
         write_ply(path, points, shape.colours, shape.normals, values, faces, notes)
-    elif file_format == "glb":
-        write_glb(path, shape, notes)
-    elif faces is None or file_format == "xyz":
+    elif file_format == "xyz":
         _write_xyz(path, points, shape.colours)
-    elif file_format == "stl":
-        _write_stl(path, points, faces)
     else:
-        _write_obj(path, points, faces, shape.normals, shape.colours, notes)
+        encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb}[file_format]
+        replace_file(path, encode(shape, notes))
     return path.stat().st_size
 
 
@@ -92,7 +92,7 @@ def estimated_bytes(
     if file_format == "ply":
         return 300 + points * (12 + 12 * normals + 3 * colours + 4 * scalars) + faces * FACE.itemsize
     if file_format == "stl":
-        return 84 + faces * FACET.itemsize
+        return 84 + faces * FACET_BYTES
     if file_format == "glb":
         return 1200 + points * (12 + 12 * normals + 4 * colours) + 12 * faces
     if file_format == "obj":
@@ -101,62 +101,70 @@ def estimated_bytes(
     return points * (3 * _NUMBER + 3 * _GREY * colours)
 
 
-def _comments(notes: Sequence[str]) -> str:
-    return "".join(f"# {to_ascii(line)}\n" for line in (f"slviewer {__version__}: units mm", *notes))
-
-
 def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> None:
+    columns = np.round(points.astype(np.float64), DECIMALS) + 0.0  # no "-0.000000"
+    lengths = [f"%.{DECIMALS}f"] * 3
     with arriving_file(path, estimated_bytes("xyz", len(points), colours=colours is not None)) as file:
-        for part in pieces(len(points)):
-            columns = [points[part]] if colours is None else [points[part], colours[part]]
-            file.write(_lines(LENGTHS if colours is None else f"{LENGTHS} %d %d %d", *columns))
+        if colours is None:
+            np.savetxt(file, columns, lengths)
+        else:
+            np.savetxt(file, np.concatenate([columns, colours], axis=1), [*lengths, "%d", "%d", "%d"])
 
 
-def _write_stl(path: Path, points: np.ndarray, faces: np.ndarray) -> None:
-    check_faces(faces, len(points))
+def _to_trimesh(shape: PointSet | Mesh, scale: float = 1.0) -> Any:
+    """A trimesh.Trimesh or PointCloud with colours and normals, which are zero where unknown."""
+    import trimesh
+
+    if isinstance(shape, PointSet):
+        return trimesh.PointCloud(scale * shape.points.astype(np.float64), shape.colours)
+    normals = None if shape.normals is None else replace_nan("nx", shape.normals)
+    return trimesh.Trimesh(
+        scale * shape.vertices.astype(np.float64),
+        shape.faces,
+        vertex_normals=normals,
+        vertex_colors=shape.colours,
+        process=False,
+    )
+
+
+def _encode_stl(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
+    from trimesh.exchange.stl import export_stl
+
     # a header that began with "solid" would be taken for a text file
     header = f"slviewer {__version__}, binary STL, units mm".encode("ascii").ljust(80)
-    with arriving_file(path, 84 + len(faces) * FACET.itemsize) as file:
-        file.write(header + np.uint32(len(faces)).astype("<u4").tobytes())
-        for part in pieces(len(faces)):
-            corners = points[faces[part]]
-            records = np.zeros(len(corners), FACET)
-            across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            records["normal"] = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
-            records["corners"] = corners
-            file.write(records.data)
+    return header + export_stl(_to_trimesh(shape))[80:]
 
 
-def _write_obj(
-    path: Path,
-    points: np.ndarray,
-    faces: np.ndarray,
-    normals: np.ndarray | None,
-    colours: np.ndarray | None,
-    notes: Sequence[str],
-) -> None:
-    check_faces(faces, len(points))
-    size = estimated_bytes("obj", len(points), len(faces), colours=colours is not None, normals=normals is not None)
-    with arriving_file(path, size) as file:
-        file.write(_comments(notes).encode("ascii"))
-        for part in pieces(len(points)):
-            if colours is None:
-                file.write(_lines(f"v {LENGTHS}", points[part]))
-            else:
-                file.write(_lines(f"v {LENGTHS} %.4f %.4f %.4f", points[part], colours[part] / 255))
-        for part in pieces(0 if normals is None else len(points)):
-            assert normals is not None
-            file.write(_lines(f"vn {LENGTHS}", replace_nan("nx", normals[part])))
-        for part in pieces(len(faces)):
-            corners = faces[part] + 1
-            if normals is None:
-                file.write(_lines("f %d %d %d", corners))
-            else:  # each vertex has its own
-                file.write(_lines("f %d//%d %d//%d %d//%d", np.repeat(corners, 2, axis=1)))
+def _encode_obj(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
+    from trimesh.exchange.obj import export_obj
+
+    header = "\n# ".join(to_ascii(line) for line in (f"slviewer {__version__}: units mm", *notes))
+    has_normals = shape.normals is not None
+    text: str = export_obj(_to_trimesh(shape), include_normals=has_normals, digits=DECIMALS, header=header)
+    return text.encode("ascii")
 
 
-def _lines(pattern: str, *columns: np.ndarray) -> bytes:
-    """A line of ASCII text for each row of the columns (n, k) side by side; `pattern` has a conversion for each."""
-    rows = np.concatenate([np.asarray(each, np.float64) for each in columns], axis=1)
-    rows = np.round(rows, DECIMALS) + 0.0  # no "-0.000000"
-    return ((pattern + "\n") * len(rows) % tuple(rows.ravel().tolist())).encode("ascii")
+def _encode_glb(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
+    """Binary glTF 2.0 in metres; normals only if all are known, since glTF has no unknown ones."""
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    points, faces = (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, ())
+    size = estimated_bytes("glb", len(points), len(faces))
+    if size > _GLB_LIMIT:
+        raise InputError(f"{size / 1e9:.1f} GB do not fit into a .glb, which ends at 4.3: write a .ply instead")
+
+    def describe(tree: dict[str, Any]) -> None:
+        words = ["vertices in metres, in the frame of the camera", "the node turns y up and z towards the viewer"]
+        tree["asset"] |= {"generator": f"slviewer {__version__}", "extras": {"notes": [*words, *notes]}}
+        # scanned surfaces are open: they have no inside that could be left undrawn
+        roughness = {"metallicFactor": 0, "roughnessFactor": 1}
+        tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": roughness}]
+        for mesh in tree["meshes"]:
+            mesh["primitives"][0]["material"] = 0
+
+    scene = trimesh.Scene()
+    scene.add_geometry(_to_trimesh(shape, 1e-3), "surface", transform=np.diag([1.0, -1.0, -1.0, 1.0]))
+    has_normals = shape.normals is not None and bool(np.isfinite(shape.normals).all())
+    content: bytes = export_glb(scene, include_normals=has_normals, tree_postprocessor=describe)
+    return content

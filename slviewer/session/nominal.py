@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,24 +12,27 @@ import numpy as np
 
 from slviewer.errors import InputError, SessionError
 from slviewer.registration.open3d_loader import open3d
-from slviewer.session.nominal_file import Format, check_nominal_file
 from slviewer.surface.shapes import Mesh
 
 Units = Literal["mm", "cm", "m", "inch"]
+FORMATS = (".stl", ".ply", ".obj")
+MOST_BYTES = 1 << 28
+"""Of a file: five million triangles of a binary STL."""
+MOST_TRIANGLES = 5_000_000
 MM: dict[Units, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 LIKELY = 5.0
 """A scan's size over the nominal's, or its inverse, from which on other units are asked for."""
 NEAR = 2.0
 """Units that bring the two so near are proposed."""
 FARTHEST_MM = 1e5
-MOST_LEFT_OUT = 0.5
+MOST_DEGENERATE = 0.5
 """Share of triangles without area from which on a file is refused."""
 
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
     """A nominal model: its ``mesh`` in mm, the file's ``name`` and content ``hash``, the ``units`` that it was read in
-    (None: none were given, and mm taken), whether it is ``closed``, and ``notes``, sentences on what was mended."""
+    (None: none were given, and mm taken), whether it is ``closed``, and ``notes``, sentences on what was repaired."""
 
     mesh: Mesh
     name: str
@@ -52,16 +56,12 @@ class Nominal:
 def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     """The model in an STL, PLY or OBJ file, whose numbers are in ``units``; where none are given, in mm.
 
-    Raises SessionError for a file that cannot be used, with the reason. Such a file may be anything: it is looked at
-    before it is loaded, and never trusted.
+    Raises SessionError for a file that cannot be used, with the reason: one that is absent, too large, damaged,
+    truncated, of another format, or without triangles.
     """
     path = Path(path).expanduser()
-    form = check_nominal_file(path)
-    try:
-        data = path.read_bytes()
-        vertices, faces = _loaded(path.name, data, form)
-    except OSError as error:
-        raise SessionError(f"{path} cannot be read ({error.strerror}): check its name") from error
+    data = _read_bytes(path)
+    vertices, faces = _load_triangles(path.name, data)
     if not np.isfinite(vertices).all():
         raise SessionError(f"{path.name} holds points that are no numbers (NaN or infinite): export the model again")
     vertices = vertices * MM[units or "mm"]
@@ -71,8 +71,8 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
             "units, or move it to its origin"
         )
     notes: list[str] = []
-    vertices, faces = _cleaned(path.name, vertices, faces, notes)
-    faces, closed = _wound(vertices, faces, notes)
+    vertices, faces = _drop_degenerate(path.name, vertices, faces, notes)
+    faces, closed = _orient_faces(vertices, faces, notes)
     digest = hashlib.blake2b(data, digest_size=20).hexdigest()
     return Nominal(Mesh(vertices, faces), path.name, digest, units, closed, tuple(notes))
 
@@ -89,60 +89,90 @@ def check_size(nominal: Nominal, points: np.ndarray) -> None:
     if 1 / LIKELY < ratio < LIKELY:
         return
     fitting = [name for name, mm in MM.items() if 1 / NEAR < ratio / mm < NEAR and name != "mm"]
-    many = f"about {_plain(ratio)} times larger" if ratio > 1 else f"about {_plain(1 / ratio)} times smaller"
-    sizes = f"{_plain(model)} mm across if its numbers are mm, and the scan {_plain(scan)} mm"
+    many = (
+        f"about {_format_size(ratio)} times larger" if ratio > 1 else f"about {_format_size(1 / ratio)} times smaller"
+    )
+    sizes = f"{_format_size(model)} mm across if its numbers are mm, and the scan {_format_size(scan)} mm"
     seen = f"{nominal.name} measures {sizes}, {many}"
     if fitting:
         raise InputError(f"{seen}: give --units {' or --units '.join(fitting)} if it is so, else --units mm")
     raise InputError(f"{seen}: see that it is the same part; give --units mm if its numbers are mm all the same")
 
 
-def _plain(size: float) -> str:
+def _format_size(size: float) -> str:
     """A size in three digits or more, never with an exponent."""
     return f"{size:,.0f}" if size >= 100 else f"{size:#.3g}"
 
 
-def _loaded(name: str, data: bytes, form: Format) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float64 and faces (m, 3) int64, as they are in the file, equal vertices made one."""
+def _read_bytes(path: Path) -> bytes:
+    if path.suffix.lower() not in FORMATS:
+        raise SessionError(f"{path.name} is no nominal model that can be read: give an STL, PLY or OBJ file")
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise SessionError(f"{path} is no file: give an STL, PLY or OBJ file")
+        if size > MOST_BYTES:
+            raise SessionError(
+                f"{path.name} has {size / 1e6:.0f} MB, and up to {MOST_BYTES / 1e6:.0f} MB are read: decimate it first"
+            )
+        return path.read_bytes()
+    except OSError as error:
+        raise SessionError(f"{path} cannot be read ({error.strerror}): check its name") from error
+
+
+def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float64 and faces (m, 3) int64 as they are in the file, duplicate vertices merged."""
     import trimesh
 
+    form = name.rpartition(".")[2].lower()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # from memory, and so without a way to the files beside it that it may name; unprocessed, or points that are
-            # no numbers would go without a word
+            # from memory, so that files beside it that it may name are not opened; unprocessed, or points that are no
+            # numbers would be dropped
             mesh: Any = trimesh.load(io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False)
             if np.isfinite(mesh.vertices).all():
                 mesh.merge_vertices(merge_tex=True, merge_norm=True)
             vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except Exception as error:  # whatever a hostile file makes its reader do
+    except Exception as error:  # a file from anywhere may make its reader fail in any way
         raise SessionError(
-            f"{name} cannot be read ({type(error).__name__}): export the model again, as triangles"
+            f"{name} cannot be read ({type(error).__name__}): it is damaged; export the model again, as triangles"
         ) from error
+    declared = re.search(rb"element face (\d{1,12})\b", data[:65536]) if form == "ply" else None
+    if declared and len(faces) < int(declared[1]):  # a text that breaks off is read as far as it goes
+        raise SessionError(
+            f"{name} is truncated: {len(faces):,} of {int(declared[1]):,} triangles were read; export the model again"
+        )
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
-        raise SessionError(f"{name} holds no triangles: export the model as a mesh")
+        raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
+    if len(faces) > MOST_TRIANGLES:
+        raise SessionError(
+            f"{name} has {len(faces):,} triangles, and at most {MOST_TRIANGLES:,} are read: decimate it first"
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
     return vertices, faces
 
 
-def _cleaned(name: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Without triangles that have no area, and without the points that only those had."""
+def _drop_degenerate(
+    name: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces without triangles that have no area, and without the vertices that only those had."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     sides = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
     sound = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9 * sides**2
     flat = len(faces) - int(np.count_nonzero(sound))
-    if flat > MOST_LEFT_OUT * len(faces):
+    if flat > MOST_DEGENERATE * len(faces):
         raise SessionError(f"{flat:,} of the {len(faces):,} triangles in {name} have no area: export the model again")
     if flat:
-        notes.append(f"{flat:,} of {len(faces):,} triangles without area were left out")
+        notes.append(f"{flat:,} of {len(faces):,} triangles without area were removed")
     faces = faces[sound]
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
 
 
-def _wound(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, bool]:
-    """Triangles that all turn one way, outwards where the model is closed; and whether it is."""
+def _orient_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, bool]:
+    """Faces wound consistently, outwards where the model is closed; and whether it is closed."""
     o3d = open3d()
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices.astype(np.float64)), o3d.utility.Vector3iVector(faces)
@@ -153,7 +183,7 @@ def _wound(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[n
     twice = len(keys) - len(np.unique(keys))  # neighbours that turn alike run along their side in opposite directions
     if twice:
         if mesh.orient_triangles():
-            faces = _as_most_were(vertices, faces, np.asarray(mesh.triangles).astype(np.int32))
+            faces = _orient_by_majority(vertices, faces, np.asarray(mesh.triangles).astype(np.int32))
             notes.append("its triangles did not all turn one way: they were turned")
         else:
             notes.append(
@@ -170,7 +200,7 @@ def _wound(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[n
     return faces, closed
 
 
-def _as_most_were(vertices: np.ndarray, before: np.ndarray, turned: np.ndarray) -> np.ndarray:
+def _orient_by_majority(vertices: np.ndarray, before: np.ndarray, turned: np.ndarray) -> np.ndarray:
     """Triangles (m, 3) that were turned alike, each part of the surface the way in which most of its area faced before:
     they are turned after the first one, which may be the one that was wrong."""
     from trimesh import graph

@@ -1,6 +1,6 @@
 """Clouds and meshes as binary PLY: little endian, float32, in mm; complete or absent."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,8 +13,6 @@ from slviewer.session.atomic import arriving_file
 COLOURS = ("red", "green", "blue")
 TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
-PIECE = 1 << 16
-"""Records that are put together at a time: a few MB, however large the file becomes."""
 UNKNOWN_SIGMA = -1.0
 """What stands for a standard deviation that nobody knows: no NaN is written, and 0 would claim too much."""
 
@@ -65,16 +63,13 @@ def write_ply(
     header.append("end_header\n")
     with arriving_file(Path(path), size) as file:
         file.write("\n".join(header).encode("ascii"))
-        for part in pieces(len(points)):
-            records = np.empty(part.stop - part.start, vertex)
-            for name, _, values in fields:
-                records[name] = replace_nan(name, values[part])
-            file.write(records.data)
-        for part in pieces(0 if faces is None else len(faces)):
-            assert faces is not None
-            triangles = np.empty(part.stop - part.start, FACE)
-            triangles["count"] = 3
-            triangles["vertices"] = faces[part]
+        records = np.empty(len(points), vertex)
+        for name, _, values in fields:
+            records[name] = replace_nan(name, values)
+        file.write(records.data)
+        if faces is not None:
+            triangles = np.empty(len(faces), FACE)
+            triangles["count"], triangles["vertices"] = 3, faces
             file.write(triangles.data)
 
 
@@ -111,11 +106,6 @@ def read_ply(path: str | Path) -> Ply:
     if (faces["count"] != 3).any():
         raise InputError(f"{path} has faces that are no triangles: triangulate it first.")
     return _content(vertices, faces["vertices"].copy() if "face" in counts else None)
-
-
-def pieces(count: int) -> Iterator[slice]:
-    """The parts in which ``count`` records are written, one after the other."""
-    return (slice(start, min(start + PIECE, count)) for start in range(0, count, PIECE))
 
 
 def to_ascii(note: str) -> str:

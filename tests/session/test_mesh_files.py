@@ -127,18 +127,13 @@ def test_units_are_stated_and_sizes_foreseen(tmp_path: Path, suffix: str) -> Non
 
 
 @pytest.mark.parametrize("suffix", MESH_FORMATS)
-def test_pieces_make_the_same_file_and_nothing_unknown_is_nan(
-    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_unknown_is_nan(tmp_path: Path, suffix: str) -> None:
     assert MESH.normals is not None and MESH.sigma_mm is not None
     normals, sigma = MESH.normals.copy(), MESH.sigma_mm.copy()
     normals[3], sigma[4] = np.nan, np.nan
     holed = Mesh(MESH.vertices, MESH.faces, normals, None, sigma)
     write_shape(tmp_path / f"whole.{suffix}", holed)
-    monkeypatch.setattr("slviewer.session.ply.PIECE", 97)
-    write_shape(tmp_path / f"pieces.{suffix}", holed)
     whole = (tmp_path / f"whole.{suffix}").read_bytes()
-    assert (tmp_path / f"pieces.{suffix}").read_bytes() == whole
     if suffix in ("obj", "xyz"):
         assert b"nan" not in whole
     found = trimesh.load(tmp_path / f"whole.{suffix}", process=False) if suffix != "xyz" else None

@@ -79,13 +79,6 @@ def test_what_is_not_known_is_no_nan_in_the_file(tmp_path: Path) -> None:
     assert b"comment ? of a scan\n" in (tmp_path / "a.ply").read_bytes()
 
 
-def test_many_points_are_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("slviewer.session.ply.PIECE", 7)
-    write_ply(tmp_path / "a.ply", POINTS, COLOURS, faces=FACES)
-    ply = read_ply(tmp_path / "a.ply")
-    assert np.array_equal(ply.points, POINTS) and ply.faces is not None and np.array_equal(ply.faces, FACES)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
