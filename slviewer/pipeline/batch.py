@@ -4,7 +4,7 @@ import os
 import secrets
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +17,7 @@ from slviewer.pipeline.batch_tasks import (
     Do,
     Task,
     TaskResult,
+    describe_error,
     list_captures,
     run_task,
     verification_file,
@@ -125,22 +126,11 @@ def batch(
     if not addresses:
         raise UsageError("no session named: give the folders or addresses of one or more")
     task = Task(do, secrets.token_hex(4), model, shape, radius, accept_rejected)
-    looking = {address: (address, tuple(captures), task.version) for address in addresses}
     progress(0.0, f"looking into {len(addresses)} sessions")
     try:
-        with ExitStack() as ended:
-            if scheduler is None:  # workers will see what is seen from here, and are as many as there is work for
-                plans: dict[str, list[str] | str] = {
-                    address: list_captures(*given) for address, given in looking.items()
-                }
-                client = ended.enter_context(
-                    _start_cluster(sum(len(plan) for plan in plans.values() if isinstance(plan, list)))
-                )
-            else:
-                client = ended.enter_context(_connect(scheduler))
-                plans = _gather(
-                    client, {a: (list_captures, *given) for a, given in looking.items()}, ignore_progress, warn
-                )
+        with _start_cluster() if scheduler is None else _connect(scheduler) as client:
+            listing = {address: (list_captures, address, tuple(captures), task.version) for address in addresses}
+            plans = _gather(client, listing, ignore_progress, warn)
             broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
             wanted = [(a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan]
             done = _run_tasks(client, wanted, task, progress, warn)
@@ -199,16 +189,15 @@ def _connect(scheduler: str) -> Iterator[Any]:
 
 
 @contextmanager
-def _start_cluster(most: int) -> Iterator[Any]:
-    """A client of worker processes on this machine, which end with it and share its cores among them: ``most``, or as
-    many as cores and memory allow."""
+def _start_cluster() -> Iterator[Any]:
+    """A client of worker processes on this machine, as many as cores and memory allow, which end with it."""
     _check_installed()
     import dask.config
     from dask.system import CPU_COUNT
     from distributed import Client, LocalCluster
     from distributed.system import MEMORY_LIMIT
 
-    workers = max(1, min(most, CPU_COUNT, MEMORY_LIMIT // BYTES_PER_WORKER))
+    workers = max(1, min(CPU_COUNT, MEMORY_LIMIT // BYTES_PER_WORKER))
     threads = str(max(1, CPU_COUNT // workers))
     libraries = ("OMP", "OPENBLAS", "MKL", "NUMBA")
     environ = {f"{library}_NUM_THREADS": os.environ.get(f"{library}_NUM_THREADS", threads) for library in libraries}
@@ -279,4 +268,4 @@ def _result_of(future: Any) -> Any:
     except ImportError as error:
         raise InputError(f"the workers cannot run slviewer ({error}): install it where they are") from error
     except Exception as error:  # whatever a worker met with ends that capture alone
-        return f"{type(error).__name__}: {error}"
+        return describe_error(error)

@@ -13,7 +13,7 @@ import numpy as np
 
 from slviewer import __version__
 from slviewer.errors import InputError, SlviewerError
-from slviewer.pipeline.batch_storage import export_folder, fetch_capture, fetch_descriptions
+from slviewer.pipeline.batch_storage import export_folder, fetch_session
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.verify import Shape, Verification, verify
 from slviewer.session.atomic import write_bytes
@@ -54,60 +54,59 @@ class TaskResult:
     verification: Verification | None = None
 
 
-def list_captures(address: str, patterns: Sequence[str], version: str) -> list[str] | str:
-    """Names of a session's captures that match any of the patterns, of its scans where there is none; else why not."""
-    try:
-        _check(version)
-        with fetch_descriptions(address) as folder, Session.open(folder) as store:
-            if not patterns:
-                names = store.capture_names("scan")
-                return names or "it holds no scan: name the captures, such as 'pose_*'"
-            there = store.capture_names()
-            names = [name for name in there if any(fnmatchcase(name, pattern) for pattern in patterns)]
-            return names or f"no capture is called {' or '.join(patterns)}: there are {', '.join(there) or 'none'}"
-    except Exception as error:  # whatever it is ends this session alone
-        return _reason(error)
+def list_captures(address: str, patterns: Sequence[str], version: str) -> list[str]:
+    """Names of a session's captures that match any of the patterns, of its scans where there is none. Raises
+    SlviewerError where there are none."""
+    _check_version(version)
+    with fetch_session(address) as folder, Session.open(folder) as store:
+        if not patterns:
+            if not (names := store.capture_names("scan")):
+                raise InputError("it holds no scan: name the captures, such as 'pose_*'")
+            return names
+        there = store.capture_names()
+        names = [name for name in there if any(fnmatchcase(name, pattern) for pattern in patterns)]
+        if not names:
+            raise InputError(f"no capture is called {' or '.join(patterns)}: there are {', '.join(there) or 'none'}")
+        return names
 
 
 def run_task(address: str, capture: str, task: Task) -> TaskResult:
-    """Do the task with one capture; what it makes lies in the session's exports when this returns."""
+    """Do the task with one capture; its files are in the session's exports when this returns."""
     warnings: list[str] = []
     started = time.perf_counter()
     try:
-        _check(task.version)
-        with fetch_capture(address, capture) as folder, _ONE, Session.open(folder) as store:
-            done = _verify(store, capture, task, warnings) if task.do == "verify" else None
-            if done is None:
+        _check_version(task.version)
+        with fetch_session(address, capture) as folder, _ONE, Session.open(folder) as store:
+            if task.do == "verify":
+                done = _verify(store, capture, task, warnings)
+            else:
                 with export_folder(address, task.batch) as made:
                     done = _reconstruct(store, capture, task, made, warnings)
-    except Exception as error:  # whatever it is ends this capture alone
-        return TaskResult(address, capture, warnings=tuple(warnings), failed=_reason(error))
+    except Exception as error:  # any error ends this capture alone
+        return TaskResult(address, capture, warnings=tuple(warnings), failed=describe_error(error))
     figures = done.figures | {"s": round(time.perf_counter() - started, 1)}
-    return replace(done, session=address, figures=figures, warnings=tuple(warnings))
+    return replace(done, session=address, capture=capture, figures=figures, warnings=tuple(warnings))
 
 
-def write_verification(address: str, parts: Sequence[Verification], task: Task) -> str:
-    """Write the verifications of one session as one, as ``verify --json`` does; returns why not, or an empty text."""
+def write_verification(address: str, parts: Sequence[Verification], task: Task) -> None:
+    """Write the verifications of one session as one, as ``verify --json`` does."""
     whole = Verification({name: comparison for part in parts for name, comparison in part.captures.items()})
-    try:
-        with export_folder(address, task.batch) as made:
-            text = json.dumps(whole.to_json(), indent=2) + "\n"
-            write_bytes(made / verification_file(task), text.encode())
-    except Exception as error:
-        return _reason(error)
-    return ""
+    with export_folder(address, task.batch) as made:
+        text = json.dumps(whole.to_json(), indent=2) + "\n"
+        write_bytes(made / verification_file(task), text.encode())
 
 
 def verification_file(task: Task) -> str:
-    """Its name in the exports."""
+    """Name of the verifications' file in the exports."""
     return f"verification_{task.shape}.json"
 
 
-def _reason(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
+    """An error in words; of an unforeseen one its type too."""
     return str(error) if isinstance(error, SlviewerError) else f"{type(error).__name__}: {error}"
 
 
-def _check(version: str) -> None:
+def _check_version(version: str) -> None:
     if version != __version__:
         raise InputError(f"the worker runs slviewer {__version__}, the batch {version}: install the same on both")
 
@@ -125,7 +124,7 @@ def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings:
     name = f"{capture}_{found.cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
     found.ply.rename(made / name)
     sigma = float(np.median(found.cloud.sigma_z[found.cloud.mask]))
-    return TaskResult("", capture, {"points": found.points, "noise mm": sigma, "file": name})
+    return TaskResult("", "", {"points": found.points, "noise mm": sigma, "file": name})
 
 
 def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> TaskResult:
@@ -141,7 +140,7 @@ def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> Ta
     )
     (comparison,) = found.captures.values()
     figures = {f"{model} RMS mm": result.rms_mm for model, result in comparison.results.items()}
-    return TaskResult("", capture, figures, verification=_without_maps(found))
+    return TaskResult("", "", figures, verification=_without_maps(found))
 
 
 def _without_maps(found: Verification) -> Verification:

@@ -195,7 +195,7 @@ def test_twelve_bits_in_sixteen():
 
 
 def test_photographed_captures(real_data: Path):
-    for recording in procam_calibration.read(real_data / "kamino_procam_jpg90"):
+    for recording in procam_calibration.LAYOUT.read(real_data / "kamino_procam_jpg90"):
         for axis in recording.sequence.axes:
             assert frame_residuals(recording.sequence, recording.frames, axis).suspects == ()
     for k in (2, 5, 8):

@@ -1,30 +1,88 @@
 """The entries of a `frames` TOML: what each image shows, and which files they are."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import translate
 from pathlib import Path
 from re import compile as pattern_of
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from slviewer.errors import InputError
-from slviewer.fringe.presets import gray_bits
-from slviewer.fringe.sequence import Axis, Frame
+from slviewer.fringe.sequence import Axis, Frame, Kind
 from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import listed, visible
 from slviewer.session.names import natural_key
 
-_GROUP_KEYS = {
-    "phase": {"steps", "period_px"},
-    "gray": {"bits", "inverse", "complementary", "msb_first"},
-    "inverse": {"bits", "msb_first"},
-    "complementary": set(),
-    "white": set(),
-    "black": set(),
-    "texture": set(),
-}
-_COMMON_KEYS = {"kind", "axis", "files", "exposure_ms"}
-_MOST_BITS = 30
+_Exposure = Annotated[float, msgspec.Meta(gt=0)] | None
+
+
+class _Group(msgspec.Struct, tag_field="kind", forbid_unknown_fields=True, kw_only=True):
+    """The entries of a `[[frames]]` table, of every kind; `files` are checked by `_file_names`."""
+
+    axis: Axis | None = None
+    files: Any = None
+    exposure_ms: _Exposure = None
+
+    def frames(self) -> list[Frame]:
+        """The frames that the group's images show: one, unless the kind says otherwise."""
+        return [Frame(self.__struct_config__.tag, self.axis)]  # type: ignore[arg-type]
+
+
+class _Phase(_Group, tag="phase"):
+    steps: Annotated[int, msgspec.Meta(ge=3, le=1000)]
+    period_px: Annotated[float, msgspec.Meta(gt=0)] | list[Annotated[float, msgspec.Meta(gt=0)]]
+
+    def frames(self) -> list[Frame]:
+        periods = self.period_px if isinstance(self.period_px, list) else [self.period_px]
+        return [
+            Frame("phase", self.axis, step=k, steps=self.steps, period_px=float(period))
+            for period in periods
+            for k in range(self.steps)
+        ]
+
+
+class _Gray(_Group, tag="gray"):
+    bits: Annotated[int, msgspec.Meta(ge=1, le=30)]
+    inverse: bool = False
+    complementary: bool = False
+    msb_first: bool = True
+
+    def frames(self) -> list[Frame]:
+        pairs = range(self.bits) if self.msb_first else reversed(range(self.bits))
+        kinds: tuple[Kind, ...] = ("gray", "inverse") if self.inverse else ("gray",)
+        frames = [Frame(kind, self.axis, bit=bit, bits=self.bits) for bit in pairs for kind in kinds]
+        extra = [Frame("complementary", self.axis)] if self.complementary else []
+        return frames + extra if self.msb_first else extra + frames
+
+
+class _Inverse(_Group, tag="inverse"):
+    bits: Annotated[int, msgspec.Meta(ge=1, le=30)]
+    msb_first: bool = True
+
+    def frames(self) -> list[Frame]:
+        bits = range(self.bits) if self.msb_first else reversed(range(self.bits))
+        return [Frame("inverse", self.axis, bit=bit, bits=self.bits) for bit in bits]
+
+
+class _Complementary(_Group, tag="complementary"):
+    pass
+
+
+class _White(_Group, tag="white"):
+    pass
+
+
+class _Black(_Group, tag="black"):
+    pass
+
+
+class _Texture(_Group, tag="texture"):
+    pass
+
+
+_AnyGroup = _Phase | _Gray | _Inverse | _Complementary | _White | _Black | _Texture
 
 
 @dataclass(frozen=True)
@@ -104,62 +162,37 @@ def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
     """A `[[frame]]` table: one image."""
     if "files" in entry:
         raise InputError(f"{where}: files belongs to [[frames]]: name the one file of a [[frame]] with file")
-    files = _files(where, {"files": entry["file"]} if "file" in entry else {}, ordered)
+    files = _file_names(where, entry.get("file"), ordered)
     where = f"{where} ({files[0]})" if files else where
-    _check_words(where, entry)
+    for key in ("kind", "axis"):
+        if not isinstance(entry.get(key, ""), str):
+            raise InputError(f"{where}: {key} must be a word in quotes, not {entry[key]!r}")
     try:
+        exposure: float | None = msgspec.convert(entry.get("exposure_ms"), _Exposure)
         frame = Frame.from_dict({key: value for key, value in entry.items() if key != "exposure_ms"})
+    except msgspec.ValidationError as error:
+        raise InputError(f"{where}: exposure_ms: {error}") from error
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
-    return FrameGroup(where, (frame,), files, _exposure(where, entry))
+    return FrameGroup(where, (frame,), files, exposure)
 
 
 def _read_group(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGroup:
     """A `[[frames]]` table: all images of one kind and axis."""
-    _check_words(where, entry)
-    kind = entry.get("kind")
-    if kind not in _GROUP_KEYS:
-        raise InputError(f"{where} has the kind {kind!r}: use one of {', '.join(_GROUP_KEYS)}")
-    where = f"{where} ({' '.join(entry[key] for key in ('kind', 'axis') if key in entry)})"
-    if unknown := sorted(set(entry) - _GROUP_KEYS[kind] - _COMMON_KEYS):
-        raise InputError(f"{where} has the unknown entry '{unknown[0]}': use {', '.join(_group_keys(kind))}")
+    words = " ".join(str(entry[key]) for key in ("kind", "axis") if key in entry)
+    where = f"{where} ({words})" if words else where
     try:
-        frames = _group_frames(kind, entry)
-    except InputError as error:
+        group: _Group = msgspec.convert(entry, _AnyGroup)
+        frames = tuple(group.frames())
+    except (msgspec.ValidationError, InputError) as error:
         raise InputError(f"{where}: {error}") from error
-    files = _files(where, entry, ordered)
+    files = _file_names(where, group.files, ordered)
     if files is not None and not (len(files) == 1 and has_wildcard(files[0])) and len(files) != len(frames):
         raise InputError(f"{where} names {len(files)} files and describes {len(frames)} images: correct one of them")
-    return FrameGroup(where, tuple(frames), files, _exposure(where, entry))
+    return FrameGroup(where, frames, files, group.exposure_ms)
 
 
-def _group_frames(kind: str, entry: Mapping[str, Any]) -> list[Frame]:
-    axis: Axis | None = entry.get("axis")
-    if kind == "phase":
-        periods = entry.get("period_px")
-        periods = periods if isinstance(periods, list) else [periods]
-        steps = _count(entry, "steps", 3)
-        return [
-            Frame("phase", axis, step=k, steps=steps, period_px=_number(period, "period_px"))
-            for period in periods
-            for k in range(steps)
-        ]
-    if kind not in ("gray", "inverse"):
-        return [Frame(kind, axis)]  # type: ignore[arg-type]
-    bits = _count(entry, "bits", 1)
-    frames: list[Frame] = []
-    for bit in gray_bits(axis, bits):  # type: ignore[arg-type]
-        negative = Frame("inverse", axis, bit=bit.bit, bits=bits)
-        frames += [negative] if kind == "inverse" else [bit, negative] if _flag(entry, "inverse") else [bit]
-    if _flag(entry, "complementary"):
-        frames.append(Frame("complementary", axis))
-    if _flag(entry, "msb_first", True):
-        return frames
-    return sorted(frames, key=lambda frame: bits if frame.kind == "complementary" else frame.bit, reverse=True)
-
-
-def _files(where: str, entry: Mapping[str, Any], ordered: bool) -> tuple[str, ...] | None:
-    named = entry.get("files")
+def _file_names(where: str, named: Any, ordered: bool) -> tuple[str, ...] | None:
     if ordered:
         if named is not None:
             raise InputError(f'{where} names files, and order = "name" takes them in order of their names: use one')
@@ -170,42 +203,3 @@ def _files(where: str, entry: Mapping[str, Any], ordered: bool) -> tuple[str, ..
     if outside := [name for name in names if Path(name).is_absolute() or ".." in Path(name).parts]:
         raise InputError(f'{where}: "{outside[0]}" lies outside of the capture\'s folder: name files inside it')
     return tuple(names)
-
-
-def _check_words(where: str, entry: Mapping[str, Any]) -> None:
-    for key in ("kind", "axis"):
-        if not isinstance(entry.get(key, ""), str):
-            raise InputError(f"{where}: {key} must be a word in quotes, not {entry[key]!r}")
-
-
-def _exposure(where: str, entry: Mapping[str, Any]) -> float | None:
-    try:
-        return _number(entry["exposure_ms"], "exposure_ms") if "exposure_ms" in entry else None
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-
-
-def _number(value: Any, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        raise InputError(f"{name} is {value!r}: give a number above 0")
-    return float(value)
-
-
-def _count(entry: Mapping[str, Any], name: str, least: int) -> int:
-    value = entry.get(name)
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 1000:
-        raise InputError(f"{name} is {value!r}: give a whole number from {least}")
-    if name == "bits" and value > _MOST_BITS:
-        raise InputError(f"bits is {value}: no projector has so many columns")
-    return value
-
-
-def _flag(entry: Mapping[str, Any], name: str, default: bool = False) -> bool:
-    value = entry.get(name, default)
-    if not isinstance(value, bool):
-        raise InputError(f"{name} is {value!r}: use true or false")
-    return value
-
-
-def _group_keys(kind: str) -> Sequence[str]:
-    return sorted(_GROUP_KEYS[kind] | _COMMON_KEYS)

@@ -66,6 +66,78 @@ class Imports:
         return (recording.read() for recording in self.recordings)
 
 
+@dataclass(frozen=True)
+class FolderLayout:
+    """How a tool lays its captures out on disk.
+
+    ``read(source, prefix=, projector=, ...)`` reads a source; ``is_capture(folder)``: whether the file names in a
+    folder are those of one capture; ``projector``: its size where none is given, None where the layout does not imply one.
+    """
+
+    name: str
+    holds: str
+    read: Callable[..., Imports]
+    is_capture: Callable[[Path], bool]
+    projector: tuple[int, int] | None = None
+
+
+def define_layout(
+    name: str,
+    holds: str,
+    describe: Callable[..., tuple[ImportableRecording, list[str]]],
+    is_capture: Callable[[Path], bool],
+    projector: tuple[int, int] | None = None,
+    needs_projector: str = "",
+) -> FolderLayout:
+    """A layout whose captures are recognised by their file names alone.
+
+    ``describe(folder, name, projector, **options)`` returns the recording of one folder and warnings;
+    ``needs_projector``: what depends on the projector's size, if anything does.
+    """
+    default = projector
+
+    def read(
+        source: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None, **options: Any
+    ) -> Imports:
+        size = projector or default
+        if size is None and needs_projector:
+            raise InputError(f"{needs_projector} depend on the projector's size: give it with --projector 1280x800")
+        return collect_captures(
+            Path(source), prefix, is_capture, holds, lambda folder, name: describe(folder, name, size, **options)
+        )
+
+    return FolderLayout(name, holds, read, is_capture, default)
+
+
+def match_images(folder: Path, pattern: re.Pattern[str]) -> tuple[dict[tuple[int, ...], Path], list[Path]]:
+    """{numbers in its name: image} of a folder's images whose stem matches the pattern, in order of the numbers, and
+    its other entries. Raises InputError where two images have the same numbers."""
+    images: dict[tuple[int, ...], Path] = {}
+    others: list[Path] = []
+    for file in sorted(visible(folder)):
+        match = pattern.fullmatch(file.stem)
+        if not match or file.suffix.lower() not in IMAGE_SUFFIXES:
+            others.append(file)
+            continue
+        numbers = tuple(int(group) for group in match.groups())
+        if numbers in images:
+            raise InputError(f"it holds {images[numbers].name} and {file.name} for one pattern: keep one of them")
+        images[numbers] = file
+    return dict(sorted(images.items())), others
+
+
+def check_complete(images: Mapping[tuple[int, ...], Path], stem: str, count: int = 0) -> None:
+    """Raise InputError where images numbered 0, 1, 2, ... have gaps, or are fewer than ``count``."""
+    count = count or max(images)[0] + 1
+    if missing := [number for number in range(count) if (number,) not in images]:
+        raise InputError(f"it lacks {stem}{listed([f'{n:02d}' for n in missing])}: copy or record them again")
+
+
+def has_images(folder: Path, pattern: re.Pattern[str]) -> bool:
+    """Whether a folder holds images whose stem matches the pattern."""
+    return any(pattern.fullmatch(entry.stem) and entry.suffix.lower() in IMAGE_SUFFIXES for entry in visible(folder))
+
+
 def collect_captures(
     source: Path,
     prefix: str | None,

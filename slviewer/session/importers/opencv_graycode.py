@@ -19,11 +19,12 @@ from slviewer.session.importers.imported import (
     ImportableRecording,
     Imports,
     collect_captures,
+    has_images,
     listed,
     strangers_warning,
 )
 
-_LIT, _MOSTLY = 0.25, 0.9
+_ILLUMINATED, _MOSTLY = 0.25, 0.9
 """Share of the largest difference from which on a pixel counts; share of these in which white is brighter than black:
 all of them but for a few that something disturbs, and half of them between two stripes."""
 _SAMPLE = re.compile(r"pattern_(cam\d+_)?(im)?\d+", re.IGNORECASE)
@@ -68,7 +69,7 @@ def read(
 
 def is_capture(folder: Path) -> bool:
     """Whether a folder holds images with the names of OpenCV's own program."""
-    return any(_SAMPLE.fullmatch(file.stem) for file in images_by_name(folder))
+    return has_images(folder, _SAMPLE)
 
 
 def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
@@ -79,7 +80,7 @@ def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
     """
     first, second = read_frames(files[-2:]).stack.astype(np.int32)
     difference = first - second
-    illuminated = np.abs(difference) > _LIT * np.abs(difference).max()
+    illuminated = np.abs(difference) > _ILLUMINATED * np.abs(difference).max()
     brighter = float((difference[illuminated] > 0).mean()) if illuminated.any() else 0.5
     ends_in_white = sequence.frames[-1].kind == "black"
     if ends_in_white != (brighter > _MOSTLY):

@@ -10,12 +10,13 @@ from pathlib import Path
 from slviewer.errors import InputError
 from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
-from slviewer.session.importers.images import IMAGE_SUFFIXES, read_image
+from slviewer.session.importers.images import read_image
 from slviewer.session.importers.imported import (
     ImportableRecording,
-    Imports,
-    collect_captures,
+    check_complete,
+    define_layout,
     listed,
+    match_images,
     strangers_warning,
     visible,
 )
@@ -28,19 +29,12 @@ _AXES: dict[str, Axis] = {"v": "x", "h": "y"}
 _FILE = re.compile(r"p18_f(\d+)", re.IGNORECASE)
 
 
-def read(source: Path, *, prefix: str | None = None, projector: tuple[int, int] = (912, 1140)) -> Imports:
-    """Captures named after their folders; each holds the axes whose folder is there, V before H.
+def describe(pose: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
+    """The recording of one folder, with the axes whose folder is there, V before H.
 
-    A pose is skipped where frames are missing, double or too many, or where the Gray code cannot number the
-    projector's columns or rows; InputError where none can be used.
+    Raises InputError where frames are missing, double or too many, or where the Gray code cannot number the projector's
+    columns or rows.
     """
-    return collect_captures(
-        Path(source), prefix, is_capture, "a folder V or H with P18_FNN images",
-        lambda folder, name: _recording(folder, name, projector),
-    )  # fmt: skip
-
-
-def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
     files: list[Path] = []
     frames: list[Frame] = []
     texture: Path | None = None
@@ -52,11 +46,20 @@ def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Impor
                 f"{_BITS} Gray bits of {_PERIOD_PX:g} px reach {_REACH_PX:g} px, and the projector has {extent} "
                 f"along {axis}: give the size of the projector that was used, or describe the frames in a TOML"
             )
-        numbered, more = _numbered(folder)
-        warnings += more
-        files += [numbered[number] for number in range(_CODED)]
+        try:
+            images, others = match_images(folder, _FILE)
+            check_complete(images, "P18_F", _CODED)
+        except InputError as error:
+            raise InputError(f"folder {folder.name}: {error}") from error
+        if extra := [file.name for (number,), file in images.items() if number > max(_TEXTURES)]:
+            raise InputError(
+                f"folder {folder.name} holds {listed(extra)}, beyond the p18 layout's F00 to F26: move them away, or "
+                "describe the frames in a TOML"
+            )
+        warnings += strangers_warning(folder, others)
+        files += list(images.values())[:_CODED]
         frames += phase_steps(axis, _STEPS, _PERIOD_PX) + gray_bits(axis, _BITS)
-        if texture is None and (textures := [numbered[number] for number in _TEXTURES if number in numbered]):
+        if texture is None and (textures := list(images.values())[_CODED:]):
             texture = textures[0]
             if len(textures) == 2:
                 texture = max(textures, key=lambda path: read_image(path).mean())
@@ -68,30 +71,6 @@ def _recording(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Impor
     return ImportableRecording(name, PatternSequence(projector, tuple(frames)), tuple(files), pose), warnings
 
 
-def _numbered(folder: Path) -> tuple[dict[int, Path], list[str]]:
-    """{frame number: file}, complete, and warnings."""
-    numbered: dict[int, Path] = {}
-    strangers: list[Path] = []
-    where = f"folder {folder.name}"
-    for file in sorted(visible(folder)):
-        match = _FILE.fullmatch(file.stem)
-        if not match or file.suffix.lower() not in IMAGE_SUFFIXES:
-            strangers.append(file)
-            continue
-        number = int(match[1])
-        if number in numbered:
-            raise InputError(f"{where} holds {numbered[number].name} and {file.name}: keep one of them")
-        numbered[number] = file
-    if missing := [number for number in range(_CODED) if number not in numbered]:
-        raise InputError(f"{where} lacks P18_F{listed([f'{n:02d}' for n in missing])}: record or copy them again")
-    if extra := [file.name for number, file in numbered.items() if number > max(_TEXTURES)]:
-        raise InputError(
-            f"{where} holds {listed(extra)}, beyond the p18 layout's F00 to F26: "
-            "move them away, or describe the frames in a TOML"
-        )
-    return numbered, strangers_warning(folder, strangers)
-
-
 def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
     """V, then H, whichever are there."""
     there = [entry for entry in visible(pose) if entry.is_dir() and entry.name.lower() in _AXES]
@@ -100,9 +79,11 @@ def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
     return sorted(((entry, _AXES[entry.name.lower()]) for entry in there), key=lambda found: found[1])
 
 
-def is_capture(folder: Path) -> bool:
-    """Whether a folder holds a pose of this layout."""
+def _is_capture(folder: Path) -> bool:
     return any(
         entry.is_dir() and entry.name.lower() in _AXES and any(_FILE.match(file.stem) for file in visible(entry))
         for entry in visible(folder)
     )
+
+
+LAYOUT = define_layout("p18", "pose_XX/{V,H}/P18_FNN images", describe, _is_capture, (912, 1140))

@@ -20,12 +20,13 @@ from typing import Literal, get_args
 from slviewer.errors import InputError
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
-from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.imported import (
     ImportableRecording,
-    Imports,
-    collect_captures,
+    check_complete,
+    define_layout,
+    has_images,
     listed,
+    match_images,
     strangers_warning,
 )
 
@@ -44,37 +45,18 @@ _SHOWN_BITS: dict[Axis, int] = {"x": 10, "y": 6}
 _SINGLE_AXIS: tuple[Codec, ...] = ("3", "4")
 
 
-def read(
-    source: Path,
-    *,
-    prefix: str | None = None,
-    projector: tuple[int, int] | None = None,
-    codec: Codec | None = None,
-    axis: Axis = "x",
-) -> Imports:
-    """Captures named after their folders. Without `codec` it is told by the number of frames, where that is enough;
-    `axis` is the one that a codec along a single axis showed.
+def describe(
+    folder: Path, name: str, projector: tuple[int, int], codec: Codec | None = None, axis: Axis = "x"
+) -> tuple[ImportableRecording, list[str]]:
+    """The recording of one folder. Without ``codec`` the number of frames determines it, where that is enough; ``axis``
+    is the one that a codec along a single axis showed.
 
-    A capture is skipped where its frames are not those of the codec.
+    Raises InputError where the frames are not those of the codec.
     """
-    if projector is None:
-        raise InputError("the fringes of SLStudio depend on the projector's size: give it with --projector 912x1140")
-
-    def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
-        numbered = {int(match[1]): file for file in images_by_name(folder) if (match := _FILE.fullmatch(file.stem))}
-        if missing := [number for number in range(max(numbered)) if number not in numbered]:
-            raise InputError(f"it lacks frameSeq_{listed([f'{n:02d}' for n in missing])}: copy or record them again")
-        files = tuple(numbered[number] for number in sorted(numbered))
-        others = sorted(set(images_by_name(folder)) - set(files))
-        sequence = _sequence(projector, len(files), codec, axis)
-        return ImportableRecording(name, sequence, files, folder), strangers_warning(folder, others)
-
-    return collect_captures(Path(source), prefix, is_capture, "frameSeq_NN images", describe)
-
-
-def is_capture(folder: Path) -> bool:
-    """Whether a folder holds frames that SLStudio wrote."""
-    return any(_FILE.fullmatch(file.stem) for file in images_by_name(folder))
+    images, others = match_images(folder, _FILE)
+    check_complete(images, "frameSeq_")
+    sequence = _sequence(projector, len(images), codec, axis)
+    return ImportableRecording(name, sequence, tuple(images.values()), folder), strangers_warning(folder, others)
 
 
 def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis: Axis) -> PatternSequence:
@@ -120,3 +102,12 @@ def _gray_cell(axis: Axis, projector: tuple[int, int]) -> float:
     if hidden < 0:
         raise InputError(f"SLStudio's Gray code of {_SHOWN_BITS[axis]} bits does not fit {extent} px along {axis}")
     return float(2**hidden)
+
+
+LAYOUT = define_layout(
+    "slstudio",
+    "frameSeq_NN images",
+    describe,
+    lambda folder: has_images(folder, _FILE),
+    needs_projector="the fringes of SLStudio",
+)
