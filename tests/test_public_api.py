@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 import slviewer as sl
+from slviewer.session.toml import describe_sequence
 from slviewer.simulation.rig import letter
-from slviewer.validation.hostile_captures import BOARD, HostileBench, describe_sequence, write_images
+from slviewer.validation.hostile_captures import BOARD, HostileBench, write_images
 
 pytestmark = pytest.mark.slow
 
@@ -23,8 +24,8 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bench = HostileBench(letter(0.15, 0, local_distortion_px=0.0), folder, poses=6)
     for part, names in (("poses", bench.targets), ("scan", ("plane_04",))):
         for name in names:
-            write_images(folder / part / name, bench.capture(name)[0])
-        (folder / part / "sequence.toml").write_text(describe_sequence(bench.sequence))
+            files = write_images(folder / part / name, bench.capture(name)[0])
+        (folder / part / "sequence.toml").write_text(describe_sequence(bench.sequence, files))
     return folder
 
 

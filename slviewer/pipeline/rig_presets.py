@@ -5,7 +5,6 @@ before a device is touched, so that a mistyped option is named and not ignored.
 """
 
 import inspect
-import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from slviewer.devices.drivers import Driver, driver, drivers
 from slviewer.errors import InputError
 from slviewer.pipeline.rig_choice import ABOUT, Choice, rig_factory
 from slviewer.session.store import Session
+from slviewer.session.toml import to_toml
 from slviewer.simulation.assets import asset_folder
 
 RigLike = Mapping[str, Any] | Path | str
@@ -111,20 +111,6 @@ def check_choice(choice: Choice, where: str) -> None:
         _check_options(str(device["driver"]), part, options, f"{where}, {part}")
 
 
-def to_toml(choice: Choice) -> str:
-    """The TOML text of a choice; `tomllib` reads the same from it. What is None is left out.
-
-    Raises InputError for values that TOML does not hold.
-    """
-    plain = {key: value for key, value in choice.items() if value is not None}
-    lines = [f"{_key(key)} = {_value(value)}" for key, value in plain.items() if not isinstance(value, Mapping)]
-    for key, table in plain.items():
-        if isinstance(table, Mapping):
-            lines += ["", f"[{_key(key)}]"]
-            lines += [f"{_key(inner)} = {_value(value)}" for inner, value in table.items() if value is not None]
-    return "\n".join(lines).lstrip("\n") + "\n"
-
-
 def _read(name: str, path: Path) -> Preset:
     try:
         choice = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -182,23 +168,3 @@ def _driver_names(choice: Choice) -> list[str]:
 
 def _names(session: Session | None) -> str:
     return ", ".join(preset.name for preset in presets(session))
-
-
-def _key(key: Any) -> str:
-    text = str(key)
-    return text if text and all(c.isascii() and (c.isalnum() or c in "-_") for c in text) else _value(text)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str | Path):
-        return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_value(each) for each in value)}]"
-    if isinstance(value, Mapping):
-        inside = ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None)
-        return f"{{{inside}}}"
-    raise InputError(f"{value!r} cannot stand in a TOML file: use text, numbers, true or false, or lists of them")

@@ -1,6 +1,5 @@
 """Files for other programs: calibrations for OpenCV and for people, pattern images for any projector."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.patterns import render
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.atomic import commit, replace_file, staged_folder, to_json, write_bytes
+from slviewer.session.toml import describe_sequence
 
 
 def write_calibration(path: Path, entries: Mapping[str, Any], meanings: Mapping[str, str] | None = None) -> None:
@@ -48,7 +48,7 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
             if not done:
                 raise InputError(f"pattern {name} could not be encoded as PNG: is the projector's size right?")
             write_bytes(staged / name, data.data)
-        write_bytes(staged / "sequence.toml", _toml(sequence, names).encode())
+        write_bytes(staged / "sequence.toml", describe_sequence(sequence, names).encode())
     commit(staged, folder)
 
 
@@ -59,20 +59,6 @@ def _words(frame: Frame) -> str:
     elif frame.kind in ("gray", "inverse"):
         parts += [f"bit{frame.bit:02d}"]
     return "_".join(str(part) for part in parts if part)
-
-
-def _toml(sequence: PatternSequence, names: list[str]) -> str:
-    """The `frames` TOML; all its values are numbers and plain words."""
-    described = sequence.to_dict()
-    frames = described.pop("frame")
-    lines = [_line(key, value) for key, value in described.items()]
-    for name, frame in zip(names, frames, strict=True):
-        lines += ["", "[[frame]]", *(_line(key, value) for key, value in {"file": name, **frame}.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _line(key: str, value: str | int | float) -> str:
-    return f"{key} = {json.dumps(value)}"
 
 
 def _file_storage(suffix: str, entries: Mapping[str, Any], meanings: Mapping[str, str]) -> str:

@@ -22,6 +22,7 @@ from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.verify import verify
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.store import Session
+from slviewer.session.toml import describe_sequence
 from slviewer.simulation.boards import printed_board
 from slviewer.simulation.hostile import Fault, Severity, expose_frames, hostile_light, render_light
 from slviewer.simulation.hostile_scenes import MirrorTable
@@ -125,10 +126,9 @@ class HostileBench:
                 continue
             source = self.folder / "images"
             shutil.rmtree(source, ignore_errors=True)
-            for name in names:
-                write_images(source / name, captures[name])
+            files = [write_images(source / name, captures[name]) for name in names]
             toml = source / "sequence.toml"
-            toml.write_text(describe_sequence(self.sequence))
+            toml.write_text(describe_sequence(self.sequence, files[0]))
             try:
                 import_frames(source, session, toml, role=role, force=True, warn=report.warnings.append)  # type: ignore[arg-type]
             except SlviewerError as error:
@@ -178,23 +178,13 @@ def compare_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> Mea
     )
 
 
-def write_images(folder: Path, frames: np.ndarray) -> None:
-    """Frames (n, h, w) uint8 as numbered image files."""
+def write_images(folder: Path, frames: np.ndarray) -> list[str]:
+    """Write frames (n, h, w) uint8 as numbered image files, and return their names."""
     folder.mkdir(parents=True)
-    for k, frame in enumerate(frames):
-        cv2.imwrite(str(folder / f"{k:02d}.bmp"), frame)  # written ten times as fast as PNG
-
-
-def describe_sequence(sequence: PatternSequence) -> str:
-    """The TOML that describes numbered images of the sequence."""
-    lines = [
-        f'projector = "{sequence.projector[0]}x{sequence.projector[1]}"',
-        f"gray_origin = {sequence.gray_origin_px}",
-    ]
-    for k, frame in enumerate(sequence.frames):
-        lines += ["[[frame]]", f'file = "{k:02d}.bmp"']
-        lines += [f"{key} = {value!r}".replace("'", '"') for key, value in frame.to_dict().items()]
-    return "\n".join(lines) + "\n"
+    names = [f"{k:02d}.bmp" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        cv2.imwrite(str(folder / name), frame)  # written ten times as fast as PNG
+    return names
 
 
 _SUSPECTED: dict[str, frozenset[str]] = {

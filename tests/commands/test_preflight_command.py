@@ -11,8 +11,9 @@ from slviewer.devices.drivers import Driver, drivers
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.simulated import preset_rig
-from slviewer.pipeline.rig_presets import save_rig, to_toml
+from slviewer.pipeline.rig_presets import save_rig
 from slviewer.session.store import Session
+from slviewer.session.toml import to_toml
 
 
 class BlindCamera(Openable):

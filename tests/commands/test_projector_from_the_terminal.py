@@ -14,8 +14,8 @@ from slviewer.commands import devices as commands
 from slviewer.devices.drivers import Driver, drivers
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings
-from slviewer.pipeline.rig_presets import to_toml
 from slviewer.session.store import Session
+from slviewer.session.toml import to_toml
 
 SIZE = (128, 96)
 

@@ -15,8 +15,8 @@ from slviewer.fringe.presets import p18
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.capture_phases import capture_texture
 from slviewer.pipeline.rig_choice import RigSetup, set_up
-from slviewer.pipeline.rig_presets import to_toml
 from slviewer.session.store import Session
+from slviewer.session.toml import to_toml
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 

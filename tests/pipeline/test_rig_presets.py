@@ -8,8 +8,9 @@ import pytest
 from slviewer.devices.drivers import Driver, drivers
 from slviewer.errors import DeviceError, InputError
 from slviewer.pipeline.rig_choice import set_up
-from slviewer.pipeline.rig_presets import check_choice, load_rig, presets, rigs, save_rig, to_toml
+from slviewer.pipeline.rig_presets import check_choice, load_rig, presets, rigs, save_rig
 from slviewer.session.store import Session
+from slviewer.session.toml import to_toml
 
 BENCH = {
     "name": "bench",

@@ -1,15 +1,14 @@
 """The `frames` TOML of a folder whose images nobody described, as the images themselves suggest it."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from slviewer.errors import InputError
 from slviewer.fringe.guess import Guess, guess_sequence
 from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
 from slviewer.session.importers.imported import listed, visible
+from slviewer.session.toml import format_value, table_lines
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ def guess_description(
     names = [file.name for file in files]
     shown = (channel or DEFAULT_CHANNEL) if images.in_colour else channel
     doubts = tuple(f"{_span(names, indices)}: {text}" for indices, text in guess.doubts)
-    return GuessedDescription(_toml(folder, names, guess, shown, projector, doubts), doubts)
+    return GuessedDescription(_write_toml(folder, names, guess, shown, projector, doubts), doubts)
 
 
 def _capture_folder(source: Path) -> Path:
@@ -53,7 +52,7 @@ def _span(names: list[str], indices: tuple[int, ...]) -> str:
     return f"{names[indices[0]]} to {names[indices[-1]]}" if whole else listed([names[i] for i in indices])
 
 
-def _toml(
+def _write_toml(
     folder: Path,
     names: list[str],
     guess: Guess,
@@ -71,10 +70,10 @@ def _toml(
         lines.append(f'projector = "{projector[0]}x{projector[1]}"')
     lines.append('order = "name"  # all images of a folder in natural order of their names')
     if channel is not None:
-        lines.append(f"channel = {_value(channel)}")
+        lines.append(f"channel = {format_value(channel)}")
     # Without gray_origin the import estimates it from the images.
     keys = ("phase_sign", "phase_offset", "gray_cell_px", "relative")
-    lines += [f"{key} = {_value(described[key])}" for key in keys if key in described]
+    lines += table_lines({key: described[key] for key in keys if key in described})
     evidence: dict[int, list[str]] = {}
     for image, text in guess.evidence:
         evidence.setdefault(image, []).append(text)
@@ -87,13 +86,5 @@ def _toml(
             lines.append(f"# [[frame]] of {name}: add its kind")
             continue
         lines.append(f"[[frame]]  # {name}")
-        lines += [f"{key} = {_value(value)}" for key, value in frame.to_dict().items()]
+        lines += table_lines(frame.to_dict())
     return "\n".join(lines) + "\n"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {_value(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return f'"{value}"' if isinstance(value, str) else repr(value)

@@ -71,7 +71,7 @@ class FolderLayout:
     """How a tool lays its captures out on disk.
 
     ``read(source, prefix=, projector=, ...)`` reads a source; ``is_capture(folder)``: whether the file names in a
-    folder are those of one capture; ``projector``: its size where none is given, None where the layout does not imply one.
+    folder are those of one capture; ``projector``: its size where none is given, None where the layout implies none.
     """
 
     name: str
