@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.optimize
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.figures import narrowest_range
@@ -26,6 +27,8 @@ MOST_RISE = 0.005
 """Distance from a plane (1 sigma), as a share of the region's size, from which on a region that bends is no plane."""
 RIVAL = 2.0
 """Another shape must leave this many times less before a region is said to hold that one instead."""
+MOST_RADIUS = 100.0
+"""Times the region's size: a cylinder of a larger radius is a plane."""
 SURE_RADIUS = 0.1
 """A radius less sure than this share of itself (1 sigma) is none."""
 
@@ -127,7 +130,7 @@ def least_squares(kind: Kind, points: np.ndarray, begin: Feature | None) -> Feat
     if kind == "sphere":
         return as_sphere(points)
     assert begin is not None
-    return _refined(begin, points)
+    return _fit_cylinder(begin, points)
 
 
 def _settled(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
@@ -139,31 +142,15 @@ def _settled(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
     return fit_settled(fit, points, estimate_start(kind, points, fit))
 
 
-def _refined(feature: Feature, points: np.ndarray) -> Feature:
-    """Levenberg-Marquardt from a start; its place ends beside the middle of the points. Raises InputError where the
-    radius runs away: the points are flat."""
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    damping, residuals = 1e-4, feature.distance(points)
-    cost = float(residuals @ residuals)
-    for _ in range(60):
-        J = feature.jacobian(points)
-        normal, gradient = J.T @ J, J.T @ residuals
-        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), gradient)
-        moved = feature.moved(step)
-        if moved.radius is not None and not 0 < moved.radius < 100 * size:
-            damping *= 10
-        else:
-            after = moved.distance(points)
-            gain = cost - float(after @ after)
-            if gain >= 0:
-                feature, residuals, cost = moved, after, cost - gain
-                damping = max(0.1 * damping, 1e-10)
-                if gain <= 1e-12 * cost:
-                    break
-            else:
-                damping *= 10
-        if damping > 1e8:
-            break
+def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
+    """The least-squares cylinder near a start; its place ends beside the middle of the points. Raises InputError where
+    the radius diverges: the points are flat."""
+    solution = scipy.optimize.least_squares(
+        lambda step: start.moved(step).distance(points), np.zeros(start.parameters), method="lm", max_nfev=600
+    )
+    feature = start.moved(solution.x)
+    if not 0 < (feature.radius or 0.0) < MOST_RADIUS * float(np.linalg.norm(np.ptp(points, axis=0))):
+        raise InputError("No cylinder fits: its radius diverges; select a region that shows more of its curve.")
     assert feature.direction is not None
     along = feature.direction * np.sign(feature.direction[np.argmax(np.abs(feature.direction))])
     middle = feature.place + ((points.mean(axis=0) - feature.place) @ along) * along

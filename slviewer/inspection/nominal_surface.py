@@ -1,4 +1,4 @@
-"""A nominal model that can be asked how far places lie off it, and on which side."""
+"""Signed distances of points from a nominal model."""
 
 from typing import Any
 
@@ -21,6 +21,8 @@ class NominalSurface:
     """A mesh, closed or open; its normals say what is outside. Distances are right within a micrometre."""
 
     def __init__(self, mesh: Mesh):
+        import trimesh
+
         if not len(mesh.faces):
             raise InputError("The nominal model has no triangles: give a mesh.")
         vertices = mesh.vertices.astype(np.float64)
@@ -33,7 +35,8 @@ class NominalSurface:
         if not self.areas.sum() > 0:
             raise InputError("The nominal model's triangles have no area: give another file.")
         self._flat = flat / np.maximum(lengths, 1e-300)[:, None]
-        self._smooth = _smooth(self._corners, self._flat, mesh.faces, len(vertices))
+        # normals of the vertices weighted by the triangles' angles tell the side of a place (Bærentzen and Aanæs 2005)
+        self._smooth = trimesh.Trimesh(vertices - self.middle, mesh.faces, process=False).vertex_normals
         self._faces = mesh.faces
         self._at_rim = _at_rim(mesh.faces, len(vertices))
         core = open3d().core
@@ -107,15 +110,3 @@ def _at_rim(faces: np.ndarray, count: int) -> np.ndarray:
     found = np.zeros(count, bool)
     found[edges[triangles == 1]] = True
     return found
-
-
-def _smooth(corners: np.ndarray, flat: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
-    """(count, 3): a normal a vertex, its triangles' weighed by their angles there: on which side of the surface a place
-    lies is told right by it (Bærentzen and Aanæs 2005)."""
-    normals = np.zeros((count, 3))
-    for k in range(3):
-        a, b = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
-        angles = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
-        for axis in range(3):
-            normals[:, axis] += np.bincount(faces[:, k], angles * flat[:, axis], count)
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300))

@@ -132,7 +132,7 @@ def test_a_pose_that_moved_is_left_out_with_its_reason(bench: FaultBench, sessio
 def test_gamma_below_five_steps_is_named_and_not_taken_for_another_period() -> None:
     three = FaultBench(letter(0.2, 3), count=6, steps=3)
     curve = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
-    sound = three.attempt([three.examine_clean(i) for i in range(6)])
+    sound = three.attempt(three.examine_clean())
     bent = three.attempt([three.examine(i, curve[three.frames(i)]) for i in range(6)])
     assert "gamma" not in sound.verdict.causes
     assert bent.verdict.level == "doubtful" and "gamma" in bent.verdict.causes
