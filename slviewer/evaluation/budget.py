@@ -1,6 +1,5 @@
 """Where the uncertainty of a measured length comes from, in the manner of the GUM."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,8 +65,3 @@ class ErrorBudget:
     def to_json(self) -> dict[str, Any]:
         """The fields, U and what it lacks."""
         return to_plain(self) | {"U_mm": self.U_mm, "k": COVERAGE, "unknown": self.unknown}
-
-
-def budget(length_mm: float, contributions: Sequence[Contribution]) -> ErrorBudget:
-    """The budget of a length."""
-    return ErrorBudget(length_mm, tuple(contributions))

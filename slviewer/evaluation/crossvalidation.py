@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
@@ -154,7 +155,8 @@ def measure_held_out(
     clouds = {name: np.asarray(model.points(phase)) for name, model in models.items()}
     common = np.logical_and.reduce([np.isfinite(points[..., 2]) for points in clouds.values()])
     features = {
-        name: _at(np.where(common[..., None], points, np.nan), observation.camera) for name, points in clouds.items()
+        name: _interpolate(np.where(common[..., None], points, np.nan), observation.camera)
+        for name, points in clouds.items()
     }
     read = np.logical_and.reduce([np.isfinite(X).all(1) for X in features.values()])
     if np.count_nonzero(read) < LEAST_FEATURES:
@@ -163,7 +165,7 @@ def measure_held_out(
     found = {}
     for name, points in clouds.items():
         seen, X = points[common].astype(float), features[name][read]
-        placed, scale = _laid_over(board, X)
+        placed, scale = _align_board(board, X)
         found[name] = HeldOutPose(
             plane_mm=float(np.sqrt(np.mean(fit_plane(seen).distance(seen) ** 2))),
             board_mm=_rms(X - placed),
@@ -197,22 +199,15 @@ def gather_results(
     return CrossValidation(poses, folds, dict(failed))
 
 
-def _at(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """(n, 3): an organised cloud (h, w, 3) between its pixels, at (n, 2) px; NaN beside invalid ones."""
-    height, width = points.shape[:2]
-    found = np.full((len(pixels), 3), np.nan)
-    inside = (pixels >= 0).all(1) & (pixels[:, 0] < width - 1) & (pixels[:, 1] < height - 1)
-    u, v = pixels[inside].T
-    i, j = np.floor(v).astype(int), np.floor(u).astype(int)
-    b, a = (v - i)[:, None], (u - j)[:, None]
-    P = points.astype(float)
-    found[inside] = (1 - b) * ((1 - a) * P[i, j] + a * P[i, j + 1]) + b * ((1 - a) * P[i + 1, j] + a * P[i + 1, j + 1])
-    return found
+def _interpolate(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(n, 3): an organised cloud (h, w, 3) at pixels (n, 2), linear between its own; NaN beside invalid ones."""
+    v_u = pixels[:, ::-1].T
+    maps = (map_coordinates(points[..., k].astype(float), v_u, order=1, cval=np.nan) for k in range(3))
+    return np.stack(list(maps), axis=1)
 
 
-def _laid_over(board: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, float]:
-    """((n, 3) the board's points where they come nearest to the measured ones without stretching, and how much longer
-    the measured ones are)."""
+def _align_board(board: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, float]:
+    """The board's points (n, 3) after the rigid best fit to the measured ones, and the scale of the measured ones."""
     laid, middle = move_points(fit_rigid(board, measured), board), measured.mean(0)
     scale = float(np.sum((laid - middle) * (measured - middle)) / np.sum((laid - middle) ** 2))
     return laid, scale

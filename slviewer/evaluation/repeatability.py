@@ -45,37 +45,29 @@ class Repeatability:
 
 
 def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> Repeatability:
-    """From (z, sigma_z) of each capture, (h, w) mm, NaN where invalid; one at a time, so that any number can be taken.
+    """Repeatability of captures given as (z, sigma_z), each (h, w) mm, NaN where invalid.
 
     Raises InputError for fewer than three captures, captures of different size, and for no pixel that all measured.
     """
-    count, means = 0, list[np.ndarray]()
-    for z, sigma_z in measured:
-        z = np.asarray(z, np.float64)
-        if count == 0:
-            first, mean, squares, noise = z, np.zeros_like(z), np.zeros_like(z), np.zeros_like(z)
-        elif z.shape != first.shape:
-            raise InputError(f"captures of {first.shape} and {z.shape} pixels are no repetition of one another")
-        count += 1
-        change = z - first  # small, so that squares keep their digits
-        step = change - mean
-        mean = mean + step / count
-        squares = squares + step * (change - mean)
-        noise = noise + np.asarray(sigma_z, np.float64) ** 2
-        means.append(change.astype(np.float32))
+    pairs = [(np.asarray(z, np.float32), np.asarray(sigma, np.float32)) for z, sigma in measured]
+    count, shapes = len(pairs), {z.shape for z, _ in pairs}
+    if len(shapes) > 1:
+        raise InputError(f"captures of {' and '.join(map(str, shapes))} pixels are no repetition of one another")
     if count < LEAST_CAPTURES:
         raise InputError(f"{count} captures show no repeatability: take {CAPTURES} of the same still object")
-    always = np.isfinite(squares)
+    depths, noise = (np.stack(maps) for maps in zip(*pairs, strict=True))
+    depths -= depths[0].copy()  # small, so that squares keep their digits
+    sigma = depths.std(axis=0, ddof=1)
+    always = np.isfinite(sigma)
     if not always.any():
         raise InputError("no pixel was measured in every capture: leave the object where it is, and in view")
-    sigma = np.sqrt(squares / (count - 1))
-    levels = [float(change[always].mean()) for change in means]
+    levels = depths[:, always].mean(axis=1, dtype=np.float64)
     return Repeatability(
         count,
         int(np.count_nonzero(always)),
         float(np.median(sigma[always])),
         float(np.percentile(sigma[always], 95)),
-        float(np.nanmedian(np.sqrt(noise[always] / count))),
-        max(levels) - min(levels),
-        sigma.astype(np.float32),
+        float(np.nanmedian(np.sqrt((noise[:, always] ** 2).mean(axis=0)))),
+        float(np.ptp(levels)),
+        sigma,
     )

@@ -13,7 +13,7 @@ from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
 from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, measure
 from slviewer.evaluation.acceptance.result import Acceptance, conclude_test
-from slviewer.evaluation.budget import Contribution, ErrorBudget, budget
+from slviewer.evaluation.budget import Contribution, ErrorBudget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
@@ -171,9 +171,9 @@ def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) 
         last = checks[-1].drift
         drift = mm * 1e-6 * float(np.hypot(last.scale_ppm, last.scale_sigma_ppm))
         since = f"the drift check of {last.capture}"
-    return budget(
+    return ErrorBudget(
         mm,
-        [
+        (
             Contribution("phase noise", noise, "A", "the scatter of the points about their fits"),
             Contribution("calibration", scatter, "A", f"the errors' scatter over {len(errors)} places"),
             Contribution(
@@ -181,5 +181,5 @@ def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) 
             ),
             Contribution("temperature", warmth, "B", f"{thing.expansion.ppm_per_kelvin:g} ppm/K of the artefact"),
             Contribution("drift", drift, "B", since),
-        ],
+        ),
     )

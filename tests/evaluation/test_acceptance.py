@@ -14,7 +14,7 @@ from slviewer.evaluation.acceptance.artefact import Artefact, Limits
 from slviewer.evaluation.acceptance.figures import AcceptanceFigure, decide, narrowest_range
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure
 from slviewer.evaluation.acceptance.result import conclude_test
-from slviewer.evaluation.budget import Contribution, budget
+from slviewer.evaluation.budget import Contribution, ErrorBudget
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
@@ -198,7 +198,7 @@ def test_repeatability_is_the_noise_whatever_the_shape():
 
 
 def test_a_budget_adds_squares_and_names_what_is_unknown():
-    found = budget(
+    found = ErrorBudget(
         100.0,
         [Contribution("a", 0.003, "A", ""), Contribution("b", 0.004, "B", ""), Contribution("drift", None, "B", "")],
     )
