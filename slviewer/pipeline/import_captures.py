@@ -135,17 +135,6 @@ def find_captures(
     return found
 
 
-def import_p18(source: Path | str, session: SessionLike, **options: Any) -> list[str]:
-    """Import ``pose_XX/{V,H}/P18_FNN.PNG`` folders, as ``import_captures``; the projector is 912x1140 by default."""
-    return import_captures(source, session, "p18", **options)
-
-
-def import_procam_calibration(source: Path | str, session: SessionLike, **options: Any) -> list[str]:
-    """Import ``capture_N/graycode_NN.*`` folders (Gray code with inverses, white, black), as ``import_captures``; the
-    projector is 1024x768 by default."""
-    return import_captures(source, session, "procam-calibration", **options)
-
-
 def import_frames(source: Path | str, session: SessionLike, sequence: Path | str, **options: Any) -> list[str]:
     """Import any folder of images that a TOML describes, as ``import_captures``.
 

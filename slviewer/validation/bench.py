@@ -37,7 +37,7 @@ from slviewer.session.ply import write_ply
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.validation.bench_floors import beside, fastest, median, megabytes, row, through
+from slviewer.validation.bench_floors import fastest, median, megabytes, move_bytes, row, time_beside
 from slviewer.validation.bench_gpu import gpu_rows
 from slviewer.validation.bench_live import LiveFigures, live_rate
 from slviewer.validation.bench_peers import fringes_row, icp_rows, missing
@@ -180,12 +180,12 @@ def _one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
 def _beside_floor(
     work: Callable[[], object], frames: np.ndarray, numbers: int, written: tuple[int, int, int]
 ) -> tuple[float, float, float]:
-    """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as `through` has them."""
+    """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as `move_bytes` has them."""
     shape = frames.shape[1:]
     values = np.zeros((numbers, *shape), np.float32)
     grey = np.zeros((written[0], *shape), frames.dtype)
     single, triple = np.zeros((written[1], *shape), np.float32), np.zeros((written[2], *shape, 3), np.float32)
-    seconds, least = beside(work, lambda: through(frames, values, grey, single, triple), 25)
+    seconds, least = time_beside(work, lambda: move_bytes(frames, values, grey, single, triple), 25)
     return seconds, megabytes(frames, values, grey, single, triple), least
 
 

@@ -1,8 +1,8 @@
 """What no stage can beat: passes that only read its bytes and write its results, and how times are taken."""
 
 import statistics
-import time
 from collections.abc import Callable
+from timeit import repeat, timeit
 from typing import Any
 
 import numpy as np
@@ -34,47 +34,33 @@ def row(
     }
 
 
-def beside(work: Callable[[], object], floor: Callable[[], object], times: int = 9) -> tuple[float, float]:
-    """Least seconds of some work and of its floor, taken in turns: other programs' share in them is least then."""
+def time_beside(work: Callable[[], object], floor: Callable[[], object], times: int = 9) -> tuple[float, float]:
+    """Least seconds of some work and of its floor, run in turns, which lessens the share of other programs."""
     work(), floor()  # compiled, and in the caches
-    taken: tuple[list[float], list[float]] = ([], [])
-    for _ in range(times):
-        for seconds, one in zip(taken, (work, floor), strict=True):
-            start = time.perf_counter()
-            one()
-            seconds.append(time.perf_counter() - start)
-    return min(taken[0]), min(taken[1])
+    seconds = [(timeit(work, number=1), timeit(floor, number=1)) for _ in range(times)]
+    return min(each[0] for each in seconds), min(each[1] for each in seconds)
 
 
 def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
-    """Median seconds."""
+    """Median seconds, after a first run that is not counted where ``warm``."""
     if warm:
         work()
-    return statistics.median(_seconds(work, times))
+    return statistics.median(repeat(work, number=1, repeat=times))
 
 
 def fastest(work: Callable[[], object], times: int) -> float:
-    """Least seconds, after a first time that is not counted."""
+    """Least seconds, after a first run that is not counted."""
     work()
-    return min(_seconds(work, times))
-
-
-def _seconds(work: Callable[[], object], times: int) -> list[float]:
-    taken = []
-    for _ in range(times):
-        start = time.perf_counter()
-        work()
-        taken.append(time.perf_counter() - start)
-    return taken
+    return min(repeat(work, number=1, repeat=times))
 
 
 def megabytes(*arrays: np.ndarray) -> float:
-    """What these arrays hold."""
+    """Size of the arrays, MB."""
     return sum(a.nbytes for a in arrays) / 1e6
 
 
 @kernel(parallel=True)
-def through(frames, numbers, grey, single, triple):
+def move_bytes(frames, numbers, grey, single, triple):
     """Reads ``frames`` (n, h, w) and float32 ``numbers`` (m, h, w) once, and writes ``grey`` (k, h, w) of 8 or 16 bits,
     ``single`` (j, h, w) float32 and ``triple`` (i, h, w, 3) float32."""
     width = frames.shape[2]

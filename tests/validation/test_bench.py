@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slviewer.validation.bench import Benchmark
-from slviewer.validation.bench_floors import beside, megabytes, row, through
+from slviewer.validation.bench_floors import megabytes, move_bytes, row, time_beside
 from slviewer.validation.bench_peers import missing
 
 
@@ -17,7 +17,7 @@ def test_the_floor_reads_and_writes_every_byte() -> None:
     numbers = rng.random((2, 7, 9)).astype(np.float32)
     grey, single = np.zeros((1, 7, 9), np.uint8), np.zeros((3, 7, 9), np.float32)
     triple = np.zeros((1, 7, 9, 3), np.float32)
-    seconds, floor = beside(lambda: None, lambda: through(frames, numbers, grey, single, triple), 3)
+    seconds, floor = time_beside(lambda: None, lambda: move_bytes(frames, numbers, grey, single, triple), 3)
     assert 0 <= seconds < floor
     np.testing.assert_array_equal(grey[0], np.bitwise_xor.reduce(frames))
     np.testing.assert_allclose(single, np.broadcast_to(numbers.sum(0), single.shape), rtol=1e-6)
