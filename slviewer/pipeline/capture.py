@@ -11,7 +11,7 @@ from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.frame_residuals import save_residuals
+from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
@@ -87,7 +87,7 @@ def capture(
         shown = str(target) if target is not None and role == "calibration" else None
         saved = keep(store, name, role, sequence, taken, source=devices.name, purpose=purpose, board=shown, force=force)
         try:
-            for sentence in save_residuals(store, name):
+            for sentence in save_check(store, name).warnings():
                 warn(f"{name}: {sentence}")
         except SlviewerError as error:  # it is saved, and can be looked at later
             warn(f"{name} is saved, and its frames could not be checked: {error}")

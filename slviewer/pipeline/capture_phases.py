@@ -17,7 +17,7 @@ from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.frame_residuals import frame_warnings
+from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_check
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
@@ -68,12 +68,21 @@ def decode_frames(name: str, sequence: PatternSequence, frames: np.ndarray) -> d
 
 
 def check_capture(
-    name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
-) -> None:  # fmt: skip
-    """Raise InputError where the frames (n, h, w) contradict their description, or next to nothing of them decodes."""
-    if found := check_description(sequence, frames):
-        others = "".join(f". Or else: {c.message}" for c in found[1:] if c.axis == found[0].axis)
-        raise InputError(f"{name}: {found[0].message}{others}")
+    name: str,
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    phases: Mapping[Axis, PhaseMap],
+    check: FrameCheck | None = None,
+) -> None:
+    """Raise InputError where the frames (n, h, w) contradict their description, or next to nothing of them decodes.
+
+    ``check``: of these frames; without it, their description is compared here.
+    """
+    contradictions = check.contradictions if check else check_description(sequence, frames)
+    if contradictions:
+        first, *others = contradictions
+        alternatives = "".join(f". Or else: {c.message}" for c in others if c.axis == first.axis)
+        raise InputError(f"{name}: {first.message}{alternatives}")
     for axis, phase in phases.items():
         illuminated, decoded = np.count_nonzero(phase.illuminated), np.count_nonzero(phase.mask)
         if decoded and decoded >= MIN_DECODED * illuminated:
@@ -185,7 +194,8 @@ def decode_captures(
                 ahead = reader.submit(captures[i + 1].stack)
             phases = decode_capture(capture, frames, relative=relative)
             if warn is not ignore_warnings:
-                for message in frame_warnings(session, capture.name, frames):
+                check = load_check(session, capture.name) or check_frames(capture.sequence, frames)
+                for message in check.warnings():
                     warn(f"{capture.name}: {message}")
                 for message in loss_warnings(capture.sequence, frames, phases):
                     warn(f"{capture.name}: {message}")

@@ -16,7 +16,7 @@ from slviewer.fringe.sequence import PerAxis, parse_size
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.frame_residuals import save_residuals
+from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.models import available
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
 from slviewer.session.capture import NewCapture
@@ -202,7 +202,7 @@ def _save(
             warn(f"not imported: {each}")
         for capture in saved:
             progress(1.0, f"looking at {capture.name}")
-            for sentence in save_residuals(store, capture.name):
+            for sentence in save_check(store, capture.name).warnings():
                 warn(f"{capture.name}: {sentence}")
     progress(1.0, "imported")
     return [capture.name for capture in saved]

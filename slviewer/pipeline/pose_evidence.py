@@ -8,10 +8,9 @@ from slviewer.calibration.diagnosis.evidence import PoseEvidence
 from slviewer.calibration.diagnosis.frames import fit_mean_turn, measure_axis, measure_motion_px, measure_white_delay
 from slviewer.calibration.diagnosis.numbering import detect_grid_size
 from slviewer.calibration.observe import Observation, pitch_px
-from slviewer.fringe.description_check import check_description
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.residual import capture_residuals
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.pipeline.frame_check import FrameCheck
 from slviewer.records import to_plain
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
@@ -29,15 +28,16 @@ def examine(
     phases: Mapping[Axis, PhaseMap],
     board: Board,
     texture: np.ndarray,
+    check: FrameCheck,
     found: Detection | None,
     seen: Observation | None,
     refused: str = "",
 ) -> PoseEvidence:
     """What the decoded frames (n, h, w) of a pose say. ``found`` and ``seen``: its board and its phase, where they
-    could be read; ``refused``: why not.
+    could be read; ``refused``: why not; ``check``: of its frames.
     """
     on_board = board_mask(board, found, texture.shape) if found is not None else None
-    suspects = {s.frame: s for axis in capture_residuals(sequence, frames) for s in axis.suspects}
+    suspects = {suspect.frame: suspect for suspect in check.suspects}
     return PoseEvidence(
         name=name,
         refused=refused,
@@ -49,7 +49,7 @@ def examine(
         if found is None
         else measure_motion_px(sequence, frames, found.pixels, float(np.median(pitch_px(board, found)))),
         turn=None if seen is None else fit_mean_turn(seen.camera, seen.projector),
-        contradictions=check_description(sequence, frames) if refused else (),
+        contradictions=check.contradictions if refused else (),
     )
 
 

@@ -11,6 +11,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_captures
+from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_check
 from slviewer.pipeline.pose_evidence import examine as examine_frames
 from slviewer.pipeline.pose_evidence import keep_evidence, known_evidence
 from slviewer.session.capture import Capture
@@ -38,23 +39,27 @@ def read_pose(
     board: Board,
     smoothing: Smoothing,
     examine: bool = False,
+    check: FrameCheck | None = None,
 ) -> Judged:
     """The observation of a decoded target pose, or the reason why there is none.
 
     ``texture`` (h, w) or (h, w, 3) uint8 shows the board. ``examine``: with the evidence of its frames (n, h, w).
+    ``check``: of its frames; computed if None.
     """
     found: Detection | None = None
     seen: Observation | None = None
     refused = ""
+    if examine:
+        check = check or check_frames(sequence, frames)
     try:
         found = detect(board, texture)
         seen = observe(name, board, found, phases, smoothing)
-        check_capture(name, sequence, frames, phases)
+        check_capture(name, sequence, frames, phases, check)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
     evidence = None
-    if examine:
-        evidence = examine_frames(name, sequence, frames, phases, board, texture, found, seen, refused)
+    if examine and check:
+        evidence = examine_frames(name, sequence, frames, phases, board, texture, check, found, seen, refused)
     return Judged(name, None if refused else seen, refused, evidence)
 
 
@@ -69,7 +74,8 @@ def judge(
 ) -> Judged:
     """Read the pose as ``read_pose`` does, and save the result in the session."""
     texture = capture_texture(capture, frames)
-    judged = read_pose(capture.name, capture.sequence, frames, phases, texture, board, smoothing, examine)
+    check = load_check(store, capture.name)
+    judged = read_pose(capture.name, capture.sequence, frames, phases, texture, board, smoothing, examine, check)
     if judged.evidence is not None:
         keep_evidence(store, capture, board, judged.evidence)
     meta = {

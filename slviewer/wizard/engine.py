@@ -18,7 +18,7 @@ from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.pipeline.check_results import Preflight
-from slviewer.pipeline.frame_residuals import save_residuals
+from slviewer.pipeline.frame_check import load_check, save_check
 from slviewer.pipeline.poses import judge_all
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, needs_page
 from slviewer.pipeline.rig_presets import save_rig
@@ -274,15 +274,15 @@ class Engine:
             self.publisher.mark_changed(session=True)
         target = reader.target()
         session = reader.session.guarded(report.saving)
+        report(0.0, f"reading {capture.name}")
+        if load_check(session, capture.name) is None:
+            for sentence in save_check(session, capture.name).warnings():
+                self.notices.add("warning", f"{capture.name}: {sentence}")
         if reader.needs_judging(capture, target):
-            report(0.0, f"reading {capture.name}")
-            judged = next(judge_all(session, [capture.name], Board.parse(target), Smoothing()))
+            judged = next(judge_all(session, [capture.name], Board.parse(target), Smoothing(), examine=True))
             if judged.observation is None:
                 self.notices.add("warning", f"{capture.name} cannot be used: {judged.refused}")
-            self.publisher.mark_changed(session=True)  # the check of the frames may take longer
-        if reader.session.state_of(f"trust/{capture.name}") != "fresh":
-            for sentence in save_residuals(session, capture.name):
-                self.notices.add("warning", f"{capture.name}: {sentence}")
+            self.publisher.mark_changed(session=True)
 
     def _handle_processing_failure(self, reader: SessionReader, capture: Capture, error: BaseException) -> None:
         self.notices.add_failure(f"Processing {capture.name}", error)

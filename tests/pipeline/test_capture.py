@@ -193,10 +193,10 @@ def test_a_capture_that_is_saved_outlives_the_look_at_its_frames(tmp_path: Path,
     def refused(*_: object) -> list[str]:
         raise SessionError("the disk is full: free some space")
 
-    monkeypatch.setattr(module, "save_residuals", interrupted)
+    monkeypatch.setattr(module, "save_check", interrupted)
     with pytest.raises(KeyboardInterrupt):
         capture(tmp_path / "fresh", "a", {"driver": "simulated", "scale": 0.1})
-    monkeypatch.setattr(module, "save_residuals", refused)
+    monkeypatch.setattr(module, "save_check", refused)
     said: list[str] = []
     capture(tmp_path / "fresh", "b", {"driver": "simulated", "scale": 0.1}, warn=said.append)
     assert said == ["b is saved, and its frames could not be checked: the disk is full: free some space"]

@@ -10,7 +10,7 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.presets import p18
 from slviewer.pipeline import capture_phases
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
-from slviewer.pipeline.frame_residuals import capture_warnings
+from slviewer.pipeline.frame_check import check_frames
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -28,7 +28,7 @@ def frames() -> np.ndarray:
 @pytest.mark.slow
 def test_a_sound_capture_passes(frames: np.ndarray) -> None:
     check_capture("pose_01", SEQUENCE, frames, decode_frames("pose_01", SEQUENCE, frames))
-    assert capture_warnings(SEQUENCE, frames) == []
+    assert check_frames(SEQUENCE, frames).warnings() == []
 
 
 @pytest.mark.slow
@@ -36,7 +36,7 @@ def test_the_most_probable_contradiction_is_the_reason(frames: np.ndarray) -> No
     wrong = replace(SEQUENCE, gray_origin_px=8.5)
     with pytest.raises(InputError, match=r"pose_01: .*gray_origin = -0\.[45]\d* .*phase_offset = -?3\.1\d"):
         check_capture("pose_01", wrong, frames, decode_frames("pose_01", wrong, frames))
-    assert any("gray_origin" in message for message in capture_warnings(wrong, frames))
+    assert any("gray_origin" in message for message in check_frames(wrong, frames).warnings())
 
 
 def seen(decoded: float, otherwise: Reason) -> PhaseMap:

@@ -8,16 +8,9 @@ from imperfect_rig import Imperfections, imperfect
 from slviewer.devices.capture import capture
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
-from slviewer.fringe.description_check import check_description
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
-from slviewer.fringe.residual import capture_residuals
-from slviewer.pipeline.frame_residuals import (
-    capture_warnings,
-    describe,
-    frame_warnings,
-    save_residuals,
-    warnings_of,
-)
+from slviewer.pipeline import frame_check
+from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_check, save_check
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
@@ -42,7 +35,7 @@ def taken(sequence_of=p18, gamma=1.0, thing="board", seed=0, **wrong):
     ],
 )
 def test_sound_captures_are_saved_without_a_word(sequence_of, gamma, thing, seed):
-    assert capture_warnings(*taken(sequence_of, gamma, thing, seed)) == []
+    assert check_frames(*taken(sequence_of, gamma, thing, seed)).warnings() == []
 
 
 @pytest.mark.parametrize(
@@ -57,25 +50,28 @@ def test_sound_captures_are_saved_without_a_word(sequence_of, gamma, thing, seed
     ],
 )
 def test_frames_that_do_not_fit_are_told(wrong, said):
-    told = capture_warnings(*taken(**wrong))
+    told = check_frames(*taken(**wrong)).warnings()
     assert any(said in sentence for sentence in told), told
     assert len(told) <= 4
 
 
-def test_residuals_are_kept_as_plain_values():
-    sequence, stack = taken(late={6})
-    found = capture_residuals(sequence, stack)
-    plain = json.loads(json.dumps(describe(found)))
-    assert [axis["axis"] for axis in plain] == ["x", "y"]
-    assert len(plain[0]["frames"]) == 18 and plain[0]["suspects"][0]["frame"] == 6
-    assert all(0.8 < frame["sigmas"] < 1.3 for frame in plain[1]["frames"])
-    assert warnings_of(found, check_description(sequence, stack)) == capture_warnings(sequence, stack)
+def test_a_check_survives_json():
+    check = check_frames(*taken(late={6}))
+    plain = json.loads(json.dumps(check.to_json()))
+    assert [axis["axis"] for axis in plain["axes"]] == ["x", "y"]
+    assert len(plain["axes"][0]["frames"]) == 18 and check.suspects[0].frame == 6
+    assert all(0.8 < frame["sigmas"] < 1.3 for frame in plain["axes"][1]["frames"])
+    read = FrameCheck.from_json(plain)
+    assert read.suspects == check.suspects and read.warnings() == check.warnings() != []
+    assert read.axes[1].frames[3].rms == pytest.approx(check.axes[1].frames[3].rms, abs=1e-4)
 
 
-def test_what_was_kept_is_told_again(tmp_path):
+def test_a_saved_check_is_read_until_the_checks_change(tmp_path, monkeypatch):
     sequence, stack = taken(lag=1)
     with Session.create(tmp_path / "session") as session:
         session.save_capture("part", "scan", sequence, stack, source="a test")
-        found = frame_warnings(session, "part", stack)
-        assert found
-        assert save_residuals(session, "part") == found == frame_warnings(session, "part", stack[:0])
+        assert load_check(session, "part") is None
+        saved = save_check(session, "part")
+        assert saved.warnings() and load_check(session, "part").warnings() == saved.warnings()
+        monkeypatch.setattr(frame_check, "VERSION", frame_check.VERSION + 1)
+        assert load_check(session, "part") is None

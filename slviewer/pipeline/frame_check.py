@@ -1,0 +1,90 @@
+"""Whether the frames of a capture fit each other and their description: computed once, saved as `trust/<name>`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slviewer.fringe.contradiction import Contradiction
+from slviewer.fringe.description_check import check_description
+from slviewer.fringe.residual import FrameResidual, FrameResiduals, capture_residuals
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.suspect import Suspect
+from slviewer.records import from_plain, to_plain
+from slviewer.session.store import Session
+
+VERSION = 2
+"""Of the checks; results of another version are computed anew."""
+MAX_WARNINGS = 4
+"""About one capture."""
+
+
+@dataclass(frozen=True)
+class FrameCheck:
+    """``axes``: how the frames of each axis fit together; ``contradictions`` of the description, the most probable
+    first. Both report nothing for a sound capture."""
+
+    axes: tuple[FrameResiduals, ...]
+    contradictions: tuple[Contradiction, ...]
+
+    @property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """Frames that contradict the others, of all axes."""
+        return tuple(suspect for axis in self.axes for suspect in axis.suspects)
+
+    def warnings(self) -> list[str]:
+        """Contradictions of the description, then suspects that these do not name; at most ``MAX_WARNINGS``."""
+        messages = [contradiction.message for contradiction in self.contradictions]
+        sentences = [suspect.sentence for suspect in self.suspects]
+        joined = list(dict.fromkeys(messages + [s for s in sentences if not any(s in m for m in messages)]))
+        if len(joined) <= MAX_WARNINGS:
+            return joined
+        more = len(joined) - MAX_WARNINGS + 1
+        return [
+            *joined[: MAX_WARNINGS - 1],
+            f"and {more} more frames do not fit: run the preflight, then capture again",
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; residuals are rounded, those that are not known are None."""
+        plain: dict[str, Any] = to_plain(self)
+        for axis in plain["axes"]:
+            for frame in axis["frames"]:
+                frame |= {key: round(frame[key], 4) if np.isfinite(frame[key]) else None for key in _FIGURES}
+        return plain
+
+    @classmethod
+    def from_json(cls, plain: Mapping[str, Any]) -> "FrameCheck":
+        """The inverse of ``to_json``."""
+        axes = [
+            {**axis, "frames": [{k: np.nan if v is None else v for k, v in f.items()} for f in axis["frames"]]}
+            for axis in plain["axes"]
+        ]
+        return from_plain({"axes": axes, "contradictions": plain["contradictions"]}, cls)
+
+
+_FIGURES = tuple(name for name in FrameResidual.__annotations__ if name != "frame")
+
+
+def check_frames(sequence: PatternSequence, stack: np.ndarray) -> FrameCheck:
+    """Check the frames (n, h, w) of a capture."""
+    return FrameCheck(tuple(capture_residuals(sequence, stack)), check_description(sequence, stack))
+
+
+def save_check(session: Session, name: str) -> FrameCheck:
+    """Check a capture's frames and save the result."""
+    capture = session.load_capture(name)
+    check = check_frames(capture.sequence, capture.frames)
+    meta = {"inputs": session.input_hashes(name), "version": VERSION, **check.to_json()}
+    session.save_result(f"trust/{name}", meta, {})
+    return check
+
+
+def load_check(session: Session, name: str) -> FrameCheck | None:
+    """The saved check of a capture; None where there is none for its frames, or of this version."""
+    result = f"trust/{name}"
+    if session.state_of(result) != "fresh":
+        return None
+    meta = session.load_result(result)[0]
+    return FrameCheck.from_json(meta) if meta.get("version") == VERSION else None
