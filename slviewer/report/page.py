@@ -34,19 +34,22 @@ class Figure:
     @property
     def png(self) -> bytes:
         """The picture as a PNG file."""
-        return self._encoded(format="PNG")
+        return _encode(self.pixels, format="PNG")
 
     @property
     def data(self) -> str:
-        """The picture as base64 of a lossless WebP file, which is a third of the PNG's size."""
-        return base64.b64encode(self._encoded(format="WEBP", lossless=True, method=3, quality=50)).decode()
+        """The picture in 64 levels a channel as base64 of a lossless WebP file, half of the PNG's size."""
+        levels = np.asarray(self.pixels & 0xFC | self.pixels >> 6, np.uint8)
+        return base64.b64encode(_encode(levels, format="WEBP", lossless=True, method=3, quality=50)).decode()
 
-    def _encoded(self, **options: Any) -> bytes:
-        from PIL import Image
 
-        buffer = io.BytesIO()
-        Image.fromarray(self.pixels).save(buffer, **options)
-        return buffer.getvalue()
+def _encode(pixels: NDArray[np.uint8], **options: Any) -> bytes:
+    """An image file of pixels (h, w, 3) uint8 RGB, by Pillow's options."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, **options)
+    return buffer.getvalue()
 
 
 @dataclass(frozen=True)

@@ -253,7 +253,7 @@ def test_how_good_a_calibration_is() -> None:
         "as the operator has chosen; recommended: splined",
         "0.0200",
         "0.100 mm",
-        "pose_09 is left out of the splined model",
+        "pose_09 is excluded from the splined model",
         "UNDECIDED",
         "−300 ppm ± 40 ppm (k = 2)",
         "Nothing is known of drift",
