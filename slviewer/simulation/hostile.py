@@ -31,6 +31,7 @@ Direction = Literal["scan", "calibration"]
 
 ALL = 1000
 """More poses than any session has."""
+_STAGES = {"rig", "scene", "moving", "pattern", "light", "signal", "frames"}
 _SUBLEVELS = 256  # a 16-bit signal holds so many steps a grey level
 
 
@@ -139,50 +140,14 @@ def expose_frames(
     return fault.frames(frames, level, shot) if fault and fault.frames else frames
 
 
-_STAGES: Mapping[str, dict[str, Callable[..., Any]]] = {
-    "auto-exposure": {"light": frame_faults.vary_exposure},
-    "exposure-loop": {"light": frame_faults.follow_exposure},
-    "white-balance": {"signal": frame_faults.shift_white_balance},
-    "jpeg": {"frames": frame_faults.compress_jpeg},
-    "gamma": {"rig": scene_faults.set_gamma},
-    "clipping": {"rig": scene_faults.overexpose},
-    "srgb": {"signal": frame_faults.encode_srgb},
-    "flicker": {"light": frame_faults.add_flicker},
-    "room-flicker": {"light": frame_faults.add_room_flicker},
-    "frame-lag": {"frames": frame_faults.delay_frames},
-    "dropped-frame": {"frames": frame_faults.lose_frames},
-    "duplicate-frame": {"frames": frame_faults.repeat_frames},
-    "swapped-frames": {"frames": frame_faults.swap_neighbours},
-    "exchanged-axes": {"frames": frame_faults.exchange_axis_frames},
-    "reversed-axis": {"pattern": scene_faults.reverse_pattern},
-    "reversed-bits": {"frames": frame_faults.reverse_bits},
-    "step-order": {"frames": frame_faults.reorder_steps},
-    "room-light": {"light": frame_faults.switch_lamp_on},
-    "hot-pixels": {"frames": frame_faults.add_hot_pixels},
-    "lens-dust": {"light": frame_faults.add_lens_dust},
-    "board-dust": {"scene": scene_faults.dirty_scene},
-    "vignetting": {"light": frame_faults.add_vignetting},
-    "defocus": {"light": frame_faults.add_defocus_gradient},
-    "colour-wheel": {"light": frame_faults.add_colour_wheel},
-    "crosstalk": {"light": frame_faults.add_crosstalk},
-    "dim-projector": {"rig": scene_faults.dim_projector},
-    "motion": {"moving": scene_faults.moving_scenes},
-    "focus-breathing": {"rig": scene_faults.refocus_camera},
-    "thermal-drift": {"rig": scene_faults.drift_projector},
-    "knocked-rig": {"rig": scene_faults.knock_projector},
-    "flexing-board": {"scene": scene_faults.flex_board},
-    "hand": {"scene": scene_faults.with_hand},
-    "mirror-table": {"scene": scene_faults.put_on_table},
-    "second-board": {"scene": scene_faults.add_second_board},
-}
-
-
-def _load_fault(name: str, row: dict[str, Any]) -> Fault:
+def _load_fault(row: dict[str, Any]) -> Fault:
+    """The fault of a table of ``faults.toml``, in which a stage is the name of a function of this package."""
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
-    values |= {"causes": frozenset(row["causes"]), **_STAGES[name]}
-    return Fault(**values)
+    for stage in _STAGES & row.keys():
+        values[stage] = getattr(scene_faults, row[stage], None) or getattr(frame_faults, row[stage])
+    return Fault(**values | {"causes": frozenset(row["causes"])})
 
 
 _TABLE = tomllib.loads(asset("simulation/faults.toml").read_text(encoding="utf-8"))
-FAULTS: Mapping[str, Fault] = {name: _load_fault(name, row) for name, row in _TABLE.items()}
+FAULTS: Mapping[str, Fault] = {name: _load_fault(row) for name, row in _TABLE.items()}
 """Every fault by name; what its severities are stands in ``assets/simulation/faults.toml``."""

@@ -1,12 +1,13 @@
 """Faults of light, signal and frame order, as pure functions of a capture's (n, h, w) arrays."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import cv2
 import numpy as np
 
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Kind, PatternSequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,39 +182,10 @@ def drop_frame(frames: np.ndarray, index: int) -> np.ndarray:
     return np.concatenate([np.delete(frames, index, axis=0), frames[-1:]])
 
 
-def duplicate_frame(frames: np.ndarray, index: int) -> np.ndarray:
-    """A frame is that before it once more."""
+def show_instead(frames: np.ndarray, places: Sequence[int], sources: Sequence[int]) -> np.ndarray:
+    """The frames with each of ``places`` showing what belongs at the place of the same number in ``sources``."""
     out = frames.copy()
-    out[index] = frames[index - 1]
-    return out
-
-
-def swap_frames(frames: np.ndarray, first: int, second: int | None = None) -> np.ndarray:
-    """Two frames, by default neighbours, have changed places."""
-    out = frames.copy()
-    second = first + 1 if second is None else second
-    out[[first, second]] = frames[[second, first]]
-    return out
-
-
-def exchange_axes(frames: np.ndarray, sequence: PatternSequence, kinds: Sequence[str] = ()) -> np.ndarray:
-    """The frames of x and y, or those of some ``kinds``, have changed places; both axes must have as many."""
-    of = {axis: [i for i, f in enumerate(sequence.frames) if f.axis == axis and (not kinds or f.kind in kinds)]
-          for axis in ("x", "y")}  # fmt: skip
-    return swap_groups(frames, of["x"], of["y"])
-
-
-def swap_groups(frames: np.ndarray, first: Sequence[int], second: Sequence[int]) -> np.ndarray:
-    """Groups of equally many frames have changed places."""
-    order = np.arange(len(frames))
-    order[list(first)], order[list(second)] = list(second), list(first)
-    return frames[order]
-
-
-def reorder(frames: np.ndarray, indices: Sequence[int], order: Sequence[int]) -> np.ndarray:
-    """Of the frames at ``indices``, the k-th place shows what belonged at place ``order[k]``."""
-    out = frames.copy()
-    out[list(indices)] = frames[[indices[k] for k in order]]
+    out[list(places)] = frames[list(sources)]
     return out
 
 
@@ -234,29 +206,28 @@ def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """A Gray frame of x repeated (level 0), a phase step (1), two phase steps and a Gray frame (2)."""
     phase, gray = _indices(shot, "phase", "x"), _indices(shot, "gray", "x")
     places = {0: [gray[-2]], 1: [phase[2]], 2: [phase[1], phase[-2], gray[-1]]}[int(level)]
-    for place in places:
-        frames = duplicate_frame(frames, place)
-    return frames
+    return show_instead(frames, places, [place - 1 for place in places])
 
 
 def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Two Gray frames of x swapped (level 0), two phase steps (1), the last phase step and the first Gray frame (2)."""
     phase, gray = _indices(shot, "phase", "x"), _indices(shot, "gray", "x")
     first = {0: gray[-2], 1: phase[1], 2: phase[-1]}[int(level)]
-    return swap_frames(frames, first)
+    return show_instead(frames, [first, first + 1], [first + 1, first])
 
 
 def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """All frames of x and y exchanged (level 0), the phase steps alone (1), the Gray frames alone (2)."""
-    kinds = {0: (), 1: ("phase",), 2: ("gray", "complementary")}[int(level)]
-    return exchange_axes(frames, shot.sequence, kinds)
+    kinds = {0: get_args(Kind), 1: ("phase",), 2: ("gray", "complementary")}[int(level)]
+    x, y = ([i for kind in kinds for i in _indices(shot, kind, axis)] for axis in ("x", "y"))
+    return show_instead(frames, x + y, y + x)
 
 
 def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary one (2)."""
     for axis in ("x",) if level == 0 else ("x", "y"):
         places = _indices(shot, "gray", axis) + (_indices(shot, "complementary", axis) if level == 2 else [])
-        frames = reorder(frames, places, range(len(places))[::-1])
+        frames = show_instead(frames, places, places[::-1])
     return frames
 
 
@@ -265,10 +236,6 @@ def reorder_steps(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     for axis in ("x", "y"):
         places = _indices(shot, "phase", axis)
         n = len(places)
-        orders: Mapping[int, list[int]] = {
-            0: [(k + n // 4) % n for k in range(n)],
-            1: [(-k) % n for k in range(n)],
-            2: [*range(0, n, 2), *range(1, n, 2)],
-        }
-        frames = reorder(frames, places, orders[int(level)])
+        orders = ([(k + n // 4) % n for k in range(n)], [-k % n for k in range(n)], [*range(0, n, 2), *range(1, n, 2)])
+        frames = show_instead(frames, places, [places[k] for k in orders[int(level)]])
     return frames

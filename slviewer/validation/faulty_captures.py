@@ -21,7 +21,7 @@ from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.simulation.boards import BoardShape, Pose, printed_board
-from slviewer.simulation.hostile_frames import delay_frames, drop_frame, swap_groups
+from slviewer.simulation.hostile_frames import delay_frames, drop_frame, show_instead
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
@@ -196,7 +196,7 @@ def _avoid_corner(bench: FaultBench) -> Attempt:
 
 def _exchange_halves(frames: np.ndarray) -> np.ndarray:
     half = len(frames) // 2  # as many frames of one axis as of the other
-    return swap_groups(frames, range(half), range(half, 2 * half))
+    return show_instead(frames, range(2 * half), [*range(half, 2 * half), *range(half)])
 
 
 FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], Attempt]]] = {

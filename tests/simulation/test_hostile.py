@@ -79,9 +79,9 @@ def test_frames_change_places():
     frames = np.arange(32, dtype=np.uint8).reshape(32, 1, 1) * np.ones((1, 2, 2), np.uint8)
     assert faults.delay_frames(frames, 2)[:, 0, 0].tolist() == [30, 31, *range(30)]
     assert faults.drop_frame(frames, 4)[:, 0, 0].tolist() == [*range(4), *range(5, 32), 31]
-    assert faults.duplicate_frame(frames, 4)[3:6, 0, 0].tolist() == [3, 3, 5]
-    assert faults.swap_frames(frames, 4)[3:7, 0, 0].tolist() == [3, 5, 4, 6]
-    assert faults.exchange_axes(frames, SEQUENCE)[:, 0, 0].tolist() == [*range(16, 32), *range(16)]
+    assert faults.repeat_frames(frames, 1, shot())[1:4, 0, 0].tolist() == [1, 1, 3]
+    assert faults.swap_neighbours(frames, 1, shot())[:4, 0, 0].tolist() == [0, 2, 1, 3]
+    assert faults.exchange_axis_frames(frames, 0, shot())[:, 0, 0].tolist() == [*range(16, 32), *range(16)]
     assert faults.reverse_bits(frames, 0, shot())[8:16, 0, 0].tolist() == [14, 13, 12, 11, 10, 9, 8, 15]
     assert faults.reorder_steps(frames, 0, shot())[:8, 0, 0].tolist() == [2, 3, 4, 5, 6, 7, 0, 1]
     assert faults.reorder_steps(frames, 1, shot())[:8, 0, 0].tolist() == [0, 7, 6, 5, 4, 3, 2, 1]
