@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from slviewer.errors import InputError
-from slviewer.geometry.jit import kernel
 from slviewer.geometry.robust import fit_reweighted
 
 Box = tuple[float, float, float, float]
@@ -35,9 +33,9 @@ class Polynomial2D:
         """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
         height, width = shape
         s, t = _normalise_pixels(origin[0] + np.arange(width), origin[1] + np.arange(height), self.box)
-        rows = chebyshev.chebvander(t, len(self.coefficients) - 1) @ self.coefficients
-        out = np.empty(shape)
-        _evaluate_chebyshev(rows, s, t, out)
+        degree = len(self.coefficients) - 1
+        out: np.ndarray = chebyshev.chebvander(t, degree) @ self.coefficients @ chebyshev.chebvander(s, degree).T
+        out[np.abs(t) > 1.0], out[:, np.abs(s) > 1.0] = np.nan, np.nan
         return out
 
 
@@ -106,18 +104,3 @@ def select_valid_samples(
 def _normalise_pixels(u: np.ndarray, v: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:
     u0, v0, u1, v1 = box
     return 2.0 * (u - u0) / (u1 - u0) - 1.0, 2.0 * (v - v0) / (v1 - v0) - 1.0
-
-
-@kernel(parallel=True)
-def _evaluate_chebyshev(rows, s, t, out):
-    """out (h, w) from each row's Chebyshev coefficients (h, degree + 1), by Clenshaw's recurrence."""
-    for y in numba.prange(out.shape[0]):
-        inside = abs(t[y]) <= 1.0
-        for x in range(out.shape[1]):
-            if not (inside and abs(s[x]) <= 1.0):
-                out[y, x] = np.nan
-                continue
-            b1, b2 = 0.0, 0.0
-            for k in range(rows.shape[1] - 1, 0, -1):
-                b1, b2 = 2.0 * s[x] * b1 - b2 + rows[y, k], b1
-            out[y, x] = s[x] * b1 - b2 + rows[y, 0]

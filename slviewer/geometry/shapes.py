@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from slviewer.errors import InputError
 
@@ -115,35 +116,15 @@ def _refine_sphere(
 ) -> tuple[np.ndarray, float, float]:
     """Levenberg-Marquardt on centre (and radius): (centre, radius, RMS of the radial distances)."""
 
-    def misfit(c: np.ndarray, r: float) -> tuple[np.ndarray, np.ndarray, float]:
-        offsets = points - c
-        lengths = _norms(offsets)
-        residuals = lengths - r
-        return offsets / np.maximum(lengths, 1e-300)[:, None], residuals, float(residuals @ residuals)
+    def distances(unknowns: np.ndarray) -> np.ndarray:
+        return _norms(points - unknowns[:3]) - (radius if fixed else unknowns[3])
 
-    unknowns = 3 if fixed else 4
-    damping = 1e-6
-    directions, residuals, cost = misfit(centre, radius)
-    for _ in range(100):
-        # Jacobian of |x - c| - r is (-direction, -1): the normal equations in 4x4 blocks
-        normal = np.empty((4, 4))
-        normal[:3, :3] = directions.T @ directions
-        normal[3, :3] = normal[:3, 3] = directions.sum(axis=0)
-        normal[3, 3] = len(points)
-        gradient = np.append(residuals @ directions, residuals.sum())
-        damped = normal[:unknowns, :unknowns] + damping * np.diag(np.diag(normal)[:unknowns])
-        step = np.zeros(4)
-        step[:unknowns] = np.linalg.solve(damped, gradient[:unknowns])
-        candidate = misfit(centre + step[:3], radius + step[3])
-        if candidate[2] <= cost:
-            centre, radius = centre + step[:3], float(radius + step[3])
-            gain = cost - candidate[2]
-            directions, residuals, cost = candidate
-            damping = max(damping * 0.1, 1e-12)
-            if gain <= 1e-14 * cost or np.abs(step).max() < 1e-10 * abs(radius):
-                break
-        else:
-            damping *= 10
-            if damping > 1e8:
-                break
-    return centre, radius, float(np.sqrt(cost / len(points)))
+    def jacobian(unknowns: np.ndarray) -> np.ndarray:
+        offsets = points - unknowns[:3]
+        derivatives = np.full((len(points), len(unknowns)), -1.0)
+        derivatives[:, :3] = -offsets / np.maximum(_norms(offsets), 1e-300)[:, None]
+        return derivatives
+
+    start = centre if fixed else np.append(centre, radius)
+    fit = least_squares(distances, start, jacobian, method="lm", ftol=1e-14, xtol=1e-12, max_nfev=200)
+    return fit.x[:3], radius if fixed else float(fit.x[3]), float(np.sqrt(2 * fit.cost / len(points)))

@@ -7,7 +7,6 @@ A polynomial of low degree over the whole image removes the local distortion tha
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solveh_banded
@@ -48,14 +47,12 @@ class SplineSurface:
 
     def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
         """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
-        out = self.trend.evaluate_grid(shape, origin)
         height, width = shape
         ny, nx = (n - 3 for n in self.coefficients.shape)
         u0, v0, u1, v1 = self.trend.box
-        cells_u, basis_u = _basis(origin[0] + np.arange(width, dtype=np.float64), u0, u1, nx)
-        cells_v, basis_v = _basis(origin[1] + np.arange(height, dtype=np.float64), v0, v1, ny)
-        _add_spline_rows(cells_u, basis_u, cells_v, basis_v, self.coefficients, out)
-        return out
+        along = _basis_matrix(origin[0] + np.arange(width, dtype=np.float64), u0, u1, nx)
+        down = _basis_matrix(origin[1] + np.arange(height, dtype=np.float64), v0, v1, ny)
+        return self.trend.evaluate_grid(shape, origin) + down @ self.coefficients @ along.T
 
 
 def fit_spline(
@@ -100,6 +97,14 @@ def fit_spline(
         return coefficients, _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients)
 
     return SplineSurface(trend, fit_reweighted(solve, rest, weights) if robust else solve(weights)[0])
+
+
+def _basis_matrix(positions: np.ndarray, start: float, end: float, cells: int) -> np.ndarray:
+    """(n, cells + 3): weight of each coefficient at each position."""
+    cell, weights = _basis(positions, start, end, cells)
+    matrix = np.zeros((len(positions), cells + 3))
+    np.put_along_axis(matrix, cell[:, None] + np.arange(4), weights, axis=1)
+    return matrix
 
 
 def _basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
@@ -169,21 +174,3 @@ def _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients):
                 total += basis_v[k, a] * basis_u[k, b] * coefficients[cells_v[k] + a, cells_u[k] + b]
         out[k] = total
     return out
-
-
-@kernel(parallel=True)
-def _add_spline_rows(cells_u, basis_u, cells_v, basis_v, coefficients, out):
-    """Adds the spline to out (h, w): each row's coefficients are joined once, then four products a pixel."""
-    for y in numba.prange(out.shape[0]):
-        row = np.zeros(coefficients.shape[1])
-        for a in range(4):
-            for j in range(coefficients.shape[1]):
-                row[j] += basis_v[y, a] * coefficients[cells_v[y] + a, j]
-        for x in range(out.shape[1]):
-            i = cells_u[x]
-            out[y, x] += (
-                basis_u[x, 0] * row[i]
-                + basis_u[x, 1] * row[i + 1]
-                + basis_u[x, 2] * row[i + 2]
-                + basis_u[x, 3] * row[i + 3]
-            )

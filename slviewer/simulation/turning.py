@@ -3,6 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
+import trimesh
 
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import MeshScene
@@ -39,7 +40,8 @@ def turning() -> dict[str, MeshScene]:
 def stone() -> tuple[np.ndarray, np.ndarray]:
     """A worn stone on a flat foot, watertight: vertices (n, 3) float64 mm with z up, triangles (m, 3) int32 that are
     counter-clockwise seen from outside. About 120 mm wide, 90 mm high, without symmetry."""
-    directions, triangles = _sphere(_SUBDIVISIONS)
+    ball = trimesh.creation.icosphere(_SUBDIVISIONS)
+    directions, triangles = np.array(ball.vertices), np.array(ball.faces, np.int32)
     rng = np.random.default_rng(12)
     radius = np.full(len(directions), _RADIUS_MM)
     for _ in range(6):  # the lopsided whole
@@ -54,25 +56,3 @@ def stone() -> tuple[np.ndarray, np.ndarray]:
     down = np.maximum(-directions[:, 2], 1e-9)
     radius = np.minimum(radius, _FOOT_MM / down)
     return directions * radius[:, None], triangles
-
-
-def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """An icosahedron whose triangles are divided in four so often: unit vertices (n, 3), triangles (m, 3) int32."""
-    golden = (1 + 5**0.5) / 2
-    corners = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
-    vertices = np.array([np.roll(corner, k) for k in (0, 1, 2) for corner in corners], dtype=float)
-    triangles = np.array([
-        (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
-        (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7),
-        (9, 8, 1),
-    ])  # fmt: skip
-    for _ in range(subdivisions):
-        edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        ends, which = np.unique(edges, axis=0, return_inverse=True)
-        halves = which.reshape(-1, 3) + len(vertices)
-        vertices = np.concatenate([vertices, vertices[ends].sum(axis=1)])
-        (a, b, c), (ab, bc, ca) = triangles.T, halves.T
-        parts = [np.stack(corners, axis=1) for corners in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-        triangles = np.concatenate(parts)
-        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
-    return vertices, triangles.astype(np.int32)
