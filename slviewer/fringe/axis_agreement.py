@@ -1,6 +1,6 @@
 """How well the frames of one axis agree with each other under a hypothesis of what each of them shows."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,10 +72,11 @@ def described_frames(
 ) -> AxisFrames:  # fmt: skip
     """The frames of an axis as a sequence has them, frame i shown in image ``images[i]``."""
 
-    def shown(kind: Kind, period: float | None = None) -> tuple[int | None, ...]:
-        chosen = [i for i in sequence.find(kind, axis) if period in (None, sequence.frames[i].period_px)]
-        chosen.sort(key=lambda i: (sequence.frames[i].step, sequence.frames[i].bit))
-        return tuple(i if images is None else images[i] for i in chosen)
+    def images_of(steps: Iterable[int]) -> tuple[int | None, ...]:
+        return tuple(i if images is None else images[i] for i in steps)
+
+    def shown(kind: Kind) -> tuple[int | None, ...]:
+        return images_of(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
 
     complementary = shown("complementary")
     return AxisFrames(
@@ -84,7 +85,7 @@ def described_frames(
         offset_rad=sequence.offset_rad(axis),
         origin_px=sequence.origin_px(axis),
         cell_px=sequence.gray_cell(axis),
-        shifts=tuple((period, shown("phase", period)) for period in sequence.periods_px(axis)),
+        shifts=tuple((period, images_of(steps)) for period, steps in sequence.phase_shifts(axis)),
         bits=shown("gray") + complementary,
         inverse=shown("inverse"),
         complementary=bool(complementary),

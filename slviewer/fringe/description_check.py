@@ -98,8 +98,8 @@ def _unsteadiness(sequence: PatternSequence, sample: LineSample, illuminated: np
     order, under equal light it does not, as long as several fringes are seen."""
     worst = 0.0
     for axis in sequence.axes:
-        for _, images in described_frames(sequence, axis).shifts[-1:]:
-            means = [float(sample.frames[i][illuminated].mean()) for i in images if i is not None]
+        for _, steps in sequence.phase_shifts(axis)[-1:]:
+            means = [float(sample.frames[i][illuminated].mean()) for i in steps]
             worst = max(worst, float(np.std(means)) / max(float(np.mean(means)), 1e-6))
     return worst
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slviewer.fringe.kernels_light import equalize, mark_clipped
+from slviewer.fringe.kernels_light import equalize
 from slviewer.fringe.layout import check_stack, white_level
 from slviewer.fringe.light_fit import (
     SHARE_PRIOR,
@@ -166,15 +166,11 @@ def equalize_frames(
         stack, np.array(chosen), gain[chosen].astype(np.float32), offset[chosen].astype(np.float32),
         along_rows[chosen].astype(np.float32), along_columns[chosen].astype(np.float32), albedo, scale, out,
     )  # fmt: skip
-    for axis in sequence.axes:
-        for period in sequence.periods_px(axis):
-            places = [
-                k
-                for k, i in enumerate(chosen)
-                if (f := sequence.frames[i]).kind == "phase" and f.axis == axis and f.period_px == period
-            ]
-            if places:
-                mark_clipped(stack, np.array([chosen[k] for k in places]), white, np.array(places), out)
+    for _, steps in (shift for axis in sequence.axes for shift in sequence.phase_shifts(axis)):
+        if places := [k for k, i in enumerate(chosen) if i in steps]:
+            clipped = np.maximum.reduce([stack[chosen[k]] for k in places]) >= white
+            for k in places:
+                out[k][clipped] = CLIPPED
     return out, scale
 
 
@@ -258,11 +254,9 @@ def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Su
 def _few_steps_across(sequence: PatternSequence, k: int) -> int:
     """The phase steps of the period between whose frames frame k lies, where they are too few to tell light that is
     uniform from light in proportion to the albedo; else 0."""
-    for axis in sequence.axes:
-        for period in sequence.periods_px(axis):
-            frames = [i for i in sequence.find("phase", axis) if sequence.frames[i].period_px == period]
-            if len(frames) <= FEW_STEPS and min(frames) < k <= max(frames):
-                return len(frames)
+    for _, steps in (shift for axis in sequence.axes for shift in sequence.phase_shifts(axis)):
+        if len(steps) <= FEW_STEPS and min(steps) < k <= max(steps):
+            return len(steps)
     return 0
 
 

@@ -165,12 +165,10 @@ def _sampled_steps(
     lines = sample.lines
     if images is not None:
         lines = lines[[i if image is None else image for i, image in enumerate(images)]]
-    for period, there in described_frames(sequence, axis, images).shifts:
-        if None in there:
+    for period, steps in sequence.phase_shifts(axis):
+        if images is not None and None in (images[i] for i in steps):
             continue
-        described = [i for i in sequence.find("phase", axis) if sequence.frames[i].period_px == period]
-        described.sort(key=lambda i: sequence.frames[i].step)
-        sampled = fringe(lines, Shift(period, tuple(described)), (0.0, 0.0), sample.white)
+        sampled = fringe(lines, Shift(period, steps), (0.0, 0.0), sample.white)
         if sampled is not None:
             yield sampled
 

@@ -30,19 +30,3 @@ def equalize(stack, frames, gain, offset, along_rows, along_columns, albedo, sca
                 for x in range(width):
                     level = (np.float32(source[x]) - added) * times + np.float32(0.5)
                     target[x] = np.uint16(min(max(level, np.float32(0)), np.float32(65534)))
-
-
-@kernel(parallel=True)
-def mark_clipped(stack, frames, white, places, out):
-    """Set all samples ``places`` (k,) of ``out`` to 65535 where one of the ``frames`` (k,) of the stack is clipped."""
-    _, height, width = stack.shape
-    for row in numba.prange(height):
-        peak = np.zeros(width, stack.dtype)
-        for k in range(len(frames)):
-            source = stack[frames[k], row]
-            for x in range(width):
-                peak[x] = max(peak[x], source[x])
-        for x in range(width):
-            if peak[x] >= white:
-                for k in range(len(places)):
-                    out[places[k], row, x] = 65535

@@ -85,7 +85,7 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
     if axis not in sequence.axes:
         there = f"use axis {sequence.axes[0]}" if sequence.axes else "phase steps or Gray bits are needed"
         raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
-    shifts = tuple(_shift(sequence, axis, period) for period in sequence.periods_px(axis))
+    shifts = tuple(Shift(*shift) for shift in sequence.phase_shifts(axis))
     gray, inverse, complementary, white, black = (
         _by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
     )
@@ -147,11 +147,6 @@ def to_eight_bits(image: np.ndarray, largest: int | None = None) -> NDArray[np.u
         return image
     white = clip_level(image.dtype, int(image.max(initial=0)) if largest is None else largest)
     return (image >> (int(white).bit_length() - 8)).astype(np.uint8)
-
-
-def _shift(sequence: PatternSequence, axis: Axis, period: float) -> Shift:
-    frames = [i for i in sequence.find("phase", axis) if sequence.frames[i].period_px == period]
-    return Shift(period, tuple(sorted(frames, key=lambda i: sequence.frames[i].step)))
 
 
 def _by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:

@@ -160,12 +160,7 @@ def steady_shift(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int
 
 
 def _shifts(sequence: PatternSequence) -> tuple[tuple[int, ...], ...]:
-    out = []
-    for axis in sequence.axes:
-        for period in sequence.periods_px(axis):
-            frames = [i for i in sequence.find("phase", axis) if sequence.frames[i].period_px == period]
-            out.append(tuple(sorted(frames, key=lambda i: sequence.frames[i].step)))
-    return tuple(out)
+    return tuple(steps for axis in sequence.axes for _, steps in sequence.phase_shifts(axis))
 
 
 def _partners(sequence: PatternSequence, coded: tuple[int, ...]) -> tuple[int, ...]:

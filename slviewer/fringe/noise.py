@@ -3,6 +3,7 @@
 import numpy as np
 
 from slviewer.fringe.layout import Layout
+from slviewer.fringe.residual_sample import columns, common_harmonics, fit_cosine
 
 ROWS = 20
 """Image rows that are sampled."""
@@ -11,8 +12,6 @@ BLOCK = 8
 BINS = 16
 OWN_HARMONICS = 4
 """Highest harmonic that is fitted pixel by pixel; what gamma makes beyond it is below the noise."""
-COMMON_HARMONICS = 6
-"""Highest harmonic that is fitted to all pixels together where n is too small for the former."""
 
 
 def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[float, float]:
@@ -61,38 +60,17 @@ def _from_phase(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarr
     n = len(samples)
     samples = samples[:, _usable(samples, white)]  # (n, blocks, BLOCK)
     own = max(1, min(OWN_HARMONICS, (n - 1) // 2 - 2))
-    k = 2 * np.pi * np.arange(n) / n
-    harmonics = [np.ones(n)] + [f(h * k) for h in range(1, own + 1) for f in (np.cos, np.sin)]
-    basis, _ = np.linalg.qr(np.stack(harmonics, axis=1))
-    residue = _project_out(basis, samples)
-    mean = samples.mean(axis=0)
-    cosine, sine = (_combine(f(k) * (2 / n), samples) for f in (np.cos, np.sin))
+    frames = samples.reshape(n, -1)
+    background, phasor = fit_cosine(frames)
+    residue = frames - background
     if own < OWN_HARMONICS:
-        residue = _without_common_harmonics(residue, basis, cosine, sine, own)
-    freedom = n - basis.shape[1]
-    return mean.mean(axis=-1), (residue**2).sum(axis=0).mean(axis=-1) / freedom, freedom * samples.shape[-1]
-
-
-def _without_common_harmonics(
-    residue: np.ndarray, basis: np.ndarray, cosine: np.ndarray, sine: np.ndarray, own: int
-) -> np.ndarray:
-    """Residues less their regression, over all pixels, on harmonics of each pixel's own fringe."""
-    n = len(residue)
-    amplitude, phase = np.hypot(cosine, sine), np.arctan2(-sine, cosine)
-    k = (2 * np.pi * np.arange(n) / n).astype(np.float32).reshape(n, 1, 1)
-    regressors = [
-        _project_out(basis, amplitude * f(h * (phase + k)))
-        for h in range(own + 1, COMMON_HARMONICS + 1)
-        for f in (np.cos, np.sin)
-    ]
-    # Some of them vanish (harmonic n + 1 is the fringe again): the pseudo-inverse leaves them out.
-    gram = np.array([[(p * q).sum() for q in regressors] for p in regressors], np.float64)
-    moment = np.array([(p * residue).sum() for p in regressors], np.float64)
-    if not gram.any():
-        return residue
-    for weight, regressor in zip(np.linalg.pinv(gram, rcond=1e-6) @ moment, regressors, strict=True):
-        residue = residue - np.float32(weight) * regressor
-    return residue
+        residue -= common_harmonics(frames, phasor, own)
+    freedom = n - 1 - 2 * own
+    for vector in np.linalg.qr(columns(np.arange(n), n, own))[0].T.astype(np.float32):
+        # Not a matrix product: BLAS would start its threads for this little, and they get in the way of numba's.
+        residue -= vector[:, None] * np.einsum("k,kp->p", vector, residue)
+    variance = (residue**2).sum(axis=0).reshape(samples.shape[1:]).mean(axis=-1) / freedom
+    return samples.mean(axis=(0, 2)), variance, freedom * samples.shape[-1]
 
 
 def _from_inverses(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -118,18 +96,6 @@ def _from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarray, np
 def _usable(samples: np.ndarray, white: float) -> np.ndarray:
     """(rows, blocks): neither clipped at white nor at black, which would hide noise."""
     return (samples.max(axis=(0, -1)) < white) & (samples.min(axis=(0, -1)) > 0)
-
-
-def _project_out(basis: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    residue = samples.copy()
-    for vector in basis.T.astype(np.float32):
-        residue -= vector.reshape(-1, 1, 1) * _combine(vector, samples)
-    return residue
-
-
-def _combine(weights: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    # Not a matrix product: BLAS would start its threads for this little, and they get in the way of numba's.
-    return np.einsum("k,kij->ij", weights.astype(np.float32), samples)
 
 
 def _binned(levels: np.ndarray, variances: np.ndarray, freedom: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -145,57 +145,60 @@ def _order(
     layout: Layout, stack: np.ndarray, wrapped: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """What to add to the wrapped phase, in periods, and where it cannot be known."""
-    threshold = background
-    heights = [bit_heights(layout, stack, i, threshold) for i in layout.gray]
-    code = np.zeros(wrapped.shape, np.int32)
-    bit = np.zeros(wrapped.shape, np.int32)
-    least = np.full(wrapped.shape, np.inf, np.float32)
-    top, bottom = np.zeros_like(wrapped), np.zeros_like(wrapped)
-    for height in heights:
-        bit ^= height > 0  # the binary digit is the parity of all Gray bits so far
-        code = 2 * code + bit
-        np.minimum(least, np.abs(height), out=least)
-        np.maximum(top, height, out=top)
-        np.minimum(bottom, height, out=bottom)
+    code, bit, heights = _read_code(layout, stack, layout.gray, background)
+    least = np.min(np.abs(heights), axis=0)
     turns = wrapped * np.float32(1 / TWO_PI) - np.float32(layout.gray_origin_px / layout.period_px)
     whole = np.floor(turns)
     part = turns - whole  # of a period, since the code edge
     undecided = np.float32(limits.UNDECIDED_BIT) * modulation
     middle = (part >= 0.25) & (part < 0.75)
     if layout.complementary is not None:
-        last = bit_heights(layout, stack, layout.complementary, threshold)
+        last = bit_heights(layout, stack, layout.complementary, background)
         half = 2 * code + (bit ^ (last > 0))
         # Near an order's edge the half-period cell before it counts as the one after it, and the phase says which.
         order = np.where(middle, half >> 1, ((half + 1) >> 1) - (part >= 0.75))
         inconsistent = np.where(middle, least, np.abs(last)) < undecided
     else:
-        mean = np.float32(fringe_mean(layout, stack))
-        contrast = np.maximum(top / (1 - mean), -bottom / mean)
-        order = code + _misread(code, heights, part, contrast, (np.float32(0.5) - mean) * contrast)
+        ahead, behind, _ = _on_border(layout, stack, code, heights)
+        order = code + (ahead & (part < np.float32(limits.EDGE))) - (behind & (part >= np.float32(1 - limits.EDGE)))
         inner = (part >= np.float32(limits.EDGE)) & (part < np.float32(1 - limits.EDGE))
         inconsistent = inner & (least < undecided)
     return order - whole, inconsistent
 
 
-def _misread(
-    code: np.ndarray, heights: list[np.ndarray], part: np.ndarray, contrast: np.ndarray, middle: np.ndarray
-) -> np.ndarray:
-    """+1 or -1 where a plain Gray code was read from the wrong side of its edge.
+def _read_code(
+    layout: Layout, stack: np.ndarray, bits: tuple[int, ...], background: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The binary number (h, w) int32 that Gray bits name, its last digit, and the bits' heights (b, h, w)."""
+    heights = np.stack([bit_heights(layout, stack, i, background) for i in bits])
+    digits = np.logical_xor.accumulate(heights > 0)  # a binary digit is the parity of all Gray bits so far
+    places = 1 << np.arange(len(bits), dtype=np.int32)[::-1]
+    return np.tensordot(places, digits.astype(np.int32), 1), digits[-1].astype(np.int32), heights
 
-    The bit that lies near the ``middle`` of black and white tells which edge the pixel is at; the phase tells on which
-    side of it. ``contrast`` is white less black.
+
+def _on_border(
+    layout: Layout, stack: np.ndarray, code: np.ndarray, heights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where a pixel lies on the upper and on the lower border of its cell, (h, w) bool, and the least height (h, w) of
+    the bits that change at neither.
+
+    The bit that lies near the middle of black and white tells which border the pixel is at.
     """
-    lower, upper = (np.full(code.shape, np.inf, np.float32) for _ in range(2))
-    for from_least, height in enumerate(reversed(heights)):
+    top, bottom = np.maximum(heights.max(axis=0), np.float32(0)), np.minimum(heights.min(axis=0), np.float32(0))
+    mean = np.float32(fringe_mean(layout, stack))
+    contrast = np.maximum(top / (1 - mean), -bottom / mean)
+    middle = (np.float32(0.5) - mean) * contrast
+    lower, upper, least = (np.full(code.shape, np.inf, np.float32) for _ in range(3))
+    for from_least, height in enumerate(heights[::-1]):
         # From k - 1 to k the Gray bit changes whose number, from the least, is the count of trailing zeros of k; from k
         # to k + 1 that of its trailing ones.
         low_bits = code & ((2 << from_least) - 1)
-        lower = np.where(low_bits == 1 << from_least, np.abs(height - middle), lower)
-        upper = np.where(low_bits == (1 << from_least) - 1, np.abs(height - middle), upper)
+        at_lower, at_upper = low_bits == 1 << from_least, low_bits == (1 << from_least) - 1
+        lower = np.where(at_lower, np.abs(height - middle), lower)
+        upper = np.where(at_upper, np.abs(height - middle), upper)
+        least = np.where(at_lower | at_upper, least, np.minimum(least, np.abs(height)))
     weak, weaker = np.float32(limits.WEAK_BIT / 2) * contrast, np.float32(limits.WEAKER)
-    ahead = (part < np.float32(limits.EDGE)) & (upper < weak) & (upper < weaker * lower)
-    behind = (part >= np.float32(1 - limits.EDGE)) & (lower < weak) & (lower < weaker * upper)
-    return ahead.astype(np.int32) - behind.astype(np.int32)
+    return (upper < weak) & (upper < weaker * lower), (lower < weak) & (lower < weaker * upper), least
 
 
 def _cell(
@@ -203,30 +206,11 @@ def _cell(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(coordinate px, undecided): the middle of the cell that the Gray bits name, or its border where the bit that
     changes there lies near the middle of black and white. Undecided where any other bit is."""
-    bits = code_bits(layout)
-    heights = [bit_heights(layout, stack, i, background) for i in bits]
-    code, bit = (np.zeros(background.shape, np.int32) for _ in range(2))
-    for height in heights:
-        bit ^= height > 0
-        code = 2 * code + bit
-    top = np.maximum(np.max(heights, axis=0), np.float32(0))
-    bottom = np.minimum(np.min(heights, axis=0), np.float32(0))
-    mean = np.float32(fringe_mean(layout, stack))
-    contrast = np.maximum(top / (1 - mean), -bottom / mean)
-    middle = (np.float32(0.5) - mean) * contrast
-    lower, upper, least = (np.full(code.shape, np.inf, np.float32) for _ in range(3))
-    for from_least, height in enumerate(reversed(heights)):
-        low_bits = code & ((2 << from_least) - 1)
-        at_lower, at_upper = low_bits == 1 << from_least, low_bits == (1 << from_least) - 1
-        lower = np.where(at_lower, np.abs(height - middle), lower)
-        upper = np.where(at_upper, np.abs(height - middle), upper)
-        least = np.where(at_lower | at_upper, least, np.minimum(least, np.abs(height)))
-    weak, weaker = np.float32(limits.WEAK_BIT / 2) * contrast, np.float32(limits.WEAKER)
-    ahead, behind = (upper < weak) & (upper < weaker * lower), (lower < weak) & (lower < weaker * upper)
+    code, _, heights = _read_code(layout, stack, code_bits(layout), background)
+    ahead, behind, least = _on_border(layout, stack, code, heights)
     part = np.where(ahead, 1.0, np.where(behind, 0.0, 0.5))
-    return layout.gray_origin_px + code_cell_px(layout) * (code + part), least < np.float32(
-        limits.UNDECIDED_BIT
-    ) * modulation
+    undecided = least < np.float32(limits.UNDECIDED_BIT) * modulation
+    return layout.gray_origin_px + code_cell_px(layout) * (code + part), undecided
 
 
 def code_bits(layout: Layout) -> tuple[int, ...]:

@@ -206,6 +206,13 @@ class PatternSequence:
         """Indices of the axis' frames of one kind, in order."""
         return [i for i in self.select(axis) if self.frames[i].kind == kind]
 
+    def phase_shifts(self, axis: Axis) -> tuple[tuple[float, tuple[int, ...]], ...]:
+        """(period px, frame indices by step) of each phase shift of the axis, longest period first."""
+        steps = sorted(self.find("phase", axis), key=lambda i: self.frames[i].step)
+        return tuple(
+            (period, tuple(i for i in steps if self.frames[i].period_px == period)) for period in self.periods_px(axis)
+        )
+
     def _check_values(self, axis: Axis) -> None:
         if self.sign(axis) not in (1, -1):
             raise InputError(f"phase_sign is {self.sign(axis)}: use 1 or -1")

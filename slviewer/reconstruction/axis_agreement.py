@@ -68,13 +68,11 @@ class Calibration(Protocol):
 class AxisAgreement:
     """How far projector points lie from the epipolar lines of their camera pixels, px of the projector.
 
-    ``median_px`` (signed) and ``spread_px`` (1.4826 MAD); ``misfit_px``: both together, 1.4826 times the median
-    distance; ``predicted_px``: what noise and the calibration's residuals make of it (1 sigma). ``in_front``: share of
-    the points that lie before both devices; ``depths_mm``: those of these points.
+    ``misfit_px``: 1.4826 times the median distance; ``predicted_px``: what noise and the calibration's residuals make
+    of it (1 sigma). ``in_front``: share of the points that lie before both devices; ``depths_mm``: those of these
+    points.
     """
 
-    median_px: float
-    spread_px: float
     misfit_px: float
     predicted_px: float
     in_front: float
@@ -247,15 +245,12 @@ def _agreement(
     distance, normal = epipolar_distance(rig, camera, projector)
     known = np.isfinite(distance)
     if not known.any():
-        return AxisAgreement(np.nan, np.nan, np.inf, 1.0, 0.0, np.empty(0), 0)
+        return AxisAgreement(np.inf, 1.0, 0.0, np.empty(0), 0)
     d = distance[known]
     predicted = float(np.sqrt(np.median(np.sum((normal[known] * sigma[known]) ** 2, axis=1)) + residual_px**2))
-    middle = float(np.median(d))
     depths = ray_depths(rig, camera[known], projector[known])
     front = (depths > 0).all(axis=1)
     return AxisAgreement(
-        median_px=middle,
-        spread_px=1.4826 * float(np.median(np.abs(d - middle))),
         misfit_px=1.4826 * float(np.median(np.abs(d))),
         predicted_px=max(predicted, 1e-6),
         in_front=float(front.mean()),
