@@ -5,7 +5,7 @@ import numpy as np
 from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
 from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_axis
 from slviewer.fringe.kernels_spikes import spike_rules
-from slviewer.fringe.layout import Layout, Shift, axis_layout, check_stack, white_level
+from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
 from slviewer.fringe.levels import cell_misfit, code_cell_px, layout_levels, lowest_coordinate, unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap
@@ -36,17 +36,19 @@ def decode(
     clipped = white if factor == 1 else CLIPPED
     noise = measure_noise(layout, stack, clipped)
     scale = grey_scale(layout, noise, white * factor)._replace(white=clipped)
+    maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
     if not layout.shifts:
-        maps = _gray_alone(layout, stack, scale)
+        kernels_gray.decode_gray(stack, scale, _gray_rules(layout), *maps)
     elif layout.numbers_periods:
-        maps = _coded(layout, stack, scale)
+        mean = fringe_mean(layout, stack) if layout.is_plain else MIDDLE
+        kernels_coded.decode_coded(stack, shifts_of(layout), scale, code_rules(layout, mean), *maps)
     elif layout.gray:
-        maps = _cells(layout, stack, scale)
+        rules = _cell_rules(layout, fringe_mean(layout, stack))
+        kernels_cells.decode_cells(stack, shifts_of(layout), ladder_of(layout), scale, rules, *maps)
     else:
-        maps = _levels(layout, stack, scale)
-    phase, *others = maps
-    _repair_spikes(layout, phase, others[-1])
-    return complete_map(axis, layout, stack, clipped, (phase, *others), noise, factor)
+        kernels_levels.decode_levels(stack, shifts_of(layout), ladder_of(layout), scale, *maps)
+    _repair_spikes(layout, maps[0], maps[-1])
+    return complete_map(axis, layout, stack, clipped, maps, noise, factor)
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
@@ -68,87 +70,6 @@ def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
     return stack.max(axis=0)
 
 
-def _coded(layout: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
-    phase, wrapped, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(4))
-    reason = np.empty(stack.shape[1:], np.uint8)
-    rules = code_rules(layout, fringe_mean(layout, stack) if layout.is_plain else MIDDLE)
-    kernels_coded.decode_coded(
-        stack,
-        steps_of(layout.shifts[0], layout.sign, layout.offset_rad),
-        np.array(layout.gray, np.int64),
-        np.array(layout.inverse, np.int64),
-        -1 if layout.complementary is None else layout.complementary,
-        scale,
-        rules,
-        phase,
-        wrapped,
-        modulation,
-        background,
-        reason,
-    )
-    return phase, wrapped, modulation, background, reason
-
-
-def _levels(layout: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
-    maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
-    kernels_levels.decode_levels(stack, shifts_of(layout), ladder_of(layout), scale, *maps)
-    return maps
-
-
-def _cells(layout: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
-    maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
-    bits = code_bits(layout)
-    inverses = [*layout.inverse, *[-1] * (len(bits) - len(layout.inverse))]
-    rules = kernels_cells.CellRules(
-        layout.gray_origin_px,
-        code_cell_px(layout),
-        limits.WEAK_BIT,
-        limits.WEAKER,
-        fringe_mean(layout, stack),
-        limits.UNDECIDED_BIT,
-    )
-    kernels_cells.decode_cells(
-        stack,
-        shifts_of(layout),
-        ladder_of(layout),
-        np.array(bits, np.int64),
-        np.array(inverses, np.int64),
-        scale,
-        rules,
-        *maps,
-    )
-    return maps
-
-
-def _gray_alone(layout: Layout, stack: np.ndarray, scale: kernels.Scale) -> tuple[np.ndarray, ...]:
-    phase, modulation, background = (np.empty(stack.shape[1:], np.float32) for _ in range(3))
-    reason = np.empty(stack.shape[1:], np.uint8)
-    rules = kernels_gray.GrayRules(
-        layout.gray_origin_px,
-        layout.gray_cell_px,
-        -0.5,
-        layout.extent - 0.5,
-        np.sqrt(0.5 if layout.inverse else 1.5),
-        limits.GRAY_UNDECIDED_SIGMAS,
-        limits.GRAY_UNDECIDED_PART,
-        limits.DARK_BITS,
-    )
-    kernels_gray.decode_gray(
-        stack,
-        np.array(layout.gray, np.int64),
-        np.array(layout.inverse, np.int64),
-        -1 if layout.white is None else layout.white,
-        -1 if layout.black is None else layout.black,
-        scale,
-        rules,
-        phase,
-        modulation,
-        background,
-        reason,
-    )
-    return phase, np.full_like(phase, np.nan), modulation, background, reason
-
-
 def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> None:
     """Move phases that were read from the wrong side of a code edge, and mask those without support."""
     rules, lists = spike_rules(layout), kernels_spikes.allocate_lists(phase.shape)
@@ -165,52 +86,68 @@ def grey_scale(layout: Layout, noise: tuple[float, float], white: float) -> kern
 
 
 def code_rules(layout: Layout, mean: float) -> kernels_coded.CodeRules:
-    """How the Gray bits of a layout are read; ``mean`` as `threshold.fringe_mean` has it."""
+    """The Gray bits of a layout whose code numbers periods; ``mean`` as `threshold.fringe_mean` returns it."""
     return kernels_coded.CodeRules(
+        np.array(layout.gray, np.int64),
+        np.array(layout.inverse, np.int64),
+        -1 if layout.complementary is None else layout.complementary,
         layout.gray_origin_px / layout.period_px,
-        limits.EDGE,
-        limits.WEAK_BIT,
-        limits.WEAKER,
         mean,
-        limits.UNDECIDED_BIT,
     )
 
 
-def steps_of(shift: Shift, sign: int, offset_rad: float = 0.0) -> kernels.Steps:
-    """The frames of a period and the cosines and sines that they are weighed with, as the kernels read them; ``sign``
-    and ``offset_rad`` are the sequence's."""
-    n = len(shift.indices)
-    half = n // 2
-    if n % 2:  # less the first frame, steps k and n - k
-        lines = [(k, 0, 0, n - k) for k in range(1, half + 1)]
-    else:
-        lines = [(0, 0, half, 0)] + [(k, half - k, half + k, n - k) for k in range(1, (half + 1) // 2)]
-        lines += [(half // 2, 0, half + half // 2, 0)] if half % 2 == 0 else []
-    angle = 2 * np.pi * np.array([line[0] for line in lines]) / n
-    cosines, sines = np.cos(angle), sign * np.sin(angle)
-    if n % 2 == 0:
-        cosines[-1:] *= half % 2  # a quarter of a turn, exactly
-    counted = n - 1 + sum(line.count(0) for line in lines)
-    frames = np.array(shift.indices, np.int64)[np.array(lines)]
-    turn = float(np.cos(offset_rad)), float(np.sin(offset_rad))
-    return kernels.Steps(
-        frames, cosines.astype(np.float32), sines.astype(np.float32), shift.indices[0], n, counted, *turn
+def _cell_rules(layout: Layout, mean: float) -> kernels_cells.CellRules:
+    """The Gray bits of a layout whose code numbers cells of more or less than a period."""
+    bits = code_bits(layout)
+    inverses = [*layout.inverse, *[-1] * (len(bits) - len(layout.inverse))]
+    cell = code_cell_px(layout)
+    return kernels_cells.CellRules(
+        np.array(bits, np.int64), np.array(inverses, np.int64), layout.gray_origin_px, cell, mean
+    )
+
+
+def _gray_rules(layout: Layout) -> kernels_gray.GrayRules:
+    """The Gray bits of a layout without phase steps."""
+    return kernels_gray.GrayRules(
+        np.array(layout.gray, np.int64),
+        np.array(layout.inverse, np.int64),
+        -1 if layout.white is None else layout.white,
+        -1 if layout.black is None else layout.black,
+        layout.gray_origin_px,
+        layout.gray_cell_px,
+        layout.extent - 0.5,
+        np.sqrt(0.5 if layout.inverse else 1.5),
     )
 
 
 def shifts_of(layout: Layout) -> kernels.Shifts:
-    """All periods of a layout, as the kernels read them."""
-    shifts = [steps_of(shift, layout.sign, layout.offset_rad) for shift in layout.shifts]
+    """The frames of all periods of a layout, and the cosines and sines that they are weighted with."""
+    frames, angles, half_turns, counted = [], [], [], []
+    for shift in layout.shifts:
+        n = len(shift.indices)
+        half = n // 2
+        if n % 2:  # less the first frame, steps k and n - k
+            lines = [(k, 0, 0, n - k) for k in range(1, half + 1)]
+        else:
+            lines = [(0, 0, half, 0)] + [(k, half - k, half + k, n - k) for k in range(1, (half + 1) // 2)]
+            lines += [(half // 2, 0, half + half // 2, 0)] if half % 2 == 0 else []
+        frames.append(np.array(shift.indices, np.int64)[np.array(lines)])
+        angles.append(2 * np.pi * np.array([line[0] for line in lines]) / n)
+        half_turns.append(n % 4 == 0)
+        counted.append(n - 1 + sum(line.count(0) for line in lines))
+    cosines = [np.cos(angle) for angle in angles]
+    for cosine, vanishes in zip(cosines, half_turns, strict=True):
+        cosine[-1] *= not vanishes  # a quarter of a turn, exactly
     return kernels.Shifts(
-        np.concatenate([shift.frames for shift in shifts]),
-        np.concatenate([shift.cosines for shift in shifts]),
-        np.concatenate([shift.sines for shift in shifts]),
-        np.cumsum([0, *(len(shift.frames) for shift in shifts)]),
-        np.array([shift.first for shift in shifts], np.int64),
-        np.array([shift.steps for shift in shifts], np.int64),
-        np.array([shift.counted for shift in shifts], np.int64),
-        shifts[0].turn_cosine,
-        shifts[0].turn_sine,
+        np.concatenate(frames),
+        np.concatenate(cosines).astype(np.float32),
+        (layout.sign * np.sin(np.concatenate(angles))).astype(np.float32),
+        np.cumsum([0, *map(len, frames)]),
+        np.array([shift.indices[0] for shift in layout.shifts], np.int64),
+        np.array([len(shift.indices) for shift in layout.shifts], np.int64),
+        np.array(counted, np.int64),
+        float(np.cos(layout.offset_rad)),
+        float(np.sin(layout.offset_rad)),
     )
 
 
@@ -227,9 +164,3 @@ def ladder_of(layout: Layout) -> kernels_levels.Ladder:
         limits.LEVEL_MISFIT,
         cell_misfit(layout),
     )
-
-
-def waves(shift: Shift, sign: int, offset_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frame indices of a period by step, and the cosines and sines that they are weighed with."""
-    angle = 2 * np.pi * sign * np.arange(len(shift.indices)) / len(shift.indices) + offset_rad
-    return np.array(shift.indices, np.int64), np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)

@@ -6,28 +6,29 @@ import numba
 import numpy as np
 
 from slviewer.fringe.kernels import ROWS
+from slviewer.fringe.kernels_coded import UNDECIDED, WEAK, WEAKER
 from slviewer.fringe.kernels_levels import allocate_levels, levels_row, phases_row
 from slviewer.geometry.jit import kernel
 
 
 class CellRules(NamedTuple):
-    """How Gray bits are read; see `limits`, and `threshold` for ``mean``. Cells of ``cell`` px begin at ``origin``."""
+    """The frames of Gray ``bits``, most significant first, and of their ``inverses``, -1 for none. Cells of ``cell`` px
+    begin at ``origin``; ``mean``: see `threshold`."""
 
+    bits: np.ndarray
+    inverses: np.ndarray
     origin: float
     cell: float
-    weak: float
-    weaker: float
     mean: float
-    undecided: float
 
 
 @numba.njit
-def cell_row(stack, bits, inverses, row, B, A, rules, heights, cell, worst):
+def cell_row(stack, row, B, A, rules, heights, cell, worst):
     """One row's coordinates px of the cells that the bits name, or of the border that a pixel lies at; ``worst`` is
-    infinite where a bit that is not the border's is undecided, else 0. ``inverses`` are frames, or -1."""
+    infinite where a bit that is not the border's is undecided, else 0."""
+    bits, inverses = rules.bits, rules.inverses
     last = len(bits) - 1
     mean, half, nothing = np.float32(rules.mean), np.float32(0.5), np.float32(0)
-    weak, weaker = np.float32(rules.weak / 2), np.float32(rules.weaker)
     for x in range(len(cell)):
         code, bit, top, bottom = 0, 0, nothing, nothing
         for b in range(len(bits)):
@@ -51,29 +52,29 @@ def cell_row(stack, bits, inverses, row, B, A, rules, heights, cell, worst):
         for b in range(len(bits)):
             if b != last - zeros and b != last - ones:
                 least = min(least, abs(heights[b]))
-        near = weak * contrast
+        near = WEAK * contrast
         part = 0.5
-        if upper < near and upper < weaker * lower:
+        if upper < near and upper < WEAKER * lower:
             part = 1.0
-        elif lower < near and lower < weaker * upper:
+        elif lower < near and lower < WEAKER * upper:
             part = 0.0
         cell[x] = rules.origin + rules.cell * (code + part)
-        worst[x] = np.float32(np.inf) if least < np.float32(rules.undecided) * B[x] else nothing
+        worst[x] = np.float32(np.inf) if least < UNDECIDED * B[x] else nothing
 
 
 @kernel(parallel=True)
-def decode_cells(stack, shifts, ladder, bits, inverses, scale, rules, phase, wrapped, modulation, background, reason):
+def decode_cells(stack, shifts, ladder, scale, rules, phase, wrapped, modulation, background, reason):
     """One or several periods, the first of whose levels the Gray bits make absolute; fills the five (h, w) maps, of the
     finest period."""
     count, height, width = len(shifts.steps), stack.shape[1], stack.shape[2]
     for block in numba.prange((height + ROWS - 1) // ROWS):
         psi, peak, room = np.empty((count, width), np.float32), np.empty(width, stack.dtype), allocate_levels(width)
         clipped, weakest, coordinate, order, own, worst, _, _, _ = room
-        heights, cell = np.empty(len(bits), np.float32), np.empty(width, np.float32)
+        heights, cell = np.empty(len(rules.bits), np.float32), np.empty(width, np.float32)
         for row in range(block * ROWS, min((block + 1) * ROWS, height)):
             B, A = modulation[row], background[row]
             phases_row(stack, shifts, scale, row, psi, wrapped[row], B, A, peak, room)
-            cell_row(stack, bits, inverses, row, B, A, rules, heights, cell, worst)
+            cell_row(stack, row, B, A, rules, heights, cell, worst)
             levels_row(
                 psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase[row], reason[row]
             )

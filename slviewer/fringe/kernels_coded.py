@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from slviewer.fringe import limits
 from slviewer.fringe.kernels import (
     PER_TURN,
     ROWS,
@@ -14,21 +15,25 @@ from slviewer.fringe.kernels import (
     five,
     is_clipped,
     is_dark,
+    period,
     shift_row,
     verdict,
 )  # fmt: skip
 from slviewer.geometry.jit import fma, kernel
 
+EDGE, FAR_EDGE = np.float32(limits.EDGE), np.float32(1 - limits.EDGE)
+WEAK, WEAKER, UNDECIDED = np.float32(limits.WEAK_BIT / 2), np.float32(limits.WEAKER), np.float32(limits.UNDECIDED_BIT)
+
 
 class CodeRules(NamedTuple):
-    """How Gray bits are read; see `limits`, and `threshold` for ``mean``."""
+    """The frames of a Gray code, most significant bit first, and of its inverses, or none; ``complementary``: that of
+    the complementary bit, or -1. Code 0 begins ``origin_turns`` periods from phase 0; ``mean``: see `threshold`."""
 
+    gray: np.ndarray
+    inverse: np.ndarray
+    complementary: int
     origin_turns: float
-    edge: float
-    weak: float
-    weaker: float
     mean: float
-    undecided: float
 
 
 @numba.njit
@@ -131,19 +136,18 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
 
 
 @numba.njit(inline="always")
-def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak, code, room, phase, reason):
+def coded_row(stack, row, scale, rules, psi, B, A, peak, code, room, phase, reason):
     """One row's absolute phase and reason from what ``shift_row`` left; ``code`` (w,) int32 and what `five`
     gives are room."""
     width = stack.shape[2]
     least, top, bottom, lower, upper = room
-    code_row(stack, gray, inverse, row, A, code, least, top, bottom, lower, upper)
-    origin, undecided = np.float32(rules.origin_turns), np.float32(rules.undecided)
-    edge, far_edge = np.float32(rules.edge), np.float32(1 - rules.edge)
+    code_row(stack, rules.gray, rules.inverse, row, A, code, least, top, bottom, lower, upper)
+    origin = np.float32(rules.origin_turns)
     per_mean, per_rest = np.float32(1 / rules.mean), np.float32(1 / (1 - rules.mean))
-    off_middle, weak, weaker = np.float32(0.5 - rules.mean), np.float32(rules.weak / 2), np.float32(rules.weaker)
+    off_middle = np.float32(0.5 - rules.mean)
     none, quarter = np.float32(np.nan), np.float32(0.25)
-    if complementary >= 0:
-        extra = stack[complementary, row]
+    if rules.complementary >= 0:
+        extra = stack[rules.complementary, row]
         for x in range(width):
             turns = psi[x] * PER_TURN - origin
             whole = np.floor(turns)
@@ -153,7 +157,7 @@ def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A,
             middle = (part >= quarter) & (part < np.float32(0.75))
             beside = np.int32(np.int32(np.int32(cell + 1) >> 1) - np.int32(part >= np.float32(0.75)))
             order = np.int32(cell >> 1) if middle else beside
-            unclear = (least[x] if middle else abs(last)) < undecided * B[x]
+            unclear = (least[x] if middle else abs(last)) < UNDECIDED * B[x]
             dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
             reason[x] = verdict(dark, clipped, unclear)
             periods = np.float32(order) - whole
@@ -164,14 +168,14 @@ def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A,
             turns = psi[x] * PER_TURN - origin
             whole = np.floor(turns)
             part = turns - whole
-            unclear = (least[x] < undecided * B[x]) & (part >= edge) & (part < far_edge)
+            unclear = (least[x] < UNDECIDED * B[x]) & (part >= EDGE) & (part < FAR_EDGE)
             dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
             reason[x] = verdict(dark, clipped, unclear)
             # On a blurred edge the bit nearest the middle and the phase may disagree about the side: the phase decides.
             contrast = max(top[x] * per_rest, np.float32(0) - bottom[x] * per_mean)
             below, above = abs(lower[x] - off_middle * contrast), abs(upper[x] - off_middle * contrast)
-            ahead = (part < edge) & (above < weak * contrast) & (above < weaker * below)
-            behind = (part >= far_edge) & (below < weak * contrast) & (below < weaker * above)
+            ahead = (part < EDGE) & (above < WEAK * contrast) & (above < WEAKER * below)
+            behind = (part >= FAR_EDGE) & (below < WEAK * contrast) & (below < WEAKER * above)
             periods = np.float32(code[x]) - whole
             periods += np.float32(1) if ahead else np.float32(0)
             periods -= np.float32(1) if behind else np.float32(0)
@@ -180,28 +184,22 @@ def coded_row(stack, gray, inverse, complementary, row, scale, rules, psi, B, A,
 
 
 @kernel()
-def coded_rows(
-    stack, shift, gray, inverse, complementary, scale, rules, first, phase, wrapped, modulation, background, reason
-):
+def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, background, reason):
     """`decode_coded` of some rows from ``first`` on: the five maps hold only those.
 
     A function of its own, which decoding and the pass to points share: it takes the compiler ten seconds.
     """
-    width = stack.shape[2]
+    width, steps = stack.shape[2], period(shifts, 0)
     peak, code, room = np.empty(width, stack.dtype), np.empty(width, np.int32), five(width)
     for i in range(len(phase)):
         row, psi, B, A = first + i, wrapped[i], modulation[i], background[i]
-        shift_row(stack, shift, row, psi, B, A, peak)
-        coded_row(
-            stack, gray, inverse, complementary, row, scale, rules, psi, B, A, peak, code, room, phase[i], reason[i]
-        )
+        shift_row(stack, steps, row, psi, B, A, peak)
+        coded_row(stack, row, scale, rules, psi, B, A, peak, code, room, phase[i], reason[i])
 
 
 @kernel(parallel=True)
-def decode_coded(
-    stack, shift, gray, inverse, complementary, scale, rules, phase, wrapped, modulation, background, reason
-):
-    """Phase shift with a plain (``complementary`` < 0) or complementary Gray code; fills the five (h, w) maps.
+def decode_coded(stack, shifts, scale, rules, phase, wrapped, modulation, background, reason):
+    """Phase shift of one period with a plain or complementary Gray code; fills the five (h, w) maps.
 
     ``phase`` is NaN where ``reason`` is not VALID, here as in the other kernels.
     """
@@ -209,6 +207,5 @@ def decode_coded(
     for block in numba.prange((height + ROWS - 1) // ROWS):
         a, b = block * ROWS, min((block + 1) * ROWS, height)
         coded_rows(
-            stack, shift, gray, inverse, complementary, scale, rules, a,
-            phase[a:b], wrapped[a:b], modulation[a:b], background[a:b], reason[a:b],
-        )  # fmt: skip
+            stack, shifts, scale, rules, a, phase[a:b], wrapped[a:b], modulation[a:b], background[a:b], reason[a:b]
+        )

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from slviewer.fringe import limits
 from slviewer.fringe.kernels import bit_height, is_dark, verdict
 from slviewer.geometry.jit import kernel
 
@@ -12,22 +13,24 @@ TWO_PI = 2 * np.pi
 
 
 class GrayRules(NamedTuple):
-    """How bits without a phase are read; see `limits`. Cells of ``cell`` px begin at ``origin``, and the projector
-    reaches from ``low`` to ``high``. ``sigma_part``: noise of a bit over that of a grey level."""
+    """The frames of a Gray code, most significant bit first, of its inverses, or none, and ``white`` and ``black``, or
+    -1. Cells of ``cell`` px begin at ``origin``; the projector ends at ``high`` px. ``sigma_part``: noise of a bit over
+    that of a grey level."""
 
+    gray: np.ndarray
+    inverse: np.ndarray
+    white: int
+    black: int
     origin: float
     cell: float
-    low: float
     high: float
     sigma_part: float
-    undecided_sigmas: float
-    undecided_part: float
-    dark_bits: int
 
 
 @kernel(parallel=True)
-def decode_gray(stack, gray, inverse, white, black, scale, rules, phase, modulation, background, reason):
-    """Projector column or row from Gray bits; ``white`` and ``black`` are frames, or -1. Fills the four (h, w) maps."""
+def decode_gray(stack, scale, rules, phase, wrapped, modulation, background, reason):
+    """Projector column or row from Gray bits alone; fills the five (h, w) maps, ``wrapped`` with NaN."""
+    gray, inverse, white, black = rules.gray, rules.inverse, rules.white, rules.black
     _, height, width = stack.shape
     per_px = TWO_PI / rules.cell
     for row in numba.prange(height):
@@ -44,7 +47,7 @@ def decode_gray(stack, gray, inverse, white, black, scale, rules, phase, modulat
                 B *= np.float32(0.5 / len(gray))
                 A *= np.float32(0.5 / len(gray))
             sigma = np.sqrt(np.float32(scale.noise_a) + np.float32(scale.noise_b) * A) * np.float32(rules.sigma_part)
-            limit = max(np.float32(rules.undecided_sigmas) * sigma, np.float32(rules.undecided_part) * B)
+            limit = max(np.float32(limits.GRAY_UNDECIDED_SIGMAS) * sigma, np.float32(limits.GRAY_UNDECIDED_PART) * B)
             code, other, bit, flipped, doubts = 0, 0, 0, 0, 0
             for b in range(len(gray)):
                 bit_above = bit_height(stack, gray, inverse, b, row, x, A)
@@ -54,13 +57,13 @@ def decode_gray(stack, gray, inverse, white, black, scale, rules, phase, modulat
                 code, other = 2 * code + bit, 2 * other + flipped
                 doubts += doubt
             unclear = doubts > 1 or abs(code - other) > 1
-            modulation[row, x], background[row, x] = B, A
-            dark = (doubts >= rules.dark_bits) | is_dark(B, A, scale)
+            modulation[row, x], background[row, x], wrapped[row, x] = B, A, np.float32(np.nan)
+            dark = (doubts >= limits.DARK_BITS) | is_dark(B, A, scale)
             reason[row, x] = verdict(dark, False, unclear)
             start, end = (
                 rules.origin + rules.cell * min(code, other),
                 rules.origin + rules.cell * (max(code, other) + 1),
             )
-            first, last = max(start, rules.low), min(end, rules.high)
+            first, last = max(start, -0.5), min(end, rules.high)
             centre = 0.5 * (first + last if first < last else start + end)
             phase[row, x] = np.float32(np.nan) if dark | unclear else np.float32(per_px * centre)

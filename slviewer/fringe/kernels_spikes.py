@@ -21,12 +21,15 @@ INCONSISTENT, OUTSIDE, UNCHANGED = np.uint8(Reason.INCONSISTENT), np.uint8(Reaso
 UP, DOWN = np.uint8(1), np.uint8(2)
 TURN, PER_TURN = np.float32(2 * math.pi), np.float32(0.5 / math.pi)
 HALF, ONE, INVALID = np.float32(0.5), np.float32(1), np.float32(math.nan)
+EDGE, FAR_EDGE, WHOLE = np.float32(limits.EDGE), np.float32(1 - limits.EDGE), np.float32(limits.WHOLE_PERIOD)
+WINDOW, MAJORITY, NEIGHBOURS = limits.WINDOW, limits.SPIKE_MAJORITY, limits.SPIKE_NEIGHBOURS
+LONELY, LONELY_NEIGHBOURS = limits.LONELY, limits.LONELY_NEIGHBOURS
 RUN = 32
 """Pixels that are passed over together where none is suspect."""
 
 
 class SpikeRules(NamedTuple):
-    """How a neighbourhood decides about a pixel; see `limits`.
+    """What of a layout the neighbourhood's decision about a pixel needs; thresholds are those of `limits`.
 
     ``cell_rad``: the phase by which neighbours differ that count as a cell apart; ``is_plain``: the order comes from a
     plain Gray code, whose edges lie at ``origin_rad``; ``low_rad`` and ``high_rad``: phases of the projector's borders,
@@ -39,13 +42,6 @@ class SpikeRules(NamedTuple):
     low_rad: float
     high_rad: float
     repeat: float
-    edge: float = limits.EDGE
-    window: int = limits.WINDOW
-    majority: float = limits.SPIKE_MAJORITY
-    neighbours: int = limits.SPIKE_NEIGHBOURS
-    whole: float = limits.WHOLE_PERIOD
-    lonely: float = limits.LONELY
-    lonely_neighbours: int = limits.LONELY_NEIGHBOURS
 
 
 def spike_rules(layout: Layout) -> SpikeRules:
@@ -82,17 +78,17 @@ def is_suspect(phase, row, x, per_cell):
 def count_votes(phase, row, x, rules):
     """(valid, agreeing, a cell above, a cell below): numbers of the neighbours in the window."""
     height, width = phase.shape
-    per_cell, nearly, own = np.float32(1 / rules.cell_rad), np.float32(rules.whole), phase[row, x]
+    per_cell, own = np.float32(1 / rules.cell_rad), phase[row, x]
     valid, agreeing, above, below = -1, -1, 0, 0  # the pixel itself is valid, and agrees
-    for v in range(max(0, row - rules.window), min(height, row + rules.window + 1)):
-        for u in range(max(0, x - rules.window), min(width, x + rules.window + 1)):
+    for v in range(max(0, row - WINDOW), min(height, row + WINDOW + 1)):
+        for u in range(max(0, x - WINDOW), min(width, x + WINDOW + 1)):
             cells = (phase[v, u] - own) * per_cell
             if rules.repeat < math.inf:
                 cells -= np.float32(rules.repeat) * np.float32(round(cells * np.float32(1 / rules.repeat)))
             valid += cells == cells  # not NaN
             agreeing += abs(cells) <= HALF
-            above += abs(cells - ONE) < nearly
-            below += abs(cells + ONE) < nearly
+            above += abs(cells - ONE) < WHOLE
+            below += abs(cells + ONE) < WHOLE
     return valid, agreeing, above, below
 
 
@@ -101,14 +97,14 @@ def period_change(phase, row, x, rules):
     """UP or DOWN where a clear majority of the neighbours is one period above or below a pixel at a code edge."""
     part = (phase[row, x] - np.float32(rules.origin_rad)) * PER_TURN
     part = part - np.float32(math.floor(part))
-    if part >= np.float32(rules.edge) and part < np.float32(1 - rules.edge):
+    if part >= EDGE and part < FAR_EDGE:
         return UNCHANGED
     valid, _, above, below = count_votes(phase, row, x, rules)
-    if valid < rules.neighbours:
+    if valid < NEIGHBOURS:
         return UNCHANGED
-    if above >= rules.majority * valid:
+    if above >= MAJORITY * valid:
         return UP
-    return DOWN if below >= rules.majority * valid else UNCHANGED
+    return DOWN if below >= MAJORITY * valid else UNCHANGED
 
 
 @numba.njit
@@ -116,7 +112,7 @@ def masking_reason(phase, row, x, suspect, rules):
     """The reason to mask a pixel, or UNCHANGED; neighbours vote only where one is ``suspect``."""
     if suspect:
         valid, agreeing, _, _ = count_votes(phase, row, x, rules)
-        if valid < rules.lonely_neighbours or agreeing < rules.lonely * valid:
+        if valid < LONELY_NEIGHBOURS or agreeing < LONELY * valid:
             return INCONSISTENT
     is_outside = phase[row, x] < np.float32(rules.low_rad) or phase[row, x] > np.float32(rules.high_rad)
     return OUTSIDE if is_outside else UNCHANGED

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from slviewer.fringe import limits
 from slviewer.fringe.kernels_spikes import SpikeRules, spike_rules
 from slviewer.fringe.layout import Layout
 from slviewer.fringe.phase import Reason
@@ -22,13 +23,13 @@ def settle(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.nd
         v, u, votes = _count_votes(phase, rules)
         part = (phase[v, u] - np.float32(rules.origin_rad)) * np.float32(1 / TWO_PI)
         part -= np.floor(part)
-        at_edge = (part < np.float32(rules.edge)) | (part >= np.float32(1 - rules.edge))
-        enough = at_edge & (votes["valid"] >= rules.neighbours)
+        at_edge = (part < np.float32(limits.EDGE)) | (part >= np.float32(1 - limits.EDGE))
+        enough = at_edge & (votes["valid"] >= limits.SPIKE_NEIGHBOURS)
         for word, shift in (("above", 1), ("below", -1)):
-            move = enough & (votes[word] >= rules.majority * votes["valid"])
+            move = enough & (votes[word] >= limits.SPIKE_MAJORITY * votes["valid"])
             phase[v[move], u[move]] += np.float32(shift * TWO_PI)
     v, u, votes = _count_votes(phase, rules)
-    lonely = (votes["valid"] < rules.lonely_neighbours) | (votes["agree"] < rules.lonely * votes["valid"])
+    lonely = (votes["valid"] < limits.LONELY_NEIGHBOURS) | (votes["agree"] < limits.LONELY * votes["valid"])
     reason[v[lonely], u[lonely]] = Reason.INCONSISTENT
     with np.errstate(invalid="ignore"):
         reason[(reason == Reason.VALID) & ((phase < rules.low_rad) | (phase > rules.high_rad))] = Reason.OUTSIDE
@@ -41,7 +42,7 @@ def _count_votes(phase: np.ndarray, rules: SpikeRules) -> tuple[np.ndarray, np.n
     ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``. The phase is
     known modulo ``rules.repeat`` cells.
     """
-    margin, repeat = rules.window, rules.repeat
+    margin, repeat = limits.WINDOW, rules.repeat
     padded = np.pad(phase, margin, constant_values=np.nan)
     per_cell = np.float32(1 / rules.cell_rad)
     centre = padded[margin:-margin, margin:-margin]
@@ -59,7 +60,7 @@ def _count_votes(phase: np.ndarray, rules: SpikeRules) -> tuple[np.ndarray, np.n
             if np.isfinite(repeat):
                 cells -= np.float32(repeat) * np.rint(cells * np.float32(1 / repeat))
             nearest = np.rint(cells)
-            whole = np.abs(cells - nearest) < np.float32(rules.whole)
+            whole = np.abs(cells - nearest) < np.float32(limits.WHOLE_PERIOD)
             votes["valid"] += np.isfinite(cells)
             votes["agree"] += nearest == 0
             votes["above"] += whole & (nearest == 1)

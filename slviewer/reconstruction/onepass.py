@@ -8,7 +8,7 @@ from slviewer.calibration.pixelwise import MAX_EXTRAPOLATION, PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.fringe import kernels_spikes as spikes
-from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of, waves
+from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of
 from slviewer.fringe.kernels import Shifts
 from slviewer.fringe.kernels_levels import Ladder
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, clip_level, white_level
@@ -58,14 +58,16 @@ class PassResult:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What a device is made ready for: frames of a camera, what they mean, and how depth comes of their phase."""
+    """What a device is made ready for: the ``shape`` (h, w) of a camera's frames, their layout, all ``frames`` that the
+    axis is decoded from, whether the texture is the background of the fringes (``is_shaded``), and the calibration."""
 
     shape: tuple[int, int]
     axis: Axis
     layout: Layout
-    order: kernels.Order
+    frames: tuple[int, ...]
     ladder: Ladder
     depths: kernels.Depths | StereoRig
+    is_shaded: bool
 
 
 @dataclass(eq=False)
@@ -80,7 +82,7 @@ class OnePass:
     model: PixelwiseModel | SplinedModel
     axis: Axis
     _layout: Layout = field(init=False, repr=False)
-    _order: kernels.Order = field(init=False, repr=False)
+    _texture: int = field(init=False, repr=False)
     _shifts: Shifts = field(init=False, repr=False)
     _ladder: Ladder = field(init=False, repr=False)
     _depths: kernels.Depths = field(init=False, repr=False)
@@ -98,7 +100,7 @@ class OnePass:
             raise InputError(
                 f"A {self.model.name} calibration measures no cloud in one pass: use the pixelwise or the splined one."
             )
-        self._order = _order(self.sequence, self._layout)
+        self._texture = texture_frame(self.sequence)
         self._shifts = shifts_of(self._layout)
         self._ladder = ladder_of(self._layout)
         self._lists = spikes.allocate_lists(self.shape)
@@ -134,13 +136,14 @@ class OnePass:
         peaks = np.zeros(-(-self.shape[0] // kernels.ROWS) if deep else 0, np.int32)
         kernels.sweep(
             frames,
-            self._order,
             self._shifts,
             self._ladder,
             code_rules(self._layout, scan.light.mean),
             grey_scale(self._layout, scan.light.noise, scan.light.white),
             self._depths,
             _maps(scan),
+            self._texture,
+            np.array(self.sequence.select(self.axis)),
             peaks,
         )
         # a camera may turn out to have more bits than it seemed
@@ -206,22 +209,10 @@ def _maps(scan: PassResult) -> kernels.Maps:
     return kernels.Maps(scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture)
 
 
-def _order(sequence: PatternSequence, layout: Layout) -> kernels.Order:
-    turned = [waves(shift, layout.sign, layout.offset_rad) for shift in layout.shifts]
-    frames, cosines, sines = (np.concatenate(parts) for parts in zip(*turned, strict=True))
-    read = {*frames.tolist(), *layout.gray, *layout.inverse}
+def texture_frame(sequence: PatternSequence) -> int:
+    """The frame that shows the scene under white light, or -1."""
     kinds = [frame.kind for frame in sequence.frames]
-    return kernels.Order(
-        frames,
-        np.cumsum([0, *(len(shift.indices) for shift in layout.shifts)]),
-        cosines,
-        sines,
-        np.array(layout.gray, np.int64),
-        np.array(layout.inverse, np.int64),
-        -1 if layout.complementary is None else layout.complementary,
-        next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), -1),
-        np.array([i for i in sequence.select(layout.axis) if i not in read], np.int64),
-    )
+    return next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), -1)
 
 
 def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.Depths:

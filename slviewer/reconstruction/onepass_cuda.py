@@ -13,7 +13,7 @@ from slviewer.fringe.decode import decode, ladder_of, texture
 from slviewer.fringe.layout import clip_level
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry import cuda_device
-from slviewer.reconstruction.onepass import Job, LightLevels, OnePass, PassResult, _order, one_pass_layout
+from slviewer.reconstruction.onepass import Job, LightLevels, OnePass, PassResult, one_pass_layout, texture_frame
 
 if TYPE_CHECKING:  # it imports CUDA
     from slviewer.reconstruction.onepass_cuda_card import Card
@@ -53,7 +53,7 @@ class CudaPass(OnePass):
             self._layout = one_pass_layout(self.sequence, self.axis)
             if self.axis not in self.model.axes:
                 raise InputError(f"The stereo calibration has no axis {self.axis}: choose another axis.")
-            self._order, self._ladder = _order(self.sequence, self._layout), ladder_of(self._layout)
+            self._texture, self._ladder = texture_frame(self.sequence), ladder_of(self._layout)
         else:
             super().__post_init__()
 
@@ -104,8 +104,8 @@ class CudaPass(OnePass):
         card.sweep(scan.light)
         if repaired:
             card.repair_spikes()
-        if self._order.texture >= 0:  # the device has no use for it
-            np.copyto(scan.texture, frames[self._order.texture])
+        if self._texture >= 0:  # the device has no use for it
+            np.copyto(scan.texture, frames[self._texture])
         highest = card.fetch(scan)
         if clip_level(frames.dtype, highest) > scan.light.white:  # a camera of more bits than it seemed
             return self._on_card(frames, replace(scan, light=self.light(frames)), repaired)
@@ -113,7 +113,8 @@ class CudaPass(OnePass):
 
     def _job(self) -> Job:
         depths = self.model.rig if isinstance(self.model, StereoModel) else self._depths
-        return Job(self.shape, self.axis, self._layout, self._order, self._ladder, depths)
+        frames = tuple(self.sequence.select(self.axis))
+        return Job(self.shape, self.axis, self._layout, frames, self._ladder, depths, self._texture < 0)
 
     def _defined(self, frames: np.ndarray, scan: PassResult) -> PassResult:
         """A stereo calibration's scan by the processor."""

@@ -14,7 +14,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import MARGIN, ray_depth
 from slviewer.reconstruction.onepass import Job, LightLevels, PassResult
 from slviewer.reconstruction.onepass_cuda_spikes import spike_kernels
-from slviewer.reconstruction.onepass_cuda_sweep import SweepPlan, sweep_kernel
+from slviewer.reconstruction.onepass_cuda_sweep import frame_slots, sweep_kernel
 from slviewer.reconstruction.pixel_depths import INVALID, pixelwise_point, splined_point
 
 THREADS = 256
@@ -28,17 +28,15 @@ class Card:
     """
 
     def __init__(self, job: Job, dtype: np.dtype) -> None:
-        found, order = job.layout, job.order
-        pixels, deep = job.shape[0] * job.shape[1], dtype == np.uint16
-        self.dtype, self._dark_sigmas = dtype, dark_sigmas(found)
-        slots = [*order.frames.tolist(), *found.gray, *found.inverse]
-        slots += [] if found.complementary is None else [found.complementary]
-        slots += order.others.tolist() if deep else []
+        layout, deep = job.layout, dtype == np.uint16
+        pixels = job.shape[0] * job.shape[1]
+        self.dtype, self._dark_sigmas = dtype, dark_sigmas(layout)
+        slots = frame_slots(layout)
+        slots += [i for i in job.frames if i not in slots] if deep else []
         measure, c, extra = _depths(job)
-        rules = spike_rules(found)
-        self._is_plain, self._shaded = rules.is_plain, order.texture < 0
-        others = len(order.others) if deep else 0
-        self._sweep = sweep_kernel(_plan(job, others), pixels, measure, deep, self._shaded)
+        rules = spike_rules(layout)
+        self._is_plain, self._shaded = rules.is_plain, job.is_shaded
+        self._sweep = sweep_kernel(job, len(slots), measure, deep)
         self._spikes = spike_kernels(rules, job.shape, measure)
 
         self.stream = cuda.stream()
@@ -104,28 +102,6 @@ class Card:
             there.copy_to_host(here.reshape(there.shape), stream=self.stream)
         self.stream.synchronize()
         return int(highest[0])
-
-
-def _plan(job: Job, others: int) -> SweepPlan:
-    found, order, ladder = job.layout, job.order, job.ladder
-    return SweepPlan(
-        tuple(int(start) for start in order.starts),
-        order.cosines,
-        order.sines,
-        len(found.gray),
-        len(found.inverse),
-        int(found.complementary is not None),
-        others,
-        found.gray_origin_px / found.period_px,
-        limits.EDGE,
-        limits.WEAK_BIT,
-        limits.WEAKER,
-        limits.UNDECIDED_BIT,
-        ladder.weights,
-        ladder.periods,
-        ladder.low,
-        ladder.misfit,
-    )
 
 
 def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:

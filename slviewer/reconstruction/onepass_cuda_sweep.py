@@ -8,59 +8,42 @@ absolute phase. Imported only where there is a device.
 import math
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from slviewer.fringe.phase import Reason
+from slviewer.fringe.kernels import DARK, INCONSISTENT, PER_TURN, SATURATED, VALID
+from slviewer.fringe.kernels_coded import EDGE, FAR_EDGE, UNDECIDED, WEAK, WEAKER
+from slviewer.fringe.layout import Layout
+from slviewer.reconstruction.onepass import Job
 
 cuda: Any = import_module("numba.cuda")  # its own annotations are not those of what a kernel may call
 
-VALID, DARK, SATURATED, INCONSISTENT = (
-    np.uint8(r) for r in (Reason.VALID, Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT)
-)
 TWO_PI = 2 * math.pi
-PER_TURN = np.float32(1 / TWO_PI)
 ZERO, HALF, ONE, NONE, ENDLESS = (np.float32(number) for number in (0, 0.5, 1, math.nan, math.inf))
-NEAR_EDGE, FAR_EDGE = np.float32(0.25), np.float32(0.75)
+QUARTER, THREE_QUARTERS = np.float32(0.25), np.float32(0.75)
 
 NOISE_A, NOISE_B, DARK_LEVELS, DARK_SIGMAS, WHITE, MEAN = range(6)
 """What a light is, float32: see `fringe.kernels.Scale`, and `threshold` for the mean."""
 
 
-class SweepPlan(NamedTuple):
-    """What of a sequence a kernel is compiled for. Frames lie one after the other: phase steps, longest period first,
-    period i from ``starts[i]`` on; Gray bits; their inverses; the complementary bit; those that only tell how bright
-    the camera's white is."""
-
-    starts: tuple[int, ...]
-    cosines: np.ndarray
-    sines: np.ndarray
-    bits: int
-    inverses: int
-    complementary: int
-    others: int
-    origin_turns: float
-    edge: float
-    weak: float
-    weaker: float
-    undecided: float
-    weights: np.ndarray
-    periods: np.ndarray
-    low: float
-    misfit: float
+def frame_slots(layout: Layout) -> list[int]:
+    """The frames that are decoded, in the order in which the kernel reads them: phase steps, longest period first; Gray
+    bits; their inverses; the complementary bit."""
+    steps = [i for shift in layout.shifts for i in shift.indices]
+    return [*steps, *layout.gray, *layout.inverse, *([] if layout.complementary is None else [layout.complementary])]
 
 
-def sweep_kernel(plan: SweepPlan, pixels: int, measure: Callable[..., Any], deep: bool, shaded: bool) -> Any:
-    """The kernel for one plan and one of `onepass_cuda_depths`.
+def sweep_kernel(job: Job, slots: int, measure: Callable[..., Any], deep: bool) -> Any:
+    """The kernel for one job and one of `onepass_cuda_card`'s ways to measure depth.
 
-    ``deep``: the largest grey level is sought, as uint16 frames need. ``shaded``: texture is the fringes' background.
-    It takes frames of n ``pixels``, (slots n,), the light, the two arrays of ``measure`` and what it writes: maps (n,),
-    points (n, 3), and the largest grey level (1,) int32.
+    ``slots``: frames on the device, those of `frame_slots` first. ``deep``: the largest grey level of all is needed,
+    as of uint16 frames. It takes frames of n pixels, (slots n,), the light, the two arrays of ``measure`` and what it
+    writes: maps (n,), points (n, 3), and the largest grey level (1,) int32.
     """
-    decode = _coded(plan, pixels) if plan.bits else _levels(plan, pixels)
-    count = plan.starts[-1] + plan.bits + plan.inverses + plan.complementary + plan.others
-    per_step = np.float32(2.0 / (plan.starts[-1] - plan.starts[-2]))
+    pixels, shaded = job.shape[0] * job.shape[1], job.is_shaded
+    decode = _coded(job.layout, pixels) if job.layout.gray else _levels(job, pixels)
+    per_step = np.float32(2.0 / job.layout.steps)
     least, stride = np.float32(1e-6), np.uint64(pixels)
 
     @cuda.jit
@@ -72,7 +55,7 @@ def sweep_kernel(plan: SweepPlan, pixels: int, measure: Callable[..., Any], deep
         if deep:
             brightest = np.int32(0)
             at = i
-            for _ in range(count):
+            for _ in range(slots):
                 brightest = max(brightest, np.int32(stack[at]))
                 at = at + stride
             if brightest > highest[0]:  # perhaps an old value; the next line settles it
@@ -95,9 +78,15 @@ def sweep_kernel(plan: SweepPlan, pixels: int, measure: Callable[..., Any], deep
     return sweep
 
 
-def _shift(plan: SweepPlan, pixels: int) -> Any:
+def _steps(layout: Layout) -> list[tuple[int, ...]]:
+    return [shift.indices for shift in layout.shifts]
+
+
+def _shift(layout: Layout, pixels: int) -> Any:
     """Device function: wrapped phase, modulation, background and largest sample of the period in some frames."""
-    cosines, sines, stride = plan.cosines.astype(np.float32), plan.sines.astype(np.float32), np.uint64(pixels)
+    angles = np.concatenate([TWO_PI * layout.sign * np.arange(n) / n for n in map(len, _steps(layout))])
+    cosines, sines = (f(angles + layout.offset_rad).astype(np.float32) for f in (np.cos, np.sin))
+    stride = np.uint64(pixels)
 
     @cuda.jit(device=True)
     def shift(stack, i, first, last):
@@ -132,15 +121,13 @@ def _verdict(B, A, clipped, inconsistent, light):
     return INCONSISTENT if inconsistent else VALID
 
 
-def _coded(plan: SweepPlan, pixels: int) -> Any:
+def _coded(layout: Layout, pixels: int) -> Any:
     """Device function: (absolute phase, reason, modulation, background) of a pixel by Gray code."""
-    shift = _shift(plan, pixels)
-    steps, bits, inverses, complementary = plan.starts[-1], plan.bits, plan.inverses > 0, plan.complementary > 0
+    shift = _shift(layout, pixels)
+    steps, bits, inverses, complementary = layout.steps, len(layout.gray), bool(layout.inverse), not layout.is_plain
     stride, code_from, inverse_from = (np.uint64(number) for number in (pixels, steps, steps + bits))
-    extra_at = np.uint64(steps + bits + plan.inverses)
-    origin, undecided = np.float32(plan.origin_turns), np.float32(plan.undecided)
-    edge, far_edge = np.float32(plan.edge), np.float32(1 - plan.edge)
-    half_weak, weaker = np.float32(plan.weak / 2), np.float32(plan.weaker)
+    extra_at = np.uint64(steps + bits + len(layout.inverse))
+    origin = np.float32(layout.gray_origin_px / layout.period_px)
 
     @cuda.jit(device=True)
     def height_of(stack, i, bit, threshold):
@@ -164,10 +151,10 @@ def _coded(plan: SweepPlan, pixels: int) -> Any:
             lower = abs(height_of(stack, i, bits - 1 - zeros, threshold) - middle)
         if ones < bits:
             upper = abs(height_of(stack, i, bits - 1 - ones, threshold) - middle)
-        weak = half_weak * contrast
+        weak = WEAK * contrast
         if part < HALF:
-            return 1 if upper < weak and upper < weaker * lower else 0
-        return -1 if lower < weak and lower < weaker * upper else 0
+            return 1 if upper < weak and upper < WEAKER * lower else 0
+        return -1 if lower < weak and lower < WEAKER * upper else 0
 
     @cuda.jit(device=True)
     def decode(stack, i, light):
@@ -187,13 +174,13 @@ def _coded(plan: SweepPlan, pixels: int) -> Any:
         if complementary:
             last = np.float32(stack[extra_at * stride + i]) - A
             half = 2 * code + (digit ^ (1 if last > ZERO else 0))
-            middle = NEAR_EDGE <= part < FAR_EDGE
-            order = half >> 1 if middle else ((half + 1) >> 1) - (1 if part >= FAR_EDGE else 0)
-            unclear = (least if middle else abs(last)) < undecided * B
+            middle = QUARTER <= part < THREE_QUARTERS
+            order = half >> 1 if middle else ((half + 1) >> 1) - (1 if part >= THREE_QUARTERS else 0)
+            unclear = (least if middle else abs(last)) < UNDECIDED * B
         else:
-            beside = part < edge or part >= far_edge
+            beside = part < EDGE or part >= FAR_EDGE
             order = code
-            unclear = not beside and least < undecided * B
+            unclear = not beside and least < UNDECIDED * B
             if beside:
                 order = code + misread(stack, i, A, top, bottom, code, part, light[MEAN])
         clipped = peak >= light[WHITE] and light[WHITE] <= A + B
@@ -204,14 +191,14 @@ def _coded(plan: SweepPlan, pixels: int) -> Any:
     return decode
 
 
-def _levels(plan: SweepPlan, pixels: int) -> Any:
+def _levels(job: Job, pixels: int) -> Any:
     """Device function: (absolute phase, reason, modulation, background) of a pixel by several periods."""
-    shift = _shift(plan, pixels)
-    count, levels = len(plan.starts) - 1, len(plan.periods)
-    starts = np.array(plan.starts, np.int32)
-    weights, periods = plan.weights.astype(np.float64), plan.periods.astype(np.float64)
+    shift, ladder = _shift(job.layout, pixels), job.ladder
+    count, levels = len(job.layout.shifts), len(ladder.periods)
+    starts = np.cumsum([0, *map(len, _steps(job.layout))]).astype(np.int32)
+    weights, periods = ladder.weights, ladder.periods
     per_px, per_rad = 1.0 / periods, periods / TWO_PI
-    low, misfit = float(plan.low), float(plan.misfit)
+    low, misfit = float(ladder.low), float(ladder.misfit)
 
     @cuda.jit(device=True)
     def decode(stack, i, light):

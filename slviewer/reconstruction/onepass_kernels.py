@@ -10,28 +10,13 @@ import numba
 import numpy as np
 
 from slviewer.calibration.splined.correction_grid import add_corrections, locate_layers
-from slviewer.fringe.kernels import ROWS, period
+from slviewer.fringe.kernels import ROWS
 from slviewer.fringe.kernels_coded import coded_rows
 from slviewer.fringe.kernels_levels import levels_rows
 from slviewer.fringe.kernels_spikes import INVALID, TURN, UP
 from slviewer.geometry.jit import fma, kernel
 from slviewer.geometry.rays import fill_points
 from slviewer.reconstruction.pixel_depths import pixelwise_point, splined_point
-
-
-class Order(NamedTuple):
-    """Which frames mean what. ``frames`` by period, longest first, and step; period i is those from ``starts[i]``.
-    ``others``: frames that only tell how bright the camera's white is."""
-
-    frames: np.ndarray
-    starts: np.ndarray
-    cosines: np.ndarray
-    sines: np.ndarray
-    gray: np.ndarray
-    inverse: np.ndarray
-    complementary: int
-    texture: int
-    others: np.ndarray
 
 
 class Depths(NamedTuple):
@@ -64,9 +49,10 @@ class Maps(NamedTuple):
 
 
 @kernel(parallel=True)
-def sweep(stack, order, shifts, ladder, rules, scale, depths, maps, peaks):
-    """Fill ``maps`` from the frames (n, h, w); ``peaks`` (blocks of rows,) int32 with the largest grey levels, where it
-    is not empty.
+def sweep(stack, shifts, ladder, rules, scale, depths, maps, texture, frames, peaks):
+    """Fill ``maps`` from the stack (n, h, w), whose frame ``texture`` shows the scene under white light, -1 for none.
+
+    ``peaks`` (blocks of rows,) int32, where it is not empty: the largest grey levels of the ``frames`` (k,).
 
     The parts are functions of their own, whose results lie in arrays of their own: the compiler then takes a tenth of
     the time, and knows that nothing overlaps.
@@ -77,54 +63,20 @@ def sweep(stack, order, shifts, ladder, rules, scale, depths, maps, peaks):
         first, last = block * ROWS, min((block + 1) * ROWS, height)
         A, psi = np.empty((last - first, width), np.float32), np.empty((last - first, width), np.float32)
         phase, B, reason = maps.phase[first:last], maps.modulation[first:last], maps.reason[first:last]
-        if len(order.gray):
-            steps = period(shifts, 0)
-            coded_rows(
-                stack, steps, order.gray, order.inverse, order.complementary, scale, rules, first,
-                phase, psi, B, A, reason,
-            )  # fmt: skip
+        if len(rules.gray):
+            coded_rows(stack, shifts, scale, rules, first, phase, psi, B, A, reason)
         else:
             levels_rows(stack, shifts, ladder, scale, first, phase, psi, B, A, reason)
-        if depths.grid.size:
-            _splined(first, last, A, depths, scale, per_step, maps)
-        else:
-            _pixelwise(first, last, A, depths, scale, per_step, maps)
-        _texture(stack, order, first, last, A, maps)
+        _measure(first, last, A, depths, scale, per_step, maps)
+        _fill_texture(stack, texture, first, last, A, maps)
         if len(peaks):
-            peaks[block] = _brightest(stack, order, first, last)
+            peaks[block] = _brightest(stack, frames, first, last)
 
 
 @kernel()
-def _pixelwise(first, last, background, depths, scale, per_step, maps):
-    """Points and their depth noise, by each pixel's own rational function."""
+def _measure(first, last, background, depths, scale, per_step, maps):
+    """Points and their depth noise: each pixel's own rational function, and what the grid adds to it, if any."""
     one, zero, none = np.float32(1), np.float32(0), np.float32(np.nan)
-    gain, centre, c = np.float32(depths.gain), np.float32(depths.centre), depths.c
-    # the phase's standard deviation is the square root of the noise's variance times 2/n, over the modulation
-    squared, least_B = per_step * gain * gain, np.float32(1e-6)
-    noise_a, noise_b = np.float32(scale.noise_a) * squared, np.float32(scale.noise_b) * squared
-    width = maps.phase.shape[1]
-    z = np.empty(width, np.float32)
-    for row in range(first, last):
-        phase, A, B = maps.phase[row], background[row - first], maps.modulation[row]
-        c0, c1, c2, ray_x, ray_y = c[0, row], c[1, row], c[2, row], c[3, row], c[4, row]
-        least, largest = depths.bounds[0, row], depths.bounds[1, row]
-        points, sigma = maps.points[row], maps.sigma_z[row]
-        for x in range(width):
-            s = fma(gain, phase[x], -centre)
-            below, contrast = fma(c2[x], s, one), max(B[x], least_B)
-            both = np.divide(one, below * contrast)  # one division for two
-            per = contrast * both
-            depth = fma(c1[x], s, c0[x]) * per
-            z[x] = depth if (s >= least[x]) & (s <= largest[x]) & (depth > zero) else none
-            slope = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
-            sigma[x] = slope * np.sqrt(fma(noise_b, A[x], noise_a))
-        fill_points(ray_x, ray_y, z, points)
-
-
-@kernel()
-def _splined(first, last, background, depths, scale, per_step, maps):
-    """The same by the compiled splined model: the rational function, then what the grid adds to it."""
-    one, none = np.float32(1), np.float32(np.nan)
     gain, centre, c, grid = np.float32(depths.gain), np.float32(depths.centre), depths.c, depths.grid
     # the phase's standard deviation is the square root of the noise's variance times 2/n, over the modulation
     squared, least_B = per_step * gain * gain, np.float32(1e-6)
@@ -135,26 +87,34 @@ def _splined(first, last, background, depths, scale, per_step, maps):
     for row in range(first, last):
         phase, A, B = maps.phase[row], background[row - first], maps.modulation[row]
         c0, c1, c2, ray_x, ray_y = c[0, row], c[1, row], c[2, row], c[3, row], c[4, row]
-        points, sigma = maps.points[row], maps.sigma_z[row]
+        sigma = maps.sigma_z[row]
         for x in range(width):
             s = fma(gain, phase[x], -centre)
             below, contrast = fma(c2[x], s, one), max(B[x], least_B)
             both = np.divide(one, below * contrast)  # one division for two
             per = contrast * both
-            rational = fma(c1[x], s, c0[x]) * per
-            inside, cell[x], rest[x] = locate_layers(rational, near, per_mm, deepest)
-            z[x] = rational if inside else none
+            z[x] = fma(c1[x], s, c0[x]) * per
             slope = abs(c1[x] - c0[x] * c2[x]) * per * per * (below * both)
             sigma[x] = slope * np.sqrt(fma(noise_b, A[x], noise_a))
-        add_corrections(z, cell, rest, grid, depths.step, row)
-        fill_points(ray_x, ray_y, z, points)
+        if grid.size:
+            for x in range(width):
+                inside, cell[x], rest[x] = locate_layers(z[x], near, per_mm, deepest)
+                z[x] = z[x] if inside else none
+            add_corrections(z, cell, rest, grid, depths.step, row)
+        else:
+            least, largest = depths.bounds[0, row], depths.bounds[1, row]
+            for x in range(width):
+                s = fma(gain, phase[x], -centre)
+                z[x] = z[x] if (s >= least[x]) & (s <= largest[x]) & (z[x] > zero) else none
+        fill_points(ray_x, ray_y, z, maps.points[row])
 
 
 @kernel()
-def _texture(stack, order, first, last, background, maps):
+def _fill_texture(stack, texture, first, last, background, maps):
+    """The frame ``texture``, or the background of the fringes where it is -1."""
     for row in range(first, last):
-        if order.texture >= 0:
-            seen = stack[order.texture, row]
+        if texture >= 0:
+            seen = stack[texture, row]
             for x in range(len(seen)):
                 maps.texture[row, x] = seen[x]
         else:
@@ -163,15 +123,14 @@ def _texture(stack, order, first, last, background, maps):
 
 
 @kernel()
-def _brightest(stack, order, first, last):
-    """The largest grey level of some rows, in the frames that the axis is decoded from."""
+def _brightest(stack, frames, first, last):
+    """The largest grey level of some rows of the frames."""
     highest = np.int32(0)
-    for frames in (order.frames, order.gray, order.inverse, order.others):
-        for k in range(len(frames)):
-            for row in range(first, last):
-                levels = stack[frames[k], row]
-                for x in range(len(levels)):
-                    highest = max(highest, np.int32(levels[x]))
+    for frame in frames:
+        for row in range(first, last):
+            levels = stack[frame, row]
+            for x in range(len(levels)):
+                highest = max(highest, np.int32(levels[x]))
     return highest
 
 

@@ -18,7 +18,7 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import render
 from slviewer.fringe import kernels_coded, kernels_levels
-from slviewer.fringe.decode import code_rules, decode, grey_scale, ladder_of, shifts_of, steps_of
+from slviewer.fringe.decode import code_rules, decode, grey_scale, ladder_of, shifts_of
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import multifrequency, p18
@@ -138,9 +138,7 @@ def _kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[],
         ladder = ladder_of(layout)
         return lambda: kernels_levels.decode_levels(frames, shifts, ladder, scale, *maps)
     rules = code_rules(layout, fringe_mean(layout, frames))
-    steps, gray = steps_of(layout.shifts[0], layout.sign), np.array(layout.gray, np.int64)
-    inverse, extra = np.array(layout.inverse, np.int64), -1 if layout.complementary is None else layout.complementary
-    return lambda: kernels_coded.decode_coded(frames, steps, gray, inverse, extra, scale, rules, *maps)
+    return lambda: kernels_coded.decode_coded(frames, shifts, scale, rules, *maps)
 
 
 def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:

@@ -267,7 +267,7 @@ def test_kernels_compile_for_real_devices(monkeypatch, model, cc):
         ptx, _ = cuda.compile_ptx(kernel.py_func, arguments, cc=cc)
         return ".visible .entry" in ptx and "ld.local" not in ptx
 
-    kernel = sweep.sweep_kernel(card._plan(job, 0), HEIGHT * WIDTH, measure, True, False)
+    kernel = sweep.sweep_kernel(job, len(job.frames), measure, True)
     light = types.UniTuple(types.float32, 6)
     assert compiled(kernel, whole, light, *tables, single, words, single, points, single, whole, types.int32[::1])
     list_moves, move, list_masked, mask = spike_kernels(spike_rules(job.layout), (HEIGHT, WIDTH), measure)
