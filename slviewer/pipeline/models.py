@@ -1,5 +1,6 @@
 """Calibrations in a session: saving, loading, choosing, and noticing when one is stale."""
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -27,6 +28,9 @@ VERDICT = "calibration/verdict"
 VALIDATION = "calibration/validation"
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
+MAX_LOADED = 2
+_LOADED: dict[str, Model] = {}  # by the hash of the saved result
+_LOADED_LOCK = threading.Lock()
 _RESTORED: dict[str, Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], Model]] = {
     "pixelwise": PixelwiseModel.from_arrays,
     "splined": SplinedModel.from_arrays,
@@ -121,7 +125,11 @@ def load_residuals(store: Session) -> dict[str, np.ndarray]:
 
 
 def load_model(store: Session, name: str) -> Model:
-    """One calibration by name."""
+    """One calibration by name.
+
+    The last ``MAX_LOADED`` stay in memory: a splined model compiles its per-pixel maps and its uncertainty when they
+    are first used, which takes seconds.
+    """
     if name not in available(store):
         there = ", ".join(available(store))
         raise InputError(
@@ -130,14 +138,23 @@ def load_model(store: Session, name: str) -> Model:
         )
     if name == "stereo":
         return load_stereo(store)
-    meta, arrays = store.load_result(f"calibration/{name}")
+    result = f"calibration/{name}"
+    content = store.input_hashes(result)[result]
+    with _LOADED_LOCK:
+        if content in _LOADED:
+            return _LOADED[content]
+    meta, arrays = store.load_result(result)
     try:
-        return _RESTORED[name](meta["model"], arrays)
+        model = _RESTORED[name](meta["model"], arrays)
     except (KeyError, TypeError) as error:
         raise SessionError(
             f"the {name} calibration in {store.folder} was saved by another version of slviewer: "
             "run `slviewer calibrate` again"
         ) from error
+    with _LOADED_LOCK:
+        while len(_LOADED) >= MAX_LOADED:
+            _LOADED.pop(next(iter(_LOADED)))
+        return _LOADED.setdefault(content, model)
 
 
 def best(store: Session, accept_rejected: bool = False) -> str:

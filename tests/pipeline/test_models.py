@@ -60,3 +60,15 @@ def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recor
         assert shown is not None and shown.session is not None and shown.session.calibration is not None
         assert "version" in shown.session.calibration.stale
         assert shown.session.calibration.stereo.reprojection_rms_px
+
+
+@pytest.mark.parametrize("name", ["pixelwise", "splined"])
+def test_a_calibration_is_loaded_again_only_when_it_has_changed(recorded: Path, tmp_path: Path, name: str) -> None:
+    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    with Session.open(folder, write=True) as store:
+        first = load_model(store, name)
+        assert load_model(store, name) is first
+        meta, arrays = store.load_result(f"calibration/{name}")
+        saved = {key: meta[key] for key in ("model", "inputs", "settings")}
+        store.save_result(f"calibration/{name}", {**saved, "settings": {"changed": 1}}, dict(arrays))
+        assert load_model(store, name) is not first
