@@ -67,7 +67,7 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
     listed = ", ".join(f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True))
     return finish_figure(
         drawing,
-        f"What camera pixel ({u}, {v}) learnt from {at.size} target poses: z as a rational function of the absolute "
+        f"Fit of camera pixel ({u}, {v}) to {at.size} target poses: z as a rational function of the absolute "
         f"phase of axis {curve.axis}, x and y as lines through the camera's centre. "
         f"{'Beside' if narrow else 'Below'}: the residuals "
         f"(RMS {listed}).",

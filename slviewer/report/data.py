@@ -147,11 +147,11 @@ class ReproductionData:
 
 @dataclass(frozen=True)
 class CaptureRow:
-    """One capture of a session. ``state``: used, left out, excluded or scan; ``why`` says why it is not used."""
+    """One capture of a session. ``state``: used, unused, excluded, waiting or scan; ``why`` says why it is not used."""
 
     name: str
     role: str
-    state: Literal["used", "left out", "excluded", "scan", "waiting"]
+    state: Literal["used", "unused", "excluded", "scan", "waiting"]
     camera: tuple[int, int]
     projector: tuple[int, int] | None
     frames: int

@@ -44,7 +44,7 @@ MOST_DRAWN = 4000
 def measurements_section(rows: Sequence[Measurement], sections: Sequence[tuple[str, Lines]]) -> Section:
     """Every measurement with its units and uncertainties, and each section as it was cut."""
     items: list[Item] = [
-        PageNotice(f"{row.name} was measured on what has since changed: measure it again.") for row in rows if row.stale
+        PageNotice(f"{row.name} is out of date: its surface has changed. Measure again.") for row in rows if row.stale
     ]
     items += [
         PageNotice(f"{row.name}: {note}.") for row in rows for note in row.data.get("fit", {}).get("warnings", ())
@@ -68,15 +68,15 @@ def measurements_section(rows: Sequence[Measurement], sections: Sequence[tuple[s
     columns += [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns += [Column("U, k = 2"), Column("of", align="left")]
     notes = [
-        "U is the expanded uncertainty: the scatter of the points, and what the calibration leaves uncertain. –: a "
+        "U is the expanded uncertainty: the scatter of the points, and the calibration's uncertainty. –: a "
         "residual or a plain reading, which has none."
     ]
     if any(q.U is not None and not q.whole for each in quantities.values() for q in each):
-        notes.append("* without the calibration's part, which this calibration does not know.")
+        notes.append("* without the calibration's part, which is unknown.")
     if body:
         items.append(Table(columns, body, "Measured on the scans", notes))
     items += [section_plot(name, lines) for name, lines in sections]
-    return Section("Measurements", "Distances, fitted shapes, and what lies between them.", items)
+    return Section("Measurements", "Distances, fitted shapes and their relations.", items)
 
 
 def section_plot(
@@ -149,7 +149,7 @@ def _deviation_table(view: Measurement) -> Table:
         ["mean", format_number(numbers["mean"], 4, signed=True), "mm", ""],
         ["RMS", format_number(numbers["rms"], 4), "mm", ""],
         ["RMS of the scan's noise alone", format_number(found["noise_mm"], 4), "mm", ""],
-        ["95 % of the points are off by less than", format_number(numbers["within_95"], 4), "mm", ""],
+        ["95 % of the points deviate by less than", format_number(numbers["within_95"], 4), "mm", ""],
         [
             "range of 99.7 % of the points, lower end",
             format_number(numbers["p_low"], 4, signed=True),
@@ -170,13 +170,13 @@ def _deviation_table(view: Measurement) -> Table:
             [f"within ± {verdict['tolerance_mm']:g} mm", format_number(verdict["within"], 2), "%", ""],
             ["inside by more than U", format_number(verdict["inside"], 2), "%", ""],
             ["outside by more than U", format_number(verdict["outside"], 2), "%", ""],
-            ["too close to tell", format_number(verdict["close"], 2), "%", ""],
+            ["undecided", format_number(verdict["close"], 2), "%", ""],
         ]
     rows.append(["area of the nominal that was measured", format_number(100 * found["coverage"], 1), "%", ""])
     share = 100 * numbers["left_out"] / max(numbers["points"] + numbers["left_out"], 1)
     notes = [
         f"{numbers['points']:,} points. {numbers['left_out']:,} ({share:.1f} %) lie farther than "
-        f"{found['reach_mm']:.3g} mm from the nominal or face another way, and are left out. The best fit adds "
+        f"{found['reach_mm']:.3g} mm from the nominal or face another direction, and are excluded. The best fit adds "
         f"{found['alignment_mm']:.4f} mm (1 sigma)."
     ]
     return Table(columns, rows, f"{view.source} against {view.data['nominal']['name']}", notes)
@@ -241,7 +241,7 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
     left.set_xlabel("grey: parts of the nominal that were not measured", fontsize=TEXT_PT, color=SOFT, loc="left")
     return finish_figure(
         drawing,
-        f"{view.name}: red lies outside the nominal surface, blue inside it. Right: how many of the points lie how far "
-        "off.",
+        f"{view.name}: red lies outside the nominal surface, blue inside it. Right: the "
+        "distribution of the deviations.",
         f"{view.source} coloured by its deviation from {view.data['nominal']['name']}, with their histogram",
     )

@@ -1,4 +1,4 @@
-"""How good a calibration is, section by section: its verdict, its models compared, the tests it stood, what it lost."""
+"""Sections on the quality of a calibration: verdict, comparison of models, acceptance tests, drift."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,8 +10,8 @@ from slviewer.report.page import Cell, Column, Headline, Item, Mark, PageNotice,
 from slviewer.report.tables import UNKNOWN, format_number
 
 _LEVELS: dict[str, tuple[str, str]] = {
-    "good": ("Good: nothing that was seen speaks against this calibration.", "good"),
-    "doubtful": ("Doubtful: it may be used with care, better corrected first.", "warning"),
+    "good": ("Good: no problems detected.", "good"),
+    "doubtful": ("Doubtful: use it with care, or correct the causes first.", "warning"),
     "rejected": ("Rejected: do not measure with this calibration.", "warning"),
 }
 _DECISIONS: dict[str | None, tuple[str, Mark]] = {
@@ -30,7 +30,7 @@ def verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
         is_corrected = finding.severity == "note"
         what = "Already corrected." if is_corrected else f"What to do: {finding.remedy}."
         items.append(PageNotice(f"{finding.sentence}. {what}", "plain" if is_corrected else "warning"))
-    text = "" if of_calibration else "This is said of the last attempt to calibrate, of which nothing came."
+    text = "" if of_calibration else "This verdict is on the last attempt to calibrate, which gave no calibration."
     return Section("Verdict", text, items)
 
 
@@ -42,7 +42,7 @@ def verdict_headline(verdict: Verdict) -> Headline:
 
 
 def models_section(models: ModelsView) -> Section:
-    """Which models there are, how they compare on poses that they were not made from, and what splined found."""
+    """Which models there are, how they compare on held-out poses, and results of the joint adjustment."""
     items: list[Item] = [PageNotice(f"{model}: {words}.", "plain") for model, words in models.scales.items()]
     used = f"Measured with {models.used}"
     used += (
@@ -166,8 +166,8 @@ def _acceptance_items(view: AcceptanceView) -> list[Item]:
     if steady := found["repeatability"]:
         notes.append(
             f"Repeatability over {steady['captures']} captures of a still object: {steady['sigma_mm']:.4f} mm (median "
-            f"over the pixels), {steady['predicted_mm']:.4f} mm expected from noise; the mean depth wandered by "
-            f"{steady['wandering_mm']:.4f} mm. It says nothing of accuracy."
+            f"over the pixels), {steady['predicted_mm']:.4f} mm expected from noise; the mean depth drifted by "
+            f"{steady['wandering_mm']:.4f} mm. This is not a measure of accuracy."
         )
     items.append(Table(columns, rows, artefact["name"], notes))
     if found["budget"]:
@@ -182,7 +182,7 @@ def _budget_table(budget: Mapping[str, Any]) -> Table:
     ]
     columns = [Column("source", align="left"), Column("standard uncertainty", "mm"), Column("type", align="centre")]
     columns.append(Column("from", align="left"))
-    without = f" Nothing is known of {' and '.join(budget['unknown'])}: U leaves it out." if budget["unknown"] else ""
+    without = f" Unknown: {' and '.join(budget['unknown'])}; U excludes it." if budget["unknown"] else ""
     notes = [f"Type A: from repeated observations; B: from anything else.{without}"]
     footer = [["expanded, k = 2", f"{budget['U_mm']:.4f}", "", ""]]
     return Table(columns, rows, f"Uncertainty of a length of {budget['length_mm']:.0f} mm", notes, footer)
@@ -209,7 +209,7 @@ def drift_section(checks: Sequence[DriftRow]) -> Section:
             ]
         )
     columns = [Column("time, UTC", align="left"), Column("capture", align="left"), Column("answer", align="left")]
-    columns += [Column("board seems larger by", "ppm"), Column("off its epipolar lines", "px")]
+    columns += [Column("change of scale", "ppm"), Column("epipolar error", "px")]
     columns.append(Column("of", align="left"))
     items: list[Item] = [
         PageNotice(f"{last.capture}: {last.verdict}{because}.", "good" if kept else "warning"),

@@ -93,7 +93,7 @@ def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
 
 def _calibration_section(data: ReproductionData) -> Section:
     items: list[Item] = [PageNotice(note) for note in data.notes]
-    items += [PageNotice(f"{name} was left out: {why}") for name, why in data.poses_left_out.items()]
+    items += [PageNotice(f"{name} was excluded: {why}") for name, why in data.poses_left_out.items()]
     rows: list[list[str | Cell]] = [
         [
             f"reprojection, {device}",
@@ -124,7 +124,7 @@ def _calibration_section(data: ReproductionData) -> Section:
     items.append(rms_maps(data.rms_maps_mm, data.pixel_curve.axis if data.pixel_curve else ""))
     return Section(
         "Experiment 1: calibration",
-        f"The stereo calibration finds both lenses and their pose from {data.poses - len(data.poses_left_out)} target "
+        f"Stereo calibration: both lenses and their poses from {data.poses - len(data.poses_left_out)} target "
         "poses. The pixel-wise model then learns, for every camera pixel, how depth follows from the absolute phase, "
         "from the same poses projected onto their ideal planes.",
         items,
@@ -177,7 +177,7 @@ def _spheres_section(data: ReproductionData) -> Section:
         ]
     return Section(
         "Experiment 2b: spheres",
-        "Flatness says nothing of scale: a projector turned by a tenth of a milliradian leaves a plane flat and bends "
+        "Flatness is no measure of scale: a projector turned by a tenth of a milliradian leaves a plane flat and bends "
         "space. A sphere of known radius, and the distances between spheres, show it. The fitted radius is free. All "
         "error maps of this experiment share one colour scale.",
         items,

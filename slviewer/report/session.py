@@ -114,14 +114,14 @@ def session_sections(data: SessionData) -> list[Section]:
 
 
 def _notice_section(data: SessionData) -> list[Section]:
-    unused = [row for row in data.captures if row.state in ("left out", "excluded")]
+    unused = [row for row in data.captures if row.state in ("unused", "excluded")]
     items: list[Item] = [PageNotice(warning) for warning in data.warnings]
     items += [PageNotice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
-    return [Section("To notice", "", items)] if items else []
+    return [Section("Warnings", "", items)] if items else []
 
 
 def _captures_section(data: SessionData) -> Section:
-    marks: dict[str, Mark] = {"used": "better", "left out": "worse", "excluded": "worse"}
+    marks: dict[str, Mark] = {"used": "better", "unused": "worse", "excluded": "worse"}
     columns = [Column("capture", align="left"), Column("role", align="left"), Column("state", align="left")]
     columns += [
         Column("camera", "px"),
@@ -306,7 +306,7 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
     columns += [
         Column("R1 / R2 / R3", "%", align="centre"),
         Column("points"),
-        Column("set aside", "%"),
+        Column("excluded", "%"),
         Column("coverage", "%"),
     ]
     masked = any(v.masked for v in found)
@@ -336,11 +336,11 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
                 row.append(format_number(100 * v.masked[model], 1) if model in v.masked else UNKNOWN)
             rows.append(row)
     notes = [
-        "Set aside: points beyond 5 robust sigma, above 2 % the RMS does not speak for the shape. Coverage: measured "
+        "Excluded: points beyond 5 robust sigma; above 2 % the RMS does not describe the shape. Coverage: measured "
         "pixels of those illuminated and modulated."
     ]
     if masked:
-        notes.append("Masked: pixels that look through parts of camera or projector that no target pose illuminated.")
+        notes.append("Masked: pixels outside the calibrated region.")
     return Table(columns, rows, caption, notes)
 
 

@@ -76,10 +76,10 @@ def test_a_calibration_shows_its_poses_and_what_a_pixel_learnt(measured: tuple[P
     expect(page.get_by_text("pose_02, camera: measured minus predicted features")).to_be_visible()
     choose(page, "Residuals", "projector")
     expect(page.get_by_text("pose_02, projector: measured minus predicted features")).to_be_visible()
-    expect(page.get_by_text(re.compile(r"What camera pixel \(\d+, \d+\) learnt from"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"Fit of camera pixel \(\d+, \d+\) to"))).to_be_visible()
     field(page, "Pixel u").fill("150")
     field(page, "Pixel v").fill("120")
-    expect(page.get_by_text("What camera pixel (150, 120) learnt from")).to_be_visible()
+    expect(page.get_by_text("Fit of camera pixel (150, 120) to")).to_be_visible()
     field(page, "Pixel v").fill("0")
     expect(page.get_by_text("Pixel (150, 0) saw the board in too few poses")).to_be_visible()
 

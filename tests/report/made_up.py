@@ -211,7 +211,7 @@ def session_data(width: int = 1600) -> SessionData:
         CaptureRow(
             "pose_09",
             "calibration",
-            "left out",
+            "unused",
             (width, height),
             (912, 1140),
             52,

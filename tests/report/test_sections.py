@@ -157,7 +157,7 @@ def test_a_sessions_report(tmp_path: Path) -> None:
     sections = session_sections(data)
     titles = [section.title for section in sections]
     assert titles == [
-        "To notice", "Reprojection", "Parameters", "Pixel-wise model", "Verification", "Captures"
+        "Warnings", "Reprojection", "Parameters", "Pixel-wise model", "Verification", "Captures"
     ]  # fmt: skip
     words = "\n".join(texts(section) for section in sections)
     for word in (
@@ -256,7 +256,7 @@ def test_how_good_a_calibration_is() -> None:
         "pose_09 is excluded from the splined model",
         "UNDECIDED",
         "−300 ppm ± 40 ppm (k = 2)",
-        "Nothing is known of drift",
+        "Unknown: drift",
         "over 10 captures",
         "plane_01: recalibrate, because the board seems too large",
         "60.500",
