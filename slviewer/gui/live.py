@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import viser
 
+from slviewer.fringe.layout import to_eight_bits
 from slviewer.gui.panel import PanelContext
-from slviewer.gui.scene import spacing
+from slviewer.gui.scene import spacing, thin
 from slviewer.wizard.live_scan import LiveCloud
 
 LAYER = "live"
@@ -73,7 +74,8 @@ class LiveScreen:
         if not clients:
             return False
         self._adapt()
-        points, colours = thinned(cloud, self._limit)
+        grey = to_eight_bits(cloud.texture)
+        points, colours = thin(cloud.points, grey, self._limit)
         self.points = len(points)
         if not len(points):
             return self._remove()
@@ -121,19 +123,3 @@ class LiveScreen:
             self._limit = min(int(1.1 * self._limit), MOST_POINTS)
         for gone in self._nodes.keys() - self._viewers.here():
             del self._nodes[gone], self._drawn[gone]
-
-
-def thinned(cloud: LiveCloud, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """((n, 3) float32 mm, (n, 3) uint8): every so many rows and columns of a cloud, `limit` measured points at most."""
-    z = cloud.points[..., 2]
-    share = 16 * np.count_nonzero(np.isfinite(z[::4, ::4])) / limit
-    rows = columns = 1
-    while rows * columns < share:
-        rows, columns = (rows, columns + 1) if rows == columns else (columns, columns)
-    points = cloud.points[::rows, ::columns].reshape(-1, 3)
-    grey = cloud.texture[::rows, ::columns].reshape(-1)
-    valid = np.isfinite(points[:, 2])
-    points, grey = points[valid], grey[valid]
-    if grey.dtype != np.uint8:
-        grey = (grey * (255.0 / max(int(cloud.texture.max()), 1))).astype(np.uint8)
-    return points, np.repeat(grey[:, None], 3, axis=1)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import viser
 import viser.transforms as tf
+from numpy.typing import NDArray
 
 Colour = tuple[int, int, int]
 
@@ -179,14 +180,7 @@ class ViewerScene:
         NaN points are skipped. Returns the number of points shown: evenly thinned to about `limit`, an organised
         cloud by rows and columns, so that no stripes appear.
         """
-        valid = np.isfinite(points).all(axis=-1)
-        excess = np.count_nonzero(valid) / limit
-        step = max(1, int(np.ceil(np.sqrt(excess) if points.ndim == 3 else excess)))
-        part = (slice(None, None, step),) * (points.ndim - 1)
-        shown = np.asarray(points[part][valid[part]], np.float32)
-        if (isinstance(colours, np.ndarray) and colours.ndim > 1) or np.shape(colours) == valid.shape:
-            chosen = np.asarray(colours)[part][valid[part]]
-            colours = np.repeat(chosen[:, None], 3, axis=1) if chosen.ndim == 1 else chosen
+        shown, colours = thin(points, colours, limit)
         if not len(shown):
             self.remove(layer, name)
             return 0
@@ -282,6 +276,26 @@ def _matrix(handle: Any) -> np.ndarray:
     T[:3, :3] = tf.SO3(np.asarray(handle.wxyz, float)).as_matrix()
     T[:3, 3] = handle.position
     return T
+
+
+def thin(
+    points: NDArray[np.float32], colours: NDArray[np.uint8] | Colour, limit: int
+) -> tuple[NDArray[np.float32], Any]:
+    """(points (n, 3), their colours (n, 3) or the one colour): every so many rows and columns of an organised cloud
+    (h, w, 3), or points of (n, 3), at most about `limit`; NaN points are skipped, grey levels become colours.
+    """
+    valid = np.asarray(np.isfinite(points).all(axis=-1))
+    excess = np.count_nonzero(valid) / limit
+    rows = columns = 1
+    while rows * columns < excess:
+        rows, columns = (rows, columns + 1) if rows == columns else (columns, columns)
+    steps = (rows, columns) if points.ndim == 3 else (rows * columns,)
+    part = tuple(slice(None, None, step) for step in steps)
+    valid = valid[part]
+    if isinstance(colours, np.ndarray) and colours.shape[: len(steps)] == points.shape[:-1]:
+        colours = colours[part][valid]
+        colours = np.repeat(colours[:, None], 3, axis=1) if colours.ndim == 1 else np.ascontiguousarray(colours)
+    return np.asarray(points[part][valid], np.float32), colours
 
 
 def spacing(points: np.ndarray) -> float:
