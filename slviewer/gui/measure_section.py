@@ -29,7 +29,7 @@ class SectionPlot:
         self._plot = Plot(context.gui)
         self._sliders: list[Any] = []
         for name in CURSORS:
-            slider = context.gui.add_slider(f"Cursor {name}, mm", 0.0, 1.0, 0.01, 0.0, visible=False)
+            slider = context.gui.add_slider(f"{name}, mm", 0.0, 1.0, 0.01, 0.0, visible=False, hint=f"Cursor {name}")
             slider.on_update(context.callback(moved))
             self._sliders.append(slider)
         self._values = Text(context.gui)
@@ -81,7 +81,7 @@ def cursor_html(cursors: np.ndarray) -> Html:
     """The values at the cursors (3, 2) mm."""
     a, b, c = cursors
     rows: list[tuple[object, object]] = [
-        (f"{q.name} A – B", f"{q.value:.3f} {q.unit}".replace("-", "−")) for q in measure_cursors(a, b)
+        (f"{q.name.capitalize()} A – B", f"{q.value:.3f} {q.unit}".replace("-", "−")) for q in measure_cursors(a, b)
     ]
     try:
         rows.append(("Radius through A, C, B", f"{radius_through(a, c, b).value:.3f} mm"))

@@ -46,7 +46,8 @@ def board_html(preview: PreviewView, board: Board | None) -> Html:
     if board is None:
         return coloured("No board is chosen", "dim")
     if preview.board is None:
-        return coloured(preview.missing or "Searching for the board …", "warning")
+        missing = preview.missing or "searching for the board …"
+        return coloured(f"{missing[:1].upper()}{missing[1:]}", "warning")
     detected, total = len(preview.board.pixels), len(board.points)
     return coloured(f"Board detected: {detected} of {total} features", "good")
 

@@ -103,7 +103,7 @@ def report_table(shown: Table) -> Html:
         tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
         return coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))
 
-    titles = [shown.caption, *(f"{c.title.capitalize()}, {c.unit}" if c.unit else c.title for c in shown.columns[1:])]
+    titles = [shown.caption, *(c.title.capitalize() + (f", {c.unit}" if c.unit else "") for c in shown.columns[1:])]
     html = table(titles, [[cell(value) for value in row] for row in (*shown.rows, *shown.footer)])
     return html + "".join(paragraph(coloured(note, "dim")) for note in shown.notes)
 

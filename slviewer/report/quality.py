@@ -95,12 +95,12 @@ def splined_table(summary: Mapping[str, Any]) -> Table:
     noise, local, covered = summary["noise_px"], summary["local_distortion_rms_px"], summary["cells_lit"]
     low, high = summary["board_height_mm"]
     rows = [
-        ["residual noise, camera", f"{noise['camera']:.4f} px"],
-        ["residual noise, projector x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"],
-        ["local distortion, camera / projector", f"{local['camera']:.3f} / {local['projector']:.3f} px RMS"],
-        ["board height, peak to valley", f"{high - low:.3f} mm"],
-        ["board feature offsets", f"{summary['board_offsets_rms_mm']:.4f} mm RMS"],
-        ["covered, camera / projector", f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %"],
+        ["Residual noise, camera", f"{noise['camera']:.4f} px"],
+        ["Residual noise, projector x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"],
+        ["Local distortion, camera / projector", f"{local['camera']:.3f} / {local['projector']:.3f} px RMS"],
+        ["Board height, peak to valley", f"{high - low:.3f} mm"],
+        ["Board feature offsets", f"{summary['board_offsets_rms_mm']:.4f} mm RMS"],
+        ["Covered, camera / projector", f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %"],
     ]
     columns = [Column("quantity", align="left"), Column("value")]
     return Table(columns, rows, "Joint adjustment (splined)", ["Pixels outside the calibrated region are masked."])
