@@ -1,16 +1,23 @@
 """The preflight without a browser: is a rig fit to capture with, and is a capture fit to measure with?"""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from slviewer.devices.protocols import Rig
 from slviewer.pipeline.capture import set_camera
-from slviewer.pipeline.check_results import Preflight
+from slviewer.pipeline.check_results import Check, Preflight
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.rig_choice import SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
+from slviewer.preflight.latency import measure_latency
+from slviewer.preflight.light import capture_burst, check_ambient, check_exposure, check_flicker, check_gamma
+from slviewer.preflight.order import check_order
 from slviewer.preflight.recorded_capture import preflight_capture
-from slviewer.preflight.run import preflight
+from slviewer.preflight.rig_under_test import RigUnderTest
+from slviewer.preflight.screen import check_pixels, check_screen
+from slviewer.preflight.stillness import check_motion
 from slviewer.session.store import Session
 
 
@@ -54,3 +61,60 @@ def check_capture(session: SessionLike, capture: str, *, progress: Progress = ig
     """
     with opened(session) as store:
         return preflight_capture(store.load_capture(capture), progress)
+
+
+_LOOKS = 52
+"""How often about the bench shows something: what progress is measured by."""
+_MEAN = 8  # images
+_LONG_MS = 300.0  # of patience where the delay is unknown
+_ALL = ("latency", "exposure", "flicker", "gamma", "pixels", "order", "repeats", "ambient", "motion")
+
+
+def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: Progress | None = None) -> Preflight:
+    """Look at an open rig, on the thread that owns its devices; about 10 s.
+
+    `say` hears of each check as it is done, in a sentence. `progress` may raise Cancelled. Raises DeviceError where a
+    device does not answer. Patterns are loaded and light is shown; what was loaded and shown before is for the caller
+    to restore.
+    """
+    began, shown = time.monotonic(), 0
+    checks: list[Check] = []
+    heard = progress or ignore_progress
+
+    def tick(doing: str) -> None:
+        nonlocal shown
+        heard(min(0.99, shown / _LOOKS), doing)
+        shown += 1
+
+    def add(*found: Check) -> None:
+        for check in found:
+            checks.append(check)
+            if say is not None:
+                say(check.sentence if not check.remedy else f"{check.sentence} {check.remedy}")
+
+    bench = RigUnderTest(rig, tick)
+    bench.measure_references()
+    delay, settle_ms = measure_latency(bench)
+    if settle_ms is None:
+        bench.settle_ms = _LONG_MS
+    seen = check_screen(bench)
+    if seen.verdict == "bad" or settle_ms is None:
+        # What else was measured would be another screen's.
+        add(seen)
+        if seen.verdict != "bad":
+            add(delay)
+        unseen = "It was not looked at, because the camera does not see what the projector is given to show."
+        rest = [name for name in _ALL if name not in {check.name for check in checks}]
+        checks += [Check(name, "unknown", unseen, "", {}) for name in rest]
+        return Preflight(tuple(checks), None, None, None, time.monotonic() - began)
+    add(seen, delay)
+    right, exposure_ms = check_exposure(bench)
+    add(right)
+    images = capture_burst(bench)
+    add(check_flicker(bench, images))
+    response, levels, middle = check_gamma(bench)
+    add(response, check_pixels(bench, middle), *check_order(bench))
+    last_dark, last_white = (bench.grab_mean(grey, "what changed meanwhile", _MEAN) for grey in (None, 255))
+    add(check_ambient(bench, last_dark), check_motion(bench, images, last_white))
+    heard(1.0, "checked")
+    return Preflight(tuple(checks), settle_ms, levels, exposure_ms, time.monotonic() - began)

@@ -1,4 +1,4 @@
-"""How long light takes from the projector's word to the camera's image, and whether its images are fresh."""
+"""Delay from the projector's change to the camera's image, and whether its images are fresh."""
 
 import math
 import time
@@ -22,24 +22,24 @@ _FEWEST_LIT = 0.01
 
 @dataclass(frozen=True)
 class _Change:
-    """When each image after a change was begun, in s since the projector said "shown", until one showed the change."""
+    """Start times of the images after a change, in s since the projector showed it, until one shows the change."""
 
-    begun: tuple[float, ...]
+    begin_s: tuple[float, ...]
     arrived: bool
 
     def arrival_ms(self, stale: int) -> float:
-        """When the first right image was begun, where images are so many behind; 0 for the very first."""
-        place = len(self.begun) - 1 - stale
-        return 1000 * self.begun[place] if place > 0 else 0.0
+        """When the first right image began, where images are so many behind; 0 for the very first."""
+        place = len(self.begin_s) - 1 - stale
+        return 1000 * self.begin_s[place] if place > 0 else 0.0
 
 
-def latency(bench: RigUnderTest) -> tuple[Check, float | None]:
+def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
     """The check, and the `settle_ms` that follows from it; fills in the bench's frame time, delay and stale images."""
     if bench.illuminated.mean() < _FEWEST_LIT:
         return Check("latency", "unknown", "The delay cannot be measured: no change of light is seen.", "", {}), None
-    begun = [bench.timed()[0] for _ in range(6)]
-    bench.frame_ms = 1000 * float(np.median(np.diff(begun)))
-    changes = [_change(bench, i) for i in range(_CHANGES)]
+    begin_s = [bench.grab_timed()[0] for _ in range(6)]
+    bench.frame_ms = 1000 * float(np.median(np.diff(begin_s)))
+    changes = [_time_change(bench, i) for i in range(_CHANGES)]
     if not all(change.arrived for change in changes):
         lost = sum(not change.arrived for change in changes)
         return (
@@ -53,11 +53,11 @@ def latency(bench: RigUnderTest) -> tuple[Check, float | None]:
             None,
         )
     settle = _settle_ms([change.arrival_ms(0) for change in changes], bench.frame_ms)
-    bench.stale = max(_stale(bench, settle, i) for i in range(_PROOFS))
+    bench.stale = max(_count_stale(bench, settle, i) for i in range(_PROOFS))
     fresh = [change.arrival_ms(bench.stale) for change in changes]
     settle = _settle_ms(fresh, bench.frame_ms)
     bench.settle_ms = settle
-    images = [len(change.begun) - 1 - bench.stale for change in changes]
+    images = [len(change.begin_s) - 1 - bench.stale for change in changes]
     figures = {
         "latency_ms": round(max(fresh), 1),
         "median_ms": round(float(np.median(fresh)), 1),
@@ -81,44 +81,44 @@ def latency(bench: RigUnderTest) -> tuple[Check, float | None]:
             settle,
         )
     if settle == 0:
-        said = "Light arrives as soon as the projector says so: the first image after each change is right."
+        sentence = "Light arrives as soon as the projector says so: the first image after each change is right."
     else:
-        said = (
+        sentence = (
             f"Light arrives up to {max(fresh):.0f} ms ({max(fresh) / bench.frame_ms:.1f} camera frames) after the "
             f"projector's word; captures wait {settle:g} ms."
         )
     long = settle > _LONG_MS
     remedy = "Switch the projector's picture processing off (game mode), so that captures are quicker." if long else ""
-    return Check("latency", "warning" if long else "good", said, remedy, figures), settle
+    return Check("latency", "warning" if long else "good", sentence, remedy, figures), settle
 
 
-def _change(bench: RigUnderTest, i: int) -> _Change:
+def _time_change(bench: RigUnderTest, i: int) -> _Change:
     """One change from dark to white or back; each begins at another moment of the camera's own clock."""
     target = 0.0 if i % 2 == 0 else 1.0  # the references leave it white
     time.sleep(bench.frame_ms / 1000 * i / _CHANGES)
     bench.show(255 if target else None, "delay of the light")
-    shown, begun = time.monotonic(), []
+    shown, begin_s = time.monotonic(), []
     while True:
-        begin, image = bench.timed()
-        begun.append(begin - shown)
-        if abs(bench.share(image, bench.illuminated) - target) < _near(bench):
-            return _Change(tuple(begun), True)
+        begin, image = bench.grab_timed()
+        begin_s.append(begin - shown)
+        if abs(bench.share(image, bench.illuminated) - target) < _change_tolerance(bench):
+            return _Change(tuple(begin_s), True)
         if begin - shown > _GIVE_UP_S:
-            return _Change(tuple(begun), False)
+            return _Change(tuple(begin_s), False)
 
 
-def _stale(bench: RigUnderTest, settle_ms: float, i: int) -> int:
+def _count_stale(bench: RigUnderTest, settle_ms: float, i: int) -> int:
     """How many images are still old after a wait that is long enough."""
     target = 0.0 if i % 2 == 0 else 1.0
     bench.show(255 if target else None, "freshness of the images")
     time.sleep((2 * settle_ms + bench.frame_ms) / 1000)
     old = 0
-    while old < 8 and abs(bench.share(bench.grab(), bench.illuminated) - target) >= _near(bench):
+    while old < 8 and abs(bench.share(bench.grab(), bench.illuminated) - target) >= _change_tolerance(bench):
         old += 1
     return old
 
 
-def _near(bench: RigUnderTest) -> float:
+def _change_tolerance(bench: RigUnderTest) -> float:
     return min(_NEAREST, max(_NEAR, 5 * bench.unsteady))
 
 

@@ -1,10 +1,124 @@
-"""Light that is not the projector's, and light that does not stand still."""
+"""Light of the projector and of the room: exposure, response to grey levels, ambient light, flicker."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.pipeline.check_results import Check
-from slviewer.preflight.burst import Burst
+from slviewer.fringe.response import fitted_gamma, harmonic_error_rad, linearising, nonlinearity
+from slviewer.pipeline.check_results import Check, CheckVerdict
+from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
 from slviewer.preflight.rig_under_test import RigUnderTest
+
+_WHITE, _DARK = 24, 12
+
+
+@dataclass(frozen=True, eq=False)
+class Burst:
+    """``white`` (n, h, w) and ``dark``; ``white_s`` and ``dark_s`` (n,): when each began, s."""
+
+    white: np.ndarray
+    dark: np.ndarray
+    white_s: np.ndarray
+    dark_s: np.ndarray
+
+
+def capture_burst(bench: RigUnderTest) -> Burst:
+    """Images in white light, then in the dark."""
+    white_s, white = _grab_images(bench, 255, _WHITE)
+    dark_s, dark = _grab_images(bench, None, _DARK)
+    return Burst(white, dark, white_s, dark_s)
+
+
+def _grab_images(bench: RigUnderTest, grey: int | None, count: int) -> tuple[np.ndarray, np.ndarray]:
+    bench.show(grey, "steadiness of the light")
+    bench.wait()
+    begin_s, images = zip(*(bench.grab_timed() for _ in range(count)), strict=True)
+    return np.array(begin_s), np.stack(images)
+
+
+_TARGET = 0.85  # of full scale, for the 99.5th percentile of what is illuminated
+_BACK_OFF = 0.5  # how much light is too much cannot be seen: half of it, then look again
+
+
+def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
+    """The check, and the exposure in ms to set instead; None where the present one is right or unknown."""
+    level, full = bench.white[bench.illuminated], bench.full
+    bright = float(np.quantile(level, 0.995))
+    clipped = float(np.mean(level >= 0.985 * full))
+    black = float(np.median(bench.dark[bench.illuminated]))
+    present = bench.rig.camera.settings().exposure_ms
+    factor = _BACK_OFF if bright >= 0.985 * full else (_TARGET * full - black) / max(bright - black, 1.0)
+    wanted = None if present is None else _round_ms(present * factor)
+    figures = {
+        "bright_share_of_full_scale": round(bright / full, 3),
+        "clipped_share": round(clipped, 4),
+        "median_contrast_levels": round(bench.contrast, 1),
+        "exposure_ms": present,
+        "suggested_exposure_ms": wanted,
+        "suggested_factor": round(factor, 2),
+    }
+    change = f"by {factor:.2g} times" if wanted is None else f"from {present:g} ms to {wanted:g} ms"
+    if clipped > CLIPPED:
+        verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
+        text = f"{100 * clipped:.1f} % of what the projector lights is saturated in white light."
+        if bright < 0.985 * full:
+            return Check("exposure", verdict, text, "Turn what shines, or capture with two exposures.", figures), None
+        return Check("exposure", verdict, text, f"Change the exposure {change}, then check again.", figures), wanted
+    if bright < WEAK * full:
+        verdict = "bad" if bright < TOO_WEAK * full else "warning"
+        text = f"White light reaches only {100 * bright / full:.0f} % of the camera's range."
+        return Check("exposure", verdict, text, f"Change the exposure {change}, or open the aperture.", figures), wanted
+    text = f"White light reaches {100 * bright / full:.0f} % of the camera's range; {100 * clipped:.1f} % is saturated."
+    return Check("exposure", "good", text, "", figures), None
+
+
+def _round_ms(milliseconds: float) -> float:
+    return float(f"{milliseconds:.3g}")
+
+
+_LEVELS = np.arange(18) * 15
+CURVED = 0.03
+"""Deviation from a straight line, as a share of white, from which the response is named."""
+_MIN_PIXELS = 500  # pixels
+_MOST_FLICKER = 0.02
+
+
+def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, float]:
+    """The check, the table for `PatternSequence.levels`, and the light of grey level 127.5 as a share of white."""
+    where = bench.usable()
+    if np.count_nonzero(where) < _MIN_PIXELS:
+        text = "The response cannot be measured: too few pixels are illuminated and not saturated."
+        return Check("gamma", "unknown", text, "Correct the exposure first.", {}), None, 0.5
+    if bench.unsteady > _MOST_FLICKER:
+        text = f"The response cannot be measured: the light flickers by {100 * bench.unsteady:.0f} %."
+        return Check("gamma", "unknown", text, "Correct the flicker first.", {}), None, 0.5
+    images = [bench.grab_mean(int(level), "response to grey levels") for level in _LEVELS]
+    light = np.array([float(image[where].sum(dtype=float)) for image in images])
+    if light[-1] <= light[0]:
+        text = "The response cannot be measured: white is no brighter than black."
+        return Check("gamma", "unknown", text, "Correct what the other checks name first.", {}), None, 0.5
+    seen = (light - light[0]) / (light[-1] - light[0])
+    exponent, curved = fitted_gamma(_LEVELS, seen), nonlinearity(_LEVELS, seen)
+    errors = {n: harmonic_error_rad(_LEVELS, seen, n) for n in (3, 4, 6, 8)}
+    figures = {
+        "gamma": round(exponent, 3),
+        "nonlinearity_percent": round(100 * curved, 2),
+        "phase_error_rad": {str(n): round(error, 5) for n, error in errors.items()},
+        "shown": _LEVELS.tolist(),
+        "seen": [round(float(s), 5) for s in seen],
+    }
+    levels = linearising(_LEVELS, seen)
+    middle = float(np.interp(127.5, _LEVELS, seen))
+    if curved <= CURVED:
+        text = f"Light is proportional to grey levels within {100 * curved:.1f} %."
+        return Check("gamma", "good", text, "", figures), levels, middle
+    text = (
+        f"Light follows grey levels with a gamma of {exponent:.2f}, {100 * curved:.0f} % off a straight line: an error "
+        f"of {errors[3]:.3f} rad with 3 steps and {errors[4]:.3f} rad with 4, before blur smooths it."
+    )
+    remedy = "Use the table that straightens it (measured just now), or 8 steps and more."
+    return Check("gamma", "warning", text, remedy, figures), levels, middle
+
 
 _BRIGHT, _TOO_BRIGHT = 0.35, 0.8  # room over projector
 _STEP = 0.02  # of the projector's light
@@ -13,7 +127,7 @@ _EXPLAINS = 0.6  # of the variance, by one mains frequency and not by the other
 _DRIFTS = 0.8
 
 
-def ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
+def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
     """Light in the dark frames, and whether it was the same at the end."""
     where = bench.illuminated
     room = float(np.median(bench.dark[where])) / max(bench.contrast, 1e-6)
@@ -39,7 +153,7 @@ def ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
     return Check("ambient", "good", f"The room adds {100 * room:.0f} % to the projector's light.", "", figures)
 
 
-def flicker(bench: RigUnderTest, burst: Burst) -> Check:
+def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
     """Brightness of whole images from one to the next, beyond what noise makes of it."""
     where, span = bench.usable(), max(bench.contrast, 1e-6)
     if not where.any():
@@ -49,25 +163,25 @@ def flicker(bench: RigUnderTest, burst: Burst) -> Check:
     )
     noise = bench.noise / np.sqrt(np.count_nonzero(where)) / span
     (white_rest, drift), (dark_rest, _) = (
-        _detrended(v / span, t) for v, t in ((white, burst.white_s), (dark, burst.dark_s))
+        _remove_drift(v / span, t) for v, t in ((white, burst.white_s), (dark, burst.dark_s))
     )
     swing = float(np.sqrt(max(0.0, float(np.var(white_rest)) - noise**2)))
     room = float(np.sqrt(max(0.0, float(np.var(dark_rest)) - noise**2)))
     present = bench.rig.camera.settings().exposure_ms
-    hertz = _mains(white_rest, burst.white_s)
+    hertz = _identify_mains(white_rest, burst.white_s)
     figures = {
         "rms_in_white": round(swing, 5),
         "rms_in_dark": round(room, 5),
         "drift": round(drift, 5),
         "mains_hz": hertz,
         "exposure_ms": present,
-        "exposures_ms": _multiples(present, hertz),
+        "exposures_ms": _mains_multiples(present, hertz),
     }
     worst = max(swing, room)
     if worst <= _UNSTEADY:
         if abs(drift) > 2 * _UNSTEADY:
-            said = f"The light drifts by {100 * abs(drift):.1f} % within a second."
-            return Check("flicker", "warning", said, "Let the projector's lamp warm up for some minutes.", figures)
+            text = f"The light drifts by {100 * abs(drift):.1f} % within a second."
+            return Check("flicker", "warning", text, "Let the projector's lamp warm up for some minutes.", figures)
         return Check("flicker", "good", f"The light is steady to {100 * worst:.2f} %.", "", figures)
     source = "room's" if room > 0.5 * swing else "projector's"
     named = {100: " (100 Hz)", 120: " (120 Hz)", None: ""}[hertz]
@@ -75,18 +189,18 @@ def flicker(bench: RigUnderTest, burst: Burst) -> Check:
         "flicker",
         "bad" if worst > _FLICKERS else "warning",
         f"The {source} light flickers by {100 * worst:.1f} % from image to image{named}.",
-        _remedy(present, hertz) + ("" if source == "projector's" else ", or switch the room's lamps off") + ".",
+        _flicker_remedy(present, hertz) + ("" if source == "projector's" else ", or switch the room's lamps off") + ".",
         figures,
     )
 
 
-def _remedy(present: float | None, hertz: int | None) -> str:
-    choices = _multiples(present, hertz)
+def _flicker_remedy(present: float | None, hertz: int | None) -> str:
+    choices = _mains_multiples(present, hertz)
     listed = " or ".join(f"{value:g} ms (a multiple of 1/{name} s)" for name, value in choices.items())
     return f"Set the exposure to {listed}, and less gain or aperture if that is too bright"
 
 
-def _multiples(present: float | None, hertz: int | None) -> dict[str, float]:
+def _mains_multiples(present: float | None, hertz: int | None) -> dict[str, float]:
     """By frequency in Hz, the multiple of its period in ms that is nearest to the present exposure."""
     return {
         str(name): round(max(1, round((present or 0.0) * name / 1000)) * 1000 / name, 2)
@@ -95,7 +209,7 @@ def _multiples(present: float | None, hertz: int | None) -> dict[str, float]:
     }
 
 
-def _detrended(values: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, float]:
+def _remove_drift(values: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, float]:
     """The values less a straight line, if that is what they mostly follow, and its rise per second."""
     line = np.polyfit(seconds - seconds[0], values, 1)
     rest = values - np.polyval(line, seconds - seconds[0])
@@ -104,7 +218,7 @@ def _detrended(values: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, flo
     return values - values.mean(), 0.0
 
 
-def _mains(values: np.ndarray, seconds: np.ndarray) -> int | None:
+def _identify_mains(values: np.ndarray, seconds: np.ndarray) -> int | None:
     """100 or 120, where one of these frequencies explains the values and the other does not; else None."""
     explained = {}
     for hertz in (100, 120):

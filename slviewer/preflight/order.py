@@ -18,7 +18,7 @@ _PERIODS = 10  # across the projector
 _LAGS = (1, 2, 3)
 
 
-def order(bench: RigUnderTest) -> tuple[Check, Check]:
+def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
     """The checks of the order, and of images that are handed out twice."""
     projector = bench.rig.projector.size
     levels = {1: Frame("white"), 0: Frame("black")}
@@ -31,10 +31,10 @@ def order(bench: RigUnderTest) -> tuple[Check, Check]:
     bench.show(None, "order of the frames")
     bench.wait()
     stack = capture(replace(bench.rig, settle_ms=bench.settle_ms), sequence)
-    return _judged(bench, sequence, stack), repeated_images(sequence, stack)
+    return _judge_order(bench, sequence, stack), check_repeats(sequence, stack)
 
 
-def _judged(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -> Check:
+def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -> Check:
     n = len(stack)
     levels = {i: int(f.kind == "white") for i, f in enumerate(sequence.frames) if f.kind in ("white", "black")}
     shares = {
@@ -52,7 +52,7 @@ def _judged(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -
         "light": [round(shares[i], 3) for i in sorted(shares)],
         "misplaced_frames": sorted({*(i + 1 for i in wrong), *(s.frame + 1 for s in misplaced)}),
     }
-    lag = next((lag for lag in _LAGS if wrong and _behind(shares, levels, lag)), 0)
+    lag = next((lag for lag in _LAGS if wrong and _lags_by(shares, levels, lag)), 0)
     if lag:
         many = "one image" if lag == 1 else f"{lag} images"
         return Check(
@@ -63,8 +63,8 @@ def _judged(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -
             figures | {"lag": lag},
         )
     if wrong or misplaced:
-        told = [s.sentence for s in misplaced] or [f"frame {wrong[0] + 1} shows the wrong level of light"]
-        sentence = "; ".join(told[:3])
+        sentences = [s.sentence for s in misplaced] or [f"frame {wrong[0] + 1} shows the wrong level of light"]
+        sentence = "; ".join(sentences[:3])
         return Check(
             "order",
             "bad",
@@ -85,13 +85,13 @@ def _judged(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -
     return Check("order", "good", f"All {n} coded frames came in order.", "", figures)
 
 
-def _behind(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:
+def _lags_by(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:
     """Whether each level is the one of `lag` frames before, where that was a level too."""
     pairs = [(shares[i], levels[i - lag]) for i in shares if i - lag in levels]
     return all(abs(share - on) < 0.3 for share, on in pairs)
 
 
-def repeated_images(sequence: PatternSequence, stack: np.ndarray) -> Check:
+def check_repeats(sequence: PatternSequence, stack: np.ndarray) -> Check:
     """Images that are the very one before, although another pattern was shown; a camera may be without noise."""
     changed = [k for k in range(1, len(stack)) if sequence.frames[k] != sequence.frames[k - 1]]
     same = [k for k in changed if np.array_equal(stack[k], stack[k - 1])]

@@ -18,8 +18,8 @@ from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_fr
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.preflight.gamma import CURVED
-from slviewer.preflight.order import repeated_images
+from slviewer.preflight.light import CURVED
+from slviewer.preflight.order import check_repeats
 from slviewer.session.capture import Capture
 
 _LIGHT_FAULTS = ("light", "flicker", "exposure-drift")
@@ -47,7 +47,7 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
     checks = (
         _description(capture.name, sequence, frames, phases),
         _order(sequence, fits),
-        repeated_images(sequence, frames),
+        check_repeats(sequence, frames),
         check_capture_exposure(sequence, frames, phases),
         _light(fits),
         _room_light(fits),

@@ -44,7 +44,7 @@ class RigUnderTest:
         self.rig.camera.grab(self._frame)
         return self._frame[:: self.stride, :: self.stride].astype(np.float32)
 
-    def timed(self) -> tuple[float, np.ndarray]:
+    def grab_timed(self) -> tuple[float, np.ndarray]:
         """When grabbing began, in s of the monotonic clock, and the image."""
         begin = time.monotonic()
         return begin, self.grab()
@@ -54,7 +54,7 @@ class RigUnderTest:
         self._tick(doing)
         self.rig.projector.show_level(grey)
 
-    def look(self, grey: int | None, doing: str, images: int = 1) -> np.ndarray:
+    def grab_mean(self, grey: int | None, doing: str, images: int = 1) -> np.ndarray:
         """The mean image under even light that has arrived."""
         self.show(grey, doing)
         self.wait()
@@ -66,7 +66,7 @@ class RigUnderTest:
         for _ in range(self.stale):
             self.grab()
 
-    def find_references(self) -> None:
+    def measure_references(self) -> None:
         """Measure dark and white, with patience: nothing is known yet of the rig's delays."""
         taken = []
         for grey, doing in ((None, "dark"), (255, "white light")):

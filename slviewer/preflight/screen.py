@@ -1,7 +1,11 @@
-"""Does the camera look at what this projector lights?"""
+"""Whether the camera sees this projector, and each pixel of a pattern is one pixel of the projector."""
 
 import numpy as np
 
+from slviewer.devices.capture import capture
+from slviewer.devices.protocols import Rig
+from slviewer.fringe.presets import phase_steps
+from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.check_results import Check
 from slviewer.preflight.rig_under_test import RigUnderTest
 
@@ -10,9 +14,9 @@ _FOLLOWS = 0.9  # correlation with the code
 _NOTHING, _LITTLE = 0.01, 0.1  # shares of the image
 
 
-def screen(bench: RigUnderTest) -> Check:
-    """On and off by a code that nothing else in the room follows; what follows it is what is lit from here on."""
-    images = np.stack([bench.look(255 if on else None, "which screen the camera sees") for on in _CODE])
+def check_screen(bench: RigUnderTest) -> Check:
+    """On and off by a code that nothing else in the room follows; its illuminated pixels are used from here on."""
+    images = np.stack([bench.grab_mean(255 if on else None, "which screen the camera sees") for on in _CODE])
     code = np.array(_CODE) - np.mean(_CODE)
     images = images - images.mean(axis=0)
     amplitude = np.tensordot(code, images, 1) / float(code @ code)  # grey levels, white less dark
@@ -22,7 +26,10 @@ def screen(bench: RigUnderTest) -> Check:
     share = float(follows.mean())
     if share >= _NOTHING:
         bench.illuminated = follows
-    figures = {"share_that_follows": round(share, 4), "contrast_levels": round(float(_middle(amplitude, follows)), 1)}
+    figures = {
+        "share_that_follows": round(share, 4),
+        "contrast_levels": round(float(_median_where(amplitude, follows)), 1),
+    }
     if share < _NOTHING:
         return Check(
             "screen",
@@ -40,9 +47,50 @@ def screen(bench: RigUnderTest) -> Check:
             "Turn the camera and the projector so that both look at the same place, or raise the exposure.",
             figures,
         )
-    sentence = f"{100 * share:.0f} % of the image follows the projector's light."
-    return Check("screen", "good", sentence, "", figures)
+    text = f"{100 * share:.0f} % of the image follows the projector's light."
+    return Check("screen", "good", text, "", figures)
 
 
-def _middle(values: np.ndarray, where: np.ndarray) -> float:
+def _median_where(values: np.ndarray, where: np.ndarray) -> float:
     return float(np.median(values[where])) if where.any() else 0.0
+
+
+_TELLS = 0.08  # grey must be so far from half as bright as white
+_OFF = 0.3  # of that distance
+
+
+def check_pixels(bench: RigUnderTest, middle: float) -> Check:
+    """Whether each pixel of a pattern is one pixel of the projector; ``middle``: light of the middle grey level as a
+    share of white, which the gamma check measured.
+
+    Stripes one pixel wide are half white and half black, and half as bright as white, whether the camera resolves them
+    or not. Where a display scales them they become grey, and grey of a gamma is not half as bright.
+    """
+    where = bench.usable()
+    if abs(middle - 0.5) < _TELLS or not where.any():
+        text = "Whether the display scales the patterns cannot be seen: its grey is as bright as its finest stripes."
+        return Check("pixels", "unknown", text, "", {"middle_grey": round(middle, 3)})
+    size = bench.rig.projector.size
+    shares = []
+    for axis in ("x", "y"):
+        sequence = PatternSequence(size, tuple(phase_steps(axis, 4, 2.0)))
+        rig = Rig(bench.rig.name, bench.rig.camera, bench.rig.projector, bench.settle_ms)
+        frames = capture(rig, sequence)[:, :: bench.stride, :: bench.stride]
+        both = (frames[0].astype(np.float32) + frames[2]) / 2  # stripes and their negative: no moire is left
+        shares.append(bench.share(both, where))
+    worst = max(shares, key=lambda share: abs(share - 0.5))
+    figures = {
+        "fine_stripes_x": round(shares[0], 3),
+        "fine_stripes_y": round(shares[1], 3),
+        "middle_grey": round(middle, 3),
+    }
+    if (worst - 0.5) / (middle - 0.5) > _OFF:
+        return Check(
+            "pixels",
+            "bad",
+            f"Stripes one pixel wide are {100 * worst:.0f} % as bright as white instead of 50 %: the display scales or "
+            "blurs the patterns.",
+            "Set the projector's native resolution, a zoom of 100 %, and no keystone correction or sharpening.",
+            figures,
+        )
+    return Check("pixels", "good", "Patterns are shown pixel for pixel.", "", figures)

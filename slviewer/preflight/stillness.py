@@ -3,7 +3,7 @@
 import numpy as np
 
 from slviewer.pipeline.check_results import Check
-from slviewer.preflight.burst import Burst
+from slviewer.preflight.light import Burst
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _BLOCK = 6  # sampled pixels
@@ -12,14 +12,14 @@ _CHANGE = 0.04  # of the projector's light
 _SOMETHING, _MUCH = 0.004, 0.05  # shares of what is illuminated
 
 
-def stillness(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Check:
+def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Check:
     """White images of the beginning, the middle and the end, block by block, whatever the light as a whole did."""
-    blocks = np.stack([_blocks(image, bench.illuminated) for image in (bench.white, *burst.white, last_white)])
+    blocks = np.stack([_block_means(image, bench.illuminated) for image in (bench.white, *burst.white, last_white)])
     seen = np.isfinite(blocks[0])
     if not seen.any():
         return Check("motion", "unknown", "Motion cannot be seen: too little is illuminated.", "", {})
     blocks = blocks[:, seen]
-    blocks = np.stack([_with_light_of(image, blocks[0]) for image in blocks])
+    blocks = np.stack([_match_light(image, blocks[0]) for image in blocks])
     noise = 1.4826 * float(np.median(np.abs(np.diff(blocks[1:-1], axis=0)))) / np.sqrt(2)
     limit = max(_SIGMAS * np.sqrt(2) * noise, _CHANGE * bench.contrast)
     moved = (np.abs(blocks[1:] - blocks[0]) > limit).mean(axis=1)
@@ -36,7 +36,7 @@ def stillness(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Chec
     return Check("motion", "good", "Nothing moved.", "", figures)
 
 
-def _with_light_of(image: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _match_light(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Blocks as they would be with the lamp and the room of the other image; most of them see the same scene."""
     here = np.ones(len(image), bool)
     fitted = image
@@ -48,7 +48,7 @@ def _with_light_of(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     return fitted
 
 
-def _blocks(image: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
+def _block_means(image: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
     """(n,) means of square blocks; NaN where not all of a block is illuminated."""
     height, width = (size // _BLOCK * _BLOCK for size in image.shape)
     shape = (height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)

@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.pipeline.rig_choice import Choice
-from slviewer.preflight.run import preflight
+from slviewer.preflight.check_rig import preflight
 from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
 from slviewer.wizard.acquisition import LIGHTS

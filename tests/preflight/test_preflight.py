@@ -13,7 +13,7 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import Cancelled
 from slviewer.pipeline.check_results import Preflight
-from slviewer.preflight.run import preflight
+from slviewer.preflight.check_rig import preflight
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
