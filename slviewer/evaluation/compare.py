@@ -36,10 +36,10 @@ class Comparison:
     """One capture of a plane or a sphere, seen through several models.
 
     ``results`` by model name, each over the pixels of ``common`` ``(h, w)`` bool: those of ``region`` ``(h, w)`` bool
-    that every model measures. ``coverage`` by model: measured over lit pixels of the region, NaN if it is not known
-    what is illuminated. ``incidence``: percent of the measured region in R1, R2, R3, or None without a depth range.
-    ``share``: of the pixels that all models measure, those in the region; ``is_searched``: the region was not given,
-    it is the largest patch of the shape.
+    that every model measures. ``coverage`` by model: share of the region's illuminated pixels that it measures, NaN
+    where these are not known. ``incidence``: percent of the measured region in R1, R2, R3, or None without a depth
+    range. ``share``: of the pixels that all models measure, those in the region; ``is_searched``: the region was not
+    given, it is the largest patch of the shape.
     """
 
     shape: Shape

@@ -10,7 +10,7 @@ _RGB = np.array(
     [(26, 54, 140), (48, 126, 208), (150, 205, 232), (236, 238, 226), (250, 205, 120), (232, 112, 52), (150, 18, 38)],
     np.float64,
 )
-"""From too little (blue) through none (near white) to too much (red): told apart by people of any colour vision."""
+"""From too little (blue) through none (near white) to too much (red): distinguishable with any colour vision."""
 
 
 def deviation_colours(signed: np.ndarray, limit: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""How far a scan lies off a nominal model, after the best fit of the one to the other."""
+"""Signed deviations of a scan from a nominal model after best-fit alignment."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -100,10 +100,10 @@ def deviation(
     initial: np.ndarray | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Deviation:
-    """Align scan points (n, 3) mm with a nominal model, and tell how far each lies off it.
+    """Align scan points (n, 3) mm with a nominal model, and return the signed distance of each.
 
     ``normals`` (n, 3) of the scan, towards the camera, NaN where unknown: what faces another way than the nominal is
-    told apart by them. ``sigma_mm``: the expected error of one point. ``reach_mm``: points farther off the nominal
+    excluded by them. ``sigma_mm``: the expected error of one point. ``reach_mm``: points farther off the nominal
     belong to something else; by default 2 % of its diagonal, never below ten times the noise. ``initial`` (4, 4) scan
     to nominal: replaces the search. Raises SlviewerError where the two cannot be aligned with trust.
     """

@@ -1,4 +1,4 @@
-"""Planes, spheres and cylinders fitted to a selected region: what they are, how sure, and whether they are any."""
+"""Planes, spheres and cylinders fitted to a selected region, with their uncertainty, or refused where none fits."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from slviewer.evaluation.fit import SET_ASIDE_SIGMA, SET_ASIDE_WARNING, fit_sett
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.inspection.features import Feature, Kind
 from slviewer.inspection.quantities import Quantity
-from slviewer.inspection.starts import as_plane, as_sphere, estimate_start
+from slviewer.inspection.starts import estimate_start, fit_plane_feature, fit_sphere_feature
 from slviewer.inspection.uncertainty import Shared, Spread, propagate_covariance, scatter_covariance
 from slviewer.records import to_plain
 
@@ -29,8 +29,8 @@ RIVAL = 2.0
 """Another shape must leave this many times less before a region is said to hold that one instead."""
 MOST_RADIUS = 100.0
 """Times the region's size: a cylinder of a larger radius is a plane."""
-SURE_RADIUS = 0.1
-"""A radius less sure than this share of itself (1 sigma) is none."""
+MOST_RADIUS_SIGMA = 0.1
+"""Largest standard deviation of a radius, as a share of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +96,9 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
         raise InputError("A point is picked, not fitted: fit a plane, a sphere or a cylinder.")
     looked_at = points[:: -(-len(points) // MOST_FITTED)]
     try:
-        feature, kept = _settled(kind, looked_at)
+        feature, kept = _fit_robustly(kind, looked_at)
     except InputError as error:
-        raise _why_not(kind, looked_at, error) from error
+        raise _describe_alternative(kind, looked_at, error) from error
     residuals = feature.distance(points)
     counted = within_sigmas(residuals, points)
     used = int(np.count_nonzero(counted))
@@ -110,8 +110,8 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
         )
     basis = looked_at[kept]
     _refuse_other(kind, feature, basis)
-    spread = _spread(feature, basis, shared, calibration)
-    _refuse_unsure(kind, feature, spread)
+    spread = _estimate_spread(feature, basis, shared, calibration)
+    _refuse_uncertain_radius(kind, feature, spread)
     warnings = []
     if aside > SET_ASIDE_WARNING:
         warnings.append(
@@ -126,14 +126,14 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
 def least_squares(kind: Kind, points: np.ndarray, begin: Feature | None) -> Feature:
     """The shape of least squared distances from points (n, 3); a cylinder needs somewhere to ``begin``."""
     if kind == "plane":
-        return as_plane(points)
+        return fit_plane_feature(points)
     if kind == "sphere":
-        return as_sphere(points)
+        return fit_sphere_feature(points)
     assert begin is not None
     return _fit_cylinder(begin, points)
 
 
-def _settled(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
+def _fit_robustly(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
     """The feature, and which of the points it was fitted to: repeated until the set is stable."""
 
     def fit(some: np.ndarray, begin: Feature | None) -> Feature:
@@ -157,7 +157,7 @@ def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
     return Feature("cylinder", middle, along, feature.radius)
 
 
-def _spread(feature: Feature, points: np.ndarray, shared: Shared | None, calibration: str) -> Spread:
+def _estimate_spread(feature: Feature, points: np.ndarray, shared: Shared | None, calibration: str) -> Spread:
     J = feature.jacobian(points)
     own = scatter_covariance(points, J, feature.distance(points))
     if shared is None:
@@ -175,14 +175,14 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
     mine = robust_sigma(feature.distance(some))
     if kind == "plane":
         size = float(np.linalg.norm(np.ptp(some, axis=0)))
-        if mine > MOST_RISE * size and mine > RIVAL * _bent(feature, some):
+        if mine > MOST_RISE * size and mine > RIVAL * _residual_from_quadric(feature, some):
             raise InputError(
                 f"The region bends: it rises {mine:.3g} mm off its best plane over {size:.3g} mm; fit a sphere or a "
                 "cylinder, or select a flatter region."
             )
         return
     other: Kind = "cylinder" if kind == "sphere" else "sphere"
-    rival, flat = _left_by(other, some), _left_by("plane", some)
+    rival, flat = _residual_of(other, some), _residual_of("plane", some)
     if rival * RIVAL < mine and rival * RIVAL < flat:
         raise InputError(
             f"The region is no {kind}: points lie {mine:.3g} mm off it, and {rival:.3g} mm off a {other} (1 sigma); "
@@ -195,11 +195,11 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
         )
 
 
-def _why_not(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
+def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
     """What the region holds instead of a shape that could not be fitted at all."""
     some = points[:: -(-len(points) // MOST_COMPARED)]
     other: Kind = "cylinder" if kind == "sphere" else "sphere"
-    flat, rival = _left_by("plane", some), _left_by(other, some)
+    flat, rival = _residual_of("plane", some), _residual_of(other, some)
     best, left = (other, rival) if rival * RIVAL < flat else ("plane", flat)
     if not np.isfinite(left):
         return error
@@ -209,15 +209,15 @@ def _why_not(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
     )
 
 
-def _left_by(kind: Kind, points: np.ndarray) -> float:
+def _residual_of(kind: Kind, points: np.ndarray) -> float:
     """How far points lie off another shape, robust sigma in mm; infinite where it does not fit at all."""
     try:
-        return robust_sigma(_settled(kind, points)[0].distance(points))
+        return robust_sigma(_fit_robustly(kind, points)[0].distance(points))
     except (InputError, np.linalg.LinAlgError):
         return float("inf")
 
 
-def _bent(plane: Feature, points: np.ndarray) -> float:
+def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
     """Robust sigma in mm about the quadratic surface over a plane: curvature taken away, noise is left."""
     assert plane.direction is not None
     offsets = points - points.mean(axis=0)
@@ -234,11 +234,11 @@ def _bent(plane: Feature, points: np.ndarray) -> float:
     return robust_sigma(heights - fit_reweighted(solve, heights, np.ones(len(heights))))
 
 
-def _refuse_unsure(kind: Kind, feature: Feature, spread: Spread) -> None:
+def _refuse_uncertain_radius(kind: Kind, feature: Feature, spread: Spread) -> None:
     if feature.radius is None:
         return
     sigma = float(spread.sigmas[-1])
-    if not sigma <= SURE_RADIUS * feature.radius:
+    if not sigma <= MOST_RADIUS_SIGMA * feature.radius:
         raise InputError(
             f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the region shows too "
             "little of its curve; select more of it."

@@ -18,7 +18,7 @@ NEGLIGIBLE = 1e-4
 
 
 class NominalSurface:
-    """A mesh, closed or open; its normals say what is outside. Distances are right within a micrometre."""
+    """A mesh, closed or open, whose normals point outside. Distances are right within a micrometre."""
 
     def __init__(self, mesh: Mesh):
         import trimesh
@@ -55,7 +55,7 @@ class NominalSurface:
         offsets = centred - found["points"].numpy().astype(np.float64)
         normals = self._flat[face]
         # inside a triangle its own plane says how far; at a side or corner the direction does, and the side of the
-        # surface is told by what is smooth between the triangles there
+        # surface follows from the normals of the vertices there
         at_side = (s < CORNER) | (t < CORNER) | (1 - s - t < CORNER)
         away = np.sum(normals * offsets, axis=1)
         if at_side.any():

@@ -1,4 +1,4 @@
-"""Where on a nominal model a scan lies, to begin with."""
+"""Initial alignment of a scan to a nominal model."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Where to start a fit in a region that also holds stray points: least median of squares over small samples."""
+"""Robust starts of fits: least median of squares over small samples."""
 
 from collections.abc import Callable
 
@@ -29,11 +29,11 @@ def estimate_start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Fe
     rated: list[tuple[float, int, Feature]] = []
     for n in range(HYPOTHESES if kind != "plane" else HYPOTHESES // 4):
         try:
-            found = _through(kind, sample, normals, rng)
+            found = _fit_sample(kind, sample, normals, rng)
         except (InputError, np.linalg.LinAlgError):
             continue
         if found is not None:
-            rated.append((_median(found, sample), n, found))
+            rated.append((_median_distance(found, sample), n, found))
     refused: InputError | None = None
     best: tuple[float, Feature] | None = None
     for rating, _, found in sorted(rated, key=lambda each: each[:2])[:POLISHED]:
@@ -44,7 +44,7 @@ def estimate_start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Fe
             except InputError as error:
                 refused = error
                 break
-            rating = _median(found, sample)
+            rating = _median_distance(found, sample)
         else:
             if best is None or rating < best[0]:
                 best = rating, found
@@ -64,11 +64,11 @@ def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0])
 
 
-def _through(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator) -> Feature | None:
+def _fit_sample(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator) -> Feature | None:
     """The shape through as few points as fix it; None where they do not."""
     if kind == "cylinder":
         assert normals is not None
-        return _cylinder(sample, normals, rng)
+        return _cylinder_through(sample, normals, rng)
     some = sample[rng.integers(0, len(sample), 3 if kind == "plane" else 4)]
     if kind == "plane":
         plane = fit_plane(some)
@@ -80,7 +80,7 @@ def _through(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np
     return Feature("sphere", some[0] + offset, None, float(np.linalg.norm(offset)))
 
 
-def _cylinder(sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> Feature | None:
+def _cylinder_through(sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> Feature | None:
     """Normals of a cylinder lie on a great circle about its axis (Gauss map): two of them give the axis, and the circle
     through three points, seen along it, the rest."""
     i, j, k = rng.integers(0, len(sample), 3)
@@ -100,17 +100,17 @@ def _cylinder(sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator)
     return Feature("cylinder", (flat[0] + offset) @ frame, axis, float(np.linalg.norm(offset)))
 
 
-def _median(feature: Feature, points: np.ndarray) -> float:
+def _median_distance(feature: Feature, points: np.ndarray) -> float:
     return float(np.median(np.abs(feature.distance(points))))
 
 
-def as_sphere(points: np.ndarray) -> Feature:
+def fit_sphere_feature(points: np.ndarray) -> Feature:
     """The least-squares sphere of points (n, 3). Raises InputError where they are too flat for one."""
     found = fit_sphere(points)
     return Feature("sphere", found.centre, None, found.radius)
 
 
-def as_plane(points: np.ndarray) -> Feature:
+def fit_plane_feature(points: np.ndarray) -> Feature:
     """The least-squares plane of points (n, 3); its place is their middle."""
     found = fit_plane(points)
     middle = points.mean(axis=0)

@@ -1,4 +1,4 @@
-"""How sure a fitted parameter is: what the points' scatter says, and what the calibration leaves, which all share."""
+"""Uncertainty of fitted parameters: from the points' scatter, and from the calibration, which all fits share."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -232,7 +232,7 @@ def _gather(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progres
 
     futures = {client.submit(*call, pure=False): key for key, call in calls.items()}
     answers: dict[Any, Any] = {}
-    told = time.monotonic()
+    warned = time.monotonic()
     try:
         ahead = as_completed(futures, loop=client.loop)
         while len(answers) < len(futures):
@@ -244,8 +244,8 @@ def _gather(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progres
                 progress(len(answers) / len(futures), f"{len(answers)} of {len(futures)}: {name}")
             if not ready:
                 time.sleep(0.05)
-                if time.monotonic() - told > PATIENCE_S:
-                    told = time.monotonic()
+                if time.monotonic() - warned > PATIENCE_S:
+                    warned = time.monotonic()
                     if not client.scheduler_info()["workers"]:
                         warn("the scheduler has no workers at the moment: waiting for some")
     finally:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 CheckVerdict = Literal["good", "warning", "bad", "unknown"]
-"""Capture; capture if you must; do not capture before it is mended; it could not be found out."""
+"""Fit to capture; with reservations; not before it is corrected; could not be determined."""
 
 _WORST_FIRST: tuple[CheckVerdict, ...] = ("bad", "warning", "good")
 

@@ -128,7 +128,7 @@ def compare(
     """
     if out is not None and Path(out).suffix.lower() != ".ply":
         raise UsageError(f"coloured points are written as .ply, not as {Path(out).name}: end its name so")
-    ideal = read_nominal(nominal, units)  # a wrong file is told before minutes of work
+    ideal = read_nominal(nominal, units)  # a wrong file is refused before minutes of work
     with opened(session, write=True) as store:
         reading = part(progress, 0.0, 0.4)
         on = surface(store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn)

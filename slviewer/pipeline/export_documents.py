@@ -1,4 +1,4 @@
-"""What other programs are told of a session beside shapes: the calibration, its coefficients, poses, verifications."""
+"""Documents of a session for other programs: the calibration, its coefficients, poses, verifications."""
 
 import csv
 import io
@@ -54,7 +54,7 @@ _CALIBRATION = {
     "reprojection_rms_px_projector": "the projector's alone, px",
 }
 _FIGURES = ("rms_mm", "overlap", "sigma_shift_mm", "sigma_turn_deg")
-"""Of a scan's registration: its RMS, the share of it that overlaps, and how sure its place is."""
+"""Of a scan's registration: its RMS, the share of it that overlaps, and the standard deviations of its pose."""
 _POSES = {
     "frames": _FRAMES,
     "model": "the calibration that the projector's pose is of",

@@ -40,7 +40,7 @@ from slviewer.session.store import Session
 
 Shape = Literal["plane", "sphere", "cylinder"]
 ROUGH = 5.0
-"""Times the points' noise: a fit that leaves more is told of."""
+"""Times the points' noise: a fit with a larger RMS gets a warning."""
 COLUMNS = ("id", "name", "kind", "scan", "quantity", "value", "unit", "U (k = 2)", "calibration in U", "state", "time")
 
 
@@ -68,10 +68,10 @@ def add_fit(session: SessionLike, on: MeasuredSurface, shape: Shape, region: Reg
     found = fit_feature(shape, on.within(region), on.shared, on.calibration)
     noise = on.noise(region)
     if found.rms > ROUGH * noise:
-        told = (
+        warning = (
             f"points lie {found.rms:.3g} mm (RMS) off the {shape}, and their noise is {noise:.2g} mm: see what it shows"
         )
-        found = replace(found, warnings=(*found.warnings, told))
+        found = replace(found, warnings=(*found.warnings, warning))
     arrays = {} if found.spread.shared is None else {"shared": found.spread.shared.astype(np.float32)}
     where = f"{region.text()}: {found.used:,} used, {found.left_out:,} left out"
     data = {"region": region, "where": where, "fit": found.to_json()}

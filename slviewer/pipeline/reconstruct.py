@@ -43,7 +43,7 @@ SAID_FROM = 1.2
 class Reconstruction:
     """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
     measures the board. ``scale`` says, in words, what correction of scale is in it; ``masked`` is the share of the
-    pixels that were left out because no target pose lit what they look through, None for models that leave out none.
+    pixels that were masked because no target pose illuminated what they look through, None for models that mask none.
     ``frame``: the one that the points are in, in words. ``raised``: the calibration's residuals over their predicted
     noise, by which sigmas are raised.
     """

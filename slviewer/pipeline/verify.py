@@ -28,7 +28,7 @@ Shape = Literal["plane", "sphere"]
 class Verification:
     """The comparison of the models on each capture.
 
-    ``masked``: {capture: {model: share of the shape's pixels that it leaves out because no target pose lit what they
+    ``masked``: {capture: {model: share of the shape's pixels that it masks because no target pose illuminated what they
     look through}}, for models that do. ``scales``: {model: what correction of scale is in it, in words}.
     """
 

@@ -1,6 +1,6 @@
 """The folder on disk: layout, atomic saves, importers of other tools' folders, exporters.
 
-`store.Session` is the door. A session folder holds
+`store.Session` is the only access. A session folder holds
 
 =========================  ==================================================================================
 `session.json`             schema number, when and by which version it was made

@@ -1,4 +1,4 @@
-"""A session: the folder that holds captures, results and decisions, and the only door to it."""
+"""A session: the folder that holds captures, results and decisions, and the only access to it."""
 
 import contextlib
 import threading
@@ -269,16 +269,16 @@ class Session:
     # decisions and exports
 
     def exclude(self, name: str, why: str) -> None:
-        """Leave a capture out of calibrations from now on, and remember why."""
+        """Exclude a capture from calibrations from now on, with the reason."""
         self.load_capture(name)
         self._decide("excluded", lambda excluded: {**(excluded or {}), name: why})
 
     def include(self, name: str) -> None:
-        """Take a capture back in. Does nothing where it was not left out."""
+        """Include a capture again. Does nothing where it was not excluded."""
         self._decide("excluded", lambda all: {other: why for other, why in (all or {}).items() if other != name})
 
     def excluded(self) -> dict[str, str]:
-        """{capture: why} of the captures that the operator left out."""
+        """{capture: reason} of the captures that the operator excluded."""
         return dict(self.decision("excluded") or {})
 
     def decide(self, what: str, value: Any) -> None:

@@ -37,10 +37,19 @@ from slviewer.session.ply import write_ply
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.validation.bench_floors import fastest, median, megabytes, move_bytes, row, time_beside
-from slviewer.validation.bench_gpu import gpu_rows
 from slviewer.validation.bench_live import LiveFigures, live_rate
-from slviewer.validation.bench_peers import fringes_row, icp_rows, missing
+from slviewer.validation.bench_rows import (
+    fastest,
+    fringes_row,
+    gpu_rows,
+    icp_rows,
+    median,
+    megabytes,
+    missing,
+    move_bytes,
+    row,
+    time_beside,
+)
 
 PERIOD_PX = 18.0
 Row = dict[str, Any]
@@ -115,9 +124,9 @@ def bench(
 
 
 def _decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:
-    """Phase steps and Gray code; the kernel's seconds are told apart."""
+    """Phase steps and Gray code; the kernel's seconds apart."""
     coded = frames[:-1]  # without the texture
-    kernel, moved, least = _beside_floor(_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
+    kernel, moved, least = _time_with_floor(_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
     whole = median(lambda: decode(sequence, frames, "x"), 5)
     defined = median(lambda: decode_reference(sequence, frames, "x"), 1, warm=False)
     alone = "phase, wrapped phase, modulation, background and reason, in arrays made before"
@@ -151,7 +160,7 @@ def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
         "splined": (6, lambda: compiled.depth(phase.phase, PERIOD_PX / (2 * np.pi), rays, True)),
     }
     for name, (numbers, work) in fast.items():
-        seconds, moved, least = _beside_floor(work, frames[:0], numbers, (0, 0, 1))
+        seconds, moved, least = _time_with_floor(work, frames[:0], numbers, (0, 0, 1))
         rows.append(row(f"reconstruct from phases, {name}", seconds, moved, least))
     one = OnePass(sequence, pixelwise, "x")
     light = one.light(frames)
@@ -169,13 +178,13 @@ def _one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
     """The fused kernel, which reads ``numbers`` float32 of calibration a pixel; nothing new is asked for in it."""
     light = one.light(frames)
     scan = one.run(frames, light)
-    seconds, moved, least = _beside_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
+    seconds, moved, least = _time_with_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
     note = "frames to phase, points, depth noise, modulation and texture; spikes not repaired"
     stage = f"one pass over {len(frames)} frames, {one.model.name}"
     return row(stage, seconds, moved, least, note=note, target="1.5 floors")
 
 
-def _beside_floor(
+def _time_with_floor(
     work: Callable[[], object], frames: np.ndarray, numbers: int, written: tuple[int, int, int]
 ) -> tuple[float, float, float]:
     """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as `move_bytes` has them."""
@@ -215,7 +224,7 @@ def _peers(
         sequence = one_axis(multifrequency(rig.projector.size, 6), "x")
         frames = renderer.capture(sequence)
         count, size = len(frames) - 1, (frames.shape[2], frames.shape[1])
-        ours, moved, least = _beside_floor(_kernel_alone(sequence, frames), frames[:-1], 0, (1, 4, 0))
+        ours, moved, least = _time_with_floor(_kernel_alone(sequence, frames), frames[:-1], 0, (1, 4, 0))
         note = "absolute and wrapped phase, modulation, background and reason, in arrays made before"
         rows.append(row(f"decode {count} frames of three periods, kernel", ours, moved, least, note=note))
         whole = median(lambda: decode(sequence, frames, "x"), 5)
@@ -272,7 +281,7 @@ def _fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, f
         calibrate_pixelwise(smoothed, stereo)
 
     seconds = fastest(work, 2)
-    tracemalloc.start()  # NumPy tells it of its arrays
+    tracemalloc.start()  # NumPy reports its arrays to it
     work()
     held = tracemalloc.get_traced_memory()[1] / 1e9
     tracemalloc.stop()

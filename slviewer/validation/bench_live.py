@@ -30,7 +30,7 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.truth import rig_record
 from slviewer.wizard.operator import Operator
 
-_LOOKS_FROM = {
+_VIEWPOINT = {
     "wxyz": [1.0, 0.0, 0.0, 0.0],
     "position": [0.0, 0.0, -500.0],
     "fov": 0.75,
@@ -52,7 +52,7 @@ class LiveFigures:
 
     Captures a second before and after that; clouds a second decoded, reconstructed and sent to the viewer that draws;
     `latency_ms`: the median from the first frame's light until a cloud is sent, NaN where none was; `growth_mb`: how
-    much more memory the program used in the last quarter than in the second, None where the system does not tell.
+    much more memory the program used in the last quarter than in the second, None where the system does not report it.
     """
 
     size: tuple[int, int]
@@ -158,7 +158,7 @@ class _Viewer:
     def _serve(self) -> None:
         while not self._closing.is_set():
             with contextlib.suppress(WebSocketException, OSError), self._connect() as connection:
-                connection.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **_LOOKS_FROM}))
+                connection.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **_VIEWPOINT}))
                 if self._draws:
                     self._draw(connection)
                 else:  # until the server gives it up, and once more then
@@ -234,7 +234,7 @@ def _last_notice(operator: Operator) -> str:
 
 
 def _memory_mb() -> float:
-    """Of this process, in use; NaN where the system does not tell."""
+    """Of this process, in use; NaN where the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:

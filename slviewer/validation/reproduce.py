@@ -17,8 +17,7 @@ from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
 from slviewer.pipeline.verify import Verification, verify
 from slviewer.session.store import Session, is_session
-from slviewer.validation.reproduction import MODELS, Reproduction
-from slviewer.validation.reproduction_report import write_reproduction
+from slviewer.validation.reproduction import MODELS, Reproduction, write_reproduction
 
 QUICK_SCALE = 0.5
 PIXEL = (500, 500)

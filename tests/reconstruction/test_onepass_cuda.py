@@ -27,7 +27,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.reconstruction.onepass_cuda import CudaPass, has_pass, one_pass
-from slviewer.validation import bench_gpu
+from slviewer.validation import bench_rows
 
 pytestmark = pytest.mark.slow
 
@@ -126,8 +126,8 @@ def scans_to(folder):
         assert cuda_device.find_device() is not None
         maps = {key: value for key, value in vars(scan).items() if isinstance(value, np.ndarray)}
         np.savez(folder / f"{number}.npz", **maps)
-    bench_gpu.TIMES = bench_gpu.AHEAD = 1
-    (folder / "rows.json").write_text(json.dumps(bench_gpu.gpu_rows(*made("complementary code, splined"))))
+    bench_rows.TIMES = bench_rows.AHEAD = 1
+    (folder / "rows.json").write_text(json.dumps(bench_rows.gpu_rows(*made("complementary code, splined"))))
     for case in list(CASES)[::2]:
         sequence, model, frames = made(case)
         one = CudaPass(sequence, model, "x")

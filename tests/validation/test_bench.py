@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from slviewer.validation.bench import Benchmark
-from slviewer.validation.bench_floors import megabytes, move_bytes, row, time_beside
-from slviewer.validation.bench_peers import missing
+from slviewer.validation.bench_rows import megabytes, missing, move_bytes, row, time_beside
 
 
 @pytest.mark.slow

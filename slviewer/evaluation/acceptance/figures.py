@@ -1,6 +1,6 @@
-"""What a test says of one property: an error, how sure it is, and whether it is allowed.
+"""What a test says of one property: an error, its uncertainty, and whether it is allowed.
 
-Two kinds of ranges are told apart. Of *form* and *flatness* the error itself is a range: the narrowest interval that
+There are two kinds of ranges. Of *form* and *flatness* the error itself is a range: the narrowest interval that
 holds 95 % (99.7 %) of the points' deviations from the fitted shape, so that a few stray points do not decide. Of
 *size*, *spacing* and *scale* the error is one number, and its ranges are where the true error lies with 95 % (99.7 %)
 probability, by the test's own uncertainty.

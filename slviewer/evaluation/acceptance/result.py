@@ -69,15 +69,15 @@ class Acceptance:
     @property
     def lacks(self) -> tuple[str, ...]:
         """What the positions leave untested."""
-        told = []
+        gaps = []
         needed = POSITIONS[self.artefact.kind]
         if len(self.positions) < needed:
-            told.append(f"{len(self.positions)} of {needed} positions were measured")
+            gaps.append(f"{len(self.positions)} of {needed} positions were measured")
         shares = [position.incidence for position in self.positions if position.incidence]
         for part in ("R1", "R3") if shares else ():
             if not any(share[part] >= OUTSIDE for share in shares):
-                told.append(f"no position lies in {part}: what is measured there is untested")
-        return tuple(told)
+                gaps.append(f"no position lies in {part}: what is measured there is untested")
+        return tuple(gaps)
 
     def rows(self) -> list[Row]:
         """One a position, keys are the columns' titles: the worst figure of each property, mm."""

@@ -1,0 +1,217 @@
+"""Rows of the benchmark: how times are taken, memory floors, a CUDA device, and other people's programs."""
+
+import statistics
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from timeit import repeat, timeit
+from typing import Any
+
+import numpy as np
+from numba import prange
+
+from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import SlviewerError
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.geometry import cuda_device
+from slviewer.geometry.jit import kernel
+from slviewer.reconstruction.onepass import LightLevels
+from slviewer.reconstruction.onepass_cuda import CudaPass
+
+
+def row(
+    stage: str,
+    seconds: float,
+    megabytes: float | None = None,
+    floor: float | None = None,
+    definition: float | None = None,
+    note: str = "",
+    target: str = "",
+) -> dict[str, Any]:
+    """One row of the table; ``floor`` and ``definition`` in seconds, for the ratios. ``target``: what is aimed at, on
+    two cores at 1600x1200."""
+    return {
+        "stage": stage,
+        "ms": 1e3 * seconds,
+        "MB": megabytes,
+        "floor ms": None if floor is None else 1e3 * floor,
+        "ratio to floor": None if floor is None else seconds / floor,
+        "ratio NumPy / kernel": None if definition is None else definition / seconds,
+        "target": target,
+        "note": note,
+    }
+
+
+def time_beside(work: Callable[[], object], floor: Callable[[], object], times: int = 9) -> tuple[float, float]:
+    """Least seconds of some work and of its floor, run in turns, which lessens the share of other programs."""
+    work(), floor()  # compiled, and in the caches
+    seconds = [(timeit(work, number=1), timeit(floor, number=1)) for _ in range(times)]
+    return min(each[0] for each in seconds), min(each[1] for each in seconds)
+
+
+def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
+    """Median seconds, after a first run that is not counted where ``warm``."""
+    if warm:
+        work()
+    return statistics.median(repeat(work, number=1, repeat=times))
+
+
+def fastest(work: Callable[[], object], times: int) -> float:
+    """Least seconds, after a first run that is not counted."""
+    work()
+    return min(repeat(work, number=1, repeat=times))
+
+
+def megabytes(*arrays: np.ndarray) -> float:
+    """Size of the arrays, MB."""
+    return sum(a.nbytes for a in arrays) / 1e6
+
+
+@kernel(parallel=True)
+def move_bytes(frames, numbers, grey, single, triple):
+    """Reads ``frames`` (n, h, w) and float32 ``numbers`` (m, h, w) once, and writes ``grey`` (k, h, w) of 8 or 16 bits,
+    ``single`` (j, h, w) float32 and ``triple`` (i, h, w, 3) float32."""
+    width = frames.shape[2]
+    for y in prange(frames.shape[1]):
+        whole, broken = np.zeros(width, frames.dtype), np.zeros(width, np.float32)
+        for k in range(frames.shape[0]):
+            line = frames[k, y]
+            for x in range(width):
+                whole[x] ^= line[x]
+        for k in range(numbers.shape[0]):
+            values = numbers[k, y]
+            for x in range(width):
+                broken[x] += values[x]
+        for k in range(grey.shape[0]):
+            for x in range(width):
+                grey[k, y, x] = whole[x]
+        for k in range(single.shape[0]):
+            for x in range(width):
+                single[k, y, x] = broken[x]
+        for k in range(triple.shape[0]):
+            for x in range(width):
+                triple[k, y, x, 0] = triple[k, y, x, 1] = triple[k, y, x, 2] = broken[x]
+
+
+TIMES = 15
+AHEAD = 8
+"""Copies that keep the device busy while what is measured is queued: it then waits for no Python."""
+
+
+def gpu_rows(
+    sequence: PatternSequence, model: PixelwiseModel | SplinedModel, frames: np.ndarray
+) -> list[dict[str, Any]]:
+    """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, repaired, with copies there and
+    back; nothing without a device."""
+    name = cuda_device.find_device()
+    if name is None:
+        return []
+    one = CudaPass(sequence, model, "x")
+    here = cuda_device.allocate_frames(frames.shape, frames.dtype)
+    here[:] = frames
+    scan = one.run(here)
+    if cuda_device.find_device() is None:  # it failed, with a warning
+        return []
+    alone, least, moved = _time_kernel(one, here, scan.light)
+    whole = median(lambda: one.run(here, scan.light, scan), TIMES)
+    ordinary = median(lambda: one.run(frames, scan.light, scan), TIMES)
+    stage, fast = f"one pass over {len(frames)} frames, {model.name}, {name}", moved / least / 1e9
+    note = f"{least / alone:.0%} of the {fast:.0f} GB/s of a copy on the device"
+    return [
+        row(f"{stage}: kernel", alone, moved / 1e6, least, note=note),
+        row(f"{stage}: with copies", whole, note=f"{1 / whole:.0f} clouds/s, frames in page-locked memory"),
+        row(f"{stage}: with copies", ordinary, note=f"{1 / ordinary:.0f} clouds/s, frames in ordinary memory"),
+    ]
+
+
+def _time_kernel(one: CudaPass, frames: np.ndarray, light: LightLevels) -> tuple[float, float, int]:
+    """(seconds of the first pass, seconds of a copy on the device that moves as much, bytes moved), by its clock."""
+    from numba import cuda
+
+    card = one.card(frames.dtype)
+    card.load(frames)
+    source, target = (cuda.device_array(card.bytes_moved // 2, np.uint8) for _ in range(2))
+    marks = [cuda.event() for _ in range(3)]
+    taken: list[tuple[float, float]] = []
+    for _ in range(TIMES):
+        for _ in range(AHEAD):
+            target.copy_to_device(source, stream=card.stream)
+        marks[0].record(card.stream)
+        target.copy_to_device(source, stream=card.stream)
+        marks[1].record(card.stream)
+        card.sweep(light)
+        marks[2].record(card.stream)
+        card.stream.synchronize()
+        taken.append((marks[0].elapsed_time(marks[1]), marks[1].elapsed_time(marks[2])))
+    copied, swept = (max(1e-3 * statistics.median(ms), 1e-9) for ms in zip(*taken, strict=True))  # simulators return 0
+    return swept, copied, card.bytes_moved
+
+
+INSTALL = "pip install 'slviewer[bench]'"
+
+
+def missing(package: str) -> str:
+    """How to install a peer that is absent, in words; empty where it is here."""
+    try:
+        version(package)
+    except PackageNotFoundError:
+        return f"{package} is not installed, and is not compared with: {INSTALL}"
+    return ""
+
+
+def fringes_row(frames: int, size: tuple[int, int], ours: float) -> dict[str, Any]:
+    """Decoding by `fringes` of as many frames of (width, height), shared among three periods; ``ours`` seconds took our
+    kernel. It makes its arrays itself: brightness and modulation of each period, and coordinates."""
+    from fringes import Fringes
+
+    width, height = size
+    coder = Fringes()
+    coder.X = coder.Y = 912
+    coder.D = 1
+    coder.K = 3
+    coder.v = [1, 8, 57]
+    coder.N = [frames // 3 + (i < frames % 3) for i in range(3)]
+    levels = np.random.default_rng(0).integers(0, 256, (int(coder.T), height, width)).astype(np.uint8)
+    seconds = fastest(lambda: coder.decode(levels), 3)
+    note = f"{seconds / ours:.0f} times our kernel; three periods, coordinates from them, in arrays of its own"
+    return row(f"decode {len(levels)} frames, fringes {version('fringes')}", seconds, note=note, target=">= 100 times")
+
+
+def icp_rows(points: np.ndarray) -> list[dict[str, Any]]:
+    """Aligning a cloud (n, 3) mm with itself, moved by 2 mm and one degree: ours, then `small-gicp`."""
+    import small_gicp
+
+    from slviewer.registration.pairwise import register
+
+    turn = np.radians(1.0)
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    T[:3, 3] = 1.5, -1.0, 1.0
+    middle = points.mean(0)
+    moved = (points - middle) @ T[:3, :3].T + T[:3, 3] + middle
+    count = f"{len(points) / 1e6:.2f} M points"
+
+    def theirs() -> object:
+        return small_gicp.align(
+            points.astype(np.float64),
+            moved.astype(np.float64),
+            registration_type="PLANE_ICP",
+            downsampling_resolution=0.5,
+            max_correspondence_distance=8.0,
+            num_threads=2,
+        )
+
+    rows = [row(f"align {count}, slviewer", _taken(lambda: register(moved, points, initial=np.eye(4))))]
+    note = "point to plane, voxels of 0.5 mm, two threads, without a judgement of the result"
+    return [*rows, row(f"align {count}, small-gicp {version('small-gicp')}", median(theirs, 1), note=note)]
+
+
+def _taken(work: Callable[[], object]) -> float:
+    """Median seconds; a cloud that may slide on itself is refused after the same work."""
+
+    def tried() -> None:
+        with suppress(SlviewerError):
+            work()
+
+    return median(tried, 1)
