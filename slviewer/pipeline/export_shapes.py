@@ -107,7 +107,7 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
     """The points of a merge, or where there is a ``plan`` one mesh through them."""
     name = merge_name(store, name)
     progress(0.1, "reading the merged points")
-    meta, merged = _read_merge(store, name, warn)
+    meta, merged = read_merge(store, f"merge/{name}", warn)
     model = str(meta.get("model", ""))
     notes = (
         f"merge {name} of {', '.join(meta['scans'])}, frame: {frame_of(store, model)}, at {meta['reference']}",
@@ -115,35 +115,34 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
     )
     if plan is None:
         said = "sigma: expected error along the normal, mm"
-        points = PointSet(merged.points, merged.normals, _colours(merged))
+        points = PointSet(merged.points, merged.normals, merged.colours)
         return Described(points, f"merge {name}", merged.scalars, (*notes, said))
     return _describe_mesh(f"merge {name}", build_mesh(_with_normals(merged), plan, part(progress, 0.1, 1)), notes)
 
 
 def merged_points(store: Session, name: str, warn: Warn) -> PointSet:
-    """The points of a merge whose outside is known, to make a mesh of; of the last one where none is named."""
-    return _with_normals(_read_merge(store, merge_name(store, name), warn)[1])
+    """The points of a merge whose normals are known, to make a mesh of; of the last one where none is named."""
+    return _with_normals(read_merge(store, f"merge/{merge_name(store, name)}", warn)[1])
 
 
-def _read_merge(store: Session, name: str, warn: Warn) -> tuple[dict[str, Any], Ply]:
-    if not is_fresh(store, f"merge/{name}"):
-        warn(f"merge {name} came from scans or a calibration that have changed since: merge again")
-    meta = store.load_result(f"merge/{name}", only=())[0]
+def read_merge(store: Session, result: str, warn: Warn) -> tuple[dict[str, Any], Ply]:
+    """The record and the points of a merge that the session stores as ``merge/<number>``; warns of a stale one."""
+    if not is_fresh(store, result):
+        warn(f"{result} came from scans or a calibration that have changed since: merge again")
+    meta = store.load_result(result, only=())[0]
     return meta, read_ply(store.exports / str(meta["ply"]))
 
 
 def _with_normals(merged: Ply) -> PointSet:
-    """In such a file a normal of 0, 0, 0 and a sigma of -1 are not known."""
     if merged.normals is None:
         raise InputError("the merged cloud has no normals: merge the scans again")
-    known = merged.normals.any(axis=1)
-    colours, sigma = _colours(merged), merged.scalars.get("sigma")
-    if sigma is not None and not (sigma[known] > 0).all():
+    known, sigma = np.isfinite(merged.normals).all(axis=1), merged.scalars.get("sigma")
+    if sigma is not None and not np.isfinite(sigma[known]).all():
         sigma = None
     return PointSet(
         merged.points[known],
         merged.normals[known],
-        None if colours is None else colours[known],
+        None if merged.colours is None else merged.colours[known],
         None if sigma is None else sigma[known],
     )
 
@@ -156,8 +155,3 @@ def _describe_mesh(whose: str, made: BuiltMesh, notes: tuple[str, ...]) -> Descr
 def _model_notes(store: Session, model: str) -> tuple[str, ...]:
     scale = describe_scale(store, model) if model else ""
     return (f"calibration {model}", *((scale,) if scale else ())) if model else ()
-
-
-def _colours(merged: Ply) -> np.ndarray | None:
-    colours = merged.colours
-    return np.repeat(colours[:, None], 3, axis=1) if colours is not None and colours.ndim == 1 else colours

@@ -10,14 +10,13 @@ from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
-from slviewer.pipeline.export_shapes import is_fresh, scan_cloud
+from slviewer.pipeline.export_shapes import read_merge, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import Model, check_accepted, load_model, preferred, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor, scale_sigma
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 
 MERGED = "merge/"
@@ -149,15 +148,8 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Measur
 
 def merged_surface(store: Session, merge: str, warn: Warn = ignore_warnings) -> MeasuredSurface:
     """A merge that the session keeps as ``merge/<number>``, in the frame of its reference's camera."""
-    meta = store.load_result(merge, only=())[0]
-    if not is_fresh(store, merge):
-        warn(f"{merge} came from scans or a calibration that have changed since: merge again")
-    points = read_ply(store.exports / str(meta["ply"]))
-    sigma = points.scalars.get("sigma")
-    sigma = np.full(len(points.points), np.nan, np.float32) if sigma is None else np.where(sigma > 0, sigma, np.nan)
-    normals = points.normals
-    if normals is not None:
-        normals = np.where(normals.any(axis=1, keepdims=True), normals, np.float32(np.nan))
+    meta, points = read_merge(store, merge, warn)
+    sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))
     model = str(meta.get("model", ""))
     return MeasuredSurface(
         points.points,
@@ -165,7 +157,7 @@ def merged_surface(store: Session, merge: str, warn: Warn = ignore_warnings) -> 
         merge,
         model,
         store.input_hashes(merge),
-        normals=normals,
+        normals=points.normals,
         faces=points.faces,
         texture=points.colours,
         scale=float(meta.get("scales", {}).get(model, 1.0)),

@@ -20,7 +20,8 @@ UNKNOWN_SIGMA = -1.0
 @dataclass(frozen=True, eq=False)
 class Ply:
     """A PLY's content: ``points`` (n, 3) float32 mm, ``colours`` (n, 3) uint8, ``normals`` (n, 3) float32, ``faces``
-    (m, 3) int32, each None where absent, and every other property of the vertices in ``scalars`` by name, (n,)."""
+    (m, 3) int32, each None where absent, and every other property of the vertices in ``scalars`` by name, (n,). Unknown
+    normals and sigmas are NaN."""
 
     points: np.ndarray
     colours: np.ndarray | None = None
@@ -131,14 +132,19 @@ def check_faces(faces: np.ndarray, count: int) -> None:
 def _content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
     names = vertices.dtype.names or ()
 
-    def joined(*fields: str) -> np.ndarray | None:
+    def join(*fields: str) -> np.ndarray | None:
         return np.stack([vertices[name] for name in fields], axis=1) if set(fields) <= set(names) else None
 
     known = {"x", "y", "z", "nx", "ny", "nz", *COLOURS}
     scalars = {name: vertices[name].copy() for name in names if name not in known}
-    points = joined("x", "y", "z")
+    for name, values in scalars.items():
+        if name.startswith("sigma"):
+            values[values == UNKNOWN_SIGMA] = np.nan
+    points, normals = join("x", "y", "z"), join("nx", "ny", "nz")
     assert points is not None
-    return Ply(points, joined(*COLOURS), joined("nx", "ny", "nz"), scalars, faces)
+    if normals is not None:
+        normals[~normals.any(axis=1)] = np.nan
+    return Ply(points, join(*COLOURS), normals, scalars, faces)
 
 
 def _fields(
