@@ -198,7 +198,7 @@ def _best_fit(
 def _coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndarray]:
     """Share of the nominal's area that was measured, and places (k, 3) in its frame of the rest. ``feet`` (n, 3): where
     on the nominal the scan's points were measured."""
-    places, _ = surface.sampled(COVERAGE_SAMPLES, seed=1)
+    places, _ = surface.sample(COVERAGE_SAMPLES, seed=1)
     thin = feet[:: -(-len(feet) // MOST_FEET)]
     tree = cKDTree(thin)
     spacing, _ = tree.query(thin[:: -(-len(thin) // 2000)], k=2)

@@ -28,15 +28,12 @@ class NominalSurface:
         vertices = mesh.vertices.astype(np.float64)
         self.middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # casting in float32 is finest about 0
         self.diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-        self._corners = (vertices - self.middle)[mesh.faces]
-        flat = np.cross(self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0])
-        lengths = np.linalg.norm(flat, axis=1)
-        self.areas = lengths / 2
-        if not self.areas.sum() > 0:
+        self._mesh: Any = trimesh.Trimesh(vertices - self.middle, mesh.faces, process=False)
+        if not self._mesh.area > 0:
             raise InputError("The nominal model's triangles have no area: give another file.")
-        self._flat = flat / np.maximum(lengths, 1e-300)[:, None]
+        self._flat = np.asarray(self._mesh.face_normals)
         # normals of the vertices weighted by the triangles' angles tell the side of a place (Bærentzen and Aanæs 2005)
-        self._smooth = trimesh.Trimesh(vertices - self.middle, mesh.faces, process=False).vertex_normals
+        self._smooth = np.asarray(self._mesh.vertex_normals)
         self._faces = mesh.faces
         self._at_rim = _at_rim(mesh.faces, len(vertices))
         core = open3d().core
@@ -87,20 +84,12 @@ class NominalSurface:
         seen[seen] = ~self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy()
         return seen
 
-    def sampled(self, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Places (count, 3) evenly over the area, and the triangles' normals there."""
-        rng = np.random.default_rng(seed)
-        # one place in each of so many equal shares of the area
-        shares = np.cumsum(self.areas) / self.areas.sum()
-        face = np.searchsorted(shares, (np.arange(count) + rng.random(count)) / count)
-        face = np.minimum(face, len(self.areas) - 1)
-        a, b = rng.random((2, count))
-        inside = a + b > 1
-        a[inside], b[inside] = 1 - a[inside], 1 - b[inside]
-        corners = self._corners[face]
-        places = corners[:, 0] + a[:, None] * (corners[:, 1] - corners[:, 0])
-        places += b[:, None] * (corners[:, 2] - corners[:, 0])
-        return places + self.middle, self._flat[face]
+    def sample(self, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Places (count, 3) mm evenly over the area, and the unit normals (count, 3) there."""
+        import trimesh
+
+        places, face = trimesh.sample.sample_surface(self._mesh, count, seed=seed)
+        return np.asarray(places) + self.middle, self._flat[face]
 
 
 def _at_rim(faces: np.ndarray, count: int) -> np.ndarray:

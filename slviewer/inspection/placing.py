@@ -42,7 +42,7 @@ def search_start(
     A scan shows one side of a part: each of the nominal's sides is tried as if a camera saw it, until one fits well;
     else the best that is accepted. Raises the first refusal where none is.
     """
-    places, facing = surface.sampled(SAMPLES)
+    places, facing = surface.sample(SAMPLES)
     step = -(-len(points) // MOST_POINTS)
     scan = prepare_scan("scan", points[::step], None if normals is None else normals[::step], sigma_mm)
     good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
