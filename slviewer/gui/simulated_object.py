@@ -27,7 +27,7 @@ class SimulatedObject:
             self._note = Text(gui)
             self._thing: Any = gui.add_dropdown("Object", (_OTHER, *self._things))
             hint = "From the camera"
-            self._distance = gui.add_number("Distance, mm", 600.0, min=NEAREST_MM, max=FARTHEST_MM, step=5.0, hint=hint)
+            self._distance = gui.add_number("Depth, mm", 600.0, min=NEAREST_MM, max=FARTHEST_MM, step=5.0, hint=hint)
             self._turn = gui.add_number("Turn, °", 0.0, min=-90.0, max=90.0, step=5.0)
             self._handles = gui.add_checkbox("3D handles", False, hint="To move and turn it in the 3D view")
         self._values = [SessionValue(each) for each in (self._thing, self._distance, self._turn)]

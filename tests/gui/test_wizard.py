@@ -131,7 +131,7 @@ def bring(page: Page, operator: Operator, depth: float) -> None:
     """Type a distance until what stands before the rig is there: a busy page may draw an older number over it."""
     for _ in range(4):
         for typed in (depth + 1, depth):
-            field(page, "Distance, mm").fill(str(typed))
+            field(page, "Depth, mm").fill(str(typed))
         if operator.wait_for(lambda s: s.world is not None and abs(s.world.T_camera_object[2, 3] - depth) < 0.5, 15.0):
             return
     raise AssertionError(f"nothing came to {depth} mm")
