@@ -247,9 +247,7 @@ def results_table(views: Sequence[VerificationView]) -> str:
             lines.append(
                 [title, shares if view.incidence else "–", *cells, _format(next(iter(view.noise_floor_mm.values())))]
             )
-        html += table(
-            [Html(f"{shape.capitalize()} RMS,&#160;mm"), Html("R1/R2/R3,&#160;%"), *models, "Noise floor"], lines
-        )
+        html += table([Html(f"{shape.capitalize()} RMS,&#160;mm"), "R1/R2/R3, %", *models, "Noise floor"], lines)
         if shape == "sphere":
             html += _table_by_model("Radius, mm", models, {view.name: view.radius_mm for view in of_shape})
     return html
