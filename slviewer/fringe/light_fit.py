@@ -334,48 +334,47 @@ class Remainder:
             "uniform": [one],
             "albedo": [albedo, albedo * (sample.column - 0.5), albedo * (sample.row - 0.5)],
         }
-        regressors: list[np.ndarray] = []
-        for term in terms:
-            by = self.shown if term in ("gain", "wave") else 1 / self.gain
-            regressors += [by * shape for shape in shapes[term]]
-        total = u * len(regressors)
-        extra = len(self.harmonics) + 1
-        normal, moment = np.zeros((total + extra, total + extra)), np.zeros(total + extra)
-        weight = self.weight
-        members = [sample.interior & ~sample.bright, sample.interior & sample.bright]
-        per_class = [weight / np.maximum(count, 1) for count in self.counts]
-        share_of = [1 - share, share]
-        link_weight = self._link_weight(variance, share)
-        # How a frame's change moves the link: through the background, and through the levels of dark and bright.
-        reach = np.empty_like(self.shown)
-        reach[:n] = 0
-        reach[model.determined] = 1 / max(len(model.determined), 1)
-        reach[n:] = -sum(
-            part * m / np.maximum(count, 1) for part, m, count in zip(share_of, members, self.counts, strict=True)
+        R = np.stack(
+            [
+                (self.shown if term in ("gain", "wave") else 1 / self.gain) * shape
+                for term in terms
+                for shape in shapes[term]
+            ]
         )
-        weighted = [r * weight for r in regressors]
-        moved = [r * reach for r in regressors]
-        for a, first in enumerate(regressors):
-            at = slice(a * u, (a + 1) * u)
-            moment[at] = (weighted[a] * self.left).sum(axis=1) + (moved[a] * (link_weight * self.link)).sum(axis=1)
-            for b in range(a, len(regressors)):
-                second = regressors[b]
-                block = np.zeros((u, u))
-                block[:n, :n] = model.keep * (weighted[a][:n] @ second[:n].T)
-                block[np.arange(n, u), np.arange(n, u)] = (weighted[a][n:] * second[n:] * sample.interior).sum(axis=1)
-                for m, by in zip(members, per_class, strict=True):
-                    block[n:, n:] -= (first[n:] * m * by) @ (second[n:] * m).T
-                block += (moved[a] * link_weight) @ moved[b].T
-                normal[at, b * u : (b + 1) * u] = block
-                normal[b * u : (b + 1) * u, at] = block.T
-        self._add_harmonics(normal, moment, regressors, moved, link_weight)
-        last = total + extra - 1
-        for a, change in enumerate(moved):
-            normal[a * u : (a + 1) * u, last] = normal[last, a * u : (a + 1) * u] = change @ (
-                link_weight * self.contrast
-            )
-        normal[last, last] = np.sum(link_weight * self.contrast**2)
-        moment[last] = np.sum(link_weight * self.contrast * self.link)
+        k, c, p = len(R), u - n, len(self.weight)
+        total, at_harmonics = k * u, slice(k * u, k * u + len(self.harmonics))
+        classes = [(~sample.bright & sample.interior, 1 - share), (sample.bright & sample.interior, share)]
+        # How a frame's change moves the link: through the background, and through the levels of dark and bright.
+        reach = np.zeros_like(self.shown)
+        reach[model.determined] = 1 / max(len(model.determined), 1)
+        for (members, part), count in zip(classes, self.counts, strict=True):
+            reach[n:] -= part * members / np.maximum(count, 1)
+        waves = [wave.sum(axis=0) / len(model.determined) for _, wave in self.harmonics]
+        moved = np.concatenate([(R * reach).reshape(total, p), np.array(waves).reshape(-1, p), self.contrast[None]])
+        link_weight = self._link_weight(variance, share)
+        normal = ((moved * link_weight) @ moved.T).astype(float)
+        moment = (moved @ (link_weight * self.link)).astype(float)
+        # What remains of the frames themselves: phase steps project by ``keep``, coded frames lose their class' mean.
+        weighted = R * self.weight
+        blocks = np.zeros((k, u, k, u))
+        phased = weighted[:, :n].reshape(k * n, p) @ R[:, :n].reshape(k * n, p).T
+        blocks[:, :n, :, :n] = model.keep[:, None] * phased.reshape(k, n, k, n)
+        for members, count in zip((members for members, _ in classes), self.counts, strict=True):
+            own = (R[:, n:] * members).reshape(k * c, p)
+            blocks[:, n:, :, n:] -= (own * (self.weight / np.maximum(count, 1)) @ own.T).reshape(k, c, k, c)
+        for i in range(c):
+            blocks[:, n + i, :, n + i] += (weighted[:, n + i] * sample.interior[i]) @ R[:, n + i].T
+        normal[:total, :total] += blocks.reshape(total, total)
+        moment[:total] += (weighted * self.left).sum(axis=2).ravel()
+        # Harmonic n of the fringe in the background of a shift of n steps is an unknown beside the light.
+        for row, (place, wave) in enumerate(self.harmonics, start=total):
+            own = (model.keep[:, place].astype(np.float32) @ wave) * self.weight
+            moment[row] += np.sum(own * self.left[:n])
+            cross = np.zeros((k, u))
+            cross[:, :n] = (own * R[:, :n]).sum(axis=2)
+            normal[row, :total] += cross.ravel()
+            normal[:total, row] += cross.ravel()
+            normal[row, at_harmonics] += [np.sum(own[other] * shown) for other, shown in self.harmonics]
         normal /= variance
         moment /= variance
         self._add_priors(normal, moment, light, terms, share, total)
@@ -402,32 +401,6 @@ class Remainder:
         error = (LINK_ERROR * self.contrast) ** 2
         return np.where(self.linked, self.weight * variance / (variance * parts + error), 0).astype(np.float32)
 
-    def _add_harmonics(
-        self,
-        normal: np.ndarray,
-        moment: np.ndarray,
-        regressors: list[np.ndarray],
-        moved: list[np.ndarray],
-        link_weight: np.ndarray,
-    ) -> None:
-        """Harmonic n of the fringe in the background of a shift of n steps, as unknowns beside the light."""
-        n, u, total = len(self.model.phased), len(self.model.used), len(regressors) * len(self.model.used)
-        kept = [(self.model.keep[:, place].astype(np.float32) @ wave) * self.weight for place, wave in self.harmonics]
-        count = len(self.model.determined)
-        means = [link_weight * wave.sum(axis=0) / count for _, wave in self.harmonics]
-        for a, (own, mean) in enumerate(zip(kept, means, strict=True)):
-            row = total + a
-            moment[row] = np.sum(own * self.left[:n]) + np.sum(mean * self.link)
-            for k, (regressor, change) in enumerate(zip(regressors, moved, strict=True)):
-                both = change @ mean
-                both[:n] += (own * regressor[:n]).sum(axis=1)
-                normal[row, k * u : (k + 1) * u] = normal[k * u : (k + 1) * u, row] = both
-            for b, (place, wave) in enumerate(self.harmonics):
-                normal[row, total + b] = np.sum(own[place] * wave) + np.sum(mean * wave.sum(axis=0)) / len(
-                    self.model.determined
-                )
-            normal[row, -1] = normal[-1, row] = np.sum(mean * self.contrast)
-
     def _add_priors(
         self, normal: np.ndarray, moment: np.ndarray, light: Light, terms: Sequence[Term], share: float, total: int
     ) -> None:
@@ -439,25 +412,20 @@ class Remainder:
             "uniform": light.uniform[model.used, None],
             "albedo": light.albedo[model.used],
         }
-        at = 0
         known = np.isin(model.used, model.informed)
-        apart, coded = np.zeros(u), known & (np.arange(u) >= n)
-        if self.linked.any() and coded.any():
-            apart[known & ~coded] = 1 / np.count_nonzero(known & ~coded)
-            apart[coded] = -1 / np.count_nonzero(coded)
-        for term in terms:
-            for k in range(now[term].shape[1]):
-                here = slice(at, at + u)
-                unit = self.scale(term)
-                precision = (PRIOR[term] * unit) ** -2
-                common = COMMON if term in ("gain", "wave") else 0.0  # the frames' mean is the scene's own
-                normal[here, here] += precision * (np.eye(u) + common * np.outer(known, known))
-                moment[here] -= precision * now[term][:, k]
-                if term == "gain" and apart.any():
-                    stiff = (GROUP_PRIOR * unit) ** -2
-                    normal[here, here] += stiff * np.outer(apart, apart)
-                    moment[here] -= stiff * apart * (apart @ now[term][:, k])
-                at += u
+        columns = [(term, column) for term in terms for column in now[term].T]
+        for a, (term, column) in enumerate(columns):
+            here = slice(a * u, (a + 1) * u)
+            precision = (PRIOR[term] * self.scale(term)) ** -2
+            common = COMMON if term in ("gain", "wave") else 0.0  # the frames' mean is the scene's own
+            normal[here, here] += precision * (np.eye(u) + common * np.outer(known, known))
+            moment[here] -= precision * column
+        phased, coded = known & (np.arange(u) < n), known & (np.arange(u) >= n)
+        if terms[0] == "gain" and self.linked.any() and coded.any():
+            apart = phased / max(np.count_nonzero(phased), 1) - coded / np.count_nonzero(coded)
+            stiff = GROUP_PRIOR**-2
+            normal[:u, :u] += stiff * np.outer(apart, apart)
+            moment[:u] -= stiff * apart * (apart @ columns[0][1])
         extra = np.arange(total, len(normal) - 1)
         normal[extra, extra] += HARMONIC_PRIOR**-2
         normal[-1, -1] += SHARE_PRIOR[1] ** -2
