@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.levels import plan_levels
+from slviewer.fringe.levels import lowest_coordinate, plan_levels, unwrap_levels
 from slviewer.fringe.limits import OUTSIDE_PX
 from slviewer.fringe.line_sample import LineSample
-from slviewer.fringe.reference import lowest_coordinate
 from slviewer.fringe.residual_sample import columns
 from slviewer.fringe.sequence import Axis, Kind, PatternSequence
 
@@ -477,18 +476,8 @@ def _levels(
         levels = plan_levels(periods, frames.extent or 1)
     except InputError:  # periods that cover the projector not at all leave the phase relative
         return None
-    common, turns_all = [], []
-    coordinate = np.zeros(len(weight))
-    for number, level in enumerate(levels):
-        angle = sum(w * psi.astype(np.float64) for w, psi in zip(level.weights, wrapped, strict=True) if w)
-        own = angle * (level.period_px / TWO_PI)
-        if number == 0:
-            low = lowest_coordinate(level.period_px, frames.extent or int(level.period_px))
-            coordinate = own - np.floor((own - low) / level.period_px) * level.period_px
-            continue
-        turns = (coordinate - own) / level.period_px
-        mean = complex((weight * np.exp(1j * TWO_PI * turns)).sum()) / max(float(weight.sum()), 1e-9)
-        common.append(abs(mean))
-        turns_all.append(float(np.angle(mean)) / TWO_PI)
-        coordinate = own + np.rint(turns) * level.period_px
-    return tuple(common), tuple(turns_all), coordinate, weight
+    low = lowest_coordinate(levels[0].period_px, frames.extent or int(levels[0].period_px))
+    coordinate, _, turns = unwrap_levels(levels, wrapped, low)
+    total = max(float(weight.sum()), 1e-9)
+    means = [complex((weight * np.exp(1j * TWO_PI * each)).sum()) / total for each in turns]
+    return tuple(map(abs, means)), tuple(float(np.angle(mean)) / TWO_PI for mean in means), coordinate, weight

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slviewer.fringe import kernels, kernels_cells, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
+from slviewer.fringe import kernels, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
 from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_axis
 from slviewer.fringe.kernels_spikes import spike_rules
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
@@ -42,11 +42,9 @@ def decode(
     elif layout.numbers_periods:
         mean = fringe_mean(layout, stack) if layout.is_plain else MIDDLE
         kernels_coded.decode_coded(stack, shifts_of(layout), scale, code_rules(layout, mean), *maps)
-    elif layout.gray:
-        rules = _cell_rules(layout, fringe_mean(layout, stack))
-        kernels_cells.decode_cells(stack, shifts_of(layout), ladder_of(layout), scale, rules, *maps)
     else:
-        kernels_levels.decode_levels(stack, shifts_of(layout), ladder_of(layout), scale, *maps)
+        ladder = ladder_of(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
+        kernels_levels.decode_levels(stack, shifts_of(layout), ladder, scale, *maps)
     _repair_spikes(layout, maps[0], maps[-1])
     return complete_map(axis, layout, stack, clipped, maps, noise, factor)
 
@@ -96,16 +94,6 @@ def code_rules(layout: Layout, mean: float) -> kernels_coded.CodeRules:
     )
 
 
-def _cell_rules(layout: Layout, mean: float) -> kernels_cells.CellRules:
-    """The Gray bits of a layout whose code numbers cells of more or less than a period."""
-    bits = code_bits(layout)
-    inverses = [*layout.inverse, *[-1] * (len(bits) - len(layout.inverse))]
-    cell = code_cell_px(layout)
-    return kernels_cells.CellRules(
-        np.array(bits, np.int64), np.array(inverses, np.int64), layout.gray_origin_px, cell, mean
-    )
-
-
 def _gray_rules(layout: Layout) -> kernels_gray.GrayRules:
     """The Gray bits of a layout without phase steps."""
     return kernels_gray.GrayRules(
@@ -151,16 +139,21 @@ def shifts_of(layout: Layout) -> kernels.Shifts:
     )
 
 
-def ladder_of(layout: Layout) -> kernels_levels.Ladder:
-    """How a layout's periods become one absolute phase; empty where Gray bits number the periods."""
-    if layout.numbers_periods:
-        return kernels_levels.Ladder(np.zeros((0, 0)), np.zeros(0), 0.0, 0.0, 0.0)
-    levels = layout_levels(layout)
-    extent = min(layout.extent, unambiguous_px(layout))
+def ladder_of(layout: Layout, mean: float = MIDDLE) -> kernels_levels.Ladder:
+    """How a layout's periods, and cells that its Gray bits number, become one absolute phase; without levels where bits
+    number the periods. ``mean`` as `threshold.fringe_mean` returns it."""
+    levels = () if layout.numbers_periods else layout_levels(layout)
+    bits = code_bits(layout) if layout.numbers_cells else ()
+    extent = min(layout.extent, unambiguous_px(layout)) if levels else 0.0
     return kernels_levels.Ladder(
-        np.array([level.weights for level in levels], np.float64),
+        np.array([level.weights for level in levels], np.float64).reshape(len(levels), len(layout.shifts)),
         np.array([level.period_px for level in levels], np.float64),
-        0.0 if layout.gray else lowest_coordinate(levels[0].period_px, extent),
+        lowest_coordinate(levels[0].period_px, extent) if levels and not bits else 0.0,
         limits.LEVEL_MISFIT,
-        cell_misfit(layout),
+        cell_misfit(layout) if levels else 0.0,
+        np.array(bits, np.int64),
+        np.array([*layout.inverse, *[-1] * (len(bits) - len(layout.inverse))] if bits else [], np.int64),
+        layout.gray_origin_px,
+        code_cell_px(layout),
+        mean,
     )

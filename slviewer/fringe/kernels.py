@@ -20,7 +20,7 @@ TURN = np.float32(6.28125)
 TURN_REST = np.float32(2 * np.pi - 6.28125)
 """2 pi in two parts: a whole number times the first is exact in float32."""
 ROWS = 4
-"""Image rows that one turn of a thread takes: room for intermediate results is asked for once."""
+"""Image rows that a thread works on at a time, with one allocation of its buffers."""
 LINE_BYTES = 64
 """Of the processor's cache."""
 HALF_PI, PI = np.float32(np.pi / 2), np.float32(np.pi)

@@ -136,11 +136,11 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
 
 
 @numba.njit(inline="always")
-def coded_row(stack, row, scale, rules, psi, B, A, peak, code, room, phase, reason):
+def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, reason):
     """One row's absolute phase and reason from what ``shift_row`` left; ``code`` (w,) int32 and what `five`
-    gives are room."""
+    gives are buffers."""
     width = stack.shape[2]
-    least, top, bottom, lower, upper = room
+    least, top, bottom, lower, upper = buffers
     code_row(stack, rules.gray, rules.inverse, row, A, code, least, top, bottom, lower, upper)
     origin = np.float32(rules.origin_turns)
     per_mean, per_rest = np.float32(1 / rules.mean), np.float32(1 / (1 - rules.mean))
@@ -190,11 +190,11 @@ def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, b
     A function of its own, which decoding and the pass to points share: it takes the compiler ten seconds.
     """
     width, steps = stack.shape[2], period(shifts, 0)
-    peak, code, room = np.empty(width, stack.dtype), np.empty(width, np.int32), five(width)
+    peak, code, buffers = np.empty(width, stack.dtype), np.empty(width, np.int32), five(width)
     for i in range(len(phase)):
         row, psi, B, A = first + i, wrapped[i], modulation[i], background[i]
         shift_row(stack, steps, row, psi, B, A, peak)
-        coded_row(stack, row, scale, rules, psi, B, A, peak, code, room, phase[i], reason[i])
+        coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase[i], reason[i])
 
 
 @kernel(parallel=True)

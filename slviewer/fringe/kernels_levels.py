@@ -6,26 +6,79 @@ import numba
 import numpy as np
 
 from slviewer.fringe.kernels import ROWS, TURN, TURN_REST, arctan2, five, is_dark_squared, period, sums_row, verdict
+from slviewer.fringe.kernels_coded import UNDECIDED, WEAK, WEAKER
 from slviewer.geometry.jit import fma, kernel
 
 PER_RAD = 1 / (2 * np.pi)
 
 
 class Ladder(NamedTuple):
-    """How several periods become one absolute phase; ``weights`` (levels, m) of the m wrapped
-    phases and ``periods`` (levels,) px describe the levels, longest first; ``low`` px is where the first is cut.
-    ``misfit`` and ``cell_misfit``: see `limits.LEVEL_MISFIT` and `levels.cell_misfit`."""
+    """How several periods become one absolute phase; ``weights`` (levels, m) of the m wrapped phases and ``periods``
+    (levels,) px describe the levels, longest first. ``misfit`` and ``cell_misfit``: see `limits.LEVEL_MISFIT` and
+    `levels.cell_misfit`.
+
+    The first level is cut at ``low`` px, or, where there are Gray ``bits``, lies in the cells that they number: frames
+    (b,), most significant bit first, and of their ``inverses``, -1 for none. Cells of ``cell`` px begin at ``origin``;
+    ``mean``: see `threshold`.
+    """
 
     weights: np.ndarray
     periods: np.ndarray
     low: float
     misfit: float
     cell_misfit: float
+    bits: np.ndarray
+    inverses: np.ndarray
+    origin: float
+    cell: float
+    mean: float
+
+
+@numba.njit
+def cell_row(stack, row, B, A, ladder, heights, cell, worst):
+    """One row's coordinates px of the cells that the bits name, or of the border that a pixel lies at; ``worst`` is
+    infinite where a bit that is not the border's is undecided, else 0."""
+    bits, inverses = ladder.bits, ladder.inverses
+    last = len(bits) - 1
+    mean, half, nothing = np.float32(ladder.mean), np.float32(0.5), np.float32(0)
+    for x in range(len(cell)):
+        code, bit, top, bottom = 0, 0, nothing, nothing
+        for b in range(len(bits)):
+            value = np.float32(stack[bits[b], row, x])
+            height = value - A[x]
+            if inverses[b] >= 0:
+                height = (value - np.float32(stack[inverses[b], row, x])) * half
+            bit ^= int(height > 0)
+            code = 2 * code + bit
+            heights[b], top, bottom = height, max(top, height), min(bottom, height)
+        contrast = max(top / (1 - mean), -bottom / mean)
+        middle = (half - mean) * contrast
+        zeros, ones = 0, 0
+        while zeros <= last and not (code >> zeros) & 1:
+            zeros += 1
+        while ones <= last and (code >> ones) & 1:
+            ones += 1
+        lower = abs(heights[last - zeros] - middle) if zeros <= last else np.float32(np.inf)
+        upper = abs(heights[last - ones] - middle) if ones <= last else np.float32(np.inf)
+        least = np.float32(np.inf)
+        for b in range(len(bits)):
+            if b != last - zeros and b != last - ones:
+                least = min(least, abs(heights[b]))
+        near = WEAK * contrast
+        part = 0.5
+        if upper < near and upper < WEAKER * lower:
+            part = 1.0
+        elif lower < near and lower < WEAKER * upper:
+            part = 0.0
+        cell[x] = ladder.origin + ladder.cell * (code + part)
+        worst[x] = np.float32(np.inf) if least < UNDECIDED * B[x] else nothing
 
 
 @numba.njit(inline="always")
 def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase, reason):
-    """One row's absolute phase and reason from its (m, w) wrapped phases; ``coordinate`` ... ``worst`` (w,) are room.
+    """One row's absolute phase and reason from its (m, w) wrapped phases.
+
+    ``coordinate`` ... ``worst`` (w,) are buffers.
 
     ``cell``: the coordinates px (w,) near which the first level's are, with ``worst`` infinite where they are not
     known; empty where the first level is cut at ``low`` instead. ``weakest``: the smallest square of a modulation.
@@ -83,20 +136,21 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order,
 
 @numba.njit(inline="always")
 def allocate_levels(width):
-    """Room for a row: whether clipped, and eight of float32."""
+    """Buffers for a row: whether clipped, and eight of float32."""
     a, b, c, d, e = five(width)
     f, g, h = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return np.empty(width, np.bool_), a, b, c, d, e, f, g, h
 
 
 @numba.njit(inline="always")
-def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, room):
+def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
     """One row's wrapped phases ``psi`` (m, w), and that ``out`` of the finest period with its modulation B and
-    background A; the room's ``clipped`` and ``weakest`` are of all periods.
+    background A; ``clipped`` and ``weakest`` of the
+    ``buffers`` are of all periods.
 
     The other periods' modulations are compared as squares, which spares their roots.
     """
-    clipped, weakest, _, _, _, _, cosine, sine, total = room
+    clipped, weakest, _, _, _, _, cosine, sine, total = buffers
     width, white = stack.shape[2], np.float32(scale.white)
     for x in range(width):
         weakest[x], clipped[x] = np.float32(np.inf), False
@@ -123,21 +177,22 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, room):
 @kernel()
 def levels_rows(stack, shifts, ladder, scale, first, phase, wrapped, modulation, background, reason):
     """`decode_levels` of some rows from ``first`` on: the five maps hold only those."""
-    count, width = len(shifts.steps), stack.shape[2]
-    psi, peak, room = np.empty((count, width), np.float32), np.empty(width, stack.dtype), allocate_levels(width)
-    clipped, weakest, coordinate, order, own, worst, _, _, _ = room
-    anywhere = np.empty(0, np.float32)
+    count, width, bits = len(shifts.steps), stack.shape[2], len(ladder.bits)
+    psi, peak, buffers = np.empty((count, width), np.float32), np.empty(width, stack.dtype), allocate_levels(width)
+    clipped, weakest, coordinate, order, own, worst, _, _, _ = buffers
+    heights, cell = np.empty(bits, np.float32), np.empty(width if bits else 0, np.float32)
     for i in range(len(phase)):
-        phases_row(stack, shifts, scale, first + i, psi, wrapped[i], modulation[i], background[i], peak, room)
-        levels_row(
-            psi, ladder, weakest, background[i], clipped, scale, anywhere, coordinate, order, own, worst, phase[i],
-            reason[i],
-        )  # fmt: skip
+        B, A = modulation[i], background[i]
+        phases_row(stack, shifts, scale, first + i, psi, wrapped[i], B, A, peak, buffers)
+        if bits:
+            cell_row(stack, first + i, B, A, ladder, heights, cell, worst)
+        levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase[i], reason[i])
 
 
 @kernel(parallel=True)
 def decode_levels(stack, shifts, ladder, scale, phase, wrapped, modulation, background, reason):
-    """Several periods, each by its own phase steps; fills the five (h, w) maps, of the finest period."""
+    """Several periods, each by its own phase steps, and Gray cells, if any; fills the five (h, w) maps, of the finest
+    period."""
     height = stack.shape[1]
     for block in numba.prange((height + ROWS - 1) // ROWS):
         a, b = block * ROWS, min((block + 1) * ROWS, height)

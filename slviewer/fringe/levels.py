@@ -101,6 +101,29 @@ def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ..
     raise InputError(f"fringe periods of {_listed(periods_px)} px tell only {reached:.0f} px apart, not {extent:g}")
 
 
+def unwrap_levels(
+    levels: tuple[Level, ...], wrapped: list[np.ndarray], low: float, near: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Coordinate px and order of the finest period, float64 of the shape of its phase, level by level.
+
+    ``wrapped``: phases rad of all periods, longest first. The first level is the one near the coordinates ``near`` px,
+    or without them from ``low`` px on. Third: for each level that is compared, the periods between the coordinate known
+    before and the level's own phase, whole where both agree.
+    """
+    coordinate, order, turns = near, np.zeros(np.shape(wrapped[0])), list[np.ndarray]()
+    for level in levels:
+        angle = sum(w * psi.astype(np.float64) for w, psi in zip(level.weights, wrapped, strict=True) if w)
+        own = np.asarray(angle * (level.period_px / (2 * np.pi)))
+        if coordinate is None:
+            order = -np.floor((own - low) / level.period_px)
+        else:
+            turns.append((coordinate - own) / level.period_px)
+            order = np.rint(turns[-1])
+        coordinate = own + order * level.period_px
+    assert coordinate is not None
+    return coordinate, order, turns
+
+
 def repeating_range(periods_px: tuple[float, ...]) -> float:
     """px after which all phases of the periods repeat, and up to which they tell coordinates apart: the longest period
     or a beat of two. Raises InputError where no such range holds whole numbers of all periods."""

@@ -13,6 +13,7 @@ from slviewer.fringe.levels import (
     lowest_coordinate,
     needed_modulation,
     unambiguous_px,
+    unwrap_levels,
 )
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap, Reason
@@ -224,23 +225,12 @@ def _order_by_levels(
     """What to add to the finest wrapped phase, in periods, and where the levels contradict each other, or the cell (see
     `_cell`) where there is one."""
     levels = layout_levels(layout)
-    inconsistent = np.zeros(wrapped[0].shape, bool)
-    coordinate, order = np.zeros(wrapped[0].shape), np.zeros(wrapped[0].shape)
-    for number, level in enumerate(levels):
-        angle = sum(w * psi.astype(np.float64) for w, psi in zip(level.weights, wrapped, strict=True) if w)
-        own = angle * (level.period_px / TWO_PI)
-        if number == 0 and cell is not None:
-            turns = (cell[0] - own) / level.period_px
-            order = np.rint(turns)
-            inconsistent = cell[1] | (np.abs(turns - order) > cell_misfit(layout))
-        elif number == 0:
-            low = lowest_coordinate(level.period_px, min(layout.extent, unambiguous_px(layout)))
-            order = -np.floor((own - low) / level.period_px)
-        else:
-            turns = (coordinate - own) / level.period_px
-            order = np.rint(turns)
-            inconsistent |= np.abs(turns - order) > limits.LEVEL_MISFIT
-        coordinate = own + order * level.period_px
+    low = lowest_coordinate(levels[0].period_px, min(layout.extent, unambiguous_px(layout)))
+    _, order, turns = unwrap_levels(levels, wrapped, low, None if cell is None else cell[0])
+    inconsistent = np.zeros(order.shape, bool) if cell is None else cell[1]
+    for k, each in enumerate(turns):
+        largest = cell_misfit(layout) if cell is not None and k == 0 else limits.LEVEL_MISFIT
+        inconsistent = inconsistent | (np.abs(each - np.rint(each)) > largest)
     return order, inconsistent
 
 
