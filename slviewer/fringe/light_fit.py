@@ -422,7 +422,7 @@ class Remainder:
             moment[here] -= precision * column
         phased, coded = known & (np.arange(u) < n), known & (np.arange(u) >= n)
         if terms[0] == "gain" and self.linked.any() and coded.any():
-            apart = phased / max(np.count_nonzero(phased), 1) - coded / np.count_nonzero(coded)
+            apart = phased / max(int(np.count_nonzero(phased)), 1) - coded / int(np.count_nonzero(coded))
             stiff = GROUP_PRIOR**-2
             normal[:u, :u] += stiff * np.outer(apart, apart)
             moment[:u] -= stiff * apart * (apart @ columns[0][1])
