@@ -16,7 +16,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import Layout
-from slviewer.fringe.residual_sample import fit_cosine, spread_rows
+from slviewer.fringe.residual_sample import fit_cosine, select_rows
 from slviewer.fringe.suspect import Suspect
 
 MOST_STEPS = 4
@@ -183,7 +183,7 @@ def _sample_lines(
     stack: np.ndarray, indices: list[int], white: float, noise: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Phasor, background and validity (lines, pixels) of some image rows, and the fringes per pixel along them."""
-    rows = spread_rows(stack.shape[1], stack.shape[2], PIXELS)
+    rows = select_rows(stack.shape[1], stack.shape[2], PIXELS)
     frames = np.stack([stack[i][rows] for i in indices])
     clipped = (frames >= white).any(axis=0)
     background, phasor = fit_cosine(frames.reshape(len(frames), -1).astype(np.float32))

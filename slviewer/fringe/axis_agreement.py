@@ -9,7 +9,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.levels import lowest_coordinate, plan_levels, unwrap_levels
 from slviewer.fringe.limits import OUTSIDE_PX
 from slviewer.fringe.line_sample import LineSample
-from slviewer.fringe.residual_sample import columns
+from slviewer.fringe.residual_sample import cosine_columns
 from slviewer.fringe.sequence import Axis, Kind, PatternSequence
 
 TWO_PI = 2 * np.pi
@@ -201,7 +201,7 @@ class AxisReader:
         there = [image for image in images if image is not None]
         if len(steps) < 3:
             return None
-        weights = np.linalg.pinv(columns(np.array(steps), n, 1))[1:].astype(np.float32)
+        weights = np.linalg.pinv(cosine_columns(np.array(steps), n, 1))[1:].astype(np.float32)
         levels = self.frames[there]
         if frames.gamma != 1.0:
             dark = self.middle - self.swing / 2
@@ -435,7 +435,7 @@ def _reach(
     return replace(result, outside=float(weight[beyond].sum() / max(float(weight.sum()), 1e-9)))
 
 
-def coordinates(reader: AxisReader, frames: AxisFrames) -> np.ndarray:
+def estimate_coordinates(reader: AxisReader, frames: AxisFrames) -> np.ndarray:
     """(p,) float64 projector px of all pixels of the sample, to within a cell of the bits that can be read; NaN where
     they are not read.
     """

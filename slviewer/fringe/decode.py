@@ -41,10 +41,10 @@ def decode(
         kernels_gray.decode_gray(stack, scale, _gray_rules(layout), *maps)
     elif layout.numbers_periods:
         mean = fringe_mean(layout, stack) if layout.is_plain else MIDDLE
-        kernels_coded.decode_coded(stack, shifts_of(layout), scale, code_rules(layout, mean), *maps)
+        kernels_coded.decode_coded(stack, pack_shifts(layout), scale, code_rules(layout, mean), *maps)
     else:
-        ladder = ladder_of(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
-        kernels_levels.decode_levels(stack, shifts_of(layout), ladder, scale, *maps)
+        ladder = pack_levels(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
+        kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, *maps)
     _repair_spikes(layout, maps[0], maps[-1])
     return complete_map(axis, layout, stack, clipped, maps, noise, factor)
 
@@ -108,7 +108,7 @@ def _gray_rules(layout: Layout) -> kernels_gray.GrayRules:
     )
 
 
-def shifts_of(layout: Layout) -> kernels.Shifts:
+def pack_shifts(layout: Layout) -> kernels.Shifts:
     """The frames of all periods of a layout, and the cosines and sines that they are weighted with."""
     frames, angles, half_turns, counted = [], [], [], []
     for shift in layout.shifts:
@@ -139,7 +139,7 @@ def shifts_of(layout: Layout) -> kernels.Shifts:
     )
 
 
-def ladder_of(layout: Layout, mean: float = MIDDLE) -> kernels_levels.Ladder:
+def pack_levels(layout: Layout, mean: float = MIDDLE) -> kernels_levels.Ladder:
     """How a layout's periods, and cells that its Gray bits number, become one absolute phase; without levels where bits
     number the periods. ``mean`` as `threshold.fringe_mean` returns it."""
     levels = () if layout.numbers_periods else layout_levels(layout)

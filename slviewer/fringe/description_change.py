@@ -135,7 +135,7 @@ def _with_values(
         if abs(late) > MAX_BEGIN_TURNS:
             out += _phase_shifted(frames, a, late, axis)
     if a.outside > MAX_OUTSIDE:
-        out += too_small(frames, a, axis)
+        out += explain_reach(frames, a, axis)
     return Answer(tuple(out), sum_shares(a), is_certain(a)) if out else None
 
 
@@ -157,7 +157,7 @@ def _phase_shifted(frames: AxisFrames, a: Agreement, late: float, axis: Axis) ->
     assert frames.fringe is not None
     period, steps = frames.fringe[0], len(frames.fringe[1])
     offset = wrap((frames.offset_rad + 2 * np.pi * late) / (2 * np.pi)) * 2 * np.pi
-    share = share_of_period(2 * np.pi * late)
+    share = describe_turns(2 * np.pi * late)
     shifted = Contradiction(
         "phase-offset",
         f"the phase steps of axis {axis} begin {share} than described: set phase_offset = {offset:.3f} (rad)",
@@ -177,7 +177,7 @@ def _phase_shifted(frames: AxisFrames, a: Agreement, late: float, axis: Axis) ->
     return [shifted, moved] if by_quarter or by_step else [moved, shifted]
 
 
-def too_small(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradiction]:
+def explain_reach(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradiction]:
     """Coordinates beyond the projector."""
     assert frames.extent is not None
     seen = (
@@ -204,7 +204,7 @@ def _with_offset(
     if not failed:
         return Answer(tuple(changes), sum_shares(a), is_certain(a)) if changes else None
     if failed == {"outside"}:
-        return Answer((*changes, *too_small(frames, a, axis)), sum_shares(a), is_certain(a))
+        return Answer((*changes, *explain_reach(frames, a, axis)), sum_shares(a), is_certain(a))
     steps = len(frames.shifts[-1][1])
     best: tuple[float, AxisFrames, Agreement] | None = None
     for turns in (0.25, -0.25, 0.5, *(wrap(k / steps) for k in range(1, steps))):
@@ -216,7 +216,7 @@ def _with_offset(
     if best is None:
         return None
     offset = wrap(best[1].offset_rad / (2 * np.pi)) * 2 * np.pi
-    text = f"the phase steps of axis {axis} begin {share_of_period(offset - frames.offset_rad)} than described"
+    text = f"the phase steps of axis {axis} begin {describe_turns(offset - frames.offset_rad)} than described"
     if changes:  # a sign and an offset: the steps in reverse order
         text = f"the {steps} phase steps of axis {axis} are in reverse order, or"
         cure = f"set phase_sign = {frames.sign} and phase_offset = {offset:.3f} for axis {axis}"
@@ -226,7 +226,7 @@ def _with_offset(
     return Answer((out,), sum_shares(best[2]), is_certain(best[2]))
 
 
-def share_of_period(angle: float) -> str:
+def describe_turns(angle: float) -> str:
     turns = wrap(angle / (2 * np.pi))
     share = {0.25: "a quarter period", 0.5: "half a period"}.get(round(abs(turns) * 20) / 20)
     return f"{share or f'{abs(turns):.2f} periods'} {'later' if turns > 0 else 'earlier'}"

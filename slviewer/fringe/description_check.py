@@ -13,8 +13,8 @@ from slviewer.fringe.agreement_tests import failed_tests, is_supported, sum_shar
 from slviewer.fringe.axis_agreement import (
     Agreement,
     AxisReader,
-    coordinates,
     described_frames,
+    estimate_coordinates,
     measure_agreement,
 )
 from slviewer.fringe.contradiction import Contradiction
@@ -230,7 +230,9 @@ def _mirrored(sequence: PatternSequence, sample: LineSample) -> tuple[Contradict
     grid = grid_sample(sample)
     shape = sample.grid.shape[1:]
     u, v = (
-        coordinates(AxisReader(grid, coded_frames(sequence, axis)), described_frames(sequence, axis)).reshape(shape)
+        estimate_coordinates(AxisReader(grid, coded_frames(sequence, axis)), described_frames(sequence, axis)).reshape(
+            shape
+        )
         for axis in sequence.axes
     )
     here, right, below = np.s_[:-APART, :-APART], np.s_[:-APART, APART:], np.s_[APART:, :-APART]

@@ -11,7 +11,7 @@ from slviewer.fringe.ghost import detect_ghosting
 from slviewer.fringe.layout import Shift
 from slviewer.fringe.line_sample import LineSample
 from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps, recover_step_order
-from slviewer.fringe.residual_sample import Fringe, fringe
+from slviewer.fringe.residual_sample import Fringe, sample_fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 NAMED_BY_STEPS = 0.5
@@ -168,7 +168,7 @@ def _sampled_steps(
     for period, steps in sequence.phase_shifts(axis):
         if images is not None and None in (images[i] for i in steps):
             continue
-        sampled = fringe(lines, Shift(period, steps), (0.0, 0.0), sample.white)
+        sampled = sample_fringe(lines, Shift(period, steps), (0.0, 0.0), sample.white)
         if sampled is not None:
             yield sampled
 

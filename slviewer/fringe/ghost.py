@@ -19,7 +19,7 @@ SIGMAS = 10.0
 """Of its standard error, which tens of thousands of pixels make small: what blur and noise pretend lies below."""
 
 
-def ghost_share(sampled: Fringe) -> tuple[float, float]:
+def measure_ghost_share(sampled: Fringe) -> tuple[float, float]:
     """The share of the image before in each image, and its standard error, from the first step of a period.
 
     NaN where three steps fit anything, or where frames of other light explain the residuals as well. Before the very
@@ -49,7 +49,7 @@ def ghost_share(sampled: Fringe) -> tuple[float, float]:
 
 def detect_ghosting(sampled: Fringe) -> list[Suspect]:
     """The first step of a period, where it holds a share of the image before it."""
-    share, error = ghost_share(sampled)
+    share, error = measure_ghost_share(sampled)
     if not (LEAST_SHARE < share < MOST_SHARE and share > SIGMAS * error):
         return []
     i = sampled.shift.indices[0]

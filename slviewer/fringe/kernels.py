@@ -61,7 +61,7 @@ class Shifts(NamedTuple):
 
 
 @numba.njit(inline="always")
-def period(shifts, i):
+def select_period(shifts, i):
     """The `Steps` of one period."""
     a, b = shifts.starts[i], shifts.starts[i + 1]
     lines = shifts.frames[a:b], shifts.cosines[a:b], shifts.sines[a:b]
@@ -100,7 +100,7 @@ def arctan2(y, x):
 
 
 @numba.njit
-def fetch(stack, frame, row):
+def prefetch_row(stack, frame, row):
     """Have a frame's next row on its way while this one is worked on: the processor itself looks ahead in one or two
     frames, not in twenty."""
     if row + 1 < stack.shape[1]:
@@ -110,7 +110,7 @@ def fetch(stack, frame, row):
 
 
 @numba.njit
-def combined(a, b, c, d):
+def combine_samples(a, b, c, d):
     """Of the samples (p, q, r, s) of a line of `Steps`: their sum, p - r - q + s, p - r + q - s, and the largest."""
     ac, bd = subtract_fixed_width(to_signed(a), to_signed(c)), subtract_fixed_width(to_signed(b), to_signed(d))
     total = add_fixed_width(add_fixed_width(to_signed(a), to_signed(b)), add_fixed_width(to_signed(c), to_signed(d)))
@@ -118,17 +118,17 @@ def combined(a, b, c, d):
 
 
 @numba.njit
-def four(a, b, c, d, cos_a, sin_a):
+def add_four(a, b, c, d, cos_a, sin_a):
     """What the samples of a line add: to all samples, to the cosines and to the sines; and the largest."""
-    total, even, odd, peak = combined(a, b, c, d)
+    total, even, odd, peak = combine_samples(a, b, c, d)
     return np.float32(total), cos_a * np.float32(even), sin_a * np.float32(odd), peak
 
 
 @numba.njit
-def eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
+def add_eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
     """The same of two lines."""
-    one, even, odd, peak = combined(a, b, c, d)
-    two, even_e, odd_e, peak_e = combined(e, f, g, h)
+    one, even, odd, peak = combine_samples(a, b, c, d)
+    two, even_e, odd_e, peak_e = combine_samples(e, f, g, h)
     cosine = fma(cos_a, np.float32(even), cos_e * np.float32(even_e))
     sine = fma(sin_a, np.float32(odd), sin_e * np.float32(odd_e))
     return np.float32(add_fixed_width(one, two)), cosine, sine, max(peak, peak_e)
@@ -145,16 +145,16 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
         e, f, g, h = stack[j[0], row], stack[j[1], row], stack[j[2], row], stack[j[3], row]
         cos_a, sin_a, cos_e, sin_e = shift.cosines[k], shift.sines[k], shift.cosines[k + 1], shift.sines[k + 1]
         for q in range(4):
-            fetch(stack, i[q], row)
-            fetch(stack, j[q], row)
+            prefetch_row(stack, i[q], row)
+            prefetch_row(stack, j[q], row)
         if k == 0:
             for x in range(width):
-                total[x], cosine[x], sine[x], peak[x] = eight(
+                total[x], cosine[x], sine[x], peak[x] = add_eight(
                     a[x], b[x], c[x], d[x], e[x], f[x], g[x], h[x], cos_a, sin_a, cos_e, sin_e
                 )
         else:
             for x in range(width):
-                all_x, cos_x, sin_x, peak_x = eight(
+                all_x, cos_x, sin_x, peak_x = add_eight(
                     a[x], b[x], c[x], d[x], e[x], f[x], g[x], h[x], cos_a, sin_a, cos_e, sin_e
                 )
                 total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
@@ -164,13 +164,13 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
         i, cos_a, sin_a = shift.frames[k], shift.cosines[k], shift.sines[k]
         a, b, c, d = stack[i[0], row], stack[i[1], row], stack[i[2], row], stack[i[3], row]
         for q in range(4):
-            fetch(stack, i[q], row)
+            prefetch_row(stack, i[q], row)
         if k == 0:
             for x in range(width):
-                total[x], cosine[x], sine[x], peak[x] = four(a[x], b[x], c[x], d[x], cos_a, sin_a)
+                total[x], cosine[x], sine[x], peak[x] = add_four(a[x], b[x], c[x], d[x], cos_a, sin_a)
         else:
             for x in range(width):
-                all_x, cos_x, sin_x, peak_x = four(a[x], b[x], c[x], d[x], cos_a, sin_a)
+                all_x, cos_x, sin_x, peak_x = add_four(a[x], b[x], c[x], d[x], cos_a, sin_a)
                 total[x], cosine[x], sine[x] = total[x] + all_x, cosine[x] + cos_x, sine[x] + sin_x
                 peak[x] = max(peak[x], peak_x)
     if shift.turn_sine != 0.0 or shift.turn_cosine < 0.0:
@@ -216,7 +216,7 @@ def is_clipped(modulation, background, peak, scale):
 
 
 @numba.njit
-def verdict(dark, clipped, inconsistent):
+def select_reason(dark, clipped, inconsistent):
     """The first reason that applies: what is clipped in all its frames has no modulation, yet is not dark."""
     unclipped = DARK if dark else (INCONSISTENT if inconsistent else VALID)
     return SATURATED if clipped else unclipped
@@ -232,7 +232,7 @@ def bit_height(stack, frames, inverses, bit, row, x, threshold):
 
 
 @numba.njit(inline="always")
-def five(width):
+def allocate_five(width):
     """Five rows of float32; arrays of their own, so that the compiler knows that none overlap."""
     a, b, c = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return a, b, c, np.empty(width, np.float32), np.empty(width, np.float32)

@@ -11,13 +11,13 @@ from slviewer.fringe.kernels import (
     ROWS,
     TURN,
     TURN_REST,
-    fetch,
-    five,
+    allocate_five,
     is_clipped,
     is_dark,
-    period,
+    prefetch_row,
+    select_period,
+    select_reason,
     shift_row,
-    verdict,
 )  # fmt: skip
 from slviewer.geometry.jit import fma, kernel
 
@@ -94,7 +94,7 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
         last = min(start + 8, len(frames))
         if (last - start) % 2:
             frame = stack[frames[start], row]
-            fetch(stack, frames[start], row)
+            prefetch_row(stack, frames[start], row)
             for x in range(width):
                 value, digit = frame[x], np.uint8(bits[x] & 1)
                 one, over_least[x], under_most[x], at_one[x], at_nought[x] = read_bit(
@@ -104,8 +104,8 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
                 most[x], fewest[x] = max(most[x], value), min(fewest[x], value)
         for b in range(start + (last - start) % 2, last, 2):  # two bits to a pass
             frame, other = stack[frames[b], row], stack[frames[b + 1], row]
-            fetch(stack, frames[b], row)
-            fetch(stack, frames[b + 1], row)
+            prefetch_row(stack, frames[b], row)
+            prefetch_row(stack, frames[b + 1], row)
             for x in range(width):
                 value, after, digit = frame[x], other[x], np.uint8(bits[x] & 1)
                 one, least_x, most_x, one_x, nought_x = read_bit(
@@ -137,7 +137,7 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
 
 @numba.njit(inline="always")
 def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, reason):
-    """One row's absolute phase and reason from what ``shift_row`` left; ``code`` (w,) int32 and what `five`
+    """One row's absolute phase and reason from what ``shift_row`` left; ``code`` (w,) int32 and what `allocate_five`
     gives are buffers."""
     width = stack.shape[2]
     least, top, bottom, lower, upper = buffers
@@ -159,7 +159,7 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
             order = np.int32(cell >> 1) if middle else beside
             unclear = (least[x] if middle else abs(last)) < UNDECIDED * B[x]
             dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
-            reason[x] = verdict(dark, clipped, unclear)
+            reason[x] = select_reason(dark, clipped, unclear)
             periods = np.float32(order) - whole
             absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
             phase[x] = none if dark | clipped | unclear else absolute
@@ -170,7 +170,7 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
             part = turns - whole
             unclear = (least[x] < UNDECIDED * B[x]) & (part >= EDGE) & (part < FAR_EDGE)
             dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
-            reason[x] = verdict(dark, clipped, unclear)
+            reason[x] = select_reason(dark, clipped, unclear)
             # On a blurred edge the bit nearest the middle and the phase may disagree about the side: the phase decides.
             contrast = max(top[x] * per_rest, np.float32(0) - bottom[x] * per_mean)
             below, above = abs(lower[x] - off_middle * contrast), abs(upper[x] - off_middle * contrast)
@@ -189,8 +189,8 @@ def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, b
 
     A function of its own, which decoding and the pass to points share: it takes the compiler ten seconds.
     """
-    width, steps = stack.shape[2], period(shifts, 0)
-    peak, code, buffers = np.empty(width, stack.dtype), np.empty(width, np.int32), five(width)
+    width, steps = stack.shape[2], select_period(shifts, 0)
+    peak, code, buffers = np.empty(width, stack.dtype), np.empty(width, np.int32), allocate_five(width)
     for i in range(len(phase)):
         row, psi, B, A = first + i, wrapped[i], modulation[i], background[i]
         shift_row(stack, steps, row, psi, B, A, peak)

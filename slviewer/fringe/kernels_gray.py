@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from slviewer.fringe import limits
-from slviewer.fringe.kernels import bit_height, is_dark, verdict
+from slviewer.fringe.kernels import bit_height, is_dark, select_reason
 from slviewer.geometry.jit import kernel
 
 TWO_PI = 2 * np.pi
@@ -59,7 +59,7 @@ def decode_gray(stack, scale, rules, phase, wrapped, modulation, background, rea
             unclear = doubts > 1 or abs(code - other) > 1
             modulation[row, x], background[row, x], wrapped[row, x] = B, A, np.float32(np.nan)
             dark = (doubts >= limits.DARK_BITS) | is_dark(B, A, scale)
-            reason[row, x] = verdict(dark, False, unclear)
+            reason[row, x] = select_reason(dark, False, unclear)
             start, end = (
                 rules.origin + rules.cell * min(code, other),
                 rules.origin + rules.cell * (max(code, other) + 1),

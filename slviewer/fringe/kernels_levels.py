@@ -5,7 +5,17 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from slviewer.fringe.kernels import ROWS, TURN, TURN_REST, arctan2, five, is_dark_squared, period, sums_row, verdict
+from slviewer.fringe.kernels import (
+    ROWS,
+    TURN,
+    TURN_REST,
+    allocate_five,
+    arctan2,
+    is_dark_squared,
+    select_period,
+    select_reason,
+    sums_row,
+)
 from slviewer.fringe.kernels_coded import UNDECIDED, WEAK, WEAKER
 from slviewer.geometry.jit import fma, kernel
 
@@ -129,7 +139,7 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order,
     finest = psi[count - 1]
     for x in range(width):
         dark, unclear = is_dark_squared(weakest[x], A[x], scale), worst[x] > misfit
-        reason[x] = verdict(dark, clipped[x], unclear)
+        reason[x] = select_reason(dark, clipped[x], unclear)
         absolute = fma(order[x], TURN, fma(order[x], TURN_REST, finest[x]))
         phase[x] = np.float32(np.nan) if dark | clipped[x] | unclear else absolute
 
@@ -137,7 +147,7 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order,
 @numba.njit(inline="always")
 def allocate_levels(width):
     """Buffers for a row: whether clipped, and eight of float32."""
-    a, b, c, d, e = five(width)
+    a, b, c, d, e = allocate_five(width)
     f, g, h = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return np.empty(width, np.bool_), a, b, c, d, e, f, g, h
 
@@ -155,7 +165,7 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
     for x in range(width):
         weakest[x], clipped[x] = np.float32(np.inf), False
     for i in range(len(shifts.steps)):  # the finest is last, and its values stay
-        steps = period(shifts, i)
+        steps = select_period(shifts, i)
         sums_row(stack, steps, row, cosine, sine, total, peak)
         first, wrapped = stack[steps.first, row], psi[i]
         per_two, per_one, counted = np.float32(2 / steps.steps), np.float32(1 / steps.steps), np.float32(steps.counted)

@@ -50,7 +50,7 @@ def layout_levels(layout: Layout) -> tuple[Level, ...]:
                 f"{where}{error}, which the projector spans: add a longer period or Gray code, or set relative = true "
                 "for a phase that is not absolute"
             ) from error
-    return plan_levels(periods, repeating_range(periods))
+    return plan_levels(periods, find_common_range(periods))
 
 
 def unambiguous_px(layout: Layout) -> float:
@@ -124,7 +124,7 @@ def unwrap_levels(
     return coordinate, order, turns
 
 
-def repeating_range(periods_px: tuple[float, ...]) -> float:
+def find_common_range(periods_px: tuple[float, ...]) -> float:
     """px after which all phases of the periods repeat, and up to which they tell coordinates apart: the longest period
     or a beat of two. Raises InputError where no such range holds whole numbers of all periods."""
     count = min(LONGEST, len(periods_px))
@@ -140,7 +140,7 @@ def repeating_range(periods_px: tuple[float, ...]) -> float:
     )
 
 
-def needed_modulation(levels: tuple[Level, ...], steps: int) -> float:
+def required_modulation(levels: tuple[Level, ...], steps: int) -> float:
     """The modulation, in standard deviations of a grey level, with which each level surely finds the order of the next.
 
     ``steps``: phase steps of the period with the fewest.

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from slviewer.fringe.light_sample import LightSample
-from slviewer.fringe.residual_sample import columns, common_harmonics, fit_cosine
+from slviewer.fringe.residual_sample import cosine_columns, fit_common_harmonics, fit_cosine
 
 Term = Literal["gain", "wave", "uniform", "albedo"]
 
@@ -193,7 +194,7 @@ class LightModel:
             turning = abs(complex(np.mean(phasor / np.maximum(np.abs(phasor), 1e-6)))) < ONE_SIDED
             # Of a fringe seen in part of its phases, harmonics cannot be separated from light: its frames are free.
             part = np.zeros((n, 2 if turning else steps))
-            part[place] = columns(np.arange(steps), steps, 1)[:, 1:] if turning else np.eye(steps)
+            part[place] = cosine_columns(np.arange(steps), steps, 1)[:, 1:] if turning else np.eye(steps)
             parts.append(part)
             self.places.append(place)
             self.turning.append(turning)
@@ -226,7 +227,7 @@ class LightModel:
                 unit = phasor / np.maximum(strength, 1e-6)
                 steps = len(shift)
                 if steps > 3 and turning:
-                    phases[place] -= common_harmonics(phases[place], phasor, 1)
+                    phases[place] -= fit_common_harmonics(phases[place], phasor, 1)
                 if steps <= HARMONIC_STEPS and turning:  # it looks like a change of the background
                     wave = (strength * unit**steps).astype(np.complex64)
                     harmonics += [(place, np.tile(part, (steps, 1))) for part in (wave.real, wave.imag)]
@@ -387,13 +388,7 @@ class Remainder:
         blocks = []
         for term in terms:
             blocks += [np.eye(len(used)) if term in ("gain", "wave") else after] * WIDTH[term]
-        rest = total - len(blocks) * len(used)
-        out = np.zeros((total, sum(block.shape[1] for block in blocks) + rest))
-        row = column = 0
-        for block in [*blocks, np.eye(rest)]:
-            out[row : row + block.shape[0], column : column + block.shape[1]] = block
-            row, column = row + block.shape[0], column + block.shape[1]
-        return out
+        return np.asarray(block_diag(*blocks, np.eye(total - len(blocks) * len(used))))
 
     def _link_weight(self, variance: float, share: float) -> np.ndarray:
         dark, bright = (np.maximum(count, 1) for count in self.counts)

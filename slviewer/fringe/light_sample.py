@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import white_level
-from slviewer.fringe.residual_sample import fit_cosine, roughness
+from slviewer.fringe.residual_sample import estimate_roughness, fit_cosine
 from slviewer.fringe.sequence import PatternSequence
 
 ROWS, COLUMNS = 48, 88
@@ -85,7 +85,9 @@ def sample_light(
         frames[i] = stack[i][row, column]
     white = white_level(stack, used)
     run = columns[0] + np.arange(width - 2 * margin)
-    rough = roughness(np.stack([stack[i][rows[::4, None], run] for i in used[:4]]).astype(np.float32), len(run))
+    rough = estimate_roughness(
+        np.stack([stack[i][rows[::4, None], run] for i in used[:4]]).astype(np.float32), len(run)
+    )
     limit = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * rough)
     if phased:
         amplitudes = np.stack([np.abs(fit_cosine(frames[list(shift)])[1]) for shift in shifts])

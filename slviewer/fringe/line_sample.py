@@ -6,7 +6,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import white_level
-from slviewer.fringe.residual_sample import roughness
+from slviewer.fringe.residual_sample import estimate_roughness
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 PIXELS = 40_000
@@ -74,7 +74,7 @@ def sample_frames(stack: np.ndarray, coded: list[int], pixels: int = PIXELS) -> 
         [np.repeat(np.arange(len(rows)), width), len(rows) + np.repeat(np.arange(len(columns)), height)]
     )
     place = np.concatenate([np.tile(np.arange(width), len(rows)), np.tile(np.arange(height), len(columns))])
-    noise = roughness(frames[coded][:, : len(rows) * width], width)
+    noise = estimate_roughness(frames[coded][:, : len(rows) * width], width)
     return LineSample(frames, line, len(rows), place, lines, grid, white, noise)
 
 

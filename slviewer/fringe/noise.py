@@ -1,9 +1,10 @@
 """The camera's noise, measured from the frames of one capture."""
 
 import numpy as np
+from scipy.optimize import nnls
 
 from slviewer.fringe.layout import Layout
-from slviewer.fringe.residual_sample import columns, common_harmonics, fit_cosine
+from slviewer.fringe.residual_sample import cosine_columns, fit_common_harmonics, fit_cosine
 
 ROWS = 20
 """Image rows that are sampled."""
@@ -64,9 +65,9 @@ def _from_phase(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarr
     background, phasor = fit_cosine(frames)
     residue = frames - background
     if own < OWN_HARMONICS:
-        residue -= common_harmonics(frames, phasor, own)
+        residue -= fit_common_harmonics(frames, phasor, own)
     freedom = n - 1 - 2 * own
-    for vector in np.linalg.qr(columns(np.arange(n), n, own))[0].T.astype(np.float32):
+    for vector in np.linalg.qr(cosine_columns(np.arange(n), n, own))[0].T.astype(np.float32):
         # Not a matrix product: BLAS would start its threads for this little, and they get in the way of numba's.
         residue -= vector[:, None] * np.einsum("k,kp->p", vector, residue)
     variance = (residue**2).sum(axis=0).reshape(samples.shape[1:]).mean(axis=-1) / freedom
@@ -112,13 +113,10 @@ def _binned(levels: np.ndarray, variances: np.ndarray, freedom: float) -> tuple[
 
 def _fit_line(levels: np.ndarray, variances: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
     """Non-negative (a, b) of variance = a + b level, each bin weighted by its own precision."""
-    if len(levels) == 0:
-        return 0.0, 0.0
+    if len(levels) < 2:
+        return (float(variances[0]) if len(levels) else 0.0), 0.0
     weight = np.sqrt(counts) / np.maximum(variances, 0.1 * variances.mean() + 1e-12)
     design = np.stack([np.ones_like(levels), levels], axis=1) * weight[:, None]
     target = variances * weight
-    candidates = [np.linalg.lstsq(design, target, rcond=None)[0]] if len(levels) > 1 else []
-    candidates += [np.array([(design[:, 0] @ target) / (design[:, 0] @ design[:, 0]), 0.0])]
-    candidates += [np.array([0.0, (design[:, 1] @ target) / max(design[:, 1] @ design[:, 1], 1e-12)])]
-    a, b = min((c for c in candidates if c.min() >= 0), key=lambda c: float(np.sum((design @ c - target) ** 2)))
+    a, b = nnls(design, target)[0]
     return float(a), float(b)

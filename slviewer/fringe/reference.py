@@ -11,13 +11,13 @@ from slviewer.fringe.levels import (
     code_cell_px,
     layout_levels,
     lowest_coordinate,
-    needed_modulation,
+    required_modulation,
     unambiguous_px,
     unwrap_levels,
 )
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.reference_spikes import settle
+from slviewer.fringe.reference_spikes import repair_spikes
 from slviewer.fringe.scatter import with_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import fringe_mean
@@ -56,7 +56,7 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
         [saturated, dark, inconsistent], [Reason.SATURATED, Reason.DARK, Reason.INCONSISTENT], Reason.VALID
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
-    phase, reason = settle(layout, phase, reason)
+    phase, reason = repair_spikes(layout, phase, reason)
     return complete_map(axis, layout, stack, white, (phase, wrapped, modulation, background, reason), noise, factor)
 
 
@@ -124,7 +124,7 @@ def dark_sigmas(layout: Layout) -> float:
     if layout.numbers_periods or not layout.shifts:
         return limits.DARK_SIGMAS
     steps = min(len(shift.indices) for shift in layout.shifts)
-    return max(limits.DARK_SIGMAS, needed_modulation(layout_levels(layout), steps))
+    return max(limits.DARK_SIGMAS, required_modulation(layout_levels(layout), steps))
 
 
 def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float, sigmas: float) -> np.ndarray:
@@ -241,7 +241,7 @@ def _gray_alone(
 
     One undecided bit whose two readings are neighbouring columns puts the pixel on the border between them.
     """
-    modulation, background = contrast(layout, stack)
+    modulation, background = measure_gray_contrast(layout, stack)
     part_of_sigma = np.sqrt(0.5 if layout.inverse else 1.5)
     sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background) * np.float32(part_of_sigma)
     limit = np.maximum(
@@ -267,7 +267,7 @@ def _gray_alone(
     return phase, modulation, background, inconsistent, doubts >= limits.DARK_BITS
 
 
-def contrast(layout: Layout, stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def measure_gray_contrast(layout: Layout, stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(modulation, background) of Gray code alone: half of white - black and their mean, else from the inverses."""
     if layout.white is not None and layout.black is not None:
         white, black = (stack[i].astype(np.float32) for i in (layout.white, layout.black))

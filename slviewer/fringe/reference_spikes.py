@@ -10,7 +10,7 @@ from slviewer.fringe.phase import Reason
 TWO_PI = 2 * np.pi
 
 
-def settle(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Phase and reason after a look at each pixel's neighbourhood; (h, w) each, new arrays.
 
     A plain Gray code may be read from the wrong side of its edge: where a clear majority of the neighbours says so,

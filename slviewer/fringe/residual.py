@@ -21,7 +21,7 @@ from slviewer.fringe.frame_light import CLIPPED, FrameLight, detect_light_faults
 from slviewer.fringe.layout import Layout, axis_layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps
-from slviewer.fringe.residual_sample import Fringe, fringe
+from slviewer.fringe.residual_sample import Fringe, sample_fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.suspect import LIGHT_FAULTS, ORDER_FAULTS, Fault, Suspect
 
@@ -128,7 +128,7 @@ def _compare(frames: _Frames, layout: Layout) -> FrameResiduals:
     suspects: list[Suspect] = []
     said: list[str] = []
     for shift in layout.shifts:
-        sampled = fringe(stack, shift, noise, white)
+        sampled = sample_fringe(stack, shift, noise, white)
         what = f"axis {axis}, period {shift.period_px:g} px"
         if sampled is None:
             residuals += [FrameResidual(i, np.nan, np.nan, np.nan) for i in shift.indices]

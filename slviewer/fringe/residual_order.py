@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from slviewer.fringe.ghost import detect_ghosting
-from slviewer.fringe.residual_sample import Fringe, columns
+from slviewer.fringe.residual_sample import Fringe, cosine_columns
 from slviewer.fringe.suspect import Fault, Suspect
 
 _AS_EXPECTED = 0.7
@@ -125,7 +125,7 @@ def detect_foreign_frames(sampled: Fringe) -> list[Suspect]:
 def _differs_in_light_only(sampled: Fringe, k: int) -> bool:
     """Whether frame k is what the others lead to expect, brighter or darker."""
     n, others = sampled.steps, np.delete(np.arange(sampled.steps), k)
-    weights = columns(np.array([k]), n, sampled.own) @ np.linalg.pinv(columns(others, n, sampled.own))
+    weights = cosine_columns(np.array([k]), n, sampled.own) @ np.linalg.pinv(cosine_columns(others, n, sampled.own))
     expected = np.einsum("k,kp->p", weights[0].astype(np.float32), sampled.frames[others])
     seen = sampled.frames[k]
     scale = float(seen @ expected) / max(float(expected @ expected), 1e-9)
@@ -162,7 +162,7 @@ class _Products:
         """What would remain of the fringe alone under `before`, where `after` is true; of the places of both."""
         shared = [place for place in before if place in after]
         keep, _ = _keep(tuple(before[place] for place in shared), self._n, self._own)
-        fringe = columns(np.array([after[place] for place in shared]), self._n, 1)[:, 1:]
+        fringe = cosine_columns(np.array([after[place] for place in shared]), self._n, 1)[:, 1:]
         return float(np.sum(keep * (fringe @ self._fringe @ fringe.T)))
 
     def least(self, steps: dict[int, int], n: int) -> float:
@@ -173,7 +173,7 @@ class _Products:
 @lru_cache(4096)
 def _keep(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
     """(len(steps),) * 2, which takes from frames of these steps what they explain; and the freedom that remains."""
-    basis, sizes, _ = np.linalg.svd(columns(np.array(steps), n, own), full_matrices=False)
+    basis, sizes, _ = np.linalg.svd(cosine_columns(np.array(steps), n, own), full_matrices=False)
     basis = basis[:, sizes > 1e-6 * sizes[0]]
     return np.eye(len(steps)) - basis @ basis.T, len(steps) - basis.shape[1]
 

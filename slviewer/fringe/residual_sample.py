@@ -45,7 +45,7 @@ class Fringe:
     @property
     def keep(self) -> np.ndarray:
         """See the class."""
-        basis, _ = np.linalg.qr(columns(np.arange(self.steps), self.steps, self.own))
+        basis, _ = np.linalg.qr(cosine_columns(np.arange(self.steps), self.steps, self.own))
         return np.eye(self.steps) - basis @ basis.T
 
     @property
@@ -54,28 +54,28 @@ class Fringe:
         return abs(complex(np.mean(self.phasor / np.maximum(np.abs(self.phasor), 1e-6)))) < _ONE_SIDED
 
 
-def columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
+def cosine_columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
     """(len(steps), 1 + 2 own): what a pixel may show at each step of n: a constant, cosines and sines."""
     angle = 2 * np.pi * np.asarray(steps, float) / n
     harmonics = [f(h * angle) for h in range(1, own + 1) for f in (np.cos, np.sin)]
     return np.stack([np.ones_like(angle), *harmonics], axis=1)
 
 
-def spread_rows(height: int, width: int, pixels: int = PIXELS) -> np.ndarray:
+def select_rows(height: int, width: int, pixels: int = PIXELS) -> np.ndarray:
     """Evenly spread rows that hold about so many pixels."""
     count = min(height, max(1, round(pixels / width)))
     return np.unique(np.linspace(0, height - 1, count).round().astype(int))
 
 
-def fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: float) -> Fringe | None:
+def sample_fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: float) -> Fringe | None:
     """The sampled fringes of one period; None where too few pixels see any."""
-    rows = spread_rows(*stack.shape[1:])
+    rows = select_rows(*stack.shape[1:])
     frames = np.stack([stack[i][rows].ravel() for i in shift.indices])
     clipped = (frames >= white) | (frames == 0)
     frames = frames.astype(np.float32)
     n = len(frames)
     background, phasor = fit_cosine(frames)
-    rough = roughness(frames, stack.shape[2])
+    rough = estimate_roughness(frames, stack.shape[2])
     least = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * rough)
     modulated = np.abs(phasor) > least
     if np.count_nonzero(modulated) < FEWEST:
@@ -90,7 +90,7 @@ def fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: f
     # n steps leave harmonics of each pixel's own to fit, as long as enough remains to contradict.
     own = 2 if n >= 10 else 1
     if n > 3:
-        frames = seen - common_harmonics(seen, phasor, own)
+        frames = seen - fit_common_harmonics(seen, phasor, own)
         background, phasor = fit_cosine(frames)
     angle = (2 * np.pi * np.arange(n) / n)[:, None]
     fitted = background + np.real(phasor * np.exp(1j * angle).astype(np.complex64))
@@ -98,7 +98,7 @@ def fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: f
     return Fringe(shift, seen, frames, fitted, beside, phasor, own, noise, rough)
 
 
-def roughness(frames: np.ndarray, width: int) -> float:
+def estimate_roughness(frames: np.ndarray, width: int) -> float:
     """Grey levels by which neighbours along a row differ from a smooth curve; a fault of a frame does not enter it. At
     least 0.29, the noise of rounding: dark and saturated pixels do not differ at all.
     """
@@ -114,7 +114,7 @@ def fit_cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return frames.mean(axis=0), cosine + 1j * sine
 
 
-def common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:
+def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:
     """(n, p): the harmonics beyond `own` that all pixels have in common, each with its own fringe's phase and strength.
 
     Harmonic m of the fringe appears among n steps as the m-th, or as the one that it cannot be told from.

@@ -13,20 +13,20 @@ from slviewer.errors import InputError
 _FINE = 16  # places per grey level at which a response is tabulated before it is inverted
 
 
-def fitted_gamma(shown: np.ndarray, seen: np.ndarray) -> float:
+def fit_gamma(shown: np.ndarray, seen: np.ndarray) -> float:
     """The exponent of the power of shown / 255 that comes nearest to the response."""
     x, y = _checked(shown, seen)
     found = minimize_scalar(lambda g: float(np.sum((x**g - y) ** 2)), bounds=(0.2, 5.0), method="bounded")
     return float(found.x)
 
 
-def nonlinearity(shown: np.ndarray, seen: np.ndarray) -> float:
+def measure_nonlinearity(shown: np.ndarray, seen: np.ndarray) -> float:
     """The largest distance of the response from a straight line, as a share of white."""
     x, y = _checked(shown, seen)
     return float(np.abs(y - x).max())
 
 
-def harmonic_error_rad(shown: np.ndarray, seen: np.ndarray, steps: int) -> float:
+def predict_phase_error(shown: np.ndarray, seen: np.ndarray, steps: int) -> float:
     """The rms error of the phase in rad that the response causes in `steps` phase steps, without any blur."""
     curve = _curve(shown, seen)
     phase = 2 * np.pi * np.arange(360) / 360
@@ -36,7 +36,7 @@ def harmonic_error_rad(shown: np.ndarray, seen: np.ndarray, steps: int) -> float
     return float(np.sqrt(np.mean(error**2)))
 
 
-def linearising(shown: np.ndarray, seen: np.ndarray) -> tuple[int, ...]:
+def linearise_levels(shown: np.ndarray, seen: np.ndarray) -> tuple[int, ...]:
     """For `PatternSequence.levels`: the 256 grey levels to show so that the light grows evenly from dark to white."""
     x = np.arange(255 * _FINE + 1) / (255 * _FINE)
     y = np.maximum.accumulate(_curve(shown, seen)(x))

@@ -6,7 +6,7 @@ import numpy as np
 
 from slviewer.fringe.layout import white_level
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.residual_sample import spread_rows
+from slviewer.fringe.residual_sample import select_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.check_results import Check, CheckVerdict
 
@@ -22,7 +22,7 @@ def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases
     illuminated = np.logical_or.reduce([phase.illuminated for phase in phases.values()])
     if not illuminated.any():
         return Check("exposure", "bad", "No pixel sees the patterns.", "Raise the exposure, or open the aperture.", {})
-    rows = spread_rows(*frames.shape[1:])
+    rows = select_rows(*frames.shape[1:])
     coded = [i for i, frame in enumerate(sequence.frames) if frame.kind != "texture"]
     brightest = np.max([frames[i][rows] for i in coded], axis=0)
     seen = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()

@@ -22,7 +22,7 @@ from slviewer.inspection.uncertainty import Spread
 from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor
-from slviewer.reconstruction.mesh import grid_triangles
+from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.records import from_plain
 from slviewer.session.atomic import replace_file
@@ -210,7 +210,7 @@ def triangles_of(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(on.points, np.float64), on.faces
     if not on.organised:
         raise InputError(f"{on.source} is a cloud without triangles: mesh it first")
-    faces = grid_triangles(on.points, JUMP * float(np.median(on.points[..., 2][on.measured])))
+    faces = triangulate_grid(on.points, JUMP * float(np.median(on.points[..., 2][on.measured])))
     return on.points[on.measured].astype(np.float64), faces
 
 

@@ -27,7 +27,7 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import describe_scale
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.mesh import grid_triangles
+from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.session.capture import Capture
 from slviewer.session.ply import write_ply
@@ -165,7 +165,7 @@ def reconstruct(
 def triangles(points: np.ndarray, keep: np.ndarray) -> np.ndarray:
     """Faces (m, 3) int32 over the pixels ``keep`` (h, w) bool of organised points; surfaces end where depth jumps."""
     kept = np.where(keep[..., None], points, np.float32(np.nan))
-    return grid_triangles(kept, JUMP * float(np.median(points[..., 2][keep])))
+    return triangulate_grid(kept, JUMP * float(np.median(points[..., 2][keep])))
 
 
 def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:

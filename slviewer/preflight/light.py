@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.fringe.response import fitted_gamma, harmonic_error_rad, linearising, nonlinearity
+from slviewer.fringe.response import fit_gamma, linearise_levels, measure_nonlinearity, predict_phase_error
 from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
 from slviewer.preflight.rig_under_test import RigUnderTest
@@ -98,8 +98,8 @@ def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, flo
         text = "The response cannot be measured: white is no brighter than black."
         return Check("gamma", "unknown", text, "Correct what the other checks name first.", {}), None, 0.5
     seen = (light - light[0]) / (light[-1] - light[0])
-    exponent, curved = fitted_gamma(_LEVELS, seen), nonlinearity(_LEVELS, seen)
-    errors = {n: harmonic_error_rad(_LEVELS, seen, n) for n in (3, 4, 6, 8)}
+    exponent, curved = fit_gamma(_LEVELS, seen), measure_nonlinearity(_LEVELS, seen)
+    errors = {n: predict_phase_error(_LEVELS, seen, n) for n in (3, 4, 6, 8)}
     figures = {
         "gamma": round(exponent, 3),
         "nonlinearity_percent": round(100 * curved, 2),
@@ -107,7 +107,7 @@ def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, flo
         "shown": _LEVELS.tolist(),
         "seen": [round(float(s), 5) for s in seen],
     }
-    levels = linearising(_LEVELS, seen)
+    levels = linearise_levels(_LEVELS, seen)
     middle = float(np.interp(127.5, _LEVELS, seen))
     if curved <= CURVED:
         text = f"Light is proportional to grey levels within {100 * curved:.1f} %."

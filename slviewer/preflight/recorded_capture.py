@@ -12,7 +12,7 @@ from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.residual import FrameResiduals, capture_residuals
-from slviewer.fringe.response import harmonic_error_rad, nonlinearity
+from slviewer.fringe.response import measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
@@ -126,7 +126,7 @@ def _response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[Fram
     gamma, steps = gamma_from_harmonic(known[axis]), axis_layout(sequence, axis).steps
     shown = np.linspace(0, 255, 18)
     seen = (shown / 255) ** gamma
-    curved, error = nonlinearity(shown, seen), harmonic_error_rad(shown, seen, steps)
+    curved, error = measure_nonlinearity(shown, seen), predict_phase_error(shown, seen, steps)
     figures = {"second_harmonic": {a: round(h, 4) for a, h in known.items()}, "gamma": round(gamma, 3)}
     said = f"a second harmonic of {100 * known[axis]:.1f} % of the fringe, as of a gamma of {gamma:.2f}"
     if curved <= CURVED:

@@ -5,7 +5,7 @@ import numpy as np
 from slviewer.errors import InputError
 
 
-def grid_triangles(points: np.ndarray, max_jump: float) -> np.ndarray:
+def triangulate_grid(points: np.ndarray, max_jump: float) -> np.ndarray:
     """Faces (m, 3) int32 of an organised cloud (h, w, 3) mm, numbering its valid points row by row.
 
     (The vertices are ``points[np.isfinite(points).all(axis=-1)]``.) Each square of four neighbouring pixels gives two

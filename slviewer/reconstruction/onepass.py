@@ -8,7 +8,7 @@ from slviewer.calibration.pixelwise import MAX_EXTRAPOLATION, PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.fringe import kernels_spikes as spikes
-from slviewer.fringe.decode import code_rules, grey_scale, ladder_of, shifts_of
+from slviewer.fringe.decode import code_rules, grey_scale, pack_levels, pack_shifts
 from slviewer.fringe.kernels import Shifts
 from slviewer.fringe.kernels_levels import Ladder
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, clip_level, white_level
@@ -101,8 +101,8 @@ class OnePass:
                 f"A {self.model.name} calibration measures no cloud in one pass: use the pixelwise or the splined one."
             )
         self._texture = texture_frame(self.sequence)
-        self._shifts = shifts_of(self._layout)
-        self._ladder = ladder_of(self._layout)
+        self._shifts = pack_shifts(self._layout)
+        self._ladder = pack_levels(self._layout)
         self._lists = spikes.allocate_lists(self.shape)
 
     @property

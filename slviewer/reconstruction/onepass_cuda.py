@@ -9,7 +9,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
-from slviewer.fringe.decode import decode, ladder_of, texture
+from slviewer.fringe.decode import decode, pack_levels, texture
 from slviewer.fringe.layout import clip_level
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry import cuda_device
@@ -53,7 +53,7 @@ class CudaPass(OnePass):
             self._layout = one_pass_layout(self.sequence, self.axis)
             if self.axis not in self.model.axes:
                 raise InputError(f"The stereo calibration has no axis {self.axis}: choose another axis.")
-            self._texture, self._ladder = texture_frame(self.sequence), ladder_of(self._layout)
+            self._texture, self._ladder = texture_frame(self.sequence), pack_levels(self._layout)
         else:
             super().__post_init__()
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.mesh import grid_triangles
+from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.surface.clean import clean, sight_cosines
@@ -207,7 +207,7 @@ def grid_mesh(cloud: Cloud) -> Mesh:
     normals = grid_normals(cloud.points)
     kept, _ = clean(cloud, normals)
     points = np.where(kept[..., None], cloud.points, np.float32(np.nan))
-    faces = grid_triangles(points, JUMP * float(np.median(points[..., 2][kept]))) if kept.any() else np.zeros((0, 3))
+    faces = triangulate_grid(points, JUMP * float(np.median(points[..., 2][kept]))) if kept.any() else np.zeros((0, 3))
     if not len(faces):
         raise InputError("No two neighbouring pixels of this scan lie on a surface: reconstruct it again.")
     along = sight_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]

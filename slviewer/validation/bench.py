@@ -18,7 +18,7 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import render
 from slviewer.fringe import kernels_coded, kernels_levels
-from slviewer.fringe.decode import code_rules, decode, grey_scale, ladder_of, shifts_of
+from slviewer.fringe.decode import code_rules, decode, grey_scale, pack_levels, pack_shifts
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import multifrequency, p18
@@ -142,9 +142,9 @@ def _kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[],
     layout = axis_layout(sequence, "x")
     scale = grey_scale(layout, measure_noise(layout, frames, 255.0), 255.0)
     maps = (*(np.zeros(frames.shape[1:], np.float32) for _ in range(4)), np.zeros(frames.shape[1:], np.uint8))
-    shifts = shifts_of(layout)
+    shifts = pack_shifts(layout)
     if not layout.gray:
-        ladder = ladder_of(layout)
+        ladder = pack_levels(layout)
         return lambda: kernels_levels.decode_levels(frames, shifts, ladder, scale, *maps)
     rules = code_rules(layout, fringe_mean(layout, frames))
     return lambda: kernels_coded.decode_coded(frames, shifts, scale, rules, *maps)

@@ -8,7 +8,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import complementary, p18
-from slviewer.fringe.reference_spikes import settle
+from slviewer.fringe.reference_spikes import repair_spikes
 
 PROJECTOR = (912, 1140)
 TWO_PI = 2 * np.pi
@@ -59,7 +59,7 @@ def _map(jump=0.0, height=40, width=60):
 
 def _settle(phase, sequence=None):
     reason = np.where(np.isnan(phase), Reason.INCONSISTENT, Reason.VALID).astype(np.uint8)
-    return settle(axis_layout(sequence or p18(PROJECTOR), "x"), phase, reason)
+    return repair_spikes(axis_layout(sequence or p18(PROJECTOR), "x"), phase, reason)
 
 
 @pytest.mark.parametrize("jump", [0.0, 3.3, -5.0, TWO_PI, -TWO_PI, 9.0, 40.0])

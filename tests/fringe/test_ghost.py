@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from slviewer.fringe.ghost import detect_ghosting, ghost_share
+from slviewer.fringe.ghost import detect_ghosting, measure_ghost_share
 from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import p18
-from slviewer.fringe.residual_sample import fringe
+from slviewer.fringe.residual_sample import sample_fringe
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.hostile import FAULTS, expose_frames, render_light
 from slviewer.simulation.rig import letter
@@ -20,12 +20,12 @@ LIGHT, RENDERER = render_light(RIG, blank_board(Pose(np.eye(3), np.array([0.0, 0
 def sampled(fault=None, severity="mild", axis="y"):
     frames = expose_frames(RIG, LIGHT, SEQUENCE, RENDERER.room_light(), 0, FAULTS[fault] if fault else None, severity)
     layout, white = axis_layout(SEQUENCE, axis), white_level(frames, SEQUENCE.select(axis))
-    return fringe(frames, layout.shifts[-1], measure_noise(layout, frames, white), white)
+    return sample_fringe(frames, layout.shifts[-1], measure_noise(layout, frames, white), white)
 
 
 @pytest.mark.parametrize(("severity", "share"), [("mild", 0.02), ("medium", 0.06), ("severe", 0.15)])
 def test_the_share_of_the_image_before_is_measured(severity, share):
-    measured, error = ghost_share(sampled("crosstalk", severity))
+    measured, error = measure_ghost_share(sampled("crosstalk", severity))
     assert measured == pytest.approx(share, rel=0.2) and error < 0.002
     (suspect,) = detect_ghosting(sampled("crosstalk", severity))
     first = next(i for i, frame in enumerate(SEQUENCE.frames) if frame.axis == "y")
@@ -43,7 +43,7 @@ def test_nothing_else_is_taken_for_it(fault, severity):
 
 
 def test_the_first_frame_of_a_capture_lacks_the_share_of_the_others():
-    assert ghost_share(sampled("crosstalk", "severe", "x"))[0] == pytest.approx(0.15, rel=0.25)
+    assert measure_ghost_share(sampled("crosstalk", "severe", "x"))[0] == pytest.approx(0.15, rel=0.25)
     assert detect_ghosting(sampled(axis="x")) == []
     (suspect,) = detect_ghosting(sampled("crosstalk", "severe", "x"))
     assert suspect.frame == 0 and " 1, the first" in suspect.sentence

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from fringe_scene import capture, slope
 
-from slviewer.fringe.decode import decode, decode_reference, shifts_of
+from slviewer.fringe.decode import decode, decode_reference, pack_shifts
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18, phase_steps
 from slviewer.fringe.sequence import PatternSequence
@@ -75,7 +75,7 @@ def test_on_frames_that_are_no_contiguous_array():
 def test_sums_of_four_frames_at_a_time_are_those_of_each(n):
     levels = np.random.default_rng(n).integers(0, 256, n)
     sequence = PatternSequence(PROJECTOR, tuple(phase_steps("x", n, 18.0)), phase_sign=-1, relative=True)
-    steps = shifts_of(axis_layout(sequence, "x"))
+    steps = pack_shifts(axis_layout(sequence, "x"))
     p, q, r, s = levels[steps.frames].T
     angle = 2 * np.pi * np.arange(n) / n
     assert steps.cosines @ (p - r - q + s) == pytest.approx(np.cos(angle) @ levels, abs=1e-3)

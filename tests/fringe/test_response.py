@@ -12,7 +12,7 @@ from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.decode import decode
 from slviewer.fringe.patterns import profile, render
 from slviewer.fringe.presets import complementary, gray
-from slviewer.fringe.response import fitted_gamma, harmonic_error_rad, linearising, nonlinearity
+from slviewer.fringe.response import fit_gamma, linearise_levels, measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.exporters import write_pattern_folder
 from slviewer.session.importers.frames import read_description
@@ -30,20 +30,20 @@ def noisy(seed=0, sigma=0.002):
 
 
 def test_a_response_says_its_gamma_and_what_it_costs():
-    assert fitted_gamma(SHOWN, noisy()) == pytest.approx(2.2, abs=0.03)
-    assert 0.28 < nonlinearity(SHOWN, SEEN) < 0.31
-    assert nonlinearity(SHOWN, SHOWN / 255) < 1e-9
-    three, four, nine = (harmonic_error_rad(SHOWN, SEEN, n) for n in (3, 4, 9))
+    assert fit_gamma(SHOWN, noisy()) == pytest.approx(2.2, abs=0.03)
+    assert 0.28 < measure_nonlinearity(SHOWN, SEEN) < 0.31
+    assert measure_nonlinearity(SHOWN, SHOWN / 255) < 1e-9
+    three, four, nine = (predict_phase_error(SHOWN, SEEN, n) for n in (3, 4, 9))
     assert 0.15 < three < 0.25 and 0.0 < nine < four < three / 5
-    assert harmonic_error_rad(SHOWN, SHOWN / 255, 3) < 1e-6
+    assert predict_phase_error(SHOWN, SHOWN / 255, 3) < 1e-6
 
 
 def test_the_table_straightens_the_response():
-    levels = np.array(linearising(SHOWN, noisy()))
+    levels = np.array(linearise_levels(SHOWN, noisy()))
     assert levels[0] == 0 and levels[-1] == 255 and (np.diff(levels) >= 0).all()
     light = (levels / 255) ** 2.2
     assert 0.0005 < np.abs(light - np.arange(256) / 255).max() < 0.015
-    assert linearising(SHOWN, SHOWN / 255) == tuple(range(256))
+    assert linearise_levels(SHOWN, SHOWN / 255) == tuple(range(256))
 
 
 def ripple_rad(phase, coordinate):
@@ -65,14 +65,14 @@ def test_phase_errors_of_gamma_shrink_with_the_table_on_a_plane(monkeypatch, ste
     renderer = Renderer(rig, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0]))))
     plain = complementary(rig.projector.size, steps, 36.0)
     truth = renderer.truth().projector[..., 0]
-    mended = replace(plain, levels=linearising(SHOWN, noisy()))
+    mended = replace(plain, levels=linearise_levels(SHOWN, noisy()))
     with_gamma, without = (ripple_rad(decode(s, renderer.capture(s), "x"), truth) for s in (plain, mended))
     assert with_gamma > before_rad
     assert with_gamma > times * without > 0.001
 
 
 def test_the_table_concerns_cosines_alone():
-    levels = linearising(SHOWN, SEEN)
+    levels = linearise_levels(SHOWN, SEEN)
     for plain in (complementary(PROJECTOR, 4, 16.0), gray(PROJECTOR)):
         sequence = replace(plain, levels=levels)
         for k, frame in enumerate(sequence.frames):
@@ -83,7 +83,7 @@ def test_the_table_concerns_cosines_alone():
 
 
 def test_the_table_is_kept_with_the_sequence(tmp_path):
-    sequence = replace(complementary((64, 48), 4, 16.0), levels=linearising(SHOWN, SEEN))
+    sequence = replace(complementary((64, 48), 4, 16.0), levels=linearise_levels(SHOWN, SEEN))
     assert PatternSequence.from_dict(json.loads(json.dumps(sequence.to_dict()))) == sequence
     assert "levels" not in complementary((64, 48)).to_dict()
     write_pattern_folder(tmp_path / "patterns", sequence)
@@ -110,4 +110,4 @@ def test_a_table_that_cannot_be_is_refused(levels):
 def test_a_response_that_was_not_measured_is_refused():
     for shown, seen in [(SHOWN[1:], SEEN[1:]), (SHOWN, SEEN * np.nan), (SHOWN[::-1], SEEN), (SHOWN[:2], SEEN[:2])]:
         with pytest.raises(InputError, match="response"):
-            linearising(shown, seen)
+            linearise_levels(shown, seen)

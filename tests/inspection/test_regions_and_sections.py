@@ -58,10 +58,10 @@ def test_a_ball_is_cut_in_a_circle_that_its_cursors_read() -> None:
 def test_an_open_surface_is_cut_in_lines_from_left_to_right_the_longest_first() -> None:
     u, v = np.meshgrid(np.arange(40.0), np.arange(30.0))
     points = np.stack([u, v, 500 - 2 * np.sin(u / 5)], -1)
-    from slviewer.reconstruction.mesh import grid_triangles
+    from slviewer.reconstruction.mesh import triangulate_grid
 
     points[:, 25] = np.nan  # a gap
-    faces, vertices = grid_triangles(points, 50.0), points[np.isfinite(points[..., 0])]
+    faces, vertices = triangulate_grid(points, 50.0), points[np.isfinite(points[..., 0])]
     plane = CutPlane.through([0, 12.5, 500], [10, 12.5, 500], [0, 0, -1])
     lines = section(vertices, faces, plane)
     assert [len(line) > 5 for line in lines] == [True, True] and np.ptp(lines[0][:, 0]) == 24 > np.ptp(lines[1][:, 0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slviewer.errors import InputError
-from slviewer.reconstruction.mesh import grid_triangles
+from slviewer.reconstruction.mesh import triangulate_grid
 
 
 def grid(shape: tuple[int, int] = (20, 30)) -> np.ndarray:
@@ -19,7 +19,7 @@ def cross_products(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def test_a_whole_grid() -> None:
     points = grid()
-    faces = grid_triangles(points, 1.0)
+    faces = triangulate_grid(points, 1.0)
     assert faces.dtype == np.int32
     assert faces.shape == (2 * 19 * 29, 3)
     normals = cross_products(points, faces)
@@ -31,34 +31,34 @@ def test_gaps_leave_the_triangles_around_them() -> None:
     for v, u in ((0, 0), (0, 29), (19, 0), (19, 29)):
         points = grid()
         points[v, u] = np.nan
-        assert len(grid_triangles(points, 1.0)) == 2 * 19 * 29 - 1
+        assert len(triangulate_grid(points, 1.0)) == 2 * 19 * 29 - 1
     points = grid()
     points[10, 10] = np.nan
-    faces = grid_triangles(points, 1.0)
+    faces = triangulate_grid(points, 1.0)
     assert len(faces) == 2 * 19 * 29 - 4  # each of the four squares keeps one
     assert (cross_products(points, faces)[:, 2] < 0).all()
     assert faces.max() == 20 * 30 - 2
-    assert grid_triangles(np.full((5, 5, 3), np.nan), 1.0).shape == (0, 3)
+    assert triangulate_grid(np.full((5, 5, 3), np.nan), 1.0).shape == (0, 3)
 
 
 def test_cut_at_jumps() -> None:
     points = grid()
     points[:, 15:, 2] += 50
-    faces = grid_triangles(points, 2.0)
+    faces = triangulate_grid(points, 2.0)
     assert len(faces) == 2 * 19 * 28
     assert np.ptp(points.reshape(-1, 3)[faces][..., 2], axis=1).max() <= 2.0
-    assert len(grid_triangles(points, 100.0)) == 2 * 19 * 29
+    assert len(triangulate_grid(points, 100.0)) == 2 * 19 * 29
 
 
 def test_a_ridge_is_cut_along_itself() -> None:
     v, u = np.mgrid[:2, :2]
     points = np.dstack([u, v, [[500, 501], [505, 500]]]).astype(np.float32)
-    faces = grid_triangles(points, 10.0)
+    faces = triangulate_grid(points, 10.0)
     assert all({0, 3} <= set(face) for face in faces.tolist())
 
 
 def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match="organised"):
-        grid_triangles(np.zeros((10, 3)), 1.0)
+        triangulate_grid(np.zeros((10, 3)), 1.0)
     with pytest.raises(InputError, match="positive"):
-        grid_triangles(grid(), 0.0)
+        triangulate_grid(grid(), 0.0)

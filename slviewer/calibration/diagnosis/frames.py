@@ -9,7 +9,7 @@ from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.origin import MIN_CONCENTRATION, MIN_EDGES, MIN_RISING
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phase_shift
-from slviewer.fringe.residual_sample import FEWEST, spread_rows
+from slviewer.fringe.residual_sample import FEWEST, select_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 ORIGIN_ROWS = 150
@@ -50,7 +50,7 @@ def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: 
     if layout.steps < 5:
         return np.nan
     indices = layout.shifts[-1].indices
-    rows = spread_rows(*stack.shape[1:])
+    rows = select_rows(*stack.shape[1:])
     frames = np.stack([stack[i][rows].ravel() for i in indices])
     white = white_level(stack, list(indices))
     frames = frames[:, (frames.max(0) < white) & (frames.min(0) > 0)].astype(np.float32)
@@ -131,7 +131,7 @@ def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:
 
     Only a white frame next to pattern frames is decisive: what follows the last one may be white too.
     """
-    rows = spread_rows(*stack.shape[1:])
+    rows = select_rows(*stack.shape[1:])
     frames = stack[:, rows].reshape(len(stack), -1)
     brightest = frames.max(0)
     illuminated = brightest > _ILLUMINATED_LEVEL * float(np.quantile(brightest, 0.98))
