@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
@@ -147,45 +148,40 @@ class AxisReader:
         self.line, self.place = sample.line[seen], sample.place[seen]
         self.across = self.line >= sample.rows
         self._noise, self._least_swing = sample.noise, sample.least_swing
-        self._bits: dict[tuple[int | None, int | None], tuple[np.ndarray, np.ndarray, float, float]] = {}
-        self.known: dict[AxisFrames, Agreement] = {}
-        self._opposed: dict[tuple[int, int], float] = {}
-        self._in_view: dict[frozenset[int], bool] = {}
+        # Each is asked for again by every hypothesis.
+        self.bit, self.opposed = cache(self._read_bit), cache(self._measure_opposed)
+        self.agreement = cache(partial(_measure_agreement, self))
+        self._in_view = cache(self._vary_enough)
 
     def is_in_view(self, frames: AxisFrames) -> bool:
         """Whether enough pixels vary between the images that are taken to be of this axis."""
         assumed = (*frames.bits, *frames.inverse, *(i for _, steps in frames.shifts for i in steps))
-        images = frozenset(i for i in assumed if i is not None)
-        if images not in self._in_view:
-            swing = np.ptp(self.frames[sorted(images)], axis=0) if images else np.zeros(0)
-            self._in_view[images] = bool(np.count_nonzero(swing > self._least_swing) >= FEWEST_PIXELS)
-        return self._in_view[images]
+        return self._in_view(frozenset(i for i in assumed if i is not None))
 
-    def opposed(self, image: int | None, inverse: int | None) -> float:
+    def _vary_enough(self, images: frozenset[int]) -> bool:
+        swing = np.ptp(self.frames[sorted(images)], axis=0) if images else np.zeros(0)
+        return bool(np.count_nonzero(swing > self._least_swing) >= FEWEST_PIXELS)
+
+    def _measure_opposed(self, image: int | None, inverse: int | None) -> float:
         """Share of the pixels inside stripes of both images that are bright in one alone; NaN for few pixels."""
         if image is None or inverse is None:
             return np.nan
-        if (image, inverse) not in self._opposed:
-            first, second = self.frames[image] - self.middle, self.frames[inverse] - self.middle
-            inside = np.minimum(np.abs(first), np.abs(second)) > INSIDE * self.swing
-            weight = self.swing * inside
-            share = float(weight[(first > 0) != (second > 0)].sum() / max(float(weight.sum()), 1e-9))
-            self._opposed[image, inverse] = share if np.count_nonzero(inside) >= FEWEST_PIXELS else np.nan
-        return self._opposed[image, inverse]
+        first, second = self.frames[image] - self.middle, self.frames[inverse] - self.middle
+        inside = np.minimum(np.abs(first), np.abs(second)) > INSIDE * self.swing
+        weight = self.swing * inside
+        share = float(weight[(first > 0) != (second > 0)].sum() / max(float(weight.sum()), 1e-9))
+        return share if np.count_nonzero(inside) >= FEWEST_PIXELS else np.nan
 
-    def bit(self, image: int | None, inverse: int | None) -> tuple[np.ndarray, np.ndarray, float, float]:
+    def _read_bit(self, image: int | None, inverse: int | None) -> tuple[np.ndarray, np.ndarray, float, float]:
         """(p,) bool value, (p,) bool decided, share decided, mean stripe width in px."""
-        key = (image, inverse)
-        if key not in self._bits:
-            high = self.middle if image is None else self.frames[image]
-            low = self.middle if inverse is None else self.frames[inverse]
-            both = image is not None and inverse is not None
-            height = (high - low) * np.float32(0.5 if both else 1.0)
-            noise = self._noise * (0.71 if both else 1.0)
-            decided = np.abs(height) > np.maximum(DECIDED * self.swing, DECIDED_SIGMAS * noise)
-            value = height > 0
-            self._bits[key] = value, decided, float(decided.mean()) if decided.size else 0.0, self._stripe(value)
-        return self._bits[key]
+        high = self.middle if image is None else self.frames[image]
+        low = self.middle if inverse is None else self.frames[inverse]
+        both = image is not None and inverse is not None
+        height = (high - low) * np.float32(0.5 if both else 1.0)
+        noise = self._noise * (0.71 if both else 1.0)
+        decided = np.abs(height) > np.maximum(DECIDED * self.swing, DECIDED_SIGMAS * noise)
+        value = height > 0
+        return value, decided, float(decided.mean()) if decided.size else 0.0, self._stripe(value)
 
     def _stripe(self, value: np.ndarray) -> float:
         """Mean width in px of stripes, along the rows or the columns, whichever is less."""
@@ -214,12 +210,10 @@ class AxisReader:
 
 def measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
     """How well the frames agree under this hypothesis."""
-    if frames not in reader.known:
-        reader.known[frames] = _agreement(reader, frames)
-    return reader.known[frames]
+    return reader.agreement(frames)
 
 
-def _agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
+def _measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
     result = Agreement()
     if len(reader.swing) < FEWEST_PIXELS:
         return result

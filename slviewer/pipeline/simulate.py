@@ -17,7 +17,7 @@ from slviewer.session.capture import NewCapture
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import printed_board
-from slviewer.simulation.plans import letter_plan, moved_objects, target_poses
+from slviewer.simulation.plans import letter_plan, objects, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene
@@ -109,4 +109,4 @@ def turn_plan(rig: SimulatedRig, board: Board, poses: int) -> dict[str, Scene]:
         f"pose_{i:02d}": printed_board(board, pose, seed=rig.seed)
         for i, pose in enumerate(target_poses(rig, board, poses), 1)
     }
-    return {**targets, **moved_objects(), **turning()}
+    return {**targets, **objects(moved=True), **turning()}

@@ -1,6 +1,6 @@
 """From frames to a cloud in one pass over them, as fast as memory allows: for live scanning and for many captures."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,7 +9,6 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.fringe import kernels_spikes as spikes
 from slviewer.fringe.decode import code_rules, grey_scale, pack_levels, pack_shifts
-from slviewer.fringe.kernels import Shifts
 from slviewer.fringe.kernels_levels import Ladder
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, clip_level, white_level
 from slviewer.fringe.levels import unambiguous_px
@@ -70,7 +69,6 @@ class Job:
     is_shaded: bool
 
 
-@dataclass(eq=False)
 class OnePass:
     """One rig and sequence, made ready: frames of one axis become a cloud by a pixelwise or a splined calibration.
 
@@ -78,17 +76,8 @@ class OnePass:
     axis that sequence or model lacks, and Gray code without phase steps.
     """
 
-    sequence: PatternSequence
-    model: PixelwiseModel | SplinedModel
-    axis: Axis
-    _layout: Layout = field(init=False, repr=False)
-    _texture: int = field(init=False, repr=False)
-    _shifts: Shifts = field(init=False, repr=False)
-    _ladder: Ladder = field(init=False, repr=False)
-    _depths: kernels.Depths = field(init=False, repr=False)
-    _lists: tuple[np.ndarray, ...] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, sequence: PatternSequence, model: PixelwiseModel | SplinedModel, axis: Axis) -> None:
+        self.sequence, self.model, self.axis = sequence, model, axis
         self._layout = one_pass_layout(self.sequence, self.axis)
         if self.axis not in self.model.axes:
             raise InputError(f"The {self.model.name} calibration has no axis {self.axis}: choose another axis.")

@@ -1,6 +1,6 @@
 """The one pass where there is a CUDA device: `one_pass` decides, and without one it is the processor's."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
@@ -38,7 +38,6 @@ def has_pass(model: object) -> TypeGuard[Fast]:
     return isinstance(model, PixelwiseModel | SplinedModel)
 
 
-@dataclass(eq=False)
 class CudaPass(OnePass):
     """`OnePass` on a CUDA device, for stereo calibrations too; for one thread at a time.
 
@@ -46,16 +45,16 @@ class CudaPass(OnePass):
     in memory from `cuda_device.allocate_frames` travel at full speed. Should the device fail, the processor goes on.
     """
 
-    _card: "Card | None" = field(init=False, repr=False, default=None)
-
-    def __post_init__(self) -> None:
-        if isinstance(self.model, StereoModel):
+    def __init__(self, sequence: PatternSequence, model: Fast, axis: Axis) -> None:
+        self._card: Card | None = None
+        if isinstance(model, StereoModel):
+            self.sequence, self.model, self.axis = sequence, model, axis  # type: ignore[assignment]
             self._layout = one_pass_layout(self.sequence, self.axis)
             if self.axis not in self.model.axes:
                 raise InputError(f"The stereo calibration has no axis {self.axis}: choose another axis.")
             self._texture, self._ladder = texture_frame(self.sequence), pack_levels(self._layout)
         else:
-            super().__post_init__()
+            super().__init__(sequence, model, axis)
 
     @property
     def shape(self) -> tuple[int, int]:

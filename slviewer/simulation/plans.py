@@ -1,57 +1,22 @@
 """What the 'letter' preset puts before its rig: target poses, planes, spheres and objects, the same every time."""
 
+import tomllib
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
+from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, blank_board, printed_board
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene, Spheres, sphere
 from slviewer.target.board import Board
 
-R1_R2_MM, R2_R3_MM = 500.0, 700.0
-"""Where the Letter's depth ranges meet: R1 in front of the calibrated depths, R2 inside, R3 behind."""
-
 _LEFT_FREE_PX = 12.0  # between the outermost circles' rims and the image's edge, at full resolution
 
-_PLANES = (
-    # depth of the middle, x and y of it, tilts about x and y in degrees
-    (452.0, 2.0, -3.0, 6.0, -8.0),
-    (471.5, -4.0, 3.0, -3.0, 19.0),
-    (548.0, 6.0, 4.0, 12.0, -11.0),
-    (596.0, -8.0, 2.0, -10.0, 14.0),
-    (703.5, 5.0, -6.0, 8.0, 17.0),
-    (734.0, -10.0, 5.0, -9.0, -12.5),
-    (780.0, 8.0, 8.0, 6.0, 10.0),
-    (755.0, -6.0, -9.0, -12.0, -8.0),
-    (544.5, 4.0, 2.0, 9.0, -21.0),
-    (668.5, 2.0, -5.0, 5.0, -24.0),
-)
-
-_SPHERES = (
-    # centre of the 196 mm sphere: its front lies 98 mm nearer
-    (6.0, -4.0, 534.0),
-    (-12.0, 8.0, 546.0),
-    (14.0, 6.0, 640.0),
-    (-16.0, -10.0, 690.0),
-    (10.0, 12.0, 815.0),
-    (-20.0, 4.0, 845.0),
-)
-
-_OBJECTS = {
-    # middle, then turns about x, y and z in degrees: as a hand sets an object down again at another depth
-    "object_r1": ((-3.0, 4.0, 455.0), (4.0, -3.0, 2.5)),
-    "object_r2": ((2.0, -3.0, 600.0), (-2.0, 3.5, -1.5)),
-    "object_r3": ((6.0, 2.0, 752.0), (1.5, 0.5, 1.0)),
-}
-
-_MOVED_OBJECTS = {
-    "object_r1": ((-1.0, 2.0, 455.0), (7.0, -4.0, 4.0)),
-    "object_r2": ((6.0, -5.0, 600.0), (-4.0, 3.5, -3.0)),
-    "object_r3": ((-4.0, 6.0, 752.0), (2.0, -3.0, -6.0)),
-}
+_PLANS = tomllib.loads(asset("simulation/plans.toml").read_text(encoding="utf-8"))
 
 
 def letter_plan(
@@ -97,43 +62,33 @@ def planes() -> dict[str, BoardScene]:
     """The blank plate at ten poses whose shares in R1/R2/R3 resemble the Letter's Table 1."""
     return {
         f"plane_{i:02d}": blank_board(Pose(rotation(np.radians([tilt_x, tilt_y, 0])), np.array([x, y, z])))
-        for i, (z, x, y, tilt_x, tilt_y) in enumerate(_PLANES, 1)
+        for i, (z, x, y, tilt_x, tilt_y) in enumerate(_PLANS["planes"], 1)
     }
 
 
 def spheres() -> dict[str, Spheres]:
     """The sphere of 196 mm diameter, twice in each of R1, R2 and R3, as in the Letter's Table 2."""
-    return {f"sphere_{i}": sphere(centre) for i, centre in enumerate(_SPHERES, 1)}
+    return {f"sphere_{i}": sphere(centre) for i, centre in enumerate(_PLANS["spheres"], 1)}
 
 
-def objects() -> dict[str, MeshScene]:
-    """The demo object in R1, R2 and R3, each time turned a little: the Letter's experiment 3."""
+def objects(moved: bool = False) -> dict[str, MeshScene]:
+    """The demo object in R1, R2 and R3, each time turned a little: the Letter's experiment 3.
+
+    ``moved``: turned by up to
+    15 degrees from one to the next, and set down beside the axis."""
     return {
         name: demo_object(Pose(rotation(np.radians(turns)), np.array(middle)))
-        for name, (middle, turns) in _OBJECTS.items()
-    }
-
-
-def moved_objects() -> dict[str, MeshScene]:
-    """As ``objects``, turned by up to 15 degrees from one to the next, and set down beside the axis."""
-    return {
-        name: demo_object(Pose(rotation(np.radians(turns)), np.array(middle)))
-        for name, (middle, turns) in _MOVED_OBJECTS.items()
+        for name, (middle, turns) in _PLANS["moved_objects" if moved else "objects"].items()
     }
 
 
 def rotation(vector: np.ndarray) -> np.ndarray:
     """(3, 3): the turn about `vector` by its length in rad."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = np.asarray(vector) / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def _directions(n: int) -> np.ndarray:
-    """(n, 2) in -1 ... 1: where in its room each board stands; corners most, then edges, then the middle."""
+    """(n, 2) in -1 ... 1: where in its view each board stands; corners most, then edges, then the middle."""
     corners = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
     cycle = [*corners, (0, 0), *corners, (1, 0), *corners, (0, -1), *corners, (-1, 0), *corners, (0, 1)]
     return np.array([cycle[i % len(cycle)] for i in range(n)], float)
@@ -164,13 +119,13 @@ def _placed(
 
 
 def _in_view(rig: SimulatedRig, board: Board, points: np.ndarray) -> np.ndarray:
-    """(...) bool: whether all features, (..., n, 3) mm in the camera frame, have room around them in both devices."""
+    """(...) bool: whether all features, (..., n, 3) mm in the camera frame, lie in both images, a margin inside."""
     radius = board.pitch_mm / 4  # circles are half a pitch wide
     fits = np.ones(points.shape[:-2], bool)
     for pixels, lens, depths in (
         (rig.camera.project(points), rig.camera, points[..., 2:]),
         (rig.project(points), rig.projector, (points @ rig.R.T + rig.t)[..., 2:]),
     ):
-        room = _LEFT_FREE_PX + radius * np.array(lens.focal_px) / depths
-        fits &= ((pixels > room) & (pixels < np.array(lens.full_size) - 1 - room)).all((-2, -1))
+        margin = _LEFT_FREE_PX + radius * np.array(lens.focal_px) / depths
+        fits &= ((pixels > margin) & (pixels < np.array(lens.full_size) - 1 - margin)).all((-2, -1))
     return fits
