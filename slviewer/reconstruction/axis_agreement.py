@@ -5,7 +5,7 @@ distance of the projector point from its epipolar line, needs no depth: it expos
 transform, another rig, and a rig that was bumped, whichever axis depth is taken from.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -43,6 +43,21 @@ EXPLAINED = 0.25
 """A hypothesis explains a misfit that it brings down to this share, or below the limit of refusal."""
 DEPTHS = (0.7, 1.4)
 """Of the nearest and the farthest calibrated depth: beyond, no calibration of ours measures (as ``splined.model``)."""
+_FLIPS = (
+    ((True, False), "the x axis is reversed; number the projector's columns from the other end", "mirrored"),
+    (
+        (False, True),
+        "the y axis is reversed; number the projector's rows from the other end",
+        "upside down and mirrored",
+    ),
+    (
+        (True, True),
+        "the projector's image is turned by 180 degrees; number columns and rows from the other end, or switch off its "
+        "ceiling mode",
+        "turned by 180 degrees",
+    ),
+)
+"""Coordinates (x, y) that run backwards, and what that says of the projector's and of the camera's image."""
 LEAST_WITHIN = 0.5
 """Share of the points between these depths, below which the depths themselves are doubtful."""
 
@@ -334,69 +349,35 @@ def _hypotheses(
 ) -> Iterator[tuple[str, StereoRig, np.ndarray, np.ndarray]]:
     """What may be wrong, in words, and rig, pixels and coordinates as they would be without."""
     size, image = np.array(rig.projector.size), np.array(rig.camera.size)
-    yield (
-        "x and y are exchanged; exchange them in the description of the frames",
-        rig, pixels, measured[:, ::-1],
-    )  # fmt: skip
-    for flip, words in (
-        ((True, False), "the x axis is reversed; number the projector's columns from the other end"),
-        ((False, True), "the y axis is reversed; number the projector's rows from the other end"),
-        (
-            (True, True),
-            "the projector's image is turned by 180 degrees; number columns and rows from the other end, or "
-            "switch off its ceiling mode",
-        ),
-    ):
-        yield words, rig, pixels, np.where(flip, size - 1 - measured, measured)
-    yield (
-        "R and T are inverted: they map the projector to the camera; import their inverse",
-        StereoRig(rig.camera, rig.projector, rig.R.T, -rig.R.T @ rig.t),
-        pixels,
-        measured,
+    exchanged = "x and y are exchanged; exchange them in the description of the frames"
+    yield exchanged, rig, pixels, measured[:, ::-1]
+    for flip, of_projector, of_camera in _FLIPS:
+        yield of_projector, rig, pixels, np.where(flip, size - 1 - measured, measured)
+        said = f"the camera's image is {of_camera}; record it as for the calibration"
+        yield said, rig, np.where(flip, image - 1 - pixels, pixels), measured
+    inverse = StereoRig(rig.camera, rig.projector, rig.R.T, -rig.R.T @ rig.t)
+    yield "R and T are inverted: they map the projector to the camera; import their inverse", inverse, pixels, measured
+    camera, projector = (
+        Lens(other.K, other.D, own.size) for own, other in ((rig.camera, rig.projector), (rig.projector, rig.camera))
     )
-    yield (
-        "the matrices of camera and projector are exchanged; import them the other way round",
-        StereoRig(
-            Lens(rig.projector.K, rig.projector.D, rig.camera.size),
-            Lens(rig.camera.K, rig.camera.D, rig.projector.size),
-            rig.R,
-            rig.t,
-        ),
-        pixels,
-        measured,
-    )
-    for factors in ((2, 2), (0.5, 0.5), (2, 1), (0.5, 1), (1, 2), (1, 0.5)):
-        which = {1: "", 2: "half", 0.5: "twice"}
-        said = " and ".join(
-            f"{which[f]} as many {word}" for f, word in zip(factors, ("columns", "rows"), strict=True) if f != 1
-        )
-        matrix = f", or correct its matrix: {_rescaling(factors[0])}" if factors[0] == factors[1] else ""
-        yield (
-            f"the patterns were described with {said} as the calibrated projector has; give the projector's size and "
-            f"the fringe period as in the calibration{matrix}",
-            rig,
-            pixels,
-            (measured + 0.5) * factors - 0.5,
-        )
-    for factor in (2.0, 0.5):
-        yield (
-            f"the camera's matrix is at {'twice' if factor > 1 else 'half'} the pixel scale of the images: "
-            f"{_rescaling(factor)}",
-            rig,
-            (pixels + 0.5) * factor - 0.5,
-            measured,
-        )
-    for flip, words in (
-        ((True, False), "the camera's image is mirrored"),
-        ((False, True), "the camera's image is upside down and mirrored"),
-        ((True, True), "the camera's image is turned by 180 degrees"),
-    ):
-        yield f"{words}; record it as for the calibration", rig, np.where(flip, image - 1 - pixels, pixels), measured
-
-
-def _rescaling(factor: float) -> str:
-    """What to do with a matrix whose pixels are so many times as fine as those of the images."""
-    return f"{'halve' if factor > 1 else 'double'} fx, fy, cx and cy"
+    said = "the matrices of camera and projector are exchanged; import them the other way round"
+    yield said, StereoRig(camera, projector, rig.R, rig.t), pixels, measured
+    for factor, times, cure in ((2.0, "twice", "halve"), (0.5, "half", "double")):
+        repair = f"{cure} fx, fy, cx and cy"
+        said = f"the camera's matrix is at {times} the pixel scale of the images: {repair}"
+        yield said, rig, (pixels + 0.5) * factor - 0.5, measured
+        fewer = "half" if factor > 1 else "twice"
+        for factors, which in (
+            ((factor, factor), f"{fewer} as many columns and {fewer} as many rows"),
+            ((factor, 1), f"{fewer} as many columns"),
+            ((1, factor), f"{fewer} as many rows"),
+        ):
+            matrix = f", or correct its matrix: {repair}" if factors[0] == factors[1] else ""
+            said = (
+                f"the patterns were described with {which} as the calibrated projector has; give the projector's size "
+                f"and the fringe period as in the calibration{matrix}"
+            )
+            yield said, rig, pixels, (measured + 0.5) * factors - 0.5
 
 
 def _size(size: tuple[int, int]) -> str:
@@ -405,8 +386,7 @@ def _size(size: tuple[int, int]) -> str:
 
 def _scale(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
     """In words, where one is a simple multiple of the other."""
-    ratio: Callable[[int], float] = lambda i: size[i] / calibrated[i]  # noqa: E731
     for factor, words in ((0.5, "half"), (2.0, "twice"), (0.25, "a quarter of"), (4.0, "four times")):
-        if ratio(0) == factor and ratio(1) == factor:
+        if size[0] == factor * calibrated[0] and size[1] == factor * calibrated[1]:
             return f" (the capture's is {words} the calibrated size)"
     return ""
