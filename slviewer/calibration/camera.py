@@ -9,12 +9,13 @@ import numpy as np
 
 from slviewer.calibration.centres import centroid_shifts
 from slviewer.calibration.diagnosis.poses import FEW_POSES
-from slviewer.calibration.diagnosis.spread_rules import HIGH_REPROJECTION_PX, MAX_FOCAL_UNCERTAINTY, MIN_TILT_DEG
+from slviewer.calibration.diagnosis.rules import HIGH_REPROJECTION_PX, MAX_FOCAL_UNCERTAINTY, MIN_TILT_DEG
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.soundness import MIN_POSES
-from slviewer.calibration.stereo import ITERATIONS, MAX_FOCAL_SIGMA
+from slviewer.calibration.stereo import ITERATIONS, MAX_FOCAL_SIGMA, rms_length
 from slviewer.errors import CalibrationRejected
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import move_points, transform_from_rvec
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection
 
@@ -24,8 +25,11 @@ MAX_ERROR_RATIO = 3.0
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """The ``lens``; ``rms_px``, the reprojection error of all pictures, and each picture's (lengths); standard
-    deviations of fx and fy px; ``excluded`` pictures, and why; the verdict."""
+    """A calibrated camera, its reprojection errors, and a verdict on it.
+
+    ``rms_px``: reprojection error of all pictures together, ``picture_rms_px`` of each one (RMS length of the
+    residuals). ``focal_sigma_px``: standard deviations of fx and fy. ``excluded``: pictures not used, with the reason.
+    """
 
     lens: Lens
     board: str
@@ -36,7 +40,7 @@ class CameraCalibration:
     verdict: Verdict
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``calibrate --camera-only --json``."""
+        """Return the plain values that ``calibrate --camera-only --json`` prints."""
         return {
             "K_camera": self.lens.K.tolist(),
             "D_camera": self.lens.D.tolist(),
@@ -49,7 +53,7 @@ class CameraCalibration:
         }
 
     def text(self) -> str:
-        """For people."""
+        """Return a report of several lines for the terminal."""
         K, D, (width, height) = self.lens.K, self.lens.D, self.lens.size
         total = len(self.picture_rms_px) + len(self.excluded)
         return "\n".join(
@@ -71,10 +75,11 @@ def calibrate_camera(
     size: tuple[int, int],
     excluded: Mapping[str, str] | None = None,
 ) -> CameraCalibration:
-    """Pinhole and Brown (k1 k2 p1 p2 k3) from the board's features in pictures of ``size`` (width, height) px.
+    """Calibrate a pinhole camera with Brown distortion (k1 k2 p1 p2 k3) from pictures of a board.
 
-    Circles are corrected from the centroids of their images to their centres by a first calibration. ``excluded``:
-    pictures without a board, and why. Raises CalibrationRejected for fewer than three pictures.
+    ``detections``: the board's features by picture name; ``size``: (width, height) px of every picture. The images of
+    circles are corrected from centroid to centre by a first calibration. ``excluded``: pictures without a board, with
+    the reason. Raises CalibrationRejected for fewer than three pictures.
     """
     names = list(detections)
     if len(names) < MIN_POSES:
@@ -84,32 +89,35 @@ def calibrate_camera(
         )
     points = [board.points[detections[name].ids] for name in names]
     pixels = [np.asarray(detections[name].pixels, float) for name in names]
-    found = _solve(points, pixels, size)
+    lens, poses, sigma = _solve_camera(points, pixels, size)
     radii = [detections[name].radius_mm for name in names]
     if any(radii):
         pixels = [
-            seen - centroid_shifts(found[0], T, X, float(np.median(radii)))
-            for seen, T, X in zip(pixels, found[1], points, strict=True)
+            centroids - centroid_shifts(lens, T, X, float(np.median(radii)))
+            for centroids, T, X in zip(pixels, poses, points, strict=True)
         ]
-        found = _solve(points, pixels, size)
-    lens, poses, sigma = found
+        lens, poses, sigma = _solve_camera(points, pixels, size)
     residuals = [
-        lens.project(X @ T[:3, :3].T + T[:3, 3]) - seen for X, T, seen in zip(points, poses, pixels, strict=True)
+        lens.project(move_points(T, X)) - measured for X, T, measured in zip(points, poses, pixels, strict=True)
     ]
-    rms = {name: _rms(r) for name, r in zip(names, residuals, strict=True)}
-    whole = _rms(np.concatenate(residuals))
-    verdict = _verdict(rms, whole, lens, poses, sigma)
-    return CameraCalibration(lens, str(board), whole, rms, sigma, dict(excluded or {}), verdict)
+    picture_rms = {name: rms_length(r) for name, r in zip(names, residuals, strict=True)}
+    total_rms = rms_length(np.concatenate(residuals))
+    verdict = _judge_camera(picture_rms, total_rms, lens, poses, sigma)
+    return CameraCalibration(lens, str(board), total_rms, picture_rms, sigma, dict(excluded or {}), verdict)
 
 
-def _solve(
+def _solve_camera(
     points: list[np.ndarray], pixels: list[np.ndarray], size: tuple[int, int]
 ) -> tuple[Lens, list[np.ndarray], tuple[float, float]]:
-    """The lens, board poses (4, 4), and standard deviations of fx and fy px."""
+    """Solve a pinhole and Brown lens by ``cv2.calibrateCamera`` from points (n, 3) mm and pixels (n, 2) by picture.
+
+    Returns the lens, T_camera_board (4, 4) mm of each picture, and the standard deviations of fx and fy in px. Raises
+    CalibrationRejected where OpenCV finds no solution.
+    """
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
     objects, images = [p.astype(np.float32) for p in points], [p.astype(np.float32) for p in pixels]
     try:
-        _, K, D, turns, shifts, deviations, _, _ = cv2.calibrateCameraExtended(
+        _, K, D, rvecs, tvecs, deviations, _, _ = cv2.calibrateCameraExtended(
             objects, images, size, np.zeros((3, 3)), np.zeros(5), criteria=criteria
         )
     except cv2.error as error:
@@ -117,22 +125,28 @@ def _solve(
             f"the camera's lens could not be solved from {len(points)} pictures: show the board in more positions and "
             f"tilts ({error.err})"
         ) from error
-    poses = []
-    for turn, shift in zip(turns, shifts, strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(np.array(turn))[0], np.array(shift).ravel()
-        poses.append(T)
+    poses = [transform_from_rvec(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
     fx, fy = (float(s) for s in deviations.ravel()[:2])
     return Lens(np.array(K), np.array(D).ravel()[:5], size), poses, (fx, fy)
 
 
-def _verdict(
-    rms: Mapping[str, float], whole: float, lens: Lens, poses: list[np.ndarray], sigma: tuple[float, float]
+def _judge_camera(
+    picture_rms: Mapping[str, float],
+    total_rms: float,
+    lens: Lens,
+    poses: list[np.ndarray],
+    focal_sigma: tuple[float, float],
 ) -> Verdict:
+    """Judge a camera calibration by its number of pictures, their tilts, and the reprojection errors in px."""
     findings = []
-    if len(rms) < FEW_POSES:
+    if len(picture_rms) < FEW_POSES:
         findings.append(
-            Finding("too-few-poses", "doubtful", f"{len(rms)} pictures", f"take {FEW_POSES} at least, better a dozen")
+            Finding(
+                "too-few-poses",
+                "doubtful",
+                f"{len(picture_rms)} pictures",
+                f"take {FEW_POSES} at least, better a dozen",
+            )
         )
     normals = np.array([T[:3, 2] for T in poses])
     spread = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
@@ -145,41 +159,36 @@ def _verdict(
                 "tilt the board by 15 to 30 degrees, in different directions",
             )
         )
-    share = max(sigma[0] / lens.K[0, 0], sigma[1] / lens.K[1, 1])
-    if not share < MAX_FOCAL_UNCERTAINTY:
+    relative_sigma = max(focal_sigma[0] / lens.K[0, 0], focal_sigma[1] / lens.K[1, 1])
+    if not relative_sigma < MAX_FOCAL_UNCERTAINTY:
         findings.append(
             Finding(
                 "uncertain",
-                "rejected" if not share < MAX_FOCAL_SIGMA else "doubtful",
-                f"the pictures leave the focal length uncertain by {100 * share:.1f} %",
+                "rejected" if not relative_sigma < MAX_FOCAL_SIGMA else "doubtful",
+                f"the pictures leave the focal length uncertain by {100 * relative_sigma:.1f} %",
                 "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
             )
         )
-    if whole > HIGH_REPROJECTION_PX:
+    if total_rms > HIGH_REPROJECTION_PX:
         findings.append(
             Finding(
                 "residuals",
                 "doubtful",
-                f"the reprojection error is {whole:.1f} px",
+                f"the reprojection error is {total_rms:.1f} px",
                 "see that the board is flat, in focus and held still, and that its notation is right",
             )
         )
-    usual = float(np.median(list(rms.values())))
-    bad = tuple(name for name, px in rms.items() if px > max(MAX_ERROR_RATIO * usual, 0.1))
-    if bad:
+    median_rms = float(np.median(list(picture_rms.values())))
+    outliers = tuple(name for name, px in picture_rms.items() if px > max(MAX_ERROR_RATIO * median_rms, 0.1))
+    if outliers:
         findings.append(
             Finding(
                 "outlier",
                 "doubtful",
-                f"in {', '.join(bad)} the reprojection error is more than {MAX_ERROR_RATIO:g} times the usual "
-                f"{usual:.2f} px",
+                f"in {', '.join(outliers)} the reprojection error is more than {MAX_ERROR_RATIO:g} times the usual "
+                f"{median_rms:.2f} px",
                 "check these pictures, and calibrate again with --exclude",
-                bad,
+                outliers,
             )
         )
     return Verdict.of(findings)
-
-
-def _rms(residuals: np.ndarray) -> float:
-    """Root mean square length."""
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))

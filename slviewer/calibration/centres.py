@@ -1,8 +1,8 @@
-"""From the centroids of circles' images to the images of their centres.
+"""Correction of circle centroids to the images of the circles' centres.
 
-Perspective and distortion move the two apart, by some hundredths of a pixel where a board is tilted. A calibration's
-own lens and poses say by how much, and a first calibration from the centroids knows them well enough: its error changes
-the correction by a hundredth.
+Perspective and distortion separate the two by some hundredths of a pixel on a tilted board. The shift follows from the
+lens and the board's pose; those of a first calibration from the centroids are accurate enough, as their error changes
+the correction by 1 % only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,38 +14,39 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import Floats, move_points
 
 CORNERS = 64
-"""Of the polygon that stands for a circle."""
+"""Corners of the polygon that approximates a circle."""
 
 
 def calibrate_centres(
     observations: Sequence[Observation],
     projector_size: tuple[int, int],
     board: str = "",
-    left_out: Mapping[str, str] | None = None,
+    excluded: Mapping[str, str] | None = None,
     *,
     strict: bool = True,
 ) -> tuple[StereoModel, list[Observation]]:
-    """``calibrate_stereo`` from the circles' centroids, then once more from their centres; and the poses it used,
-    centred.
+    """Run ``calibrate_stereo`` on the circles' centroids, correct these to centres, and run it again.
 
-    Raises what ``calibrate_stereo`` does.
+    Parameters and errors are those of ``calibrate_stereo``. Returns the model and the corrected observations of the
+    poses that it used.
     """
-    stereo = calibrate_stereo(observations, projector_size, board, left_out, strict=strict)
+    stereo = calibrate_stereo(observations, projector_size, board, excluded, strict=strict)
     used = [o for o in observations if o.name in stereo.poses]
     corrected = move_to_centres(used, stereo)
     if all(new is old for new, old in zip(corrected, used, strict=True)):
         return stereo, used
-    stereo = calibrate_stereo(corrected, projector_size, board, stereo.left_out, strict=strict)
+    stereo = calibrate_stereo(corrected, projector_size, board, stereo.excluded, strict=strict)
     return stereo, [o for o in corrected if o.name in stereo.poses]
 
 
-def centroid_shifts(lens: Lens, T_camera_board: np.ndarray, points: np.ndarray, radius_mm: float) -> np.ndarray:
-    """(n, 2) px: the area centroid of each disc's image, less the image of its centre.
+def centroid_shifts(lens: Lens, T_camera_board: Floats, points: Floats, radius_mm: float) -> Floats:
+    """Return the shift (n, 2) px from the image of each circle's centre to the area centroid of the circle's image.
 
-    Discs of ``radius_mm`` lie at ``points`` (n, 3) mm in the board's plane, at ``T_camera_board`` (4, 4). NaN where the
-    lens does not see a disc.
+    Circles of ``radius_mm`` have their centres at ``points`` (n, 3) mm in the board's plane; ``T_camera_board`` (4, 4)
+    mm. NaN where a circle is not in the lens's field of view. Raises InputError for a negative radius.
     """
     if not radius_mm >= 0:
         raise InputError(f"circles of radius {radius_mm:g} mm were given: the radius is 0 or more")
@@ -53,9 +54,8 @@ def centroid_shifts(lens: Lens, T_camera_board: np.ndarray, points: np.ndarray, 
     # a regular polygon of a circle's area shares its second moments, which the shift comes from, to 1e-5
     reach = radius_mm * np.sqrt(2 * np.pi / (CORNERS * np.sin(2 * np.pi / CORNERS)))
     rim = reach * np.stack([np.cos(angles), np.sin(angles), np.zeros(CORNERS)], axis=1)
-    R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
-    centre = lens.project(points @ R.T + t)
-    outline = lens.project((points[:, None] + rim) @ R.T + t) - centre[:, None]
+    centre = lens.project(move_points(T_camera_board, points))
+    outline = lens.project(move_points(T_camera_board, points[:, None] + rim)) - centre[:, None]
     x, y = outline[..., 0], outline[..., 1]
     ahead = np.roll(outline, -1, axis=1)
     cross = x * ahead[..., 1] - ahead[..., 0] * y
@@ -66,9 +66,9 @@ def centroid_shifts(lens: Lens, T_camera_board: np.ndarray, points: np.ndarray, 
 
 
 def move_to_centres(observations: Sequence[Observation], stereo: StereoModel) -> list[Observation]:
-    """The same observations with circles at their centres, and their projector coordinates read there.
+    """Return the observations with circle centroids corrected to centres, and projector coordinates moved alike.
 
-    Poses that ``stereo`` did not use stay as they are, and so do corners and circles that are centred already.
+    Poses that ``stereo`` did not use, corners, and circles that are corrected already are returned unchanged.
     """
     radii = [o.radius_mm for o in observations if o.radius_mm]
     radius = float(np.median(radii)) if radii else 0.0  # one board: what differs between poses is noise
@@ -76,6 +76,7 @@ def move_to_centres(observations: Sequence[Observation], stereo: StereoModel) ->
 
 
 def _move_to_centres(observation: Observation, stereo: StereoModel, radius_mm: float) -> Observation:
+    """Return one observation with its circles of ``radius_mm`` at their centres."""
     shift = centroid_shifts(stereo.rig.camera, stereo.poses[observation.name], observation.points, radius_mm)
     projector = observation.projector
     if observation.slopes is not None:

@@ -1,4 +1,4 @@
-"""Conditions that target poses must fulfil before a rig can be solved from them; each raises its own error."""
+"""Checks of target poses before a stereo calibration; each raises CalibrationRejected with its own message."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,10 +12,10 @@ MIN_POSES = 3
 MIN_TILT_SPREAD_DEG = 4.0
 
 
-def check_enough(used: Sequence[Observation], left_out: Mapping[str, str]) -> None:
-    """Three poses or more."""
+def check_pose_count(used: Sequence[Observation], excluded: Mapping[str, str]) -> None:
+    """Raise CalibrationRejected for fewer than MIN_POSES poses; the message lists the ``excluded`` ones."""
     if len(used) < MIN_POSES:
-        why = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
+        why = "".join(f"; {name}: {reason}" for name, reason in excluded.items())
         raise CalibrationRejected(
             f"{len(used)} usable pose{'s' * (len(used) != 1)}, and at least {MIN_POSES} are needed: "
             f"capture the board in more positions and tilts{why}"
@@ -23,7 +23,10 @@ def check_enough(used: Sequence[Observation], left_out: Mapping[str, str]) -> No
 
 
 def check_tilts(used: Sequence[Observation]) -> None:
-    """Parallel boards share their vanishing line and do not determine the focal length."""
+    """Raise CalibrationRejected where all boards are nearly parallel.
+
+    Parallel boards share their vanishing line and do not determine the focal length.
+    """
     spread = nominal_tilt_spread_deg(used)
     if spread < MIN_TILT_SPREAD_DEG:
         raise CalibrationRejected(
@@ -33,7 +36,7 @@ def check_tilts(used: Sequence[Observation]) -> None:
 
 
 def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
-    """The largest angle between two boards, as a lens of a usual focal length would see them; 0 for less than two."""
+    """Estimate the largest angle in degrees between two boards with a nominal lens; 0 for fewer than two boards."""
     normals = []
     for o in used:
         width, height = o.size
@@ -50,8 +53,8 @@ def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
 
 
 def check_handedness(used: Sequence[Observation]) -> None:
-    """Camera and projector see the same side of a board: a mirror image in one of them is no view of it."""
-    mirrored = sum(_orientation(o.points, o.camera) * _orientation(o.points, o.projector) < 0 for o in used)
+    """Raise CalibrationRejected where projector coordinates are a mirror image of the camera's in most poses."""
+    mirrored = sum(_handedness(o.points, o.camera) * _handedness(o.points, o.projector) < 0 for o in used)
     if mirrored > len(used) / 2:
         raise CalibrationRejected(
             f"in {mirrored} of {len(used)} poses the projector's coordinates are a mirror image of what the camera "
@@ -59,8 +62,8 @@ def check_handedness(used: Sequence[Observation]) -> None:
         )
 
 
-def _orientation(points: np.ndarray, pixels: np.ndarray) -> float:
-    """Positive where x turns into y the same way on the board and in the image."""
-    read = np.isfinite(pixels).all(1)
-    affine = np.column_stack([points[read, :2], np.ones(np.count_nonzero(read))])
-    return float(np.linalg.det(np.linalg.lstsq(affine, pixels[read], rcond=None)[0][:2]))
+def _handedness(points: np.ndarray, pixels: np.ndarray) -> float:
+    """Return the determinant of the affine map from board points (n, 3) mm to pixels (n, 2): negative if mirrored."""
+    measured = np.isfinite(pixels).all(1)
+    design = np.column_stack([points[measured, :2], np.ones(np.count_nonzero(measured))])
+    return float(np.linalg.det(np.linalg.lstsq(design, pixels[measured], rcond=None)[0][:2]))

@@ -6,16 +6,18 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.soundness import check_enough, check_handedness, check_tilts
+from slviewer.calibration.soundness import check_handedness, check_pose_count, check_tilts
 from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import Floats, move_points, transform_from_rvec
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
-from slviewer.records import to_plain
+from slviewer.records import from_plain, to_plain
 
 MIN_FEATURES = 12
 MAX_FOCAL_SIGMA = 0.05
@@ -24,14 +26,20 @@ MAX_REPROJECTION_PX = 2.0
 """Above this the features and the model do not belong together, whatever the cause."""
 ROBUST_SIGMAS = 6.0
 ITERATIONS = 200
+_SAVED_KEYS = {"excluded": "left_out", "features_excluded": "features_set_aside"}
+"""Keys on disk of the fields whose names differ from them."""
 
 
 @dataclass(frozen=True)
 class StereoModel:
-    """A calibrated camera and projector, and how well the poses agree with them.
+    """A calibrated camera and projector with the target poses they were calibrated from.
 
-    ``poses`` map board to camera (4, 4); ``pose_rms_px`` holds (camera, projector) reprojection RMS of each pose used;
-    ``residuals_px`` (n, 4) holds camera and projector residuals of each pose's features (NaN: excluded or not read).
+    ``poses``: T_camera_board (4, 4) mm by pose name. ``reprojection_rms_px``: RMS length of the residuals of "camera",
+    "projector" and "stereo" (both together); ``pose_rms_px``: (camera, projector) of each pose. ``excluded``: poses not
+    used, with the reason. ``depth_range_mm``: nearest and farthest feature; None for a calibration made elsewhere.
+    ``focal_sigma_px``: standard deviation of the focal length by device. ``features_excluded``: number of outliers
+    among the features. ``residuals_px`` (n, 4): camera and projector residuals of each pose's features, NaN where
+    excluded or not measured.
     """
 
     rig: StereoRig
@@ -40,10 +48,10 @@ class StereoModel:
     reprojection_rms_px: Mapping[str, float]
     poses: Mapping[str, np.ndarray]
     pose_rms_px: Mapping[str, tuple[float, float]]
-    left_out: Mapping[str, str]
+    excluded: Mapping[str, str]
     depth_range_mm: tuple[float, float] | None
     focal_sigma_px: Mapping[str, float]
-    features_set_aside: int = 0
+    features_excluded: int = 0
     residuals_px: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     name = "stereo"
@@ -60,38 +68,54 @@ class StereoModel:
 
     @property
     def residual_px(self) -> float:
-        """How far, in projector px, the target poses' features miss their epipolar lines (1 sigma): lens distortion
-        that Brown's polynomial lacks, and noise; 0 for a calibration made elsewhere."""
+        """Standard deviation in projector px of the features' distances from their epipolar lines.
+
+        It holds noise and the lens distortion that Brown's polynomial lacks; 0 for a calibration made elsewhere.
+        """
         rms = self.reprojection_rms_px
         if not rms:
             return 0.0
         magnification = self.rig.projector.K[1, 1] / self.rig.camera.K[1, 1]
         return float(np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2))  # of one coordinate
 
-    def sight(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2)."""
-        return self.rig.camera.undistort(pixels), self.rig.projector.undistort(projector)
+    def undistort_pairs(
+        self, camera_pixels: NDArray[np.float64], projector_pixels: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the undistorted normalised coordinates (n, 2) of camera pixels (n, 2) and of projector pixels (n, 2).
 
-    def points(self, phase: PhaseMap) -> np.ndarray:
-        """(h, w, 3) float32 mm from one axis (eq. 6-8, the distorted projection met exactly); NaN where invalid."""
+        NaN where the inversion of the distortion fails.
+        """
+        return self.rig.camera.undistort(camera_pixels), self.rig.projector.undistort(projector_pixels)
+
+    def points(self, phase: PhaseMap) -> NDArray[np.float32]:
+        """Triangulate the absolute phase of one axis (eq. 6-8, with exact inversion of the projector's distortion).
+
+        Returns points (h, w, 3) float32 mm in the camera's frame; NaN where the phase is invalid.
+        """
         z = triangulate(self.rig, phase.coordinate, phase.axis)
         return points_from_depth(self.rig.camera.rays(), z)
 
-    def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
-        """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``."""
+    def sigma_z(self, phase: PhaseMap, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Predict the standard deviation of depth (h, w) mm from the phase noise, ``|dz/dphi| sigma_phi``."""
         z = points[..., 2].astype(float)
         per_rad = depth_per_px(self.rig, phase.axis, z) * phase.period_px / (2 * np.pi)
         return (per_rad * phase.sigma_phase).astype(np.float32)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, without the residuals; the inverse of `records.from_plain`."""
+        """Return plain values for JSON, without the residuals; ``from_dict`` is the inverse."""
         data: dict[str, Any] = to_plain(replace(self, residuals_px={}))
         del data["residuals_px"]
-        return data
+        return {_SAVED_KEYS.get(name, name): value for name, value in data.items()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "StereoModel":
+        """Return the model that ``to_dict`` saved. Raises InputError that names an invalid field."""
+        names = {key: name for name, key in _SAVED_KEYS.items()}
+        return from_plain({names.get(key, key): value for key, value in data.items()}, cls)
 
     @classmethod
     def from_rig(cls, rig: StereoRig) -> "StereoModel":
-        """A calibration of which only the rig is known: no poses, no residuals, no calibrated depths."""
+        """Return a model of a rig that was calibrated elsewhere: no poses, no residuals, no calibrated depths."""
         return cls(rig, "", ("x", "y"), {}, {}, {}, {}, None, {})
 
 
@@ -99,51 +123,54 @@ def calibrate_stereo(
     observations: Sequence[Observation],
     projector_size: tuple[int, int],
     board: str = "",
-    left_out: Mapping[str, str] | None = None,
+    excluded: Mapping[str, str] | None = None,
     *,
     strict: bool = True,
 ) -> StereoModel:
-    """Pinhole and Brown (k1 k2 p1 p2 k3) for both devices, and their relative pose, from board features.
+    """Calibrate camera and projector, pinhole and Brown (k1 k2 p1 p2 k3) each, and their relative pose (step 1).
 
-    Features beyond 6 robust sigma, and poses most of whose features are, are excluded and named. Raises
-    CalibrationRejected where the poses cannot determine the devices: too few, all parallel, or features that
-    contradict the model. Not ``strict``: a solution for diagnosis only, whatever it contradicts; raises only
-    where there is none.
+    ``board``: its notation, stored with the model. ``excluded``: poses that were excluded before, with the reason.
+    Features beyond 6 robust sigma are excluded, and so is a pose most of whose features are. Raises CalibrationRejected
+    where the poses cannot determine the devices: too few, all parallel, or features that contradict the model.
+    ``strict=False`` skips these checks and the exclusion of outliers, for diagnosis only; it raises
+    CalibrationRejected only where OpenCV finds no solution.
     """
-    left_out = dict(left_out or {})
-    kept: dict[str, np.ndarray] = {}
+    excluded = dict(excluded or {})
+    inliers: dict[str, NDArray[np.bool_]] = {}
     for observation in observations:
-        usable = np.isfinite(observation.projector).all(1) & np.isfinite(observation.camera).all(1)
+        measured = np.isfinite(observation.projector).all(1) & np.isfinite(observation.camera).all(1)
         if len(observation.surfaces) < 2:
             only = ", ".join(observation.surfaces)
-            left_out[observation.name] = f"holds the {only} axis alone: a calibration pose needs both x and y"
-        elif usable.sum() < MIN_FEATURES:
-            left_out[observation.name] = (
-                f"{usable.sum()} of {len(usable)} features carry both projector coordinates: light the whole board"
+            excluded[observation.name] = f"holds the {only} axis alone: a calibration pose needs both x and y"
+        elif measured.sum() < MIN_FEATURES:
+            excluded[observation.name] = (
+                f"{measured.sum()} of {len(measured)} features carry both projector coordinates: light the whole board"
             )
         else:
-            kept[observation.name] = usable
-    used = [o for o in observations if o.name in kept]
-    check_enough(used, left_out)
+            inliers[observation.name] = measured
+    used = [o for o in observations if o.name in inliers]
+    check_pose_count(used, excluded)
     if strict:
         check_handedness(used)
         check_tilts(used)
 
     for _ in range(4):
-        solution = _Solution.fit(used, [kept[o.name] for o in used], projector_size, strict)
-        outliers = _find_outliers(solution, used, kept)
+        solution = _Solution.fit(used, inliers, projector_size, strict)
+        outliers = _detect_outliers(solution, used, inliers)
         if not (outliers and strict):  # a diagnosis keeps all features
             break
-        for name, bad in outliers.items():
-            kept[name] = kept[name] & ~bad
-            if kept[name].sum() < max(MIN_FEATURES, 0.5 * len(bad)):
-                left_out[name] = (
-                    f"{bad.sum()} of {len(bad)} features disagree with the other poses: "
+        for name, is_outlier in outliers.items():
+            inliers[name] = inliers[name] & ~is_outlier
+            if inliers[name].sum() < max(MIN_FEATURES, 0.5 * len(is_outlier)):
+                excluded[name] = (
+                    f"{is_outlier.sum()} of {len(is_outlier)} features disagree with the other poses: "
                     "was the board moved during the capture, or its grid shifted?"
                 )
                 used = [o for o in used if o.name != name]
-        check_enough(used, left_out)
-    model = solution.model(used, kept, board, left_out)
+        check_pose_count(used, excluded)
+    else:  # the last round excluded features or poses too
+        solution = _Solution.fit(used, inliers, projector_size, strict)
+    model = solution.to_model(used, inliers, board, excluded)
     if strict:
         _check_agreement(model)
     return model
@@ -151,20 +178,28 @@ def calibrate_stereo(
 
 @dataclass(frozen=True)
 class _Solution:
-    camera: Lens
-    projector: Lens
-    R: np.ndarray
-    t: np.ndarray
-    poses: list[tuple[np.ndarray, np.ndarray]]
+    """Result of ``cv2.stereoCalibrate``: the rig, T_camera_board (4, 4) mm of each pose, focal sigmas by device."""
+
+    rig: StereoRig
+    poses: list[Floats]
     focal_sigma_px: dict[str, float]
 
     @classmethod
     def fit(
-        cls, used: Sequence[Observation], kept: Sequence[np.ndarray], projector_size: tuple[int, int], strict: bool
+        cls,
+        used: Sequence[Observation],
+        inliers: Mapping[str, NDArray[np.bool_]],
+        projector_size: tuple[int, int],
+        strict: bool,
     ) -> "_Solution":
-        objects = [o.points[k].astype(np.float32) for o, k in zip(used, kept, strict=True)]
-        cameras = [o.camera[k].astype(np.float32) for o, k in zip(used, kept, strict=True)]
-        projectors = [o.projector[k].astype(np.float32) for o, k in zip(used, kept, strict=True)]
+        """Solve each device by itself, then both together with their relative pose, from the inlier features.
+
+        Raises CalibrationRejected where OpenCV finds no solution or a focal length is not positive, and if ``strict``
+        where one is too uncertain.
+        """
+        objects = [o.points[inliers[o.name]].astype(np.float32) for o in used]
+        cameras = [o.camera[inliers[o.name]].astype(np.float32) for o in used]
+        projectors = [o.projector[inliers[o.name]].astype(np.float32) for o in used]
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
         sigma: dict[str, float] = {}
         intrinsics = []
@@ -208,61 +243,49 @@ class _Solution:
                     "check the target's notation, the projector's size, the fringe period, and that x and y are not "
                     "exchanged"
                 )
-        return cls(
-            Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size),
-            Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size),
-            np.array(R),
-            np.array(T).ravel(),
-            [(cv2.Rodrigues(np.array(r))[0], np.array(t).ravel()) for r, t in zip(rvecs, tvecs, strict=True)],
-            sigma,
-        )
+        camera = Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size)
+        projector = Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size)
+        poses = [transform_from_rvec(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
+        return cls(StereoRig(camera, projector, np.array(R), np.array(T)), poses, sigma)
 
-    @property
-    def rig(self) -> StereoRig:
-        return StereoRig(self.camera, self.projector, self.R, self.t)
+    def residuals(self, index: int, observation: Observation) -> Floats:
+        """Return the camera and projector residuals (n, 4) px of every feature of one pose."""
+        X = move_points(self.poses[index], observation.points)
+        predicted = self.rig.camera.project(X), self.rig.project(X)
+        return np.hstack([observation.camera - predicted[0], observation.projector - predicted[1]])
 
-    def residuals(self, index: int, observation: Observation) -> np.ndarray:
-        """(n, 4) px: camera and projector residuals of every feature of one pose."""
-        R, t = self.poses[index]
-        X = observation.points @ R.T + t
-        return np.hstack([observation.camera - self.camera.project(X), observation.projector - self.rig.project(X)])
-
-    def model(
+    def to_model(
         self,
         used: Sequence[Observation],
-        kept: Mapping[str, np.ndarray],
+        inliers: Mapping[str, NDArray[np.bool_]],
         board: str,
-        left_out: Mapping[str, str],
+        excluded: Mapping[str, str],
     ) -> StereoModel:
-        residuals, poses, pose_rms, depths = {}, {}, {}, []
-        for i, o in enumerate(used):
-            r = np.where(kept[o.name][:, None], self.residuals(i, o), np.nan)
-            residuals[o.name] = r
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = self.poses[i]
-            poses[o.name] = T
-            pose_rms[o.name] = (_rms_px(r[:, :2]), _rms_px(r[:, 2:]))
-            depths.append((o.points @ T[:3, :3].T + T[:3, 3])[:, 2])
-        every = np.concatenate(list(residuals.values()))
-        rms = {"camera": _rms_px(every[:, :2]), "projector": _rms_px(every[:, 2:])}
+        """Return the calibrated model with the reprojection errors of the inlier features."""
+        residuals = {
+            o.name: np.where(inliers[o.name][:, None], self.residuals(i, o), np.nan) for i, o in enumerate(used)
+        }
+        z = np.concatenate([move_points(T, o.points)[:, 2] for T, o in zip(self.poses, used, strict=True)])
+        all_residuals = np.concatenate(list(residuals.values()))
+        rms = {"camera": rms_length(all_residuals[:, :2]), "projector": rms_length(all_residuals[:, 2:])}
         rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
-        z = np.concatenate(depths)
         return StereoModel(
             rig=self.rig,
             board=board,
             axes=("x", "y"),
             reprojection_rms_px=rms,
-            poses=poses,
-            pose_rms_px=pose_rms,
-            left_out=left_out,
+            poses={o.name: T for o, T in zip(used, self.poses, strict=True)},
+            pose_rms_px={name: (rms_length(r[:, :2]), rms_length(r[:, 2:])) for name, r in residuals.items()},
+            excluded=excluded,
             depth_range_mm=(float(z.min()), float(z.max())),
             focal_sigma_px=self.focal_sigma_px,
-            features_set_aside=int(sum((~k).sum() for name, k in kept.items() if name in poses)),
+            features_excluded=int(sum((~inliers[name]).sum() for name in residuals)),
             residuals_px=residuals,
         )
 
 
 def _check_agreement(model: StereoModel) -> None:
+    """Raise CalibrationRejected where the reprojection error is too large or a board lies behind the camera."""
     rms = model.reprojection_rms_px
     if rms["stereo"] > MAX_REPROJECTION_PX:
         raise CalibrationRejected(
@@ -274,21 +297,23 @@ def _check_agreement(model: StereoModel) -> None:
         raise CalibrationRejected("the solution puts the board behind the camera: check the target's notation")
 
 
-def _rms_px(residuals: np.ndarray) -> float:
-    """Root mean square length of 2-D residuals, as OpenCV reports it."""
+def rms_length(residuals: np.ndarray) -> float:
+    """Return the root mean square length of 2-D residuals (n, 2), as OpenCV reports it; rows with NaN do not count."""
     return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
 
 
-def _find_outliers(
-    solution: _Solution, used: Sequence[Observation], kept: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """Per pose, the features still in use that lie beyond ROBUST_SIGMAS of all features, in either device."""
+def _detect_outliers(
+    solution: _Solution, used: Sequence[Observation], inliers: Mapping[str, NDArray[np.bool_]]
+) -> dict[str, NDArray[np.bool_]]:
+    """Return the outliers (n,) bool among the inliers so far, of each pose that has some.
+
+    An outlier's residual exceeds ROBUST_SIGMAS times the robust sigma of all features, in either device.
+    """
     lengths = {}
     for i, o in enumerate(used):
         r = solution.residuals(i, o)
         lengths[o.name] = np.stack([np.hypot(r[:, 0], r[:, 1]), np.hypot(r[:, 2], r[:, 3])], axis=1)
-    every = np.concatenate([lengths[o.name][kept[o.name]] for o in used])
-    sigma = np.median(every, axis=0) / 1.1774  # of a Rayleigh distribution
+    sigma = np.median(np.concatenate([lengths[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774  # Rayleigh
     limit = np.maximum(ROBUST_SIGMAS * sigma, 0.05)
-    outliers = {o.name: kept[o.name] & (lengths[o.name] > limit).any(1) for o in used}
-    return {name: bad for name, bad in outliers.items() if bad.any()}
+    outliers = {o.name: inliers[o.name] & (lengths[o.name] > limit).any(1) for o in used}
+    return {name: is_outlier for name, is_outlier in outliers.items() if is_outlier.any()}

@@ -75,6 +75,18 @@ def fit_polynomial(
     return Polynomial2D(coefficients, box)
 
 
+def monomials(points: np.ndarray, degree: int) -> np.ndarray:
+    """(n, m): x^i y^j of points (n, 2) for i from 0 and j from 0 while i + j <= ``degree``; j runs fastest."""
+    x, y = points.T
+    return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+
+
+def scale_to_unit_square(points: np.ndarray) -> np.ndarray:
+    """(n, 2): points (n, 2) scaled so that their extent along x and along y is -1 to 1."""
+    low = points.min(0)
+    return np.asarray(2 * (points - low) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1)
+
+
 def parse_box(extent: Sequence[float]) -> Box:
     """(u0, v0, u1, v1) px of a box, or of a whole image given as (width, height), outer pixel edges included."""
     if len(extent) == 2:

@@ -6,6 +6,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import rigid_transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +38,7 @@ class StereoRig:
     @property
     def T_projector_camera(self) -> np.ndarray:
         """(4, 4): maps camera-frame points into the projector's frame."""
-        T = np.eye(4)
-        T[:3, :3] = self.R
-        T[:3, 3] = self.t
-        return T
+        return rigid_transform(self.R, self.t)
 
     def to_projector(self, points: np.ndarray) -> np.ndarray:
         """Camera-frame points (..., 3) mm in the projector's frame, (..., 3) mm."""

@@ -1,7 +1,7 @@
 """Rigid motions as matrices (4, 4): ``T_b_a`` maps points of frame a into frame b."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Floats = NDArray[np.float64]
@@ -14,6 +14,11 @@ def rigid_transform(R: Floats, t: Floats) -> Floats:
     return T
 
 
+def transform_from_rvec(rvec: ArrayLike, tvec: ArrayLike) -> Floats:
+    """(4, 4): the motion of a rotation vector (rad) and a translation (mm) as OpenCV returns them, of any shape."""
+    return rigid_transform(Rotation.from_rotvec(np.ravel(rvec)).as_matrix(), np.ravel(tvec))
+
+
 def turn_about(rotation: Floats, centre: Floats, shift: Floats | float = 0.0) -> Floats:
     """(4, 4): the turn by a rotation vector (3,) rad about ``centre`` (3,) mm, then the shift (3,) mm."""
     R = Rotation.from_rotvec(rotation).as_matrix()
@@ -21,8 +26,13 @@ def turn_about(rotation: Floats, centre: Floats, shift: Floats | float = 0.0) ->
 
 
 def move_points(T: Floats, points: np.ndarray) -> Floats:
-    """(n, 3): points (n, 3) mm moved by ``T`` (4, 4); NaN stays NaN."""
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+    """(..., n, 3): points (n, 3) mm moved by each motion ``T`` (..., 4, 4); NaN stays NaN."""
+    return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
+
+
+def rotation_angle(R: Floats) -> Floats:
+    """(...,) rad: the angle of rotations (..., 3, 3), 0 to pi."""
+    return np.asarray(Rotation.from_matrix(R).magnitude())
 
 
 def fit_rigid(points: Floats, targets: Floats) -> Floats:

@@ -50,12 +50,12 @@ def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) ->
 
 def exclusions_html(calibration: CalibrationView) -> Html:
     """Excluded poses and features, each with its reason; empty where there are none."""
-    n = calibration.stereo.features_set_aside
+    n = calibration.stereo.features_excluded
     features = (
         f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma): shadow or occlusion." if n else ""
     )
     note = paragraph(coloured(features, "dim")) if features else Html("")
-    lines = [f"{name}: {why}" for name, why in calibration.stereo.left_out.items()]
+    lines = [f"{name}: {why}" for name, why in calibration.stereo.excluded.items()]
     if calibration.splined is not None:
         lines += [
             f"{name}, in the splined model only: it {why}"

@@ -6,7 +6,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.attempt import Attempt
+from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration
 from slviewer.calibration.diagnosis.verdict import Verdict, judge_splined
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
@@ -67,28 +67,28 @@ class CalibrationResult:
         return {
             "models": models,
             "poses_used": list(self.stereo.poses),
-            "poses_left_out": dict(self.stereo.left_out),
+            "poses_left_out": dict(self.stereo.excluded),
             "verdict": self.verdict.to_json(),
         }
 
     def text(self) -> str:
         """For people."""
         s = self.stereo
-        rms, total = s.reprojection_rms_px, len(s.poses) + len(s.left_out)
+        rms, total = s.reprojection_rms_px, len(s.poses) + len(s.excluded)
         fc, fp = s.rig.camera.K, s.rig.projector.K
         sigma = s.focal_sigma_px
         near, far = s.depth_range_mm or (np.nan, np.nan)
         lines = [
             f"poses: {len(s.poses)} of {total} used, boards at {near:.0f}-{far:.0f} mm",
-            *(f"  left out: {name}: {why}" for name, why in s.left_out.items()),
+            *(f"  left out: {name}: {why}" for name, why in s.excluded.items()),
             f"stereo: reprojection RMS camera {rms['camera']:.3f} px, projector {rms['projector']:.3f} px, "
             f"stereo {rms['stereo']:.3f} px",
             f"  camera focal length {fc[0, 0]:.1f}, {fc[1, 1]:.1f} px (+- {sigma['camera']:.1f}); "
             f"projector {fp[0, 0]:.1f}, {fp[1, 1]:.1f} px (+- {sigma['projector']:.1f}); "
             f"baseline {s.baseline_mm:.2f} mm",
         ]
-        if s.features_set_aside:
-            lines.append(f"  {s.features_set_aside} features set aside beyond 6 robust sigma")
+        if s.features_excluded:
+            lines.append(f"  {s.features_excluded} features set aside beyond 6 robust sigma")
         if self.pixelwise is not None:
             for axis in self.pixelwise.axes:
                 fit = self.pixelwise.fits[axis]
@@ -230,7 +230,7 @@ def _save_models(
 
 
 def _fit_models(
-    found: Attempt, models: Sequence[str], progress: Progress, warn: Warn, excluded: Container[str] = ()
+    found: DiagnosedCalibration, models: Sequence[str], progress: Progress, warn: Warn, excluded: Container[str] = ()
 ) -> CalibrationResult:
     """The models that follow from a stereo calibration that was not rejected, with the verdict on all of them.
 
@@ -240,7 +240,7 @@ def _fit_models(
     assert stereo is not None
     if found.warning:
         warn(found.warning)
-    for name, why in stereo.left_out.items():
+    for name, why in stereo.excluded.items():
         if name not in excluded:
             warn(f"{name} is left out: {why}")
     for finding in found.verdict.findings:
@@ -283,6 +283,6 @@ def _fit(
     pixelwise_end = 0.0 if "pixelwise" not in models else 0.33 if "splined" in models else 1.0
     pixelwise = fit("pixelwise", calibrate_pixelwise, 0.0, pixelwise_end, "pixel-wise fit")
     splined = fit("splined", calibrate_splined, pixelwise_end, 1.0, "joint adjustment")
-    for name, why in splined.bundle.left_out.items() if splined else ():
+    for name, why in splined.bundle.excluded.items() if splined else ():
         warn(f"{name} is excluded from the splined model: it {why}")
     return CalibrationResult(stereo, pixelwise, splined)

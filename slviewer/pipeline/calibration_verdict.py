@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from slviewer.calibration.diagnosis.attempt import Attempt, attempt_stereo
+from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.evidence import Evidence
 from slviewer.calibration.diagnosis.rules import judge_evidence
 from slviewer.calibration.diagnosis.verdict import Verdict
@@ -28,7 +28,7 @@ def attempt(
     smoothing: Smoothing,
     left_out: Mapping[str, str],
     progress: Progress,
-) -> Attempt:
+) -> DiagnosedCalibration:
     """Read and examine the target poses, calibrate stereo from them, and judge it. ``left_out``: poses that the
     operator excluded.
     """
@@ -44,11 +44,11 @@ def attempt_poses(
     board: Board,
     left_out: Mapping[str, str],
     progress: Progress,
-) -> Attempt:
+) -> DiagnosedCalibration:
     """Calibrate stereo from ``count`` target poses as they are read, and judge it; ``left_out`` as in ``attempt``."""
     if contradiction := contradicting(sequence):
         evidence = Evidence(str(board), sequence.projector, (), contradiction=contradiction)
-        return Attempt(judge_evidence(evidence), evidence, None, (), dict(left_out))
+        return DiagnosedCalibration(judge_evidence(evidence), evidence, None, (), dict(left_out))
     observations: list[Observation] = []
     evidence_of_poses = []
     refused = dict(left_out)
@@ -60,10 +60,10 @@ def attempt_poses(
             observations.append(pose.observation)
         if pose.evidence is not None:
             evidence_of_poses.append(pose.evidence)
-    found = attempt_stereo(observations, evidence_of_poses, sequence.projector, board, refused)
-    if found.stereo is None:
-        return found
-    return replace(found, stereo=replace(found.stereo, left_out=found.left_out))
+    result = calibrate_with_diagnosis(observations, evidence_of_poses, sequence.projector, board, refused)
+    if result.stereo is None:
+        return result
+    return replace(result, stereo=replace(result.stereo, excluded=result.excluded))
 
 
 def contradicting(sequence: PatternSequence) -> str:

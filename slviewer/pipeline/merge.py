@@ -89,7 +89,7 @@ class Merge:
             "letter_rms_mm": dict(letter.EXPERIMENT_3_ICP_RMS_MM),
             "points": len(self.fused.surface),
             "shared": self.fused.shared,
-            "left_out": self.fused.left_out,
+            "left_out": self.fused.excluded,
         }
 
     def text(self) -> str:
@@ -119,7 +119,7 @@ class Merge:
                 f"contradicting points: {100 * worst_pair.share:.2g} % at most of what both scans of a pair cover lies "
                 f"more than {worst_pair.gate_mm:.2g} mm in front of the other's surface"
             )
-        far = {name: counts["far"] for name, counts in self.fused.left_out.items() if counts.get("far")}
+        far = {name: counts["far"] for name, counts in self.fused.excluded.items() if counts.get("far")}
         if far:
             counted = ", ".join(f"{count} points of {name}" for name, count in far.items())
             lines.append(f"removed as far from everything else: {counted}")

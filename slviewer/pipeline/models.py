@@ -87,7 +87,7 @@ def load_stereo(store: Session) -> StereoModel:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
     meta = store.load_result("calibration/stereo", only=())[0]
     if "model" in meta:
-        return from_plain(meta["model"], StereoModel)
+        return StereoModel.from_dict(meta["model"])
     captures = store.captures()
     if not captures and not (meta["camera"] and meta["projector"]):
         raise InputError(f"{store.folder} holds no capture that tells the camera's size: import the scans first")

@@ -178,7 +178,7 @@ def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping
     elif capture.name in stereo.poses:
         state = "used"
     else:
-        state, why = "unused", stereo.left_out.get(capture.name, "added after the calibration")
+        state, why = "unused", stereo.excluded.get(capture.name, "added after the calibration")
     return CaptureRow(
         name=capture.name,
         role=capture.role,

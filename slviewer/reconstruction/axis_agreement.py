@@ -65,7 +65,7 @@ LEAST_WITHIN = 0.5
 class Calibration(Protocol):
     """A calibration as far as rays are concerned. ``rig``: its pinholes and their arrangement."""
 
-    def sight(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def undistort_pairs(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and of ``projector`` pixels (n, 2);
         NaN where not calibrated."""
 
@@ -205,7 +205,7 @@ def local_misfit(
     other about as much.
     """
     rig = calibration.pinholes
-    distance, normal = epipolar_distance(rig, *calibration.sight(pixels, measured))
+    distance, normal = epipolar_distance(rig, *calibration.undistort_pairs(pixels, measured))
     known = np.isfinite(distance)
     distance, noise = np.abs(distance[known]), np.sum((normal[known] * sigma[known]) ** 2, axis=1)
     tile = (pixels[known, ::-1] * TILES / np.array(rig.camera.size[::-1])).astype(int) @ (TILES[1], 1)
@@ -225,7 +225,7 @@ def measure_agreement(
     """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px, of noise ``sigma``
     (n, 2) px, miss each other; None where fewer than 200 are calibrated."""
     rig = calibration.pinholes
-    found = _agreement(rig, *calibration.sight(pixels, measured), sigma, calibration.residual_px)
+    found = _agreement(rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px)
     return found if found.pixels >= LEAST_PIXELS else None
 
 

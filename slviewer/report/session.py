@@ -166,7 +166,7 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
         ]
     if stereo.pose_rms_px:
         items.append(_pose_table(stereo.pose_rms_px))
-    aside = stereo.features_set_aside
+    aside = stereo.features_excluded
     text = [
         "How far the target's features lie from where the calibration predicts them, in px: "
         + ", ".join(f"{device} {value:.3f}" for device, value in rms.items())

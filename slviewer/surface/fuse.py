@@ -31,7 +31,7 @@ class Fused:
 
     ``surface``: its points, with normals towards the cameras, the sigma along them, colours where every scan has some.
     ``source`` (n,) uint8 says which of ``names`` a point's place across the normal comes from; ``seen_by`` (n,) uint8
-    how many scans it is the mean of. ``left_out``: pixels of each scan that lie on no surface, and why; ``pairs``: how
+    how many scans it is the mean of. ``excluded``: pixels of each scan that lie on no surface, and why; ``pairs``: how
     scans that overlap agree, by their names.
     """
 
@@ -39,7 +39,7 @@ class Fused:
     source: np.ndarray
     seen_by: np.ndarray
     names: tuple[str, ...]
-    left_out: dict[str, dict[str, int]]
+    excluded: dict[str, dict[str, int]]
     pairs: dict[tuple[str, str], SurfaceAgreement]
 
     @property
@@ -68,7 +68,7 @@ def fuse(
         views[name] = prepare_view(name, cloud, T_reference_scan[name])
     names = tuple(views)
     pairs = agreements(views, lambda share: say(0.3 + 0.1 * share))
-    left_out = {
+    excluded = {
         name: {
             "edges": v.cleaned.edges,
             "grazing": v.cleaned.grazing,
@@ -78,7 +78,7 @@ def fuse(
         for name, v in views.items()
     }
     for name, denied in _denied(views, pairs, lambda share: say(0.4 + 0.1 * share)).items():
-        left_out[name]["unconfirmed"] = int(denied.sum())
+        excluded[name]["unconfirmed"] = int(denied.sum())
         views[name] = views[name].without(denied)
     gains = colour_gains(views, pairs)
     parts = []
@@ -91,7 +91,7 @@ def fuse(
         source=np.repeat(np.arange(len(names), dtype=np.uint8), [len(part[0]) for part in parts]),
         seen_by=np.concatenate([part[1] for part in parts]),
         names=names,
-        left_out=left_out,
+        excluded=excluded,
         pairs=pairs,
     )
 

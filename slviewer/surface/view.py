@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.polynomial import monomials
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.surface.clean import ExcludedPixels, clean, close_pinholes, sight_cosines
@@ -147,7 +148,7 @@ def _rgb(texture: np.ndarray | None, crop: tuple[slice, slice]) -> np.ndarray | 
 
 def _fit_pixels(name: str, points: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """(2 + 2 + 42,) float64: middle and half width of the lines of sight (x/z, y/z), then the coefficients of a
-    polynomial of degree 5 in the normalised ones for the column and for the row, in the order of ``terms``.
+    polynomial of degree 5 in the normalised ones for the column and for the row, in the order of ``monomials``.
 
     Good to a fraction of a pixel whatever the lens: what is found there is then taken for where it lies, not for where
     it was expected.
@@ -159,7 +160,7 @@ def _fit_pixels(name: str, points: np.ndarray, kept: np.ndarray) -> np.ndarray:
     rays = p[:, :2] / p[:, 2:]
     low, high = rays.min(axis=0), rays.max(axis=0)
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-9)
-    A = terms((rays - middle) / half)
+    A = monomials((rays - middle) / half, _DEGREE)
     pixels = np.stack([u, v], axis=1).astype(np.float64)
     coefficients, *_ = np.linalg.lstsq(A, pixels, rcond=1e-10)
     off = float(np.sqrt(np.mean((A @ coefficients - pixels) ** 2)))
@@ -169,9 +170,3 @@ def _fit_pixels(name: str, points: np.ndarray, kept: np.ndarray) -> np.ndarray:
             "give the organised cloud in the frame of the camera that took it."
         )
     return np.concatenate([middle, half, coefficients.T.ravel()])
-
-
-def terms(rays: np.ndarray) -> np.ndarray:
-    """(n, 21): x^i y^j for i from 0 and j from 0 while i + j <= 5, of rays (n, 2)."""
-    x, y = rays.T
-    return np.stack([x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1)

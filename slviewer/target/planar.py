@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError
+from slviewer.geometry.polynomial import monomials
 
 HUBER_SIGMAS = 3.0
 """Features farther from a grid's map than so many robust standard deviations weigh less in its fit."""
@@ -53,7 +54,8 @@ class GridMap:
 
     def to_image(self, points: np.ndarray) -> np.ndarray:
         """(n, 2) px of points (n, 2) in pitches; beyond the features as far as the polynomial can be trusted."""
-        return to_image(self.H, points) + _monomials(points, self.low, self.span, self.degree) @ self.coefficients
+        scaled = 2 * (points - self.low) / self.span - 1
+        return to_image(self.H, points) + monomials(scaled, self.degree) @ self.coefficients
 
     def pitch_px(self, points: np.ndarray) -> np.ndarray:
         """(n,) px: the side of a square of one pitch, at points (n, 2) in pitches; 0 behind the camera."""
@@ -69,7 +71,7 @@ def fit_grid_map(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -
     H = fit_homography(points, pixels, robust)
     low, span = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-9)
     degree = 3 if len(points) >= 25 else 1
-    terms = _monomials(points, low, span, degree)
+    terms = monomials(2 * (points - low) / span - 1, degree)
     bent = pixels - to_image(H, points)
     weight = np.ones(len(points))
     for _ in range(8 if robust else 1):
@@ -79,9 +81,3 @@ def fit_grid_map(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -
         sigma = 1.26 * float(np.median(off))  # of two coordinates, robustly
         weight = np.sqrt(np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(off, 1e-9)))
     return GridMap(H, low, span, degree, coefficients, residuals, sigma)
-
-
-def _monomials(points: np.ndarray, low: np.ndarray, span: np.ndarray, degree: int) -> np.ndarray:
-    """(n, m): the monomials up to a degree, of points (n, 2) scaled to -1 to 1 over the features."""
-    x, y = (2 * (points - low) / span - 1).T
-    return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.attempt import Attempt, attempt_stereo
+from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.poses import FEW_POSES
 from slviewer.calibration.diagnosis.verdict import Cause
 from slviewer.calibration.observe import Smoothing
@@ -101,11 +101,11 @@ class FaultBench:
                 self._examined[i] = self.examine(i, self.render(self.poses[i], i) if frames is None else frames)
         return [self._examined[i] for i in range(self.count if count is None else count)]
 
-    def attempt(self, captures: Sequence[Judged], board: Board | None = None) -> Attempt:
+    def attempt(self, captures: Sequence[Judged], board: Board | None = None) -> DiagnosedCalibration:
         """The calibration from examined captures."""
         observations = [each.observation for each in captures if each.observation is not None]
         evidence = [each.evidence for each in captures if each.evidence is not None]
-        return attempt_stereo(observations, evidence, self.rig.projector.size, board or self.board)
+        return calibrate_with_diagnosis(observations, evidence, self.rig.projector.size, board or self.board)
 
     def attempt_disturbed(
         self,
@@ -113,7 +113,7 @@ class FaultBench:
         sequence: PatternSequence | None = None,
         board: Board | None = None,
         **rendering: Any,
-    ) -> Attempt:
+    ) -> DiagnosedCalibration:
         """The calibration from ``EVERY`` captures, all with their frames changed, another description, or rendered
         otherwise."""
         captures = [
@@ -122,14 +122,14 @@ class FaultBench:
         ]
         return self.attempt(captures, board)
 
-    def attempt_with(self, i: int, frames: np.ndarray) -> Attempt:
+    def attempt_with(self, i: int, frames: np.ndarray) -> DiagnosedCalibration:
         """The calibration from all captures, one with other frames."""
         captures = self.examine_clean()
         captures[i] = self.examine(i, frames)
         return self.attempt(captures)
 
 
-def _describe_periods(bench: FaultBench, **period_px: float) -> Attempt:
+def _describe_periods(bench: FaultBench, **period_px: float) -> DiagnosedCalibration:
     """Fringes of other periods than the description says, {axis: described period}."""
     frames = [
         replace(f, period_px=period_px[f.axis]) if f.kind == "phase" and f.axis in period_px else f
@@ -138,12 +138,12 @@ def _describe_periods(bench: FaultBench, **period_px: float) -> Attempt:
     return bench.attempt_disturbed(sequence=replace(bench.sequence, frames=tuple(frames)))
 
 
-def _describe_board(bench: FaultBench, columns: int, rows: int) -> Attempt:
+def _describe_board(bench: FaultBench, columns: int, rows: int) -> DiagnosedCalibration:
     """A board of another size than the one that was captured."""
     return bench.attempt_disturbed(board=replace(bench.board, columns=columns, rows=rows))
 
 
-def _renumber(bench: FaultBench, order: FrameChange) -> Attempt:
+def _renumber(bench: FaultBench, order: FrameChange) -> DiagnosedCalibration:
     """Features of one pose in another order; ``order`` turns (rows, columns) indices."""
     captures = bench.examine_clean()
     seen = captures[2].observation
@@ -156,7 +156,7 @@ def _renumber(bench: FaultBench, order: FrameChange) -> Attempt:
     return bench.attempt(captures)
 
 
-def _move(bench: FaultBench, by_mm: Sequence[float], share: float) -> Attempt:
+def _move(bench: FaultBench, by_mm: Sequence[float], share: float) -> DiagnosedCalibration:
     """One pose whose board has moved after this share of the frames."""
     pose, frames = bench.poses[2], bench.frames(2).copy()
     from_frame = round(share * len(frames))
@@ -164,12 +164,12 @@ def _move(bench: FaultBench, by_mm: Sequence[float], share: float) -> Attempt:
     return bench.attempt_with(2, frames)
 
 
-def _apply_gamma(bench: FaultBench, gamma: float) -> Attempt:
+def _apply_gamma(bench: FaultBench, gamma: float) -> DiagnosedCalibration:
     light = replace(bench.rig.light, gamma=gamma)
     return replace(bench, rig=replace(bench.rig, light=light)).attempt_disturbed()
 
 
-def _tilt_alike(bench: FaultBench, tilt_deg: float, spread_deg: float) -> Attempt:
+def _tilt_alike(bench: FaultBench, tilt_deg: float, spread_deg: float) -> DiagnosedCalibration:
     """All boards tilted alike, but for a hand's unsteadiness."""
     rng = np.random.default_rng(5)
     middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
@@ -182,7 +182,7 @@ def _tilt_alike(bench: FaultBench, tilt_deg: float, spread_deg: float) -> Attemp
     return bench.attempt(captures)
 
 
-def _avoid_corner(bench: FaultBench) -> Attempt:
+def _avoid_corner(bench: FaultBench) -> DiagnosedCalibration:
     """Poses of which none reaches the image's top right."""
     wide = replace(bench, count=MANY)
     width, height = bench.rig.camera.size
@@ -199,7 +199,7 @@ def _exchange_halves(frames: np.ndarray) -> np.ndarray:
     return show_instead(frames, range(2 * half), [*range(half, 2 * half), *range(half)])
 
 
-FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], Attempt]]] = {
+FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]] = {
     "x and y frames exchanged": ("axes-swapped", lambda bench: bench.attempt_disturbed(_exchange_halves)),
     "columns from right to left": ("axis-reversed", lambda bench: bench.attempt_disturbed(reverse="x")),
     "rows from bottom to top": ("axis-reversed", lambda bench: bench.attempt_disturbed(reverse="y")),

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from time import perf_counter
 
-from slviewer.calibration.diagnosis.attempt import Attempt
+from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration
 from slviewer.calibration.diagnosis.verdict import Cause
 from slviewer.evaluation.render import Row
 from slviewer.pipeline.feedback import Progress, ignore_progress
@@ -33,7 +33,7 @@ def prove_causes(
     ``steps``. A fault passes where the first finding is its cause, a clean calibration where there is none.
     """
     bench = FaultBench(letter(scale, seed), count=poses, steps=steps)
-    cases: list[tuple[str, Cause | None, Callable[[], Attempt]]] = [
+    cases: list[tuple[str, Cause | None, Callable[[], DiagnosedCalibration]]] = [
         (name, FAULTS[name][0], lambda name=name: FAULTS[name][1](bench))  # type: ignore[misc]
         for name in faults
     ]
@@ -74,5 +74,5 @@ def prove_causes(
     return Proof(right == len(rows), scale, rows, {"confusion": confusion, "cases": record}, below=[line])
 
 
-def _attempt_clean(bench: FaultBench) -> Attempt:
+def _attempt_clean(bench: FaultBench) -> DiagnosedCalibration:
     return bench.attempt(bench.examine_clean())

@@ -250,7 +250,7 @@ class SessionReader:
         if calibration is not None:
             if self._meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
                 return "used", ""
-            why = calibration.stereo.left_out.get(pose.name, "")
+            why = calibration.stereo.excluded.get(pose.name, "")
             if why and not why.startswith("excluded by the operator"):  # such a pose was included again since
                 return "unused", why
         return "good", ""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
 
-from slviewer.calibration.diagnosis.attempt import Attempt, attempt_stereo
+from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.frames import fit_mean_turn, gamma_from_harmonic
 from slviewer.calibration.diagnosis.numbering import describe_misnumbering
@@ -42,11 +42,11 @@ def observations(count: int = 20) -> list[Observation]:
     return [observation(TRUE, T, f"pose_{k:02d}") for k, T in enumerate(board_poses(count))]
 
 
-def attempt(poses: list[Observation]) -> Attempt:
-    return attempt_stereo(poses, [PoseEvidence(o.name) for o in poses], PROJECTOR, BOARD)
+def attempt(poses: list[Observation]) -> DiagnosedCalibration:
+    return calibrate_with_diagnosis(poses, [PoseEvidence(o.name) for o in poses], PROJECTOR, BOARD)
 
 
-def plane_rms_mm(found: Attempt, poses: list[Observation]) -> float:
+def plane_rms_mm(found: DiagnosedCalibration, poses: list[Observation]) -> float:
     """Of the features of all poses, reconstructed from x: the mean over the poses."""
     assert found.stereo is not None
     rms = []
@@ -59,7 +59,7 @@ def plane_rms_mm(found: Attempt, poses: list[Observation]) -> float:
 def test_a_sound_calibration_is_good() -> None:
     found = attempt(observations(8))
     assert found.verdict == Verdict() and found.verdict.level == "good" and found.verdict.reason == ""
-    assert len(found.observations) == 8 and not found.left_out
+    assert len(found.observations) == 8 and not found.excluded
 
 
 @pytest.mark.parametrize("order", ["transposed", "row", "mirrored", "noise", "bent", "moved"])
@@ -90,7 +90,7 @@ def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None
     cause = {"noise": "outlier", "bent": "outlier", "moved": "moved"}.get(order, "board-numbering")
     assert found.verdict.causes == (cause,) and found.verdict.findings[0].poses == ("pose_04",)
     assert found.verdict.level == "good"  # it is excluded
-    assert list(found.left_out) == ["pose_04"] and "pose" in found.left_out["pose_04"]
+    assert list(found.excluded) == ["pose_04"] and "pose" in found.excluded["pose_04"]
     assert found.stereo is not None and base.stereo is not None
     assert found.stereo.baseline_mm == pytest.approx(base.stereo.baseline_mm, rel=2e-3)
     assert plane_rms_mm(found, clean) == pytest.approx(plane_rms_mm(base, clean), rel=0.02)
@@ -107,7 +107,7 @@ def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> Non
     assert "reprojection error" in found.verdict.findings[0].sentence
     exchanged = [dataclasses.replace(o, projector=o.projector[:, ::-1]) for o in observations(6)]
     evidence = [PoseEvidence(o.name, turn=fit_mean_turn(o.camera, o.projector)) for o in exchanged]
-    found = attempt_stereo(exchanged, evidence, PROJECTOR, BOARD)
+    found = calibrate_with_diagnosis(exchanged, evidence, PROJECTOR, BOARD)
     assert found.verdict.level == "rejected" and found.verdict.causes[0] == "axes-swapped"
     assert found.stereo is None or np.isfinite(found.stereo.reprojection_rms_px["stereo"])
 

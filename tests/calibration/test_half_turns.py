@@ -49,7 +49,7 @@ def calibrated(seen: list[Observation], true) -> SplinedModel:
 def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
     as_held, found = calibrated(seen, true), calibrated(mixed, true)
     assert as_held.bundle.turned == () and found.bundle.turned == tuple(f"pose_{i:02d}" for i in TURNED)
-    assert not found.bundle.left_out and "pose_01, pose_04, pose_07" in found.text()
+    assert not found.bundle.excluded and "pose_01, pose_04, pose_07" in found.text()
     assert found.bundle.noise.camera_px == pytest.approx(as_held.bundle.noise.camera_px, rel=0.05)
     assert np.abs(found.bundle.state.offsets - as_held.bundle.state.offsets).max() < 0.003
     assert np.sqrt(np.mean(found.bundle.state.offsets**2)) > 0.025

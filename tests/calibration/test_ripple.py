@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from splined_rig import BOARD, PERIOD, SAMPLE_PX, observation, poses, rig
 
-from slviewer.calibration.diagnosis.capture_rules import find_ripple, find_wrong_period
+from slviewer.calibration.diagnosis.capture_rules import diagnose_period, diagnose_ripple
 from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.ripple import Ripple, measure_ripple
 from slviewer.calibration.diagnosis.solution import measure_solution
@@ -53,18 +53,18 @@ def evidence(seen, stereo, ripple: dict, steps: int, period_seen: float = PERIOD
 
 
 def test_as_many_waves_as_steps_are_gamma_and_few_are_changing_light(seen, stereo) -> None:
-    (found,) = find_ripple(evidence(seen, stereo, {"x": Ripple(0.4, 3, 0.4, 0.1)}, 3))
+    (found,) = diagnose_ripple(evidence(seen, stereo, {"x": Ripple(0.4, 3, 0.4, 0.1)}, 3))
     assert (found.cause, found.severity) == ("gamma", "doubtful")
     assert "repeats 3 times" in found.sentence and "0.40 px" in found.sentence and "0.10 px" in found.sentence
-    (found,) = find_ripple(evidence(seen, stereo, {"x": Ripple(0.4, 1, 0.4, 0.1)}, 8))
+    (found,) = diagnose_ripple(evidence(seen, stereo, {"x": Ripple(0.4, 1, 0.4, 0.1)}, 8))
     assert (found.cause, found.severity) == ("residuals", "doubtful") and "exposure" in found.text()
-    assert not list(find_ripple(evidence(seen, stereo, {"x": Ripple(0.02, 3, 0.02, 0.1)}, 3)))
+    assert not list(diagnose_ripple(evidence(seen, stereo, {"x": Ripple(0.02, 3, 0.02, 0.1)}, 3)))
 
 
 def test_a_ripple_is_not_taken_for_another_period(seen, stereo) -> None:
     """By 0.17 px the code seems to begin elsewhere in the fringe."""
-    assert [f.cause for f in find_wrong_period(evidence(seen, stereo, {}, 3, 13.4))] == ["fringe-period"]
-    assert not list(find_wrong_period(evidence(seen, stereo, {"x": Ripple(0.27, 3, 0.27, 0.1)}, 3, 13.4)))
+    assert [f.cause for f in diagnose_period(evidence(seen, stereo, {}, 3, 13.4))] == ["fringe-period"]
+    assert not list(diagnose_period(evidence(seen, stereo, {"x": Ripple(0.27, 3, 0.27, 0.1)}, 3, 13.4)))
 
 
 def test_residuals_beyond_noise_are_doubtful_and_never_good() -> None:

@@ -81,13 +81,13 @@ def test_weights_come_from_the_residuals(model) -> None:
     assert 0.006 < noise.camera_px < 0.012
     assert max(noise.excess_px) < 0.003 and all(0.004 < s < 0.008 for s in noise.sample_px)
     assert all(fit.camera_trust > 0.7 and fit.projector_trust > 0.7 for fit in model.bundle.fits.values())
-    assert "splined" in model.text() and not model.bundle.left_out
+    assert "splined" in model.text() and not model.bundle.excluded
 
 
 def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(model, seen, stereo, true) -> None:
     moved = observation(true, poses(true, 12)[5], "pose_05", SHAPE, moved_mm=0.5)
     bundle = adjust_bundle([moved if o.name == "pose_05" else o for o in seen], stereo)
-    assert list(bundle.left_out) == ["pose_05"] and "moved" in bundle.left_out["pose_05"]
+    assert list(bundle.excluded) == ["pose_05"] and "moved" in bundle.excluded["pose_05"]
     z = np.full(true.camera.size[::-1], 600.0)
     phase = phase_map(true, z)
     good, other = (m.points(phase)[..., 2] for m in (model, SplinedModel(bundle)))
@@ -99,7 +99,7 @@ def test_poses_read_with_more_noise_count_less_and_do_not_pass_for_moved(seen, s
     noisy = ("pose_02", "pose_07")
     read = [replace(o, camera=o.camera + rng.normal(0, 0.02, o.camera.shape)) if o.name in noisy else o for o in seen]
     bundle = adjust_bundle(read, stereo)
-    assert not bundle.left_out
+    assert not bundle.excluded
     assert all(bundle.fits[name].camera_trust > 0.65 for name in noisy)
     assert bundle.noise.camera_px < 0.013  # that of the others
 

@@ -9,7 +9,6 @@ from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
 
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected
-from slviewer.records import from_plain
 
 TRUE = rig()
 
@@ -27,7 +26,7 @@ def test_the_reprojection_error_is_the_features_noise(model: StereoModel) -> Non
     # RMS of 2-D residuals of 0.02 px noise a coordinate, less what the parameters absorb
     for device in ("camera", "projector", "stereo"):
         assert 0.024 < model.reprojection_rms_px[device] < 0.030
-    assert len(model.poses) == 12 and not model.left_out
+    assert len(model.poses) == 12 and not model.excluded
 
 
 def test_it_finds_the_rig(model: StereoModel) -> None:
@@ -44,7 +43,7 @@ def test_depths_are_those_of_the_boards(model: StereoModel) -> None:
 
 
 def test_it_survives_saving(model: StereoModel) -> None:
-    again = from_plain(model.to_dict(), StereoModel)
+    again = StereoModel.from_dict(model.to_dict())
     assert np.array_equal(again.rig.R, model.rig.R) and again.pose_rms_px == model.pose_rms_px
 
 
@@ -53,7 +52,7 @@ def test_a_pose_that_moved_is_left_out_by_name_and_changes_nothing(model: Stereo
     moved = poses[4].projector + 1.5 * np.sin(np.arange(poses[4].projector.size)).reshape(-1, 2)
     poses[4] = dataclasses.replace(poses[4], projector=moved)
     found = calibrate_stereo(poses, PROJECTOR, str(BOARD))
-    assert list(found.left_out) == ["pose_04"] and "moved" in found.left_out["pose_04"]
+    assert list(found.excluded) == ["pose_04"] and "moved" in found.excluded["pose_04"]
     assert found.baseline_mm == pytest.approx(model.baseline_mm, abs=0.5)
 
 
@@ -62,14 +61,14 @@ def test_single_wrong_features_are_set_aside(model: StereoModel) -> None:
     for k in (1, 5, 7):
         poses[k].camera[10 + k] += 3.0
     found = calibrate_stereo(poses, PROJECTOR, str(BOARD))
-    assert found.features_set_aside >= 3 and not found.left_out
+    assert found.features_excluded >= 3 and not found.excluded
     assert found.reprojection_rms_px["camera"] < 0.030
 
 
 def test_a_pose_of_one_axis_is_left_out() -> None:
     poses = observations()
     poses[2] = observation(TRUE, board_poses(12)[2], "pose_02", axes=("x",))
-    assert "both x and y" in calibrate_stereo(poses, PROJECTOR).left_out["pose_02"]
+    assert "both x and y" in calibrate_stereo(poses, PROJECTOR).excluded["pose_02"]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -85,9 +85,9 @@ def test_strays_flying_pixels_and_what_others_see_through_go() -> None:
     points[28, 38] *= 1.05  # behind the surface, by 14 mm
     points[24:35, 18:29] *= 0.97  # a patch that stands 9 mm before it
     found = fuse({**scans, "middle": replace(scans["middle"], points=points)}, poses)
-    left_out = found.left_out["middle"]
-    assert left_out["groups"] == 9 and left_out["edges"] > 60 and left_out["unconfirmed"] > 40
-    assert found.left_out["near"]["unconfirmed"] == 0
+    excluded = found.excluded["middle"]
+    assert excluded["groups"] == 9 and excluded["edges"] > 60 and excluded["unconfirmed"] > 40
+    assert found.excluded["near"]["unconfirmed"] == 0
     assert np.abs(off(found.surface.points)).max() < 0.5
 
 

@@ -1,5 +1,5 @@
-"""Why a calibration is not what it should be: evidence from frames, poses and the solution, and the cause behind it.
+"""Diagnosis of calibrations: evidence from frames, poses and the solution; rules that turn it into a verdict.
 
-`frames` and `numbering` look at one pose, `solution` at all of them together; their results are plain `evidence`.
-`rules` turn evidence into findings, each a cause with its remedy, and `verdict` is what the operator reads.
+`frames` and `numbering` examine one pose, `solution` and `ripple` all of them together; their results are `evidence`.
+`rules` turn evidence into findings, each a cause with its remedy, and `verdict` orders the findings.
 """

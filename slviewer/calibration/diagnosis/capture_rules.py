@@ -1,4 +1,4 @@
-"""Causes that lie in how poses were captured, or in how their frames are described."""
+"""Rules on the capture of the poses and on the description of their frames; each yields the findings of one cause."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -7,8 +7,16 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import Evidence
 from slviewer.calibration.diagnosis.frames import gamma_from_harmonic
-from slviewer.calibration.diagnosis.poses import COMMON_SHARE, ORDERS, frame_order, list_poses, severity_of, was_refused
+from slviewer.calibration.diagnosis.poses import (
+    COMMON_SHARE,
+    ORDERS,
+    classify_frame_order,
+    format_poses,
+    rate_severity,
+    was_refused,
+)
 from slviewer.calibration.diagnosis.verdict import CAUSES, Cause, Finding, Severity
+from slviewer.geometry.robust import robust_sigma
 
 MAX_SATURATED = 0.12
 REJECTED_SATURATED = 0.3
@@ -24,7 +32,7 @@ _SYMPTOMS = ("projector-size", "fringe-period", "unreadable")
 CODE_ORIGIN_PX = 0.5
 """px from column 0: the origin of most Gray codes, whose phase gives the fringe's true period."""
 RIPPLE_PEAK = 2.0
-"""Times the RMS of a ripple: about its largest value, by which the phase there may be off."""
+"""Peak of a ripple over its RMS."""
 
 _ORDER_REMEDY: dict[Cause, str] = {
     "frame-lag": "let the camera wait longer after each pattern (the preflight measures the delay), and capture again",
@@ -34,57 +42,60 @@ _ORDER_REMEDY: dict[Cause, str] = {
 }
 
 
-def find_frame_faults(e: Evidence) -> Iterator[Finding]:
-    """Frames that lag, are lost or out of order, by what most explains them."""
-    orders = {pose.name: order for pose in e.poses if (order := frame_order(pose))}
+def diagnose_frame_order(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding for each way in which frames are out of order: lagging, missing, or exchanged."""
+    orders = {pose.name: order for pose in e.poses if (order := classify_frame_order(pose))}
     for cause in ORDERS:
         names = tuple(name for name, order in orders.items() if order == cause)
         if names:
-            is_excluded = all(name in e.set_aside or was_refused(e, name) for name in names)
+            is_excluded = all(name in e.excluded or was_refused(e, name) for name in names)
             yield Finding(
                 cause,
-                severity_of(e, names, is_excluded),
-                f"{list_poses(e, names)} {ORDERS[cause]}",
+                rate_severity(e, names, is_excluded),
+                f"{format_poses(e, names)} {ORDERS[cause]}",
                 _ORDER_REMEDY[cause],
                 names,
             )
 
 
-def find_saturation(e: Evidence) -> Iterator[Finding]:
-    """Boards that clip."""
+def diagnose_saturation(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding where too many of the boards' pixels are saturated."""
     shares = {pose.name: max((a.saturated for a in pose.axes.values()), default=0.0) for pose in e.poses}
     names = tuple(name for name, share in shares.items() if share > MAX_SATURATED)
     if not names:
         return
-    usual = float(np.median([shares[name] for name in names]))
+    median_share = float(np.median([shares[name] for name in names]))
     severity: Severity = "doubtful" if len(names) > 0.25 * len(e.poses) else "note"
-    if len(names) >= COMMON_SHARE * len(e.poses) and (usual > REJECTED_SATURATED or e.solution is None):
+    if len(names) >= COMMON_SHARE * len(e.poses) and (median_share > REJECTED_SATURATED or e.solution is None):
         severity = "rejected"
     yield Finding(
         "saturation",
         severity,
-        f"{list_poses(e, names)} {100 * usual:.0f} % of the board's illuminated pixels are saturated",
+        f"{format_poses(e, names)} {100 * median_share:.0f} % of the board's illuminated pixels are saturated",
         "lower the exposure or the gain until white stays below the camera's full scale, and capture again",
         names,
     )
 
 
-def find_mirroring(e: Evidence) -> Iterator[Finding]:
-    """Axes exchanged or reversed: the projector coordinates are a mirror image of the camera's."""
-    turns = [(pose.name, np.array(pose.turn)) for pose in e.poses if pose.turn is not None and not frame_order(pose)]
-    turned = [(name, turn) for name, turn in turns if np.linalg.det(turn) < 0]
-    if len(turned) <= COMMON_SHARE * len(turns):
+def diagnose_mirroring(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding where the axes are exchanged or one is reversed: the projector's image is a mirror image."""
+    jacobians = {
+        pose.name: np.array(pose.turn) for pose in e.poses if pose.turn is not None and not classify_frame_order(pose)
+    }
+    mirrored = {name: J for name, J in jacobians.items() if np.linalg.det(J) < 0}
+    if len(mirrored) <= COMMON_SHARE * len(jacobians):
         return
-    mean = np.mean([turn / np.linalg.norm(turn, axis=1, keepdims=True) for _, turn in turned], axis=0)
-    names = tuple(name for name, _ in turned)
-    seen = (
-        f"in {len(turned)} of {len(turns)} poses the projector's coordinates are a mirror image of what the camera sees"
+    mean = np.mean([J / np.linalg.norm(J, axis=1, keepdims=True) for J in mirrored.values()], axis=0)
+    names = tuple(mirrored)
+    observation = (
+        f"in {len(mirrored)} of {len(jacobians)} poses the projector's coordinates are a mirror image of what the "
+        "camera sees"
     )
     if classify_mirroring(mean) == "axes-swapped":
         yield Finding(
             "axes-swapped",
             "rejected",
-            f"{seen}, as if x and y were exchanged",
+            f"{observation}, as if x and y were exchanged",
             "exchange the x and y (V and H) frames in the description of the sequence, or in the projector",
             names,
         )
@@ -94,54 +105,54 @@ def find_mirroring(e: Evidence) -> Iterator[Finding]:
         yield Finding(
             "axis-reversed",
             "rejected",
-            f"{seen}, as if its {axis} axis were reversed ({across})",
+            f"{observation}, as if its {axis} axis were reversed ({across})",
             f"switch off the projector's {mode} mode, or number its {'columns' if axis == 'x' else 'rows'} from the "
             "other end",
             names,
         )
 
 
-def classify_mirroring(turn: np.ndarray) -> Cause:
-    """Of a mirrored (2, 2) turn from camera to projector: which exchange leaves devices that stand upright."""
-    reversed_, swapped = abs(turn[0, 0]) + abs(turn[1, 1]), abs(turn[0, 1]) + abs(turn[1, 0])
-    return "axes-swapped" if swapped > reversed_ else "axis-reversed"
+def classify_mirroring(jacobian: np.ndarray) -> Cause:
+    """Return the cause of a mirrored Jacobian (2, 2) of projector by camera pixels, assuming both devices upright."""
+    diagonal, off_diagonal = abs(np.diag(jacobian)).sum(), abs(np.diag(jacobian[::-1])).sum()
+    return "axes-swapped" if off_diagonal > diagonal else "axis-reversed"
 
 
-def find_wrong_period(e: Evidence) -> Iterator[Finding]:
-    """A fringe period that is not the one described."""
+def diagnose_period(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding where the fringe period differs from its description.
+
+    Evidence is the phase at the Gray code's edges, or the projector's aspect ratio by the calibration.
+    """
     if e.contradiction:
         sentence, _, remedy = e.contradiction.partition(": ")
         yield Finding("fringe-period", "rejected", sentence, remedy or "correct the sequence's description")
         return
-    if any(find_mirroring(e)):  # the code is of another axis, or from its other end
+    if any(diagnose_mirroring(e)):  # the code is of another axis, or from its other end
         return
-    if _aliased_gamma_poses(e):  # it moves the phase at which the code begins
+    if _list_aliased_gamma_poses(e):  # gamma moves the phase at which the code begins
         return
-    sound = [pose for pose in e.poses if not frame_order(pose)]
+    ordered = [pose for pose in e.poses if not classify_frame_order(pose)]
     wrong = {}
     for axis in ("x", "y"):
-        seen = np.array([p.axes[axis].period_seen_px for p in sound if axis in p.axes])
-        seen = seen[np.isfinite(seen)]
-        if len(seen) < 3:
+        periods = np.array([p.axes[axis].period_seen_px for p in ordered if axis in p.axes])
+        periods = periods[np.isfinite(periods)]
+        if len(periods) < 3:
             continue
-        said = float(np.median([p.axes[axis].period_px for p in sound if axis in p.axes]))
-        middle = float(np.median(seen))
-        sigma = 1.4826 * 1.2533 * float(np.median(np.abs(seen - middle))) / np.sqrt(len(seen))
+        described = float(np.median([p.axes[axis].period_px for p in ordered if axis in p.axes]))
+        measured = float(np.median(periods))
+        sigma = 1.2533 * robust_sigma(periods) / np.sqrt(len(periods))  # of a median
         if (
-            abs(middle / said - 1) > MAX_PERIOD_ERROR
-            and abs(middle - said) > PERIOD_SIGMAS * sigma
-            and CODE_ORIGIN_PX * abs(said / middle - 1) > RIPPLE_PEAK * ripple_px(e)
+            abs(measured / described - 1) > MAX_PERIOD_ERROR
+            and abs(measured - described) > PERIOD_SIGMAS * sigma
+            and CODE_ORIGIN_PX * abs(described / measured - 1) > RIPPLE_PEAK * max_ripple_px(e)
         ):
-            wrong[axis] = (said, middle)
+            wrong[axis] = f"{axis}: {measured:.1f} px measured, {described:g} px described"
     if wrong:
-        both = " and ".join(
-            f"{axis}: {seen:.1f} px measured, {said:g} px described" for axis, (said, seen) in wrong.items()
-        )
         yield Finding(
             "fringe-period",
             "rejected",
-            f"the fringes do not have the period that the sequence's description gives ({both}), by where the Gray "
-            "code's edges fall in them",
+            f"the fringe period differs from the sequence's description ({' and '.join(wrong.values())}), by the phase "
+            "at the Gray code's edges",
             "correct period_px in the description, or project the patterns without scaling",
         )
     elif e.solution is not None and e.solution.aspect > 0 and not e.tilts_undetermined:
@@ -155,31 +166,33 @@ def find_wrong_period(e: Evidence) -> Iterator[Finding]:
             )
 
 
-def find_wrong_description(e: Evidence) -> Iterator[Finding]:
-    """Contradictions between frames and description that no other rule explains."""
-    first = {pose.name: pose.contradictions[0] for pose in e.poses if pose.contradictions and not frame_order(pose)}
+def diagnose_description(e: Evidence) -> Iterator[Finding]:
+    """Yield the contradictions between frames and description that no other rule explains."""
+    first = {
+        pose.name: pose.contradictions[0] for pose in e.poses if pose.contradictions and not classify_frame_order(pose)
+    }
     for cause in dict.fromkeys(contradiction.cause for contradiction in first.values()):
         if cause not in CAUSES or cause in _CAUSES_IN_POSES:
             continue
         # Codes beyond the projector may be those of another axis or of another period.
         if cause in _SYMPTOMS and (
-            any(find_mirroring(e)) or any(f.severity == "rejected" for f in find_wrong_period(e))
+            any(diagnose_mirroring(e)) or any(f.severity == "rejected" for f in diagnose_period(e))
         ):
             continue
         names = tuple(name for name, contradiction in first.items() if contradiction.cause == cause)
         sentence, _, remedy = first[names[0]].message.rpartition(": ")
         yield Finding(
-            cause, severity_of(e, names, is_excluded=True), f"{list_poses(e, names)} {sentence}", remedy, names
+            cause, rate_severity(e, names, is_excluded=True), f"{format_poses(e, names)} {sentence}", remedy, names
         )
 
 
-def find_wrong_board_size(e: Evidence) -> Iterator[Finding]:
-    """A board of other columns and rows than those given, in most of the poses."""
+def diagnose_board_size(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding where most poses show a board of other columns and rows than those given."""
     kind, _, rest = e.board.partition(":")
-    seen = Counter(pose.grid for pose in e.poses if pose.grid is not None and pose.refused)
-    if kind != "circles" or not seen:
+    grids = Counter(pose.grid for pose in e.poses if pose.grid is not None and pose.refused)
+    if kind != "circles" or not grids:
         return
-    grid, count = seen.most_common(1)[0]
+    grid, count = grids.most_common(1)[0]
     given = rest.split(":")[0]
     if count < COMMON_SHARE * len(e.poses) or sorted(map(int, given.split("x"))) == sorted(grid):
         return
@@ -192,20 +205,22 @@ def find_wrong_board_size(e: Evidence) -> Iterator[Finding]:
     )
 
 
-def ripple_px(e: Evidence) -> float:
-    """px, RMS: residuals that repeat with the fringe, on the axis where they are larger: where a camera pixel covers
-    much of a fringe, its axis hides them; 0 where they are not known."""
-    return max((found.rms_px for found in e.solution.ripple.values()), default=0.0) if e.solution else 0.0
+def max_ripple_px(e: Evidence) -> float:
+    """Return the larger RMS, in px, of both axes' residuals that repeat with the fringe; 0 where not measured.
+
+    The larger one, as an axis hides them where a camera pixel covers much of a fringe.
+    """
+    return max((ripple.rms_px for ripple in e.solution.ripple.values()), default=0.0) if e.solution else 0.0
 
 
-def find_ripple(e: Evidence) -> Iterator[Finding]:
-    """Residuals that repeat with the fringe and exceed the samples' noise: the light is no cosine of the pattern."""
-    found = {axis: r for axis, r in (e.solution.ripple if e.solution else {}).items() if r.rms_px > r.noise_px}
-    if not found:
+def diagnose_ripple(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding where residuals repeat with the fringe and exceed the noise: the fringe is not sinusoidal."""
+    ripples = {axis: r for axis, r in (e.solution.ripple if e.solution else {}).items() if r.rms_px > r.noise_px}
+    if not ripples:
         return
-    axis, worst = max(found.items(), key=lambda item: item[1].rms_px / item[1].noise_px)
+    axis, worst = max(ripples.items(), key=lambda item: item[1].rms_px / item[1].noise_px)
     steps = min((a.steps for p in e.poses for a in p.axes.values() if a.steps), default=0)
-    seen = (
+    observation = (
         f"the phase has an error that repeats {worst.waves} times a fringe period ({worst.rms_px:.2f} px RMS in "
         f"{axis}, beside {worst.noise_px:.2f} px of predicted noise)"
     )
@@ -213,8 +228,8 @@ def find_ripple(e: Evidence) -> Iterator[Finding]:
         yield Finding(
             "gamma",
             "doubtful",
-            f"{seen}, as where the light does not grow evenly with the grey level (gamma) and is read with {steps} "
-            "phase steps",
+            f"{observation}, as where the light does not grow evenly with the grey level (gamma) and is read with "
+            f"{steps} phase steps",
             "set the gamma of projector and camera to 1, or let the preflight make light linear, and take eight phase "
             "steps or more",
         )
@@ -222,31 +237,32 @@ def find_ripple(e: Evidence) -> Iterator[Finding]:
         yield Finding(
             "residuals",
             "doubtful",
-            f"{seen}, as where exposure or light changes from frame to frame",
+            f"{observation}, as where exposure or light changes from frame to frame",
             "lock exposure, gain and white balance, switch off ambient light, and capture again",
         )
 
 
-def _aliased_gamma_poses(e: Evidence) -> tuple[str, ...]:
-    """Poses in which gamma shifts the phase of three or four steps; empty unless they are most of them."""
+def _list_aliased_gamma_poses(e: Evidence) -> tuple[str, ...]:
+    """List the poses in which gamma shifts the phase of three or four steps; empty unless they are the majority."""
     names = tuple(pose.name for pose in e.poses if any(s.fault == "gamma" for s in pose.suspects))
     return names if len(names) > COMMON_SHARE * len(e.poses) else ()
 
 
-def find_gamma(e: Evidence) -> Iterator[Finding]:
-    """Light that does not grow evenly with the grey level."""
-    if names := _aliased_gamma_poses(e):
+def diagnose_gamma(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding where the light is not linear in the grey level (gamma)."""
+    if names := _list_aliased_gamma_poses(e):
         yield Finding(
             "gamma",
             "doubtful",
-            f"{list_poses(e, names)} the light does not grow evenly with the grey level (gamma), which few phase steps "
-            "do not average out: the phase was corrected as far as this could be measured",
+            f"{format_poses(e, names)} the light does not grow evenly with the grey level (gamma), which few phase "
+            "steps do not average out: the phase was corrected as far as this could be measured",
             "set the projector's gamma to 1, or let the preflight make light linear, and take eight phase steps or "
             "more",
             names,
         )
         return
-    ratios = [a.harmonic for p in e.poses if not frame_order(p) for a in p.axes.values() if np.isfinite(a.harmonic)]
+    ordered = [pose for pose in e.poses if not classify_frame_order(pose)]
+    ratios = [a.harmonic for p in ordered for a in p.axes.values() if np.isfinite(a.harmonic)]
     if not ratios:
         return
     exponent = gamma_from_harmonic(float(np.median(ratios)))

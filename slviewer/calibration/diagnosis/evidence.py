@@ -18,9 +18,10 @@ from slviewer.records import from_plain
 class AxisEvidence:
     """Measurements from the frames of one axis; NaN where not measurable.
 
-    ``period_px`` as described; ``period_seen_px`` by where the Gray code's edges fall in the phase. ``saturated``:
-    share of the board's illuminated pixels (of all, where no board was detected) that clip. ``harmonic``: second
-    harmonic over the fringe; ``steps`` of the finest phase shift, 0 for Gray code alone.
+    ``period_px``: fringe period by the sequence's description; ``period_seen_px``: measured, from the phases at the
+    Gray code's edges. ``steps``: of the finest phase shift, 0 for Gray code alone. ``readable``, ``saturated``: share
+    of the board's illuminated pixels (of the image's, where no board was detected) that are valid, and that clip.
+    ``harmonic``: amplitude of the fringe's second harmonic over the first.
     """
 
     period_px: float
@@ -35,12 +36,12 @@ class AxisEvidence:
 class PoseEvidence:
     """Evidence of one capture of the target.
 
-    ``refused``: why its board or its phase could not be read; empty where they could. ``grid``: columns and rows of the
-    circles that were seen, where the board that was given could not be laid over them. ``displaced``: how many frames
-    late (positive) or early the white frame came. ``moved_px``: by how much the features moved in the camera from the
-    frames of one axis to those of the other. ``numbering``: how the features are misnumbered, in words.
-    ``turn`` (2, 2): how the projector's coordinates change a camera pixel, in the mean over the board.
-    ``contradictions``: between a refused capture and its description.
+    ``refused``: why its board or phase could not be read, "" where they could. ``grid``: columns and rows of the grid
+    of circles detected where the given board does not fit it. ``suspects``: frames that contradict the others.
+    ``displaced``: number of frames by which the white frame is late (positive) or early. ``moved_px``: motion of the
+    features in the camera between the frames of the two axes. ``numbering``: how the features are misnumbered, "" where
+    they are not. ``turn`` (2, 2): mean Jacobian of the projector coordinates by camera pixels over the board.
+    ``contradictions``: between a refused capture and the sequence's description.
     """
 
     name: str
@@ -56,7 +57,7 @@ class PoseEvidence:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "PoseEvidence":
-        """The inverse of `records.to_plain`; what was not measured may be None instead of NaN."""
+        """Return the evidence that `records.to_plain` saved; None is read as NaN."""
         axes = {name: {k: np.nan if v is None else v for k, v in axis.items()} for name, axis in data["axes"].items()}
         moved = np.nan if data["moved_px"] is None else data["moved_px"]
         return from_plain({**data, "axes": axes, "moved_px": moved}, cls)
@@ -64,7 +65,7 @@ class PoseEvidence:
 
 @dataclass(frozen=True)
 class ExcludedPose:
-    """A pose that the fit excluded: residuals in px, RMS, by the calibration that the others gave."""
+    """RMS residuals in px of a pose that the fit excluded, under the calibration from the other poses."""
 
     camera_px: float
     projector_px: float
@@ -74,36 +75,37 @@ class ExcludedPose:
 class SolutionEvidence:
     """Evidence of a stereo calibration and of the poses it excluded.
 
-    ``focal_sigma``: relative uncertainty of the focal lengths; ``tilt_spread_deg``: the largest angle between two
-    boards; ``empty_corners`` of the image, by name, that no pose reached and the projector lights; ``aspect`` fy / fx
-    of the projector; ``centre_off``: how far its principal point lies from the middle, in widths and heights.
-    ``ripple``: residuals that repeat with the fringe, by axis.
+    ``used``: names of the poses; ``excluded``: residuals of those that the fit excluded. ``median_pose_rms_px``: median
+    over the poses of (camera, projector) reprojection RMS. ``focal_sigma``: relative standard deviation of the focal
+    length by device; ``tilt_spread_deg``: the largest angle between two boards; ``empty_corners``: corners of the image
+    that the projector illuminates and no pose covers; ``aspect``: fy / fx of the projector. ``ripple``: residuals that
+    repeat with the fringe, by axis.
     """
 
     used: tuple[str, ...]
-    strayed: Mapping[str, ExcludedPose]
+    excluded: Mapping[str, ExcludedPose]
     reprojection_px: float
-    usual_px: tuple[float, float]
+    median_pose_rms_px: tuple[float, float]
     focal_sigma: Mapping[str, float]
     tilt_spread_deg: float
     empty_corners: tuple[str, ...]
     aspect: float
-    centre_off: tuple[float, float]
     ripple: Mapping[Axis, Ripple] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """All evidence of a calibration. ``refusal``: why no calibration could be made, or why one that was made is none;
-    empty otherwise. ``contradiction``: why the sequence's description cannot be true. ``board`` in its notation.
-    ``set_aside``: poses excluded from the fit, and why. ``tilt_spread_deg``: roughly the largest angle between two
-    boards, before any fit.
+    """All evidence of a calibration.
+
+    ``board``: its notation. ``excluded``: poses excluded before the fit, with the reason. ``refusal``: why no
+    calibration could be made, or why it was rejected; "" otherwise. ``contradiction``: why the sequence's description
+    cannot be true, or "". ``tilt_spread_deg``: the largest angle between two boards, estimated with a nominal lens.
     """
 
     board: str
     projector: tuple[int, int]
     poses: tuple[PoseEvidence, ...]
-    set_aside: Mapping[str, str] = field(default_factory=dict)
+    excluded: Mapping[str, str] = field(default_factory=dict)
     refusal: str = ""
     contradiction: str = ""
     tilt_spread_deg: float = np.nan
@@ -111,8 +113,7 @@ class Evidence:
 
     @property
     def tilts_undetermined(self) -> bool:
-        """Whether the boards are so nearly parallel that a fit's angles and focal lengths are
-        undetermined."""
+        """Whether the boards are so nearly parallel that a fit's angles and focal lengths are undetermined."""
         return self.tilt_spread_deg < MIN_TILT_SPREAD_DEG
 
     @property

@@ -16,35 +16,40 @@ ORIGIN_ROWS = 150
 """Image lines along which the Gray code's edges are located."""
 MIN_ORIGIN_PX = 0.2
 """px: a Gray code whose origin is nearer to a column's middle does not determine the period."""
-_ORIGIN_CANDIDATES = 4000  # candidate origins a turn
-_BEST_SHARE = 0.97  # of the edges that the best origin explains
-_WHITE_LEVEL = 0.8  # of the brightest that a pixel was seen: a frame that reaches it nearly everywhere is white
-_WHITE_SHARE = 0.97
+_ORIGIN_CANDIDATES = 4000  # candidate phases per period
+_BEST_SHARE = 0.97  # phases inside this share of the largest number of intervals are averaged
+_WHITE_LEVEL = 0.8  # of a pixel's brightest value over all frames
+_WHITE_SHARE = 0.97  # share of the pixels above that level in a white frame
 _ILLUMINATED_LEVEL = 0.5  # of the brightest pixels: illuminated by the projector
 
 
 def measure_axis(
     sequence: PatternSequence, stack: np.ndarray, phase: PhaseMap, board: np.ndarray | None
 ) -> AxisEvidence:
-    """Evidence of one axis' frames. ``board`` (h, w) bool: the detected board's pixels, None for the whole image."""
+    """Measure the evidence from one axis' frames.
+
+    ``stack`` (n, h, w): all frames of the capture; ``board`` (h, w) bool: the detected board's pixels, None for the
+    whole image.
+    """
     valid = phase.reason == Reason.VALID
     where = np.ones(phase.reason.shape, bool) if board is None else board
     illuminated = (phase.reason != Reason.DARK) & where
     saturated = (phase.reason == Reason.SATURATED) & where
-    seen = float(np.count_nonzero(illuminated))
+    total = max(1.0, float(np.count_nonzero(illuminated)))
     return AxisEvidence(
         period_px=phase.period_px,
         steps=phase.steps,
-        readable=np.count_nonzero(valid & where) / max(1.0, seen),
-        saturated=np.count_nonzero(saturated) / max(1.0, seen),
+        readable=np.count_nonzero(valid & where) / total,
+        saturated=np.count_nonzero(saturated) / total,
         harmonic=measure_second_harmonic(sequence, stack, phase.axis),
         period_seen_px=measure_period(sequence, stack, phase.axis),
     )
 
 
 def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
-    """The second harmonic of the finest fringe over the first, signed: positive where light grows ever faster with the
-    grey level, as gamma makes it. NaN where five steps or more do not show it, or too few pixels see fringes.
+    """Return the amplitude of the finest fringe's second harmonic over the first, positive for a gamma above 1.
+
+    NaN for fewer than five phase steps, which do not separate the two, and where too few pixels have fringes.
     """
     layout = axis_layout(sequence, axis)
     if layout.steps < 5:
@@ -71,10 +76,10 @@ def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: 
 
 
 def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
-    """px: the fringe period for which the Gray code would begin where the description says that it does.
+    """Measure the fringe period in px from the phase at which the Gray code begins.
 
-    The code's edges show at which phase it begins, and that place, in px, is known beforehand. NaN without a Gray code
-    beside a phase shift, where it begins too near to a column's middle, or where the frames are in no order.
+    The code's origin in px is known from the sequence's description, and its phase from the code's edges. NaN without
+    both a phase shift and a Gray code, where the origin is too close to phase 0, or where the edges do not agree.
     """
     layout = axis_layout(sequence, axis)
     if not (layout.shifts and layout.gray) or abs(layout.gray_origin_px) < MIN_ORIGIN_PX:
@@ -89,10 +94,10 @@ def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> 
 
 
 def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> float:
-    """Turns, -0.5 ... 0.5, of the phase at which each code begins; NaN where the edges do not agree.
+    """Return the phase at which the codes begin, in periods, -0.5 to 0.5; NaN where the edges do not agree.
 
-    An edge lies somewhere between the phases of two neighbouring pixels: the place that lies in the most of such
-    intervals is known better than any of them.
+    An edge is at a phase between those of two neighbouring pixels. The result is the phase inside the largest number
+    of these intervals, which is more precise than any one of them.
     """
     wrapped, modulation, background, _ = phase_shift(stack, layout.shifts[0].indices, layout.sign, layout.offset_rad)
     illuminated = modulation >= dark_limit(background, measure_noise(layout, stack, white), white, dark_sigmas(layout))
@@ -116,10 +121,10 @@ def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> flo
     begin, length = begin[length > 0], length[length > 0]
     places = np.linspace(-np.pi, np.pi, _ORIGIN_CANDIDATES, endpoint=False)
     start = np.mod((begin + np.pi) / (2 * np.pi), 1.0) * _ORIGIN_CANDIDATES
-    held = np.zeros(3 * _ORIGIN_CANDIDATES)
-    np.add.at(held, np.ceil(start).astype(int), 1.0)
-    np.add.at(held, np.floor(start + length / (2 * np.pi) * _ORIGIN_CANDIDATES).astype(int) + 1, -1.0)
-    count = np.cumsum(held).reshape(3, _ORIGIN_CANDIDATES).sum(0)
+    change = np.zeros(3 * _ORIGIN_CANDIDATES)
+    np.add.at(change, np.ceil(start).astype(int), 1.0)
+    np.add.at(change, np.floor(start + length / (2 * np.pi) * _ORIGIN_CANDIDATES).astype(int) + 1, -1.0)
+    count = np.cumsum(change).reshape(3, _ORIGIN_CANDIDATES).sum(0)
     if count.max() < MIN_CONCENTRATION * len(begin):
         return np.nan
     best = np.exp(1j * places)[count > _BEST_SHARE * count.max()]
@@ -127,9 +132,9 @@ def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> flo
 
 
 def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:
-    """By how many frames the white ones came late (positive) or early; 0 where in time or undecidable.
+    """Return the delay of the white frame: 1 where it is one frame late, -1 where early, 0 where on time or unknown.
 
-    Only a white frame next to pattern frames is decisive: what follows the last one may be white too.
+    Only a white frame next to pattern frames is decisive, as the projector may show white after the last one.
     """
     rows = select_rows(*stack.shape[1:])
     frames = stack[:, rows].reshape(len(stack), -1)
@@ -139,22 +144,21 @@ def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:
         return 0
     frames, brightest = frames[:, illuminated], brightest[illuminated]
     white = np.mean(frames >= _WHITE_LEVEL * brightest, axis=1) > _WHITE_SHARE
-    shown = [frame.kind in ("white", "texture") for frame in sequence.frames]
-    for i, should in enumerate(shown):
-        if not should:
-            continue
+    expected = [frame.kind in ("white", "texture") for frame in sequence.frames]
+    for i in np.flatnonzero(expected):
         before, after = i - 1, i + 1
-        if before >= 0 and not shown[before] and white[before]:
+        if before >= 0 and not expected[before] and white[before]:
             return -1
-        if not white[i] and after < len(shown) and not shown[after] and white[after]:
+        if not white[i] and after < len(expected) and not expected[after] and white[after]:
             return 1
     return 0
 
 
 def measure_motion_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, pitch: float) -> float:
-    """px by which features at ``pixels`` (n, 2) moved, in the median, between the frames of one axis and the other's.
+    """Measure the median motion in px of features at ``pixels`` (n, 2) between the frames of the two axes.
 
-    ``pitch`` px is their distance. NaN where only one axis was captured, or the images cannot be compared.
+    ``pitch``: distance of neighbouring features, px. NaN where only one axis was captured, or where fewer than four
+    features can be tracked.
     """
     scenes = [image for axis in sequence.axes if (image := _scene_image(sequence, stack, axis)) is not None]
     if len(scenes) < 2 or len(pixels) < 4:
@@ -165,15 +169,15 @@ def measure_motion_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.n
     points = np.asarray(pixels, np.float32).reshape(-1, 1, 2)
     # Where circles are a few pixels apart, a coarser image of them is of other circles.
     levels = int(np.clip(np.log2(max(pitch, 1.0) / 12), 0, 3))
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(
         first, second, points, points.copy(), winSize=(window, window), maxLevel=levels
     )
-    shift = (moved - points).reshape(-1, 2)[np.asarray(found).ravel() > 0]
+    shift = (tracked - points).reshape(-1, 2)[np.asarray(status).ravel() > 0]
     return float(np.median(np.linalg.norm(shift, axis=1))) if len(shift) >= 4 else np.nan
 
 
 def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarray | None:
-    """(h, w) float32: the scene in even light, from the frames of one axis alone; None where they give none."""
+    """Average the frames of one axis to an image (h, w) float32 without patterns; None where they do not cancel."""
     layout = axis_layout(sequence, axis)
     frames = list(layout.shifts[-1].indices) if layout.shifts else []
     if not frames and layout.inverse:
@@ -187,15 +191,18 @@ def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np
 
 
 def gamma_from_harmonic(harmonic: float) -> float:
-    """The exponent whose power of a cosine has this ratio of second harmonic to first."""
+    """Return the exponent for which a power of a sinusoidal fringe has this ratio of second harmonic to first."""
     return float((1 + 2 * harmonic) / (1 - harmonic))
 
 
 def fit_mean_turn(camera: np.ndarray, projector: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """(2, 2): how the projector's pixels (n, 2) change with the camera's (n, 2), in the mean; None for too few."""
-    read = np.isfinite(camera).all(1) & np.isfinite(projector).all(1)
-    if np.count_nonzero(read) < 4:
+    """Fit the Jacobian (2, 2) of projector pixels (n, 2) by camera pixels (n, 2), least squares over all features.
+
+    Rows with NaN do not count; None for fewer than four others.
+    """
+    known = np.isfinite(camera).all(1) & np.isfinite(projector).all(1)
+    if np.count_nonzero(known) < 4:
         return None
-    design = np.column_stack([camera[read], np.ones(np.count_nonzero(read))])
-    (a, b), (c, d) = np.linalg.lstsq(design, projector[read], rcond=None)[0][:2].T
+    design = np.column_stack([camera[known], np.ones(np.count_nonzero(known))])
+    (a, b), (c, d) = np.linalg.lstsq(design, projector[known], rcond=None)[0][:2].T
     return (float(a), float(b)), (float(c), float(d))

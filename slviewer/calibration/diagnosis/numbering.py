@@ -1,4 +1,4 @@
-"""Whether the features of a pose are numbered as the board's are, and how many circles the board really has."""
+"""Checks of the numbering of a pose's features, and the size of the grid of circles that an image shows."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,6 +8,7 @@ import numpy as np
 
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.half_turns import opposite_features
+from slviewer.geometry.polynomial import monomials, scale_to_unit_square
 from slviewer.target.blobs import find_blobs
 from slviewer.target.board import Board
 from slviewer.target.images import SEARCH_PX, BoardImage, resize_image
@@ -16,47 +17,47 @@ from slviewer.target.numbering import select_upright
 from slviewer.target.planar import to_image
 
 MISNUMBERED_PITCHES = 0.8
-"""Features that lie so many pitches off their places on the board are numbered as others."""
+"""A residual of this many pitches shows that features are misnumbered."""
 FIT_PITCHES = 0.25
-"""How far, in pitches, features of the right numbers may lie off; what a lens bends smoothly does not count."""
-_FULL_SHARE = 0.9  # of the nodes within a lattice's extent, for it to be a whole grid
-_CLEAR_RATIO = 0.25  # pitches within which features count while the board's plane and the lens's bend are sought
+"""Largest residual in pitches of correctly numbered features, after removal of lens distortion."""
+_FULL_SHARE = 0.9  # least share of a lattice's nodes that are occupied in a whole grid
+_INLIER_PITCHES = 0.25  # largest residual of inliers in the fit of homography and lens distortion
 
 
 def describe_misnumbering(board: Board, points: np.ndarray, pixels: np.ndarray) -> str:
-    """How the features of a pose at ``pixels`` (n, 2) are misnumbered, in words; empty where they are not.
+    """Describe how features with ``points`` (n, 3) mm at ``pixels`` (n, 2) are misnumbered; "" where they are not.
 
-    ``points`` (n, 3) mm are where the numbering says they are. Other numberings of the whole grid are tried where the
-    one given does not fit, or is a mirror image.
+    Where the numbering of a whole grid does not fit, typical misnumberings (transposed, shifted) are tried.
     """
     columns, rows = board.features
-    off, mirrored = _measure_misfit(points, pixels, board.pitch_mm)
-    whole = len(points) == columns * rows and board.kind in ("circles", "chessboard")
-    if off < MISNUMBERED_PITCHES:
-        return "transposed or mirrored" if mirrored and whole else ""
-    if not whole:
+    residual, is_mirrored = _measure_misfit(points, pixels, board.pitch_mm)
+    is_whole = len(points) == columns * rows and board.kind in ("circles", "chessboard")
+    if residual < MISNUMBERED_PITCHES:
+        return "transposed or mirrored" if is_mirrored and is_whole else ""
+    if not is_whole:
         return "mixed up"
     index = np.arange(columns * rows).reshape(rows, columns)
-    stories = {
+    hypotheses = {
         "transposed": [index.T, np.arange(columns * rows).reshape(columns, rows).T],
         "shifted by a row": [np.roll(index, k, axis=0) for k in (1, -1, 2, -2)],
         "shifted by a column": [np.roll(index, k, axis=1) for k in (1, -1, 2, -2)],
         "shifted": [np.roll(index.ravel(), k).reshape(rows, columns) for k in (1, -1)],
     }
     best, least = "mixed up", FIT_PITCHES
-    for story, orders in stories.items():
+    for description, orders in hypotheses.items():
         for order in orders:
-            left, _ = _measure_misfit(points, pixels[order.ravel()], board.pitch_mm)
-            if left < least:
-                best, least = story, left
+            residual, _ = _measure_misfit(points, pixels[order.ravel()], board.pitch_mm)
+            if residual < least:
+                best, least = description, residual
     return best
 
 
 def reconcile_marks(board: Board, observations: Sequence[Observation]) -> tuple[list[Observation], str]:
-    """The observations of a board of circles numbered alike, and a warning; empty where the poses agree on the mark.
+    """Renumber poses of a board of circles so that all are numbered by its mark, or none; return them and a warning.
 
-    A board has a mark in all poses or in none. What a minority of them takes for one is something else: these poses are
-    numbered by the rule for boards without a mark (``slviewer.target.numbering``), as the others are.
+    A board has a mark in all poses or in none. Marks that only a minority of poses shows are taken for clutter: these
+    poses are renumbered by the rule for boards without a mark (``slviewer.target.numbering``). The warning is "" where
+    nothing was changed.
     """
     doubtful = [o.name for o in observations if o.marked]
     if not doubtful or 2 * len(doubtful) >= len(observations):
@@ -70,7 +71,7 @@ def reconcile_marks(board: Board, observations: Sequence[Observation]) -> tuple[
 
 
 def _number_by_rule(board: Board, observation: Observation) -> Observation:
-    """The observation, numbered as without a detected mark."""
+    """Renumber an observation by the rule for boards without a mark."""
     partner = opposite_features(board.points)
     plain = replace(observation, marked=False)
     if partner is None or len(observation.points) != len(board.points):
@@ -83,8 +84,9 @@ def _number_by_rule(board: Board, observation: Observation) -> Observation:
 
 
 def detect_grid_size(board: Board, image: np.ndarray) -> tuple[int, int] | None:
-    """Columns and rows of the grid of circles that an image shows, the longer side along the board's longer one; None
-    where no whole grid is seen, or the board has no circles in columns and rows.
+    """Detect the (columns, rows) of the grid of circles in an image, whatever the board's own; None without a grid.
+
+    The longer side is given as the board's longer side. None for boards that are no regular grid of circles.
     """
     if board.kind != "circles":
         return None
@@ -107,26 +109,29 @@ def detect_grid_size(board: Board, image: np.ndarray) -> tuple[int, int] | None:
 
 
 def _measure_misfit(points: np.ndarray, pixels: np.ndarray, pitch_mm: float) -> tuple[float, bool]:
-    """(pitches that the worst features lie off the plane of the others, whether the plane is mirrored).
+    """Return (residual of the worst 1 % of the features in pitches, whether the homography is mirrored).
 
-    A cubic of the place on the board, which is how lenses bend it, is taken away first.
+    Residuals are those of a homography and a cubic polynomial (lens distortion), fitted robustly to points (n, 3) mm
+    and pixels (n, 2); inf where there is no homography.
     """
     board = np.asarray(points[:, :2], float) / pitch_mm
     scale = float(np.sqrt(np.ptp(pixels, axis=0).prod() / max(np.ptp(board, axis=0).prod(), 1e-9)))
-    H, near = cv2.findHomography(board, np.asarray(pixels, float), cv2.RANSAC, 2 * _CLEAR_RATIO * max(scale, 1e-6))
+    H, inliers = cv2.findHomography(
+        board, np.asarray(pixels, float), cv2.RANSAC, 2 * _INLIER_PITCHES * max(scale, 1e-6)
+    )
     if H is None or abs(np.linalg.det(H)) < 1e-12:
         return np.inf, False
     H = H * np.sign(board.mean(0) @ H[2, :2] + H[2, 2])
     with np.errstate(divide="ignore", invalid="ignore"):
-        left = np.nan_to_num((pixels - to_image(H, board)) / max(scale, 1e-6), nan=1e6, posinf=1e6, neginf=-1e6)
-    x, y = (2 * (board - board.min(0)) / np.maximum(np.ptp(board, axis=0), 1e-9) - 1).T
-    terms = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
-    counts = np.asarray(near).ravel() > 0
+        offset = np.nan_to_num((pixels - to_image(H, board)) / max(scale, 1e-6), nan=1e6, posinf=1e6, neginf=-1e6)
+    terms = monomials(scale_to_unit_square(board), 3)
+    inlier = np.asarray(inliers).ravel() > 0
+    residual = np.linalg.norm(offset, axis=1)
     for _ in range(3):
-        if np.count_nonzero(counts) < 2 * terms.shape[1]:
+        if np.count_nonzero(inlier) < 2 * terms.shape[1]:
+            residual = np.linalg.norm(offset, axis=1)
             break
-        off = np.linalg.norm(left - terms @ np.linalg.lstsq(terms[counts], left[counts], rcond=None)[0], axis=1)
-        counts = off < max(_CLEAR_RATIO, 3 * float(np.median(off[counts])))
-    else:
-        return float(np.sort(off)[-max(1, len(off) // 100)]), bool(np.linalg.det(H) < 0)
-    return float(np.sort(np.linalg.norm(left, axis=1))[-max(1, len(left) // 100)]), bool(np.linalg.det(H) < 0)
+        distortion = terms @ np.linalg.lstsq(terms[inlier], offset[inlier], rcond=None)[0]
+        residual = np.linalg.norm(offset - distortion, axis=1)
+        inlier = residual < max(_INLIER_PITCHES, 3 * float(np.median(residual[inlier])))
+    return float(np.sort(residual)[-max(1, len(residual) // 100)]), bool(np.linalg.det(H) < 0)

@@ -1,4 +1,4 @@
-"""Residuals that repeat with the fringe: what light that is no cosine of the pattern leaves in the phase.
+"""Ripple: phase errors that repeat with the fringe, as of a non-linear response or of flicker.
 
 A response that is not linear puts harmonics h into the fringe, and n phase steps read those with h = k n +- 1 as an
 error of the phase with n k waves a period (Guo, He and Zhang, Opt. Lasers Eng. 43, 2005). Light that changes between
@@ -14,21 +14,25 @@ from slviewer.calibration.observe import AXES, Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import fit_polynomial
+from slviewer.geometry.robust import robust_sigma
 
 MAX_WAVES = 8
-"""A period: the most that are searched for; four and fewer samples a wave would tell nothing."""
+"""Largest number of waves per fringe period that is fitted."""
 DEGREE = 6
-"""Of the polynomial in camera pixels that takes what the lenses exclude of a pose's residuals."""
+"""Degree of the polynomial in camera pixels that removes lens distortion from a pose's residuals."""
 OUTLIER_SIGMAS = 5.0
 MIN_SAMPLES = 500
 MIN_RESPONSE = 0.15
-"""Of a wave's amplitude, that must be left of it in the mean over a sample's block."""
+"""Waves that the mean over a sample's block attenuates to less than this share of their amplitude are not fitted."""
 
 
 @dataclass(frozen=True)
 class Ripple:
-    """One axis, px of the projector: RMS of the residuals that repeat with the fringe, the number of ``waves`` a period
-    that is strongest among them, its RMS, and the noise that the samples are predicted to have (median)."""
+    """Ripple of one axis in projector px.
+
+    ``rms_px``: RMS of all residuals that repeat with the fringe; ``waves``: waves per period of their strongest
+    component, ``strongest_px`` its RMS; ``noise_px``: median of the samples' predicted noise.
+    """
 
     rms_px: float
     waves: int
@@ -37,23 +41,29 @@ class Ripple:
 
 
 def measure_ripple(observations: Sequence[Observation], stereo: StereoModel) -> dict[Axis, Ripple]:
-    """The ripple of each axis over the samples of all poses that the calibration used; axes without fringes, or with
-    too few samples, are not in it."""
+    """Measure the ripple of each axis over the samples of all poses that the calibration used.
+
+    Axes without fringes or with too few samples are missing from the result.
+    """
     residuals: dict[Axis, list[np.ndarray]] = {axis: [] for axis in AXES}
     for o in observations:
         if o.samples is None or o.name not in stereo.poses:
             continue
-        smooth_free = _detrend_residuals(o, stereo)
+        detrended = _detrend_residuals(o, stereo)
         for column, axis in enumerate(AXES):
-            if axis in smooth_free and o.periods_px[axis] > 2.0:
-                turns = o.samples.projector[:, column] / o.periods_px[axis]
-                block = np.broadcast_to(_block_periods(o.samples.camera, turns), (len(turns), 3))
-                residuals[axis].append(np.column_stack([turns, smooth_free[axis], o.samples.sigma[:, column], block]))
-    return {axis: found for axis, rows in residuals.items() if rows and (found := _fit_ripple(np.concatenate(rows)))}
+            if axis in detrended and o.periods_px[axis] > 2.0:
+                periods = o.samples.projector[:, column] / o.periods_px[axis]
+                block = np.broadcast_to(_measure_blocks(o.samples.camera, periods), (len(periods), 3))
+                residuals[axis].append(np.column_stack([periods, detrended[axis], o.samples.sigma[:, column], block]))
+    ripples = {axis: _fit_ripple(np.concatenate(rows)) for axis, rows in residuals.items() if rows}
+    return {axis: ripple for axis, ripple in ripples.items() if ripple is not None}
 
 
 def _detrend_residuals(o: Observation, stereo: StereoModel) -> Mapping[Axis, np.ndarray]:
-    """(n,) px an axis: measured less predicted projector coordinates of a pose's samples, without their smooth part."""
+    """Return measured less predicted projector coordinates (n,) px of a pose's samples, by axis.
+
+    A polynomial in camera pixels is removed, which takes the lens distortion. Axes with too few samples are missing.
+    """
     assert o.samples is not None
     T = stereo.poses[o.name]
     rays = np.column_stack([stereo.rig.camera.undistort(o.samples.camera), np.ones(len(o.samples.camera))])
@@ -62,51 +72,57 @@ def _detrend_residuals(o: Observation, stereo: StereoModel) -> Mapping[Axis, np.
     difference = o.samples.projector - stereo.rig.project(points)
     u, v = o.samples.camera.T
     box = (u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5)
-    found: dict[Axis, np.ndarray] = {}
+    detrended: dict[Axis, np.ndarray] = {}
     for column, axis in enumerate(AXES):
         known = np.isfinite(difference[:, column])
         if np.count_nonzero(known) < 4 * (DEGREE + 1) ** 2:
             continue
         values = difference[known, column]
         smooth = fit_polynomial(u[known], v[known], values, None, box, DEGREE, robust=True)
-        left = np.full(len(u), np.nan)
-        left[known] = values - smooth.evaluate(u[known], v[known])
-        found[axis] = left
-    return found
+        detrended[axis] = np.full(len(u), np.nan)
+        detrended[axis][known] = values - smooth.evaluate(u[known], v[known])
+    return detrended
 
 
-def _block_periods(camera: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """(3,): periods a camera pixel, along the image's columns and its rows, and how many pixels a side a sample's block
-    has; the mean over them flattens a ripple."""
-    known = np.isfinite(turns)
+def _measure_blocks(camera: np.ndarray, periods: np.ndarray) -> np.ndarray:
+    """Return the change of the phase in periods per camera pixel along u and along v, and the blocks' side in px, (3,).
+
+    ``camera`` (n, 2) px: centres of a pose's blocks; ``periods`` (n,): their projector coordinates in fringe periods.
+    """
+    known = np.isfinite(periods)
     design = np.column_stack([camera[known], np.ones(np.count_nonzero(known))])
-    slopes = np.linalg.lstsq(design, turns[known], rcond=None)[0][:2]
-    places, counts = np.unique(np.round(2 * camera[:, 0]) / 2, return_counts=True)
-    places = places[counts > 0.1 * counts.max()]  # whole blocks
-    side = float(np.median(np.diff(places))) if len(places) > 1 else 1.0
+    slopes = np.linalg.lstsq(design, periods[known], rcond=None)[0][:2]
+    columns, counts = np.unique(np.round(2 * camera[:, 0]) / 2, return_counts=True)
+    columns = columns[counts > 0.1 * counts.max()]  # whole blocks
+    side = float(np.median(np.diff(columns))) if len(columns) > 1 else 1.0
     return np.array([abs(slopes[0]), abs(slopes[1]), max(1.0, round(side))])
 
 
-def _fit_ripple(rows: np.ndarray) -> Ripple | None:
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < MIN_SAMPLES:
+def _fit_ripple(samples: np.ndarray) -> Ripple | None:
+    """Fit waves of 1 to MAX_WAVES per fringe period to residuals, by least squares; None for fewer than MIN_SAMPLES.
+
+    ``samples`` (n, 6): projector coordinate in periods, residual px, predicted noise px, and the three numbers of
+    ``_measure_blocks``, by which the mean over a block attenuates each wave. Rows with NaN do not count.
+    """
+    samples = samples[np.isfinite(samples).all(axis=1)]
+    if len(samples) < MIN_SAMPLES:
         return None
-    turns, residual, sigma = rows.T[:3]
-    spread = 1.4826 * float(np.median(np.abs(residual)))
-    kept = np.abs(residual) < OUTLIER_SIGMAS * max(spread, 1e-9)
-    turns, residual, block = turns[kept], residual[kept], rows[kept, 3:]
+    periods, residual, sigma = samples.T[:3]
+    spread = robust_sigma(residual, about=0.0)
+    inlier = np.abs(residual) < OUTLIER_SIGMAS * max(spread, 1e-9)
+    periods, residual, block = periods[inlier], residual[inlier], samples[inlier, 3:]
     waves = np.arange(1, MAX_WAVES + 1)
-    angle = 2 * np.pi * turns[:, None] * waves
-    flattened = np.ones((len(turns), MAX_WAVES))
+    angle = 2 * np.pi * periods[:, None] * waves
+    response = np.ones((len(periods), MAX_WAVES))
     for slope in (block[:, :1], block[:, 1:2]):  # the mean of a wave over equally spaced pixels
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.sinc(block[:, 2:] * slope * waves) / np.sinc(slope * waves)
-        flattened *= np.nan_to_num(mean)
-    flattened[:, np.median(np.abs(flattened), axis=0) < MIN_RESPONSE] = 0.0
-    design = np.hstack([flattened * np.cos(angle), flattened * np.sin(angle)])
-    solved = np.linalg.lstsq(design, residual, rcond=None)[0].reshape(2, MAX_WAVES)
-    # less what independent noise gives: a variance of 2 s^2 / n in each coefficient
-    power = np.maximum(np.sum(solved**2, axis=0) / 2 - 2 * spread**2 / len(residual), 0.0)
+        response *= np.nan_to_num(mean)
+    response[:, np.median(np.abs(response), axis=0) < MIN_RESPONSE] = 0.0
+    design = np.hstack([response * np.cos(angle), response * np.sin(angle)])
+    amplitudes = np.linalg.lstsq(design, residual, rcond=None)[0].reshape(2, MAX_WAVES)
+    # less the expectation from independent noise: a variance of 2 s^2 / n in each coefficient
+    power = np.maximum(np.sum(amplitudes**2, axis=0) / 2 - 2 * spread**2 / len(residual), 0.0)
     strongest = int(np.argmax(power))
     return Ripple(
         float(np.sqrt(power.sum())), int(waves[strongest]), float(np.sqrt(power[strongest])), float(np.median(sigma))

@@ -1,6 +1,6 @@
-"""Verdict on a calibration: good, doubtful or rejected, its causes, and remedies."""
+"""Verdict on a calibration: good, doubtful or rejected, with causes and remedies."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -9,9 +9,7 @@ from slviewer.records import to_plain
 
 Level = Literal["good", "doubtful", "rejected"]
 Severity = Literal["note", "doubtful", "rejected"]
-"""A note is repaired already, as by leaving a pose out; what is doubtful may be used with care; what is rejected may
-not.
-"""
+"""note: repaired already, as by excluding a pose; doubtful: may be used with care; rejected: must not be used."""
 Cause = Literal[
     "frame-lag",
     "missing-frame",
@@ -40,12 +38,12 @@ Cause = Literal[
     "residuals",
 ]
 CAUSES: tuple[Cause, ...] = get_args(Cause)
-"""From what spoils everything that follows to what is only its consequence: a finding explains those after it."""
+"""From root causes to their consequences: a finding may explain those of later causes."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One cause: ``sentence``: the observation; ``remedy``: what to do; ``poses``: where it was observed."""
+    """A detected fault: its cause and severity, the observation (``sentence``), the ``remedy``, and the poses."""
 
     cause: Cause
     severity: Severity
@@ -54,7 +52,7 @@ class Finding:
     poses: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """Both sentences in one."""
+        """Return observation and remedy in one line."""
         return f"{self.sentence}: {self.remedy}"
 
 
@@ -66,14 +64,14 @@ class Verdict:
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":
-        """Findings in order: what rejects before what is doubtful before notes, causes before their consequences."""
+        """Return the verdict of findings sorted by severity, the worst first, then by cause, root causes first."""
         severities = get_args(Severity)
         ranked = sorted(findings, key=lambda f: (-severities.index(f.severity), CAUSES.index(f.cause)))
         return cls(tuple(ranked))
 
     @property
     def level(self) -> Level:
-        """As bad as the worst finding; notes leave it good."""
+        """Severity of the worst finding; a verdict with notes only is good."""
         worst = self.findings[0].severity if self.findings else "note"
         return "good" if worst == "note" else worst
 
@@ -88,40 +86,39 @@ class Verdict:
         return self.findings[0].text() if self.findings else ""
 
     def text(self) -> str:
-        """For people."""
+        """Return a report of several lines for the terminal."""
         lines = [f"verdict: {self.level}"]
         lines += [f"  {finding.severity}: {finding.text()}" for finding in self.findings]
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; the inverse of `records.from_plain`."""
+        """Return plain values, which `records.from_plain` reads back."""
         return {"level": self.level, **to_plain(self)}
 
 
 DOUBTFUL_RATIO = 4.0
-"""Of residuals over predicted noise. On clean rigs, whose lenses bend as no polynomial does, it is 0.5 to 1.1, and 0.8
-on real Gray code. A block of 5 by 5 camera pixels whose noise is fully alike, as after demosaicing or compression,
-scatters by up to five times what is predicted of independent pixels: in part, as such noise is, by less than four."""
+"""Ratio of residuals to predicted noise. It is 0.5 to 1.1 on clean simulated rigs with local distortion, and 0.8 on
+real Gray code. Noise that is correlated between pixels, as after demosaicing or compression, raises it to less than 4:
+it would be 5 if the 5 by 5 camera pixels of a block had identical noise."""
 EXPLAINING_CAUSES = ("gamma", "saturation", "moved", "frame-lag", "frame-order", "missing-frame")
 REJECTED_RATIO = 25.0
 REJECTED_PX = 1.0
-"""Beyond both the phases contradict the geometry, whatever the noise: a column more or less than was measured."""
+"""Beyond both limits the phases contradict the geometry, whatever the noise."""
 
 
 def judge_splined(verdict: Verdict, noise: Noise) -> Verdict:
-    """The verdict with what the joint adjustment's residuals add to it; a cause that explains them is known already
-    where one of ``EXPLAINING_CAUSES`` was found."""
-    ratios: Mapping[str, float] = dict(zip("xy", noise.ratio, strict=True))
-    axis = max(ratios, key=lambda name: ratios[name])
-    ratio, px = ratios[axis], noise.sample_px["xy".index(axis)]
+    """Return the verdict with a finding added where the joint adjustment's residuals exceed their predicted noise.
+
+    The finding names the first of ``EXPLAINING_CAUSES`` among the others as its probable cause.
+    """
+    ratio, px, axis = max(zip(noise.ratio, noise.sample_px, "xy", strict=True))
     if ratio < DOUBTFUL_RATIO:
         return verdict
     known = [finding.cause for finding in verdict.findings if finding.cause in EXPLAINING_CAUSES]
     because = f" (probable cause: {known[0]}, named above)" if known else ""
-    rejected = ratio > REJECTED_RATIO and px > REJECTED_PX
     finding = Finding(
         "residuals",
-        "rejected" if rejected else "doubtful",
+        "rejected" if ratio > REJECTED_RATIO and px > REJECTED_PX else "doubtful",
         f"the residuals of the joint adjustment in {axis}, {px:.2f} px, are {ratio:.1f} times the predicted noise"
         f"{because}",
         "see that light, exposure and rig did not change while a pose was captured, that the projector scales nothing, "

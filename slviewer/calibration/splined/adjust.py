@@ -125,7 +125,7 @@ def adjust_bundle(
             f"{np.count_nonzero(aside)} of {len(names)} poses contradict the others: capture the board anew, at rest"
         )
     fits = _fit_statistics(names, residuals, _sigmas(residuals, noise, sample_sigma, data), data)
-    left_out = {
+    excluded = {
         name: f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera, "
         f"{fits[name].projector_trust:.2f} in the projector): was the board moved during the capture?"
         for name, out in zip(names, aside, strict=True)
@@ -139,7 +139,7 @@ def adjust_bundle(
         noise=noise,
         strengths=(strengths[0], strengths[1]),
         fits=fits,
-        left_out=left_out,
+        excluded=excluded,
         depth_range_mm=_depth_range(state, data, aside),
         camera_poses=camera_poses,
         projector_poses=projector_poses,

@@ -33,7 +33,7 @@ class Bundle:
     """The unknowns of ``poses``, and their information.
 
     ``points`` (f, 3) mm: the board's features, whose offsets the state has. ``strengths`` 1/px^2: of the camera's and
-    the projector's prior. ``left_out``: poses excluded, with the reason. ``camera_poses`` and ``projector_poses``: how
+    the projector's prior. ``excluded``: poses not used, with the reason. ``camera_poses`` and ``projector_poses``: how
     many poses illuminated each cell of the fields (rows, columns). ``turned``: poses whose board was numbered from the
     other end, and is no more.
 
@@ -46,7 +46,7 @@ class Bundle:
     noise: Noise
     strengths: tuple[float, float]
     fits: Mapping[str, PoseFit]
-    left_out: Mapping[str, str]
+    excluded: Mapping[str, str]
     depth_range_mm: tuple[float, float]
     camera_poses: np.ndarray
     projector_poses: np.ndarray
@@ -79,8 +79,8 @@ class Bundle:
 
     def to_dict(self) -> dict[str, Any]:
         """What is not an array, JSON-able."""
-        keys = ("poses", "noise", "strengths", "fits", "left_out", "depth_range_mm", "steps", "turned")
-        data: dict[str, Any] = to_plain({key: getattr(self, key) for key in keys})
+        keys = ("poses", "noise", "strengths", "fits", "depth_range_mm", "steps", "turned")
+        data: dict[str, Any] = to_plain({key: getattr(self, key) for key in keys} | {"left_out": self.excluded})
         return data
 
     def to_arrays(self) -> dict[str, np.ndarray]:
@@ -122,7 +122,7 @@ class Bundle:
             noise=from_plain(data["noise"], Noise),
             strengths=(strengths[0], strengths[1]),
             fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
-            left_out=data["left_out"],
+            excluded=data["left_out"],
             depth_range_mm=(depths[0], depths[1]),
             camera_poses=a["camera_poses"],
             projector_poses=a["projector_poses"],

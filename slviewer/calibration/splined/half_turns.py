@@ -12,6 +12,7 @@ import numpy as np
 from slviewer.calibration.splined.normal import PoseData, predict_observations
 from slviewer.calibration.splined.unknowns import State
 from slviewer.errors import InputError
+from slviewer.geometry.polynomial import monomials, scale_to_unit_square
 from slviewer.target.board import Board
 
 DECISION_SIGMAS = 5.0
@@ -107,8 +108,6 @@ def _odd_part(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np
     """(p, 2 f): of places (p, f, 2), what half a turn of the board changes the sign of, and is not smooth."""
     # the circle there moves the other way when the board is turned: what reverses is the mean of both
     odd = (places + places[:, partner]) / 2
-    x, y = (2 * (points[:, :2] - points[:, :2].min(0)) / np.maximum(np.ptp(points[:, :2], axis=0), 1e-9) - 1).T
-    smooth = np.stack([x**i * y**j for i in range(SMOOTH_DEGREE + 1) for j in range(SMOOTH_DEGREE + 1 - i)], axis=1)
-    basis, _ = np.linalg.qr(smooth)
+    basis, _ = np.linalg.qr(monomials(scale_to_unit_square(points[:, :2]), SMOOTH_DEGREE))
     odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)
     return np.asarray(odd.reshape(len(places), -1))

@@ -67,7 +67,7 @@ class SplinedModel:
         """The same of both axes, whichever is larger: how far, in projector px, points miss their epipolar lines."""
         return max(self.excess_px(axis) for axis in AXES)
 
-    def sight(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def undistort_pairs(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2); NaN
         where no target pose supports one of them."""
         rays = undistort(self.rig.camera, pixels), undistort(self.rig.projector, projector)
@@ -169,7 +169,7 @@ class SplinedModel:
                 "projector": float(np.mean(bundle.projector_poses > 0)),
             },
             "sigma_volume_mm": self.sigma_volume,
-            "left_out": dict(bundle.left_out),
+            "left_out": dict(bundle.excluded),
             "turned": list(bundle.turned),
         }
 

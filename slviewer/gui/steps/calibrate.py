@@ -365,7 +365,7 @@ def _summary(calibration: CalibrationView) -> Html:
     if rms:
         rows.append(("Reprojection RMS, camera", coloured(f"{rms['camera']:.3f} px", "plain", bold=True)))
         rows.append(("Reprojection RMS, projector", coloured(f"{rms['projector']:.3f} px", "plain", bold=True)))
-    rows.append(("Poses used", f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.left_out)}"))
+    rows.append(("Poses used", f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.excluded)}"))
     if stereo.depth_range_mm:
         rows.append(("Calibrated depths (R2)", "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm)))
     rows.append(("Baseline", f"{stereo.baseline_mm:.2f} mm"))
