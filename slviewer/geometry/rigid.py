@@ -30,6 +30,12 @@ def move_points(T: Floats, points: np.ndarray) -> Floats:
     return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
 
 
+def nearest_rotation(M: Floats) -> Floats:
+    """(3, 3): the rotation nearest to a matrix (3, 3) in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
 def rotation_angle(R: Floats) -> Floats:
     """(...,) rad: the angle of rotations (..., 3, 3), 0 to pi."""
     return np.asarray(Rotation.from_matrix(R).magnitude())

@@ -10,9 +10,8 @@ from functools import cached_property
 
 import numpy as np
 
-from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceBench
-from slviewer.calibration.guidance.initial_rig import MIN_POSES as MIN_POSES_FOR_RIG
-from slviewer.calibration.guidance.initial_rig import estimate_rig
+from slviewer.calibration.guidance.coarse_rig import MIN_POSES as MIN_POSES_FOR_RIG
+from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceModel, estimate_rig
 from slviewer.calibration.guidance.pose_selection import suggest_poses
 from slviewer.calibration.next_pose import (
     Coverage,
@@ -131,7 +130,7 @@ def plan(given: PlanInput) -> PosePlan:
     spread = _spread_poses(given, rig.camera, known)
     expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in seen]) / given.projector[0])
     try:
-        guidance = suggest_poses(GuidanceBench(rig, given.board, expected), list(spread.poses.values()))
+        guidance = suggest_poses(GuidanceModel(rig, given.board, expected), list(spread.poses.values()))
     except (InputError, np.linalg.LinAlgError):  # devices that share no view: better coverage may repair it
         return spread
     if guidance is None:

@@ -5,9 +5,8 @@ import pytest
 from splined_rig import BOARD, poses, rig
 
 from slviewer.calibration.guidance import pose_selection
-from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceBench
-from slviewer.calibration.guidance.information import Information, Sensitivity
-from slviewer.calibration.guidance.initial_rig import estimate_rig
+from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceModel, estimate_rig
+from slviewer.calibration.guidance.information import RigInformation, VolumeSensitivity, information_rows
 from slviewer.calibration.guidance.pose_selection import suggest_poses
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
@@ -44,8 +43,8 @@ def known(true, seen) -> tuple[StereoRig, list[np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
-def bench(known) -> GuidanceBench:
-    return GuidanceBench(known[0], BOARD)
+def bench(known) -> GuidanceModel:
+    return GuidanceModel(known[0], BOARD)
 
 
 def test_few_poses_tell_where_things_will_be_seen(true, seen, known) -> None:
@@ -61,9 +60,9 @@ def test_few_poses_tell_where_things_will_be_seen(true, seen, known) -> None:
 
 
 def test_the_gain_of_a_pose_is_what_it_will_bring(bench, known) -> None:
-    undistort_pairs = Sensitivity.from_bench(bench, depth_range(BOARD, bench.stereo.camera))
-    rows = bench.rows(np.array(known[1]))
-    before, after = (Information.from_rows(bench, rows[:n], undistort_pairs) for n in (5, 6))
+    sensitivity = VolumeSensitivity.from_model(bench, depth_range(BOARD, bench.stereo.camera))
+    rows = information_rows(bench, np.array(known[1]))
+    before, after = (RigInformation.from_rows(bench, rows[:n], sensitivity) for n in (5, 6))
     gain = before.gain(rows[5])
     assert gain == pytest.approx(before.variances.mean() - after.variances.mean(), rel=1e-3) and gain > 0
     assert (after.variances <= before.variances * (1 + 1e-6)).all()
@@ -81,9 +80,10 @@ def test_guided_poses_are_seen_and_know_more_than_others(true, bench, known) -> 
         X = BOARD.points @ had[-1][:3, :3].T + had[-1][:3, 3]
         for pixels, device in ((true.camera.project(X), true.camera), (true.project(X), true.projector)):
             assert ((pixels > -1) & (pixels < np.array(device.size))).all()
-    undistort_pairs = Sensitivity.from_bench(bench, depth_range(BOARD, bench.stereo.camera))
+    sensitivity = VolumeSensitivity.from_model(bench, depth_range(BOARD, bench.stereo.camera))
     reached, by_design = (
-        Information.from_rows(bench, bench.rows(np.array(poses)), undistort_pairs).sigma_mm for poses in (had, known[1])
+        RigInformation.from_rows(bench, information_rows(bench, np.array(poses)), sensitivity).sigma_mm
+        for poses in (had, known[1])
     )
     assert sigmas[0] > sigmas[1] > sigmas[2] > reached
     assert reached < 0.8 * by_design  # as many that reach the corners by design

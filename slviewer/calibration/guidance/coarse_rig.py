@@ -1,11 +1,13 @@
-"""Coarse model of the rig for guidance: lenses without local distortion, and the observations of a board in it."""
+"""Approximate rig from few poses, and the coarse model with which guidance predicts visibility and information."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from slviewer.calibration.guidance.information_rows import pose_rows
 from slviewer.calibration.splined.board_shape import (
     GAUGE_MM,
     HEIGHT_SIGMA_MM,
@@ -15,28 +17,37 @@ from slviewer.calibration.splined.board_shape import (
     offset_gauge,
 )
 from slviewer.calibration.splined.fields import CELLS_ACROSS, RIDGE, Device, roughness
-from slviewer.calibration.splined.unknowns import LENS, RIG, Arrangement, UnknownLayout
+from slviewer.calibration.splined.unknowns import Arrangement, UnknownLayout
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import Floats, move_points, nearest_rotation, rotation_angle, transform_from_rvec
 from slviewer.target.board import Board
 
 COARSE_CELLS = 10
-"""Cells across an image: half the wavelength of what guidance must tell apart, and a third of the adjustment's time a
-pose."""
+"""Cells of the displacement fields across an image; the joint adjustment has more (``fields.CELLS_ACROSS``)."""
 FEATURES, SAMPLES = (5, 4), (9, 7)
-"""Places along and across a board that stand for all its features, and for all its bright pixels."""
+"""Points (across, down) that represent all features of a board, and all its bright pixels."""
 BOARD_SAMPLES = 4000
-"""Bright places that a pose is read at."""
+"""Bright pixels that a pose contributes to the joint adjustment."""
 MARGIN = 0.006
-"""Of the image's width, left free around the outermost features."""
+"""Margin around the outermost features in a visible pose, in widths of the image."""
+MIN_POSES = 3
+MAX_FEATURES = 60
+"""Features of a pose from which a rig is estimated."""
+POSES_FOR_TWO_COEFFICIENTS = 6
+"""With fewer poses only one radial distortion coefficient is estimated."""
+MAX_DISAGREEMENT = 0.05, 0.1
+"""Largest median deviation of the poses' camera-projector transforms from the common one: rotation in rad, and
+translation over its length."""
+_FOCALS = 0.4, 12.0  # plausible focal lengths, in widths of the image
 
 
 @dataclass(frozen=True)
 class ExpectedNoise:
-    """Standard deviations before a joint adjustment has measured them, and how far lenses depart from Brown's.
+    """Expected noise and local lens distortion before a joint adjustment has measured them.
 
-    ``feature`` and ``sample``: of a coordinate, in widths of the image; ``strengths``: of the two priors at the
-    adjustment's own knots, for displacements in widths of the image.
+    ``feature`` and ``sample``: standard deviations of a coordinate, in widths of the image; ``strengths``: of the
+    camera's and the projector's prior at the adjustment's own knots, for displacements in widths of the image.
     """
 
     feature: float = 2.5e-5
@@ -44,18 +55,20 @@ class ExpectedNoise:
     strengths: tuple[float, float] = (4e8, 2e8)
 
     def with_noise(self, samples: np.ndarray) -> "ExpectedNoise":
-        """What is expected where samples' noise is known of some poses (n,), in widths of the projector's image; NaN:
-        not of this one. What makes phases noisy makes features so too; little noise of phases says nothing of them.
+        """Return the expectation updated by the measured noise (n,) of some poses' samples, in widths of the image.
+
+        NaN where a pose's noise is not known. Larger noise raises that of the features in proportion; smaller does not
+        lower it.
         """
         if not np.isfinite(samples).any():
             return self
-        seen = float(np.nanmedian(samples))
-        return replace(self, sample=seen, feature=self.feature * max(seen / self.sample, 1.0))
+        measured = float(np.nanmedian(samples))
+        return replace(self, sample=measured, feature=self.feature * max(measured / self.sample, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
-class GuidanceBench:
-    """One rig and one board, as far as they are known."""
+class GuidanceModel:
+    """Coarse model of one rig and one board, for predicting which poses are visible and how informative they are."""
 
     stereo: StereoRig
     board: Board
@@ -63,17 +76,17 @@ class GuidanceBench:
 
     @cached_property
     def rig(self) -> Arrangement:
-        """Both devices without displacement, on coarse knots."""
+        """Both devices without local distortion, on coarse knots."""
         camera, projector = (_coarse_device(lens) for lens in (self.stereo.camera, self.stereo.projector))
         return Arrangement(camera, projector, np.array(self.stereo.R), np.array(self.stereo.t))
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(f, 3) mm: features that stand for all."""
+        """(f, 3) mm: features that represent all those of the board."""
         low, high = self.board.points.min(0), self.board.points.max(0)
         x, y = np.meshgrid(*(np.linspace(low[k], high[k], n) for k, n in enumerate(FEATURES)))
-        places = np.column_stack([x.ravel(), y.ravel()])
-        nearest = np.argmin(np.linalg.norm(self.board.points[None, :, :2] - places[:, None], axis=2), axis=1)
+        grid = np.column_stack([x.ravel(), y.ravel()])
+        nearest = np.argmin(np.linalg.norm(self.board.points[None, :, :2] - grid[:, None], axis=2), axis=1)
         return np.ascontiguousarray(self.board.points[np.unique(nearest)])
 
     @cached_property
@@ -87,43 +100,37 @@ class GuidanceBench:
 
     @property
     def features_per_point(self) -> float:
-        """Features that each of ``points`` stands for."""
+        """Number of the board's features that each of ``points`` represents."""
         return len(self.board.points) / len(self.points)
 
-    def rows(self, T_camera_board: np.ndarray) -> list[np.ndarray]:
-        """(rows, unknowns) for each of the poses (k, 4, 4): what the board tells there; see ``pose_rows``."""
-        width = self.stereo.camera.size[0], self.stereo.projector.size[0]
-        feature = self.expected.feature * width[0] / np.sqrt(self.features_per_point)
-        told = []
-        for T, pixels in zip(T_camera_board, self._pixels(T_camera_board), strict=True):
-            sample = self.expected.sample * width[1] / np.sqrt(BOARD_SAMPLES / max(len(pixels), 1))
-            told.append(pose_rows(self.rig, self.layout, T, self.points, self.frame, pixels, (feature, sample)))
-        return told
+    def sample_pixels(self, T_camera_board: Floats) -> list[Floats]:
+        """Return camera pixels (m, 2) on a regular grid of the board, as far as both devices see them, for each pose.
 
-    def _pixels(self, T: np.ndarray) -> list[np.ndarray]:
-        """(m, 2) for each pose: camera pixels at regular places of the board that camera and projector both see."""
+        ``T_camera_board``: (k, 4, 4) mm.
+        """
         outline = self.board.outline()
-        middles = [(np.arange(n) + 0.5) / n for n in SAMPLES]
-        x, y = np.meshgrid(*(outline[0, k] + m * np.ptp(outline[:, k]) for k, m in enumerate(middles)))
-        places = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-        points = np.einsum("kij,nj->kni", T[:, :3, :3], places) + T[:, None, :3, 3]
-        pixels = self.stereo.camera.project(points)
-        seen = _is_inside(pixels, self.stereo.camera, 0) & _is_inside(
-            self.stereo.project(points), self.stereo.projector, 0
-        )
-        return [p[s] for p, s in zip(pixels, seen, strict=True)]
+        shares = [(np.arange(n) + 0.5) / n for n in SAMPLES]
+        x, y = np.meshgrid(*(outline[0, k] + share * np.ptp(outline[:, k]) for k, share in enumerate(shares)))
+        pixels, visible = self._project(T_camera_board, np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]), 0)
+        return [p[v] for p, v in zip(pixels, visible, strict=True)]
 
-    def in_view(self, T: np.ndarray) -> np.ndarray:
-        """(k,) bool: poses T (k, 4, 4) at which both devices see every feature, with some margin."""
+    def is_visible(self, T_camera_board: Floats) -> NDArray[np.bool_]:
+        """(k,) bool: poses (k, 4, 4) mm at which both devices see every feature of the board, with a margin."""
         margin = 0.25 * self.board.pitch_mm if self.board.kind in ("circles", "acircles") else None
-        corners = self.board.outline(margin)
-        points = np.einsum("kij,nj->kni", T[:, :3, :3], corners) + T[:, None, :3, 3]
-        here, there = self.stereo.camera.project(points), self.stereo.project(points)
-        seen = _is_inside(here, self.stereo.camera, MARGIN) & _is_inside(there, self.stereo.projector, MARGIN)
-        return np.asarray(seen.all(1))
+        return np.asarray(self._project(T_camera_board, self.board.outline(margin), MARGIN)[1].all(1))
 
-    def prior(self) -> np.ndarray:
-        """(unknowns, unknowns): the information there is before any pose."""
+    def _project(self, T_camera_board: Floats, points: Floats, margin: float) -> tuple[Floats, NDArray[np.bool_]]:
+        """Project board points (n, 3) mm at each pose (k, 4, 4).
+
+        Returns the camera's pixels (k, n, 2) and whether they are inside both images, (k, n) bool, with a ``margin`` in
+        widths of the image.
+        """
+        X = move_points(T_camera_board, points)
+        pixels, camera, projector = self.stereo.camera.project(X), self.stereo.camera, self.stereo.projector
+        return pixels, _is_inside(pixels, camera, margin) & _is_inside(self.stereo.project(X), projector, margin)
+
+    def prior(self) -> Floats:
+        """Return the information matrix (unknowns, unknowns) before any pose, in the order of ``layout``."""
         at = self.layout
         A = np.zeros((at.size, at.size))
         diagonal = np.arange(at.size)
@@ -137,33 +144,78 @@ class GuidanceBench:
         starts = at.camera_field, at.projector_field
         for device, start, strength, width in zip(self.rig[:2], starts, self.expected.strengths, widths, strict=True):
             n = device.coefficients[0].size
-            # the same energy of a field's curvature, and the same ridge, on other knots
-            grown = CELLS_ACROSS / COARSE_CELLS
-            form = roughness(device.coefficients) + RIDGE * (grown**4 - 1) * np.eye(n)
+            # the same curvature energy of a field, and the same ridge, as on the adjustment's knots
+            cell_ratio = CELLS_ACROSS / COARSE_CELLS
+            form = roughness(device.coefficients) + RIDGE * (cell_ratio**4 - 1) * np.eye(n)
             for k in range(2):
                 block = slice(start + k * n, start + (k + 1) * n)
-                A[block, block] = strength / width**2 / grown**2 * form
+                A[block, block] = strength / width**2 / cell_ratio**2 * form
         return A
 
-    def _weak_prior_sigmas(self) -> np.ndarray:
-        """(24,): standard deviations of the rig's numbers that hold what few poses leave open."""
+    def _weak_prior_sigmas(self) -> Floats:
+        """(24,): wide prior standard deviations of both lenses, rotation (rad) and translation (mm)."""
         lens = [
             np.concatenate([np.repeat(0.3 * K[[0, 1], [0, 1]].mean(), 4), [0.5, 0.5, 0.02, 0.02, 2.0]])
             for K in (self.stereo.camera.K, self.stereo.projector.K)
         ]
-        wide = np.concatenate([*lens, [0.3] * 3, [300.0] * 3])
-        assert len(wide) == RIG == 2 * LENS + 6
-        return wide
+        return np.concatenate([*lens, [0.3] * 3, [300.0] * 3])
 
 
 def _coarse_device(lens: Lens) -> Device:
+    """Return a device with the lens's parameters and a zero displacement field on coarse knots."""
     width, height = lens.size
     down = int(np.clip(round(COARSE_CELLS * height / width), 4, 2 * COARSE_CELLS))
     return Device(lens.parameters, np.zeros((2, down + 3, COARSE_CELLS + 3)), np.array(lens.size, float))
 
 
-def _is_inside(pixels: np.ndarray, lens: Lens, free: float) -> np.ndarray:
-    """(...) bool: of pixels (..., 2); NaN is not."""
-    room = free * lens.size[0]
+def _is_inside(pixels: Floats, lens: Lens, margin: float) -> NDArray[np.bool_]:
+    """(...,) bool: pixels (..., 2) inside the lens's image less a margin in image widths; False for NaN."""
+    margin_px = margin * lens.size[0]
     with np.errstate(invalid="ignore"):
-        return np.asarray(((pixels > room - 0.5) & (pixels < np.array(lens.size) - 0.5 - room)).all(-1))
+        return np.asarray(((pixels > margin_px - 0.5) & (pixels < np.array(lens.size) - 0.5 - margin_px)).all(-1))
+
+
+def estimate_rig(
+    points: Sequence[np.ndarray],
+    camera: Sequence[np.ndarray],
+    projector: Sequence[np.ndarray],
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+) -> tuple[StereoRig, list[Floats]] | None:
+    """Estimate an approximate rig and T_camera_board (4, 4) mm of every pose; None where the poses do not determine it.
+
+    Of each pose: ``points`` (n, 3) mm on the board, and their ``camera`` and ``projector`` pixels (n, 2), NaN where
+    unknown. ``sizes``: (width, height) px of camera and projector.
+    """
+    chosen = []
+    for p, c, q in zip(points, camera, projector, strict=True):
+        known = np.nonzero(np.isfinite(c).all(1) & np.isfinite(q).all(1))[0]
+        if len(known) < 12:
+            return None
+        subset = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
+        chosen.append([np.ascontiguousarray(a[subset], np.float32) for a in (p, c, q)])
+    if len(chosen) < MIN_POSES:
+        return None
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    if len(chosen) < POSES_FOR_TWO_COEFFICIENTS:
+        flags |= cv2.CALIB_FIX_K2
+    lenses, poses = [], []
+    for k, size in enumerate(sizes):
+        objects, images = [c[0] for c in chosen], [c[1 + k] for c in chosen]
+        try:
+            _, K, D, rvecs, tvecs = cv2.calibrateCamera(objects, images, size, np.eye(3), np.zeros(5), flags=flags)
+        except cv2.error:
+            return None
+        if not (np.isfinite(K).all() and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))):
+            return None
+        lenses.append(Lens(K, np.ravel(D)[:5], size))
+        poses.append([transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)])
+    T = np.array(poses[1]) @ np.linalg.inv(poses[0])  # T_projector_camera by each pose
+    t = np.median(T[:, :3, 3], axis=0)
+    R = nearest_rotation(np.median(T[:, :3, :3], axis=0))
+    rotation = np.median(rotation_angle(T[:, :3, :3] @ R.T))
+    translation = np.median(np.linalg.norm(T[:, :3, 3] - t, axis=1)) / max(float(np.linalg.norm(t)), 1e-9)
+    if rotation > MAX_DISAGREEMENT[0] or translation > MAX_DISAGREEMENT[1]:
+        return None
+    if any(pose[2, 3] <= 0 for pose in poses[0]):
+        return None
+    return StereoRig(lenses[0], lenses[1], R, t), poses[0]

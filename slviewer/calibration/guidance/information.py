@@ -1,83 +1,169 @@
-"""Information of poses: the uncertainty it leaves in the working volume, and the gain of one more pose."""
+"""Information of target poses on the rig: the uncertainty in the working volume, and the gain of one more pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cholesky, eigh, solve_triangular
 
-from slviewer.calibration.guidance.coarse_rig import GuidanceBench
+from slviewer.calibration.guidance.coarse_rig import BOARD_SAMPLES, GuidanceModel
+from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
+from slviewer.calibration.splined.normal import allocate_workspace
 from slviewer.calibration.splined.posterior import point_rows
-from slviewer.calibration.splined.unknowns import State
+from slviewer.calibration.splined.residuals import DENSE, HEIGHT, OFFSET, feature_row, sample_row
+from slviewer.calibration.splined.unknowns import RIG, State
 from slviewer.calibration.splined.volume import Volume, depth_axis, motion_free, working_volume
+from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats
 
 NEGLIGIBLE = 1e-4
-"""Of the points' mean variance, that gains need not tell."""
+"""Share of the points' mean variance that gains neglect."""
+POSE = HEIGHT
+"""Number of a pose's unknowns; they come first in every row."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sensitivity:
-    """The working volume, and how its points' errors that no rigid motion explains answer to the unknowns."""
+class VolumeSensitivity:
+    """Points of the working volume and the Jacobian (3 m, unknowns) of their errors, less their common rigid motion."""
 
     volume: Volume
-    jacobian: np.ndarray
+    jacobian: Floats
 
     @classmethod
-    def from_bench(
-        cls, bench: GuidanceBench, depths_mm: tuple[float, float], columns: int = 9, rows: int = 7
-    ) -> "Sensitivity":
-        """``depths_mm``: nearest and farthest that boards are held at."""
-        volume = working_volume(bench.rig, depths_mm, columns=columns, rows=rows)
-        state = State(bench.rig, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((len(bench.points), 2)))
-        rows_of = point_rows(state, depth_axis(bench.rig, volume), volume.pixels, volume.z).toarray()
-        known = np.isfinite(rows_of).all(axis=1).reshape(-1, 3).all(axis=1)
+    def from_model(cls, model: GuidanceModel, depths_mm: tuple[float, float]) -> "VolumeSensitivity":
+        """Compute the Jacobian of a regular grid of points; ``depths_mm``: nearest and farthest board."""
+        volume = working_volume(model.rig, depths_mm)
+        state = State(model.rig, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((len(model.points), 2)))
+        by_rig = point_rows(state, depth_axis(model.rig, volume), volume.pixels, volume.z).toarray()
+        known = np.isfinite(by_rig).all(axis=1).reshape(-1, 3).all(axis=1)
         volume = Volume(volume.pixels[known], volume.z[known], volume.points[known], volume.projector[known])
-        rows_of = rows_of.reshape(len(known), 3, -1)[known].reshape(3 * len(volume.z), -1)
-        full = np.zeros((len(rows_of), bench.layout.size))
-        full[:, bench.layout.rig :] = motion_free(rows_of.T, volume.points).T
-        return cls(volume, full)
+        by_rig = by_rig.reshape(len(known), 3, -1)[known].reshape(3 * len(volume.z), -1)
+        jacobian = np.zeros((len(by_rig), model.layout.size))
+        jacobian[:, model.layout.rig :] = motion_free(by_rig.T, volume.points).T
+        return cls(volume, jacobian)
 
 
 @dataclass(frozen=True, eq=False)
-class Information:
-    """Of the poses had: the points' ``variances`` (m,) mm^2, and what the unknowns may still do.
+class RigInformation:
+    """Uncertainty of the rig after some poses.
 
-    ``free`` (n, n) float32: each column is a way in which the unknowns are off by one sigma, independent of the others,
-    the last ones those that matter most for the points; ``counts`` (k,) float32 mm: what each of the last k adds to the
-    points' error, root mean square.
+    ``variances`` (m,) mm^2 of the volume's points. ``modes`` (n, n) float32: a factor of the unknowns' covariance,
+    ``modes @ modes.T``, whose columns act on the volume independently of each other and with increasing effect;
+    ``mode_rms_mm`` (k,) float32: RMS error over the volume's points by each of the last k modes.
     """
 
-    variances: np.ndarray
-    free: np.ndarray
-    counts: np.ndarray
+    variances: Floats
+    modes: NDArray[np.float32]
+    mode_rms_mm: NDArray[np.float32]
 
     @classmethod
-    def from_rows(cls, bench: GuidanceBench, rows: Sequence[np.ndarray], sight: Sensitivity) -> "Information":
-        """From what each pose tells (see ``GuidanceBench.rows``)."""
-        A = bench.prior()
+    def from_rows(
+        cls, model: GuidanceModel, rows: Sequence[Floats], sensitivity: VolumeSensitivity
+    ) -> "RigInformation":
+        """Combine the prior with the rows of each pose (see ``information_rows``)."""
+        A = model.prior()
         if len(rows):
-            told = np.concatenate(rows)
-            A += told.T @ told
+            J = np.concatenate(rows)
+            A += J.T @ J
         scale = 1.0 / np.sqrt(np.diag(A))
         L = cholesky(A * scale * scale[:, None], lower=True, check_finite=False)
-        free = solve_triangular(L, np.diag(scale), lower=True, check_finite=False).T
-        answer = sight.jacobian @ free
-        variances = (answer**2).sum(axis=1).reshape(-1, 3).sum(axis=1)
-        shares, ways = eigh(answer.T @ answer / len(variances), check_finite=False)
-        shares = np.maximum(shares, 0.0)
-        most = int((np.cumsum(shares) > NEGLIGIBLE * shares.sum()).sum())
-        return cls(variances, (free @ ways).astype(np.float32), np.sqrt(shares[-most:]).astype(np.float32))
+        factor = solve_triangular(L, np.diag(scale), lower=True, check_finite=False).T
+        errors = sensitivity.jacobian @ factor
+        variances = (errors**2).sum(axis=1).reshape(-1, 3).sum(axis=1)
+        mode_variances, rotation = eigh(errors.T @ errors / len(variances), check_finite=False)
+        mode_variances = np.maximum(mode_variances, 0.0)
+        count = int((np.cumsum(mode_variances) > NEGLIGIBLE * mode_variances.sum()).sum())
+        mode_rms = np.sqrt(mode_variances[-count:])
+        return cls(variances, (factor @ rotation).astype(np.float32), mode_rms.astype(np.float32))
 
     @property
     def sigma_mm(self) -> float:
-        """Root mean square over the volume, in all directions together."""
+        """3D standard deviation of the volume's points, RMS over the volume."""
         return float(np.sqrt(self.variances.mean()))
 
-    def gain(self, rows: np.ndarray) -> float:
-        """mm^2 by which a pose that tells these rows lowers the mean variance over the volume."""
-        seen = rows.astype(np.float32) @ self.free
-        inner = (seen @ seen.T).astype(np.float64)
+    def gain(self, rows: Floats) -> float:
+        """Return the decrease in mm^2 of the points' mean variance by one more pose with these information rows."""
+        by_mode = rows.astype(np.float32) @ self.modes
+        inner = (by_mode @ by_mode.T).astype(np.float64)
         inner[np.diag_indices(len(inner))] += 1.0
-        told = seen[:, -len(self.counts) :] * self.counts
+        weighted = by_mode[:, -len(self.mode_rms_mm) :] * self.mode_rms_mm
         L = cholesky(inner, lower=True, check_finite=False)
-        return float((solve_triangular(L, told.astype(np.float64), lower=True, check_finite=False) ** 2).sum())
+        return float((solve_triangular(L, weighted.astype(np.float64), lower=True, check_finite=False) ** 2).sum())
+
+
+def information_rows(model: GuidanceModel, T_camera_board: Floats) -> list[Floats]:
+    """Compute the information of a flat board at each pose (k, 4, 4) mm on all unknowns but the pose itself.
+
+    Returns J (rows, unknowns) of each pose: derivatives of features and samples over their standard deviations, with
+    the pose projected out, so that J.T @ J is the information. Rows of what a device does not see are 0.
+    """
+    at = model.layout
+    starts = np.array([at.height, at.offsets, at.rig, at.camera_field, at.projector_field]) + POSE
+    widths = model.stereo.camera.size[0], model.stereo.projector.size[0]
+    feature_sigma = model.expected.feature * widths[0] / np.sqrt(model.features_per_point)
+    information = []
+    for T, pixels in zip(T_camera_board, model.sample_pixels(T_camera_board), strict=True):
+        sample_sigma = model.expected.sample * widths[1] / np.sqrt(BOARD_SAMPLES / max(len(pixels), 1))
+        R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+        rows = np.zeros((2 * (len(model.points) + len(pixels)), POSE + at.size))
+        pixels = np.ascontiguousarray(pixels)
+        weights = 1.0 / feature_sigma, 1.0 / sample_sigma
+        _fill_rows(model.rig, R, t, model.points, model.frame, pixels, *weights, starts, rows)
+        basis, _ = np.linalg.qr(rows[:, :POSE])
+        by_others = rows[:, POSE:]
+        information.append(by_others - basis @ (basis.T @ by_others))
+    return information
+
+
+@kernel()
+def _fill_rows(rig, R, t, points, frame, pixels, feature_weight, sample_weight, at, rows):
+    """Fill ``rows`` with the weighted derivatives of a board's features (two rows each), then of its sample pixels.
+
+    ``at``: where height, offsets, rig, camera field and projector field begin in a row.
+    """
+    work = allocate_workspace()
+    row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
+    heights, nowhere = np.zeros(HEIGHT_TERMS), np.zeros(2)
+    stride, across = rig.camera.coefficients.shape[2], rig.projector.coefficients.shape[2]
+    knots, others = stride * rig.camera.coefficients.shape[1], across * rig.projector.coefficients.shape[1]
+    for n in range(points.shape[0]):
+        u, _, ci, cj = feature_row(rig, R, t, heights, frame, points[n], nowhere, work, row)
+        if not np.isfinite(u):
+            continue
+        for k in range(2):
+            out = rows[2 * n + k]
+            _copy_dense(out, row[k], feature_weight, at)
+            for c in range(2):
+                out[at[1] + 2 * n + c] = feature_weight * row[k, OFFSET + c]
+            _add_field(out, feature_weight, work.camera_basis, at[3] + k * knots + cj * stride + ci, stride)
+    for n in range(pixels.shape[0]):
+        u, _, ci, cj, pi, pj = sample_row(rig, R, t, heights, frame, pixels[n, 0], pixels[n, 1], work, row, by_field)
+        if not np.isfinite(u):
+            continue
+        for k in range(2):
+            out = rows[2 * (points.shape[0] + n) + k]
+            _copy_dense(out, row[k], sample_weight, at)
+            for c in range(2):
+                start = at[3] + c * knots + cj * stride + ci
+                _add_field(out, sample_weight * by_field[k, c], work.camera_basis, start, stride)
+            _add_field(out, sample_weight, work.projector_basis, at[4] + k * others + pj * across + pi, across)
+
+
+@kernel()
+def _copy_dense(out, row, weight, at):
+    """Copy the weighted derivatives by pose, board height, and the rig's parameters into a full row."""
+    for c in range(HEIGHT):
+        out[c] = weight * row[c]
+    for c in range(HEIGHT_TERMS):
+        out[at[0] + c] = weight * row[HEIGHT + c]
+    for c in range(RIG):
+        out[at[2] + c] = weight * row[OFFSET + 2 + c]
+
+
+@kernel()
+def _add_field(out, weight, basis, start, stride):
+    """Add the weighted values of the 16 splines of one field component to a full row."""
+    for a in range(4):
+        for b in range(4):
+            out[start + a * stride + b] += weight * basis[2, a] * basis[0, b]

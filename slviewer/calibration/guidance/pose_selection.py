@@ -1,61 +1,73 @@
-"""The pose that lowers the predicted sigma over the working volume most, among those that both devices would see."""
+"""Selection of the next pose: the visible one that lowers the predicted sigma over the working volume most."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
-import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from slviewer.calibration.guidance.coarse_rig import GuidanceBench
-from slviewer.calibration.guidance.information import Information, Sensitivity
+from slviewer.calibration.guidance.coarse_rig import GuidanceModel
+from slviewer.calibration.guidance.information import RigInformation, VolumeSensitivity, information_rows
 from slviewer.calibration.next_pose import depth_range
+from slviewer.geometry.rigid import Floats, rigid_transform, rotation_angle
 
 DEPTHS = (0.0, 0.2, 0.45, 0.75, 1.1, 1.45)
-"""Where boards may be held, from nearest (0) over farthest (1) to beyond it, for the sake of what lies behind."""
+"""Candidate depths, from nearest (0) to farthest (1) recommended depth, and beyond it."""
 TILTS_DEG = ((0, 0), (16, 0), (-16, 0), (0, 16), (0, -16), (22, 22), (22, -22), (-22, 22), (-22, -22), (32, 0),
              (-32, 0), (0, 32), (0, -32))  # fmt: skip
-"""About x and y."""
+"""Candidate tilts about x and y."""
 DIRECTIONS = tuple((x, y) for x, y in product((-1.0, 0.0, 1.0), repeat=2))
-"""The image's corners, edges and middle: a board goes as far there as it stays in view."""
-_OFFSETS = 15  # places along each side that are tried
+"""Directions from the image's centre in which the farthest visible pose is a candidate; (0, 0): the most central."""
+_OFFSETS = 15  # positions along each side of the image that are tested for visibility
 TRIALS = 56
-"""Poses whose gain is computed, drawn from all; and near the best of them a fifth as many again."""
+"""Number of randomly drawn candidates whose gain is computed; a fifth as many more near the best of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Guidance:
-    """The best poses T_camera_board (k, 4, 4), the best first; the predicted 3D sigma mm (RMS over the volume) with the
-    poses had, and with the best one more."""
+    """Recommended poses: T_camera_board (k, 4, 4) mm, the best first.
+
+    ``sigma_mm``: predicted 3D standard deviation (RMS over the volume) from the poses so far; ``sigma_next_mm``: with
+    the best pose added.
+    """
 
     poses: np.ndarray
     sigma_mm: float
     sigma_next_mm: float
 
 
-def suggest_poses(bench: GuidanceBench, poses: Sequence[np.ndarray]) -> Guidance | None:
-    """What to capture after ``poses`` T_camera_board (4, 4); None where no pose is in view of both devices."""
-    candidates = candidate_poses(bench)
+def suggest_poses(model: GuidanceModel, poses: Sequence[Floats]) -> Guidance | None:
+    """Recommend the next poses after ``poses``, T_camera_board (4, 4) mm each; None where no pose is visible."""
+    candidates = list_candidate_poses(model)
     if not len(candidates):
         return None
-    sight = Sensitivity.from_bench(bench, depth_range(bench.board, bench.stereo.camera))
-    information = Information.from_rows(bench, bench.rows(np.reshape(poses, (-1, 4, 4))), sight)
-    rng = np.random.default_rng(len(poses))
-    tried = rng.permutation(len(candidates))[:TRIALS]
-    gains = dict(zip(tried.tolist(), map(information.gain, bench.rows(candidates[tried])), strict=True))
+    sensitivity = VolumeSensitivity.from_model(model, depth_range(model.board, model.stereo.camera))
+    rows = information_rows(model, np.reshape(poses, (-1, 4, 4)))
+    information = RigInformation.from_rows(model, rows, sensitivity)
+
+    def compute_gains(indices: list[int]) -> dict[int, float]:
+        """Return the gain of each of these candidates by its index."""
+        return {
+            i: information.gain(rows)
+            for i, rows in zip(indices, information_rows(model, candidates[indices]), strict=True)
+        }
+
+    gains = compute_gains(np.random.default_rng(len(poses)).permutation(len(candidates))[:TRIALS].tolist())
     best = max(gains, key=lambda i: gains[i])
     nearest = np.argsort([_pose_distance(candidates[best], T) for T in candidates])[: TRIALS // 5]
-    more = [i for i in nearest.tolist() if i not in gains]
-    gains |= dict(zip(more, map(information.gain, bench.rows(candidates[more])), strict=True))
+    gains |= compute_gains([i for i in nearest.tolist() if i not in gains])
     order = sorted(gains, key=lambda i: -gains[i])
-    left = max(float(information.variances.mean()) - gains[order[0]], 0.0)
-    return Guidance(candidates[order], information.sigma_mm, float(np.sqrt(left)))
+    next_variance = max(float(information.variances.mean()) - gains[order[0]], 0.0)
+    return Guidance(candidates[order], information.sigma_mm, float(np.sqrt(next_variance)))
 
 
-def candidate_poses(bench: GuidanceBench) -> np.ndarray:
-    """(k, 4, 4): poses at several depths and tilts, each in the middle of what both devices see and as far towards its
-    corners and edges as keeps the board in view."""
-    camera, board = bench.stereo.camera, bench.board
+def list_candidate_poses(model: GuidanceModel) -> Floats:
+    """Return visible poses T_camera_board (k, 4, 4) mm at several depths and tilts.
+
+    At each depth and tilt: the most central pose, and the farthest visible ones towards the image's corners and edges.
+    """
+    camera, board = model.stereo.camera, model.board
     near, far = depth_range(board, camera)
     middle = (board.points.min(0) + board.points.max(0)) / 2
     width, height = camera.size
@@ -65,28 +77,31 @@ def candidate_poses(bench: GuidanceBench) -> np.ndarray:
         [(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1], np.ones(u.size)]
     )
     places = 2 * np.column_stack([u / (width - 1), v / (height - 1)]) - 1
-    held = list(product(DEPTHS, TILTS_DEG))
-    R = np.array([cv2.Rodrigues(np.radians(np.array([*tilt, 0.0])))[0] for _, tilt in held])
-    depths = near + (far - near) * np.array([share for share, _ in held])
-    T = np.tile(np.eye(4), (len(held), len(rays), 1, 1))
-    T[..., :3, :3] = R[:, None]
-    T[..., :3, 3] = depths[:, None, None] * rays - (R @ middle)[:, None]
-    found = []
-    for each, seen in zip(T, bench.in_view(T.reshape(-1, 4, 4)).reshape(T.shape[:2]), strict=True):
-        if seen.any():
-            found.append(each[seen][_select_spread(places[seen])])
-    return np.concatenate(found) if found else np.zeros((0, 4, 4))
+    attitudes = list(product(DEPTHS, TILTS_DEG))
+    R = Rotation.from_rotvec([(*tilt, 0.0) for _, tilt in attitudes], degrees=True).as_matrix()
+    depths = near + (far - near) * np.array([share for share, _ in attitudes])
+    t = depths[:, None, None] * rays - (R @ middle)[:, None]
+    T = rigid_transform(np.broadcast_to(R[:, None], (*t.shape, 3)), t)
+    candidates = [np.zeros((0, 4, 4))]
+    for poses, visible in zip(T, model.is_visible(T.reshape(-1, 4, 4)).reshape(T.shape[:2]), strict=True):
+        if visible.any():
+            candidates.append(poses[visible][_select_extremes(places[visible])])
+    return np.concatenate(candidates)
 
 
-def _select_spread(places: np.ndarray) -> list[int]:
-    """Which of the places (n, 2) lie farthest towards each of `DIRECTIONS`; the middle is theirs."""
-    inward = 0.01 * (places**2).sum(1)
-    off = ((places - (places.min(0) + places.max(0)) / 2) ** 2).sum(1)
-    return sorted({int(np.argmax(places @ np.array(to) - inward) if any(to) else np.argmin(off)) for to in DIRECTIONS})
+def _select_extremes(places: Floats) -> list[int]:
+    """Return the indices of the places (n, 2), in image units of -1 to 1, farthest in each of ``DIRECTIONS``.
+
+    For direction (0, 0): the place nearest to the centre of their bounding box.
+    """
+    penalty = 0.01 * (places**2).sum(1)  # of two equally far places the more central one
+    off_centre = ((places - (places.min(0) + places.max(0)) / 2) ** 2).sum(1)
+    return sorted(
+        {int(np.argmax(places @ np.array(d) - penalty) if any(d) else np.argmin(off_centre)) for d in DIRECTIONS}
+    )
 
 
-def _pose_distance(one: np.ndarray, other: np.ndarray) -> float:
-    """How different two poses are: a tenth of the distance counts like 15 degrees."""
-    shift = float(np.linalg.norm(one[:3, 3] - other[:3, 3])) / (0.1 * one[2, 3])
-    turn = float(np.arccos(np.clip((np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2, -1, 1)))
-    return shift + turn / np.radians(15)
+def _pose_distance(T: Floats, other: Floats) -> float:
+    """Return a distance of two poses (4, 4): translation over a tenth of the depth, plus rotation over 15 degrees."""
+    translation = float(np.linalg.norm(T[:3, 3] - other[:3, 3])) / (0.1 * T[2, 3])
+    return translation + float(rotation_angle(T[:3, :3].T @ other[:3, :3])) / np.radians(15)

@@ -34,7 +34,7 @@ class PoseData(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Room for one thread."""
+    """Buffers of one thread for the kernels of ``residuals``."""
 
     camera_basis: np.ndarray
     projector_basis: np.ndarray
@@ -50,7 +50,8 @@ class Workspace(NamedTuple):
 
 
 @kernel()
-def _allocate_workspace():
+def allocate_workspace():
+    """Return a workspace of zeros."""
     return Workspace(
         np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((2, 3)), np.zeros((2, 9)), np.zeros((2, 9)), np.zeros((2, 2)),
         np.zeros((3, HEIGHT_TERMS)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
@@ -102,7 +103,7 @@ def _split_poses(poses: int) -> list[np.ndarray]:
 
 @kernel()
 def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
-    work = _allocate_workspace()
+    work = allocate_workspace()
     row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
     for i in poses:
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
@@ -117,7 +118,7 @@ def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
 
 @kernel()
 def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_w, sample_w, at, poses, A, b):
-    work = _allocate_workspace()
+    work = allocate_workspace()
     row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
     columns = np.empty(DENSE, np.int64)  # of a row's entries, in the order of the vector
     for c in range(HEIGHT_TERMS):
