@@ -67,7 +67,7 @@ def search_start(
         if best.rms_mm <= good and best.overlap >= GOOD_OVERLAP:
             break
     if best is None and isinstance(refusal, Refused):
-        raise refusal.about(
+        raise refusal.with_context(
             "The scan was not found on the nominal model: see that it shows this part, at this size, and that little "
             "else is in view. One of the tries ended so:"
         )

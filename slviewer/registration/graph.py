@@ -1,4 +1,4 @@
-"""Many scans as a graph: scans are nodes, registered pairs are edges, and loops say how well these fit together."""
+"""Pose graph: scans are nodes, registered pairs are edges; initial poses, loop gaps, and optimisation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,16 +10,21 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
+from slviewer.geometry.rigid import move_points, rigid_transform
 from slviewer.registration.refine import Uncertainty
 
 _FLOOR_MM, _FLOOR_DEG = 0.003, 0.002
-"""What calibrations and gates leave of an edge, however many points it has."""
+"""Least standard deviation of an edge, however many points it has."""
+_LEVER_MM = 100.0
+"""Length that converts angles to mm, so that all unknowns are of one scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """``T`` (4, 4) maps scan ``scan`` into the frame of scan ``onto``; ``covariance`` (6, 6) of a small rotation (rad)
-    about ``centre`` (3,) mm and a shift (mm) there, in that frame."""
+    """A registered pair: ``T`` (4, 4) mm maps points of node ``scan`` into the frame of node ``onto``.
+
+    ``covariance`` (6, 6): of a small rotation (rad) about ``centre`` (3,) mm and a translation (mm), in that frame.
+    """
 
     scan: int
     onto: int
@@ -29,14 +34,14 @@ class Edge:
 
     @property
     def variance(self) -> float:
-        """Of the shift at the centre, mm squared, with what the rotation adds at 100 mm."""
-        total = np.trace(self.covariance[3:, 3:]) + 1e4 * np.trace(self.covariance[:3, :3])
-        return float(total + _FLOOR_MM**2 + (100 * np.radians(_FLOOR_DEG)) ** 2)
+        """Variance in mm^2 of the translation plus that of the rotation at a lever of 100 mm."""
+        total = np.trace(self.covariance[3:, 3:]) + _LEVER_MM**2 * np.trace(self.covariance[:3, :3])
+        return float(total + _FLOOR_MM**2 + (_LEVER_MM * np.radians(_FLOOR_DEG)) ** 2)
 
 
 @dataclass(frozen=True)
 class LoopGap:
-    """What is left where a loop should close: mm at the middle of the overlap, degrees, and expected mm."""
+    """The gap of a loop: translation at the middle of the overlap, rotation, and the expected translation."""
 
     shift_mm: float
     turn_deg: float
@@ -46,14 +51,17 @@ class LoopGap:
 def spanning_poses(
     nodes: int, edges: Sequence[Edge], root: int, costs: np.ndarray | None = None
 ) -> tuple[np.ndarray, list[int]]:
-    """Each node's pose (nodes, 4, 4) in the root's frame along the surest edges, NaN where none leads; and for each
-    node the index of the edge that leads to it, -1 for none. ``costs`` replace the edges' variances."""
+    """Compute poses along the tree of shortest paths from the root, by the edges' variances or the given ``costs``.
+
+    Returns T_root_node (nodes, 4, 4) mm, NaN for unconnected nodes, and the index of the tree's edge that leads to each
+    node, -1 for the root and unconnected ones.
+    """
     costs = np.array([edge.variance for edge in edges]) if costs is None else costs
     poses = np.full((nodes, 4, 4), np.nan)
     poses[root] = np.eye(4)
-    by = [-1] * nodes
+    tree = [-1] * nodes
     if not edges:
-        return poses, by
+        return poses, tree
     best: dict[tuple[int, int], int] = {}
     for k, edge in enumerate(edges):
         key = min(edge.scan, edge.onto), max(edge.scan, edge.onto)
@@ -66,57 +74,55 @@ def spanning_poses(
     for node in np.argsort(distance):
         if node == root or not np.isfinite(distance[node]):
             continue
-        one, other = int(node), int(before[node])
-        k = best[min(one, other), max(one, other)]
-        step = edges[k].T if edges[k].scan == one else np.linalg.inv(edges[k].T)
-        poses[one], by[one] = poses[other] @ step, k
-    return poses, by
+        child, parent = int(node), int(before[node])
+        k = best[min(child, parent), max(child, parent)]
+        step = edges[k].T if edges[k].scan == child else np.linalg.inv(edges[k].T)
+        poses[child], tree[child] = poses[parent] @ step, k
+    return poses, tree
 
 
 def loop_gap(edge: Edge, poses: np.ndarray, expected_mm: float = float("nan")) -> LoopGap:
-    """How far an edge is from where the poses put its scan."""
-    residual = residuals([edge], poses)[0]
+    """Return the gap between an edge and the relative pose of its nodes by ``poses`` (n, 4, 4)."""
+    residual = edge_residuals([edge], poses)[0]
     return LoopGap(float(np.linalg.norm(residual[3:])), float(np.degrees(np.linalg.norm(residual[:3]))), expected_mm)
 
 
-def loop_of(edge: Edge, edges: Sequence[Edge], by: Sequence[int]) -> list[int]:
-    """The nodes round the loop that an edge closes over the tree, its own ends first and last."""
+def loop_nodes(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> list[int]:
+    """Return the nodes of the loop that an edge closes with the ``tree`` of ``spanning_poses``, from end to end."""
 
-    def to_root(node: int) -> list[int]:
-        way = [node]
-        while by[way[-1]] >= 0:
-            step = edges[by[way[-1]]]
-            way.append(step.onto if step.scan == way[-1] else step.scan)
-        return way
+    def path_to_root(node: int) -> list[int]:
+        """Return the nodes from a node to the root, both included."""
+        path = [node]
+        while tree[path[-1]] >= 0:
+            step = edges[tree[path[-1]]]
+            path.append(step.onto if step.scan == path[-1] else step.scan)
+        return path
 
-    one, other = to_root(edge.scan), to_root(edge.onto)
-    while len(one) > 1 and len(other) > 1 and one[-2] == other[-2]:
-        one.pop(), other.pop()
-    return one + other[-2::-1]
-
-
-def expected_mm(edge: Edge, edges: Sequence[Edge], by: Sequence[int]) -> float:
-    """Expected gap of the loop that an edge closes, mm, from the variances round it."""
-    loop = loop_of(edge, edges, by)
-    pairs = {frozenset(pair) for pair in pairwise(loop)}
-    steps = [edges[k].variance for k in by if k >= 0 and frozenset((edges[k].scan, edges[k].onto)) in pairs]
-    return float(np.sqrt(sum(steps) + edge.variance))
+    first, second = path_to_root(edge.scan), path_to_root(edge.onto)
+    while len(first) > 1 and len(second) > 1 and first[-2] == second[-2]:
+        first.pop(), second.pop()
+    return first + second[-2::-1]
 
 
-_LEVER_MM = 100.0
-"""Unknown turns are counted in mm at so many mm, so that all unknowns are alike."""
+def expected_gap_mm(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> float:
+    """Return the expected gap in mm of the loop that an edge closes, from the variances of its edges."""
+    pairs = {frozenset(pair) for pair in pairwise(loop_nodes(edge, edges, tree))}
+    variances = [edges[k].variance for k in tree if k >= 0 and frozenset((edges[k].scan, edges[k].onto)) in pairs]
+    return float(np.sqrt(sum(variances) + edge.variance))
 
 
 def optimise_poses(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray:
-    """The poses (n, 4, 4) in the root's frame that all edges together make most likely, from poses near by."""
-    moved, cost, _ = _problem(poses, edges, root)
-    return moved(least_squares(cost, np.zeros(6 * (len(poses) - 1)), x_scale="jac").x)
+    """Optimise approximate poses T_root_node (n, 4, 4) mm by weighted least squares over all edges."""
+    apply_step, cost, _ = _build_problem(poses, edges, root)
+    return apply_step(least_squares(cost, np.zeros(6 * (len(poses) - 1)), x_scale="jac").x)
 
 
 def pose_uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> list[Uncertainty]:
-    """How sure each pose (n, 4, 4) in the root's frame is by all edges together, at the middle of what they share: the
-    farther from the root, the less. The root's own is 0."""
-    _, cost, middle = _problem(poses, edges, root)
+    """Return the uncertainty of each optimised pose T_root_node (n, 4, 4), at the mean of the edges' centres.
+
+    It grows with the distance from the root along the graph; the root's own is 0.
+    """
+    _, cost, middle = _build_problem(poses, edges, root)
     steps = np.eye(6 * (len(poses) - 1)) * 1e-3
     J = np.stack([(cost(step) - cost(-step)) / 2e-3 for step in steps], axis=1)
     unit = np.repeat([1 / _LEVER_MM, 1.0], 3)
@@ -126,40 +132,39 @@ def pose_uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> l
     return [Uncertainty(block, middle) for block in blocks]
 
 
-def _problem(
+def _build_problem(
     poses: np.ndarray, edges: Sequence[Edge], root: int
 ) -> tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray], np.ndarray]:
-    """Of the unknowns x (6 (n - 1),), a turn and a shift about a middle (3,) for every pose but the root's: the poses
-    moved so, the edges' residuals then, in standard deviations; and the middle."""
+    """Return the least-squares problem of the poses T_root_node (n, 4, 4): (apply_step, cost, middle).
+
+    Its unknowns x (6 (n - 1),) are a rotation (in mm at the lever) and a translation about ``middle`` (3,) mm for each
+    node but the root. ``apply_step(x)`` returns the moved poses, ``cost(x)`` the edges' residuals in sigmas.
+    """
     free = [node for node in range(len(poses)) if node != root]
-    roots = []
-    for edge in edges:
-        whole = edge.covariance + np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_MM**2] * 3)
-        roots.append(np.linalg.inv(np.linalg.cholesky(whole)))
-    middle = np.mean([(poses[edge.onto] @ np.append(edge.centre, 1.0))[:3] for edge in edges], axis=0)
+    floor = np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_MM**2] * 3)
+    whitening = np.linalg.inv(np.linalg.cholesky(np.array([edge.covariance for edge in edges]) + floor))
+    middle = np.mean([move_points(poses[edge.onto], edge.centre[None])[0] for edge in edges], axis=0)
 
-    def moved(x: np.ndarray) -> np.ndarray:
-        turn, shift = x.reshape(-1, 2, 3).transpose(1, 0, 2)
-        M = np.tile(np.eye(4), (len(free), 1, 1))
-        M[:, :3, :3] = Rotation.from_rotvec(turn / _LEVER_MM).as_matrix()
-        M[:, :3, 3] = shift + middle - M[:, :3, :3] @ middle
-        out = poses.copy()
-        out[free] = M @ poses[free]
-        return out
-
-    whiten = np.array(roots)
+    def apply_step(x: np.ndarray) -> np.ndarray:
+        """Return the poses (n, 4, 4) moved by the unknowns."""
+        rotation, translation = x.reshape(-1, 2, 3).transpose(1, 0, 2)
+        R = Rotation.from_rotvec(rotation / _LEVER_MM).as_matrix()
+        moved = poses.copy()
+        moved[free] = rigid_transform(R, translation + middle - R @ middle) @ poses[free]
+        return moved
 
     def cost(x: np.ndarray) -> np.ndarray:
-        return np.asarray(np.einsum("kij,kj->ki", whiten, residuals(edges, moved(x))).ravel())
+        """Return the whitened residuals (6 m,) of the edges."""
+        return np.asarray(np.einsum("kij,kj->ki", whitening, edge_residuals(edges, apply_step(x))).ravel())
 
-    return moved, cost, middle
+    return apply_step, cost, middle
 
 
-def residuals(edges: Sequence[Edge], poses: np.ndarray) -> np.ndarray:
-    """(n, 6): rotation (rad) and shift (mm) at the centre from each edge to where the poses put its scan."""
+def edge_residuals(edges: Sequence[Edge], poses: np.ndarray) -> np.ndarray:
+    """Return (m, 6): rotation (rad) and translation (mm, at the edge's centre) from each edge to the poses' own."""
     scans, ontos = [edge.scan for edge in edges], [edge.onto for edge in edges]
-    there = np.linalg.inv(poses[ontos]) @ poses[scans]
-    D = there @ np.linalg.inv(np.array([edge.T for edge in edges]))
+    relative = np.linalg.inv(poses[ontos]) @ poses[scans]
+    D = relative @ np.linalg.inv(np.array([edge.T for edge in edges]))
     centres = np.array([edge.centre for edge in edges])
     shift = np.einsum("kij,kj->ki", D[:, :3, :3], centres) + D[:, :3, 3] - centres
     return np.hstack([Rotation.from_matrix(D[:, :3, :3]).as_rotvec(), shift])

@@ -1,8 +1,8 @@
-"""Many scans of one object brought into the frame of one of them: pairs, loops, and what contradicts them.
+"""Multiway registration: bring many scans of one object into the frame of one of them.
 
-Scans that follow one another are expected to overlap, and the last one with the first; where they do not, every other
-pair that could join what is apart is tried. Once every scan has a place, pairs that must overlap there are registered
-too: they close loops. A pair that the others contradict is dropped; the rest is adjusted together.
+Consecutive scans are expected to overlap, and the last one with the first; where they do not, every other pair that
+could connect the pose graph is tried. Once all scans are connected, further pairs that overlap at the estimated poses
+are registered, which close loops. Pairs that contradict the others are dropped; the poses are then optimised together.
 """
 
 import os
@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration import graph
 from slviewer.registration.consistency import select_consistent_edges
@@ -28,24 +29,28 @@ from slviewer.registration.scan import Scan
 from slviewer.registration.start import Candidate, Start
 from slviewer.registration.turntable import TurntableAxis, fit_turntable_axis
 
-Given = TypeVar("Given")
-Made = TypeVar("Made")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 Pair = tuple[str, str]
-"""A scan, and the one that it lies on."""
+"""Names of a scan and of the scan whose frame it is registered to."""
 
 MOST_SCANS = 255
 ALL_PAIRS = 4
-"""So few scans are registered each with every other."""
-_MORE_PAIRS = 2
-"""For each scan, at most, once its place is known."""
-_OVERLAPPING = 0.3
+"""Up to this number of scans, every pair is registered."""
+_LOOP_PAIRS = 2
+"""Largest number of loop-closing pairs per scan."""
+_LOOP_OVERLAP = 0.3
+"""Least predicted overlap of a loop-closing pair."""
 
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """Where to start from. ``poses`` (4, 4) by name are last poses: where each scan lies in any one frame (identity for
-    scans that were registered before). ``step_deg`` is a turntable's angle from each scan to the next, ``axis`` its
-    axis, found from the first pairs where it is None. ``picked`` starts, by pair. Where nothing is given: features."""
+    """Initial alignments of a multiway registration; by features where nothing is given.
+
+    ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame. ``step_deg``: a turntable's angle from
+    each scan to the next; ``axis``: its axis, None to estimate it from the first pairs. ``picked``: initial poses from
+    picked points, by pair.
+    """
 
     poses: Mapping[str, np.ndarray] | None = None
     step_deg: float | None = None
@@ -55,8 +60,10 @@ class Starts:
 
 @dataclass(frozen=True)
 class Loop:
-    """Round ``names``, and from the last to the first, the pairs should lead back to where they began; ``before`` the
-    adjustment and ``after``."""
+    """A loop of the pose graph through the scans ``names`` and back to the first, with its gap.
+
+    ``before``, ``after``: the gap before and after the poses were optimised.
+    """
 
     names: tuple[str, ...]
     before: LoopGap
@@ -65,12 +72,11 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where every scan lies.
+    """Result of a multiway registration.
 
-    ``T_reference_scan`` (4, 4) by name, into the frame of ``reference``, and how sure each is (``uncertainties``), by
-    all that lies between the two. ``pairs``: the registrations that it was made from; ``loops`` that they close, the
-    worst first. ``dropped``: pairs that registered and that the others contradict, and ``refused`` ones that did not
-    register, each with why.
+    ``T_reference_scan`` (4, 4) mm by name, into the frame of ``reference``, with ``uncertainties``. ``pairs``: the
+    registrations from which it was computed; ``loops`` of them, the one with the largest gap first. ``dropped``: pairs
+    that the others contradict; ``refused``: pairs that could not be registered; each with the reason.
     """
 
     reference: str
@@ -82,16 +88,20 @@ class Alignment:
     refused: Mapping[Pair, str]
 
     def on_reference(self) -> dict[str, Registration]:
-        """For every scan but the reference: its pose in the reference's frame, after the adjustment, with the
-        uncertainty of that; the other figures are those of the surest pair that it is part of, that with the reference
-        itself where there is one."""
-        found = {}
+        """Return a registration onto the reference for every other scan, with its optimised pose and uncertainty.
+
+        The remaining figures are those of the pair with the reference where there is one, else of the scan's pair with
+        the smallest uncertainty.
+        """
+        registrations = {}
         for name, T in self.T_reference_scan.items():
             if name != self.reference:
                 own = [pair for pair in self.pairs if name in pair]
                 best = min(own, key=lambda p: (self.reference not in p, self.pairs[p].uncertainty.shift_mm))
-                found[name] = replace(self.pairs[best], T_reference_scan=T, uncertainty=self.uncertainties[name])
-        return found
+                registrations[name] = replace(
+                    self.pairs[best], T_reference_scan=T, uncertainty=self.uncertainties[name]
+                )
+        return registrations
 
 
 def register_all(
@@ -100,23 +110,22 @@ def register_all(
     starts: Starts | None = None,
     progress: Progress | None = None,
 ) -> Alignment:
-    """Bring 2 to 255 scans, in the order in which they were taken, into the frame of the one called ``reference``.
+    """Register 2 to 255 scans, by name in the order of capture, into the frame of the one called ``reference``.
 
-    ``progress`` receives the share of the work done, 0 to 1, and may raise to cancel.
+    ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
 
-    Raises ``InputError`` for an unknown reference or too few scans, and ``Refused``, naming the scans, where one hangs
-    on nothing or where pairs contradict one another and nothing tells which is wrong.
+    Raises ``InputError`` for an unknown reference or too few scans, and ``Refused``, naming the scans, where a scan
+    cannot be connected to the reference or where it is undecidable which of contradicting pairs are wrong.
     """
     if reference not in scans:
         raise InputError(f"There is no scan called {reference!r}: choose the reference among {', '.join(scans)}.")
     if not 2 <= len(scans) <= MOST_SCANS:
         raise InputError(f"{len(scans)} scan(s) given: registering takes 2 to {MOST_SCANS} scans of one object.")
-    work = _Work(scans, reference, starts or Starts(), progress or (lambda share: None))
-    return work.done()
+    return _PoseGraphBuilder(scans, reference, starts or Starts(), progress or (lambda share: None)).build()
 
 
 def _check_trusted(name: str, scan: Scan) -> None:
-    """Raises InputError, with what becomes of its points, where too few of a scan can be used."""
+    """Raise InputError where too few points of a scan are away from edges, so that a registration would fail later."""
     if scan.trusted is None or np.count_nonzero(scan.trusted) >= LEAST_POINTS or len(scan.points) < LEAST_POINTS:
         return
     raise InputError(
@@ -126,34 +135,36 @@ def _check_trusted(name: str, scan: Scan) -> None:
     )
 
 
-class _Work:
-    """One call of ``register_all``: what was tried so far."""
+class _PoseGraphBuilder:
+    """Builds the pose graph of one call of ``register_all``, pair by pair, and optimises it."""
 
-    def __init__(self, scans: Mapping[str, Scan | Cloud], reference: str, starts: Starts, say: Progress) -> None:
-        self.names, self.reference, self.starts, self._progress = list(scans), reference, starts, say
-        self._share, self._saying = 0.0, Lock()
+    def __init__(self, scans: Mapping[str, Scan | Cloud], reference: str, starts: Starts, progress: Progress) -> None:
+        self.names, self.reference, self.starts, self._progress = list(scans), reference, starts, progress
+        self._share, self._progress_lock = 0.0, Lock()
         self.root = self.names.index(reference)
-        self.found: dict[Pair, Registration] = {}
+        self.registered: dict[Pair, Registration] = {}
         self.refused: dict[Pair, Refused] = {}
-        self.say(0.0)
-        self.scans = _side_by_side(self._ready, list(scans.items()))
+        self._report(0.0)
+        self.scans = _map_parallel(self._prepare, list(scans.items()))
         self.size = min(scan.size for scan in self.scans)
-        self.expected = len(self._first_pairs()) + (_MORE_PAIRS * len(scans) if len(scans) > ALL_PAIRS else 0)
+        self.expected = len(self._list_first_pairs()) + (_LOOP_PAIRS * len(scans) if len(scans) > ALL_PAIRS else 0)
 
-    def done(self) -> Alignment:
+    def build(self) -> Alignment:
+        """Register pairs until all scans are connected, close loops, and optimise the poses."""
         for pair, start in (self.starts.picked or {}).items():
-            self._try(*pair, start)
-        known = self._known_poses()
-        self._try_each([(pair, self._start(known, *pair)) for pair in self._first_pairs()])
-        self._join()
-        poses = self._tree()[0]
+            self._register(pair, start)
+        known = self._initial_poses()
+        self._register_all([(pair, self._relative_pose(known, *pair)) for pair in self._list_first_pairs()])
+        self._connect()
+        poses = self._spanning_poses()[0]
         if len(self.names) > ALL_PAIRS:
             self._close_loops(poses)
-        return self._adjusted()
+        return self._optimise()
 
-    # which pairs, and from where
+    # selection of pairs and of their initial poses
 
-    def _first_pairs(self) -> list[Pair]:
+    def _list_first_pairs(self) -> list[Pair]:
+        """List every pair of a few scans, or each scan with the one before it and the last with the first."""
         names = self.names
         if len(names) <= ALL_PAIRS:
             pairs = [(a, b) for i, a in enumerate(names) for b in names[:i]]
@@ -161,22 +172,22 @@ class _Work:
             pairs = [(b, a) for a, b in pairwise(names)] + [(names[-1], names[0])]
         return [(b, a) if a == self.reference else (a, b) for a, b in pairs]
 
-    def _known_poses(self) -> dict[str, tuple[np.ndarray, Start]]:
-        """Where scans lie in a frame of their own, as far as it is known before any search."""
+    def _initial_poses(self) -> dict[str, tuple[np.ndarray, Start]]:
+        """Return T_world_scan (4, 4) mm by name from given poses or the turntable, and its origin; {} without these."""
         if self.starts.poses is not None:
             return {name: (np.asarray(T, dtype=np.float64), "initial") for name, T in self.starts.poses.items()}
         step = self.starts.step_deg
         if step is None:
             return {}
-        axis = self.starts.axis or self._axis(step)
-        return {name: (axis.turned(-step * k), "turntable") for k, name in enumerate(self.names)}
+        axis = self.starts.axis or self._estimate_axis(step)
+        return {name: (axis.rotation(-step * k), "turntable") for k, name in enumerate(self.names)}
 
-    def _axis(self, step_deg: float) -> TurntableAxis:
-        """Found from pairs in a row that register without knowing it."""
+    def _estimate_axis(self, step_deg: float) -> TurntableAxis:
+        """Estimate the turntable's axis from the first two consecutive pairs that register by features."""
         steps = []
         for before, name in pairwise(self.names):
-            if (found := self._register(name, before, None)) is not None:
-                steps.append(found.T_reference_scan)
+            if (registration := self._register((name, before))) is not None:
+                steps.append(registration.T_reference_scan)
             if len(steps) == 2:
                 break
         if not steps:
@@ -184,174 +195,191 @@ class _Work:
                           "give the axis, or scan at smaller steps.")  # fmt: skip
         return fit_turntable_axis(steps, step_deg)
 
-    def _start(self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str) -> Candidate | None:
+    def _relative_pose(self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str) -> Candidate | None:
+        """Return the initial pose of a pair from poses in a common frame; None where one of them is not known."""
         if scan not in known or onto not in known:
             return None
         return Candidate(np.linalg.inv(known[onto][0]) @ known[scan][0], known[scan][1])
 
-    def _join(self) -> None:
-        """Try what could join scans that are apart from the reference's, the most promising first."""
-        while lost := [k for k, pose in enumerate(self._tree()[0]) if not np.isfinite(pose).all()]:
-            there = [k for k in range(len(self.names)) if k not in lost]
-            waiting = []
-            for a in lost:
-                for b in there:
+    def _connect(self) -> None:
+        """Register further pairs, the most promising first, until every scan is connected to the reference.
+
+        Raises ``Refused`` where no pair is left to try.
+        """
+        while unconnected := [k for k, T in enumerate(self._spanning_poses()[0]) if not np.isfinite(T).all()]:
+            candidates = []
+            for a in unconnected:
+                for b in sorted(set(range(len(self.names))) - set(unconnected)):
                     pair = self.names[a], self.names[b]
-                    if not {pair, pair[::-1]} & {*self.found, *self.refused}:
-                        begun = search_starts(self.scans[a], self.scans[b], self.size)
-                        waiting.append((begun[0].score if begun else 0.0, pair, begun))
-            for _, pair, begun in sorted(waiting, key=lambda one: -one[0]):
-                if self._try(*pair, None, begun):
+                    if not self._was_tried(pair):
+                        starts = search_starts(self.scans[a], self.scans[b], self.size)
+                        candidates.append((starts[0].score if starts else 0.0, pair, starts))
+            for _, pair, starts in sorted(candidates, key=lambda candidate: -candidate[0]):
+                if self._register(pair, starts=starts):
                     break
             else:
-                raise self._hanging([self.names[k] for k in lost])
-
-    def _hanging(self, lost: list[str]) -> Refused:
-        told = next(error for pair, error in self.refused.items() if set(pair) & set(lost))
-        if len(lost) == 1:
-            return told.about(f"{lost[0]} could not be merged: nothing joins it to {self.reference}.")
-        return told.about(f"{', '.join(lost)} could not be merged: nothing joins them to {self.reference}.")
+                names = [self.names[k] for k in unconnected]
+                error = next(error for pair, error in self.refused.items() if set(pair) & set(names))
+                pronoun = "it" if len(names) == 1 else "them"
+                raise error.with_context(
+                    f"{', '.join(names)} could not be merged: nothing joins {pronoun} to {self.reference}."
+                )
 
     def _close_loops(self, poses: np.ndarray) -> None:
-        """Register pairs that must overlap where the scans lie now."""
-        count = dict.fromkeys(self.names, 0)
-        shares, wanted = [], []
+        """Register the pairs that overlap most at ``poses`` (n, 4, 4), up to a number per scan."""
+        overlaps = []
         for i, a in enumerate(self.names):
             for j, b in enumerate(self.names[:i]):
-                if not {(a, b), (b, a)} & {*self.found, *self.refused}:
-                    self.say(self._share)  # it may raise to cancel
+                if not self._was_tried((a, b)):
+                    self._report(self._share)  # it may raise to cancel
                     T = np.linalg.inv(poses[j]) @ poses[i]
-                    shares.append((_overlap(self.scans[i], self.scans[j], T), (a, b), T))
-        for share, (a, b), T in sorted(shares, key=lambda one: -one[0]):
-            if share < _OVERLAPPING or max(count[a], count[b]) >= _MORE_PAIRS:
-                continue
-            count[a], count[b] = count[a] + 1, count[b] + 1
-            wanted.append(((a, b), Candidate(T, "initial")))
-        self._try_each(wanted)
+                    overlaps.append((_estimate_overlap(self.scans[i], self.scans[j], T), (a, b), T))
+        count, pairs = dict.fromkeys(self.names, 0), []
+        for overlap, (a, b), T in sorted(overlaps, key=lambda entry: -entry[0]):
+            if overlap >= _LOOP_OVERLAP and max(count[a], count[b]) < _LOOP_PAIRS:
+                count[a], count[b] = count[a] + 1, count[b] + 1
+                pairs.append(((a, b), Candidate(T, "initial")))
+        self._register_all(pairs)
 
-    # registering
+    # registration of pairs
 
-    def _ready(self, given: tuple[str, Scan | Cloud]) -> PreparedScan:
-        name, scan = given
+    def _was_tried(self, pair: Pair) -> bool:
+        """Whether a pair, either way round, was registered or refused."""
+        return bool({pair, pair[::-1]} & {*self.registered, *self.refused})
+
+    def _prepare(self, item: tuple[str, Scan | Cloud]) -> PreparedScan:
+        """Prepare a named scan for registration, using only its points away from edges."""
+        name, scan = item
         scan = scan if isinstance(scan, Scan) else Scan.from_cloud(scan)
-        chosen = slice(None) if scan.trusted is None else scan.trusted
+        trusted = slice(None) if scan.trusted is None else scan.trusted
         _check_trusted(name, scan)
-        normals = None if scan.normals is None else scan.normals[chosen]
-        made = prepare_scan(name, scan.points[chosen], normals, scan.sigma_mm)
-        self.say(self._share + 0.2 / len(self.names))
-        return made
+        normals = None if scan.normals is None else scan.normals[trusted]
+        prepared = prepare_scan(name, scan.points[trusted], normals, scan.sigma_mm)
+        self._report(self._share + 0.2 / len(self.names))
+        return prepared
 
-    def _try_each(self, wanted: Sequence[tuple[Pair, Candidate | None]]) -> None:
-        """Register pairs, none of which waits for another, and keep what came in their order."""
-        waiting = [(pair, start) for pair, start in wanted if not {pair, pair[::-1]} & set(self.found)]
-        for (pair, _), result in zip(waiting, _side_by_side(lambda one: self._registered(*one), waiting), strict=True):
-            self._keep(pair, result)
-
-    def _try(self, scan: str, onto: str, start: Candidate | None, begun: list[Candidate] | None = None) -> bool:
-        if (scan, onto) in self.found or (onto, scan) in self.found:
-            return True
-        return self._register(scan, onto, start, begun) is not None
+    def _register_all(self, pairs: Sequence[tuple[Pair, Candidate | None]]) -> None:
+        """Register independent pairs from their initial poses in parallel, and store the results in their order."""
+        pending = [(pair, start) for pair, start in pairs if not {pair, pair[::-1]} & set(self.registered)]
+        results = _map_parallel(lambda item: self._align(*item), pending)
+        for (pair, _), result in zip(pending, results, strict=True):
+            self._store(pair, result)
 
     def _register(
-        self, scan: str, onto: str, start: Candidate | None, begun: list[Candidate] | None = None
+        self, pair: Pair, start: Candidate | None = None, starts: list[Candidate] | None = None
     ) -> Registration | None:
-        return self._keep((scan, onto), self._registered((scan, onto), start, begun))
+        """Register a pair unless it is, and store the result; None where it is refused.
 
-    def _registered(
-        self, pair: Pair, start: Candidate | None, begun: list[Candidate] | None = None
+        ``start``: its initial pose; ``starts``: candidate poses of an earlier search.
+        """
+        done = self.registered.get(pair) or self.registered.get(pair[::-1])
+        return done or self._store(pair, self._align(pair, start, starts))
+
+    def _align(
+        self, pair: Pair, start: Candidate | None, starts: list[Candidate] | None = None
     ) -> Registration | Refused:
-        tried = len(self.found) + len(self.refused)
-        share = 0.2 + 0.7 * min(1.0, tried / (self.expected + 1))
-        one = 0.7 / (self.expected + 1)
+        """Register a pair and return the result or the refusal; may run in several threads."""
+        tried = len(self.registered) + len(self.refused)
+        before = 0.2 + 0.7 * min(1.0, tried / (self.expected + 1))
+        step = 0.7 / (self.expected + 1)
         a, b = (self.scans[self.names.index(name)] for name in pair)
         try:
             return register_prepared(
-                a, b, size=self.size, initial=start, starts=begun, progress=lambda part: self.say(share + one * part)
+                a,
+                b,
+                size=self.size,
+                initial=start,
+                starts=starts,
+                progress=lambda share: self._report(before + step * share),
             )
         except Refused as error:
             return error
 
-    def _keep(self, pair: Pair, result: Registration | Refused) -> Registration | None:
+    def _store(self, pair: Pair, result: Registration | Refused) -> Registration | None:
+        """Store the result of a pair in ``registered`` or ``refused``; return the registration if it is one."""
         if isinstance(result, Refused):
             self.refused[pair] = result
             return None
-        self.found[pair] = result
+        self.registered[pair] = result
         self.refused.pop(pair, None)
         self.refused.pop(pair[::-1], None)
         return result
 
-    def say(self, share: float) -> None:
-        """The share of the work that is done, which never goes back; whoever hears it may raise to cancel."""
-        with self._saying:
+    def _report(self, share: float) -> None:
+        """Report the completed share of the work, never less than before; the receiver may raise to cancel."""
+        with self._progress_lock:
             self._share = max(self._share, share)
             self._progress(self._share)
 
-    # putting together
+    # optimisation
 
     def _edges(self) -> list[Edge]:
+        """Return the registered pairs as edges of the pose graph."""
         return [
             Edge(
-                self.names.index(scan), self.names.index(onto), found.T_reference_scan,
-                found.uncertainty.covariance, found.uncertainty.centre,
+                self.names.index(scan), self.names.index(onto), result.T_reference_scan,
+                result.uncertainty.covariance, result.uncertainty.centre,
             )
-            for (scan, onto), found in self.found.items()
+            for (scan, onto), result in self.registered.items()
         ]  # fmt: skip
 
-    def _tree(self) -> tuple[np.ndarray, list[int]]:
+    def _spanning_poses(self) -> tuple[np.ndarray, list[int]]:
+        """Return ``graph.spanning_poses`` of all registered pairs."""
         return graph.spanning_poses(len(self.names), self._edges(), self.root)
 
-    def _adjusted(self) -> Alignment:
-        self.say(0.92)
-        pairs, edges = list(self.found), self._edges()
-        gates = [self.found[pair].gate_mm for pair in pairs]
-        kept, dropped = select_consistent_edges(len(self.names), edges, self.root, gates, self._fits)
-        told = {
+    def _optimise(self) -> Alignment:
+        """Drop contradicting pairs and optimise the poses of all scans."""
+        self._report(0.92)
+        pairs, edges = list(self.registered), self._edges()
+        gates = [self.registered[pair].gate_mm for pair in pairs]
+        consistent, gaps = select_consistent_edges(len(self.names), edges, self.root, gates, self._is_good_fit)
+        dropped = {
             pairs[k]: f"{pairs[k][0]} -> {pairs[k][1]} contradicts the other pairs by {shift:.1f} mm "
-            f"and {turn:.1f} degrees, and is left out"
-            for k, (shift, turn) in dropped.items()
+            f"and {turn:.1f} degrees, and is excluded"
+            for k, (shift, turn) in gaps.items()
         }
-        edges, pairs = [edges[k] for k in kept], [pairs[k] for k in kept]
-        start, by = graph.spanning_poses(len(self.names), edges, self.root)
+        edges, pairs = [edges[k] for k in consistent], [pairs[k] for k in consistent]
+        start, tree = graph.spanning_poses(len(self.names), edges, self.root)
         poses = graph.optimise_poses(start, edges, self.root) if len(edges) >= len(self.names) else start
         loops = []
         for k, edge in enumerate(edges):
-            if k not in by:
-                expected = graph.expected_mm(edge, edges, by)
-                names = tuple(self.names[node] for node in graph.loop_of(edge, edges, by))
+            if k not in tree:
+                expected = graph.expected_gap_mm(edge, edges, tree)
+                names = tuple(self.names[node] for node in graph.loop_nodes(edge, edges, tree))
                 loops.append(Loop(names, graph.loop_gap(edge, start, expected), graph.loop_gap(edge, poses)))
-        self.say(1.0)
+        self._report(1.0)
         return Alignment(
             self.reference,
             dict(zip(self.names, poses, strict=True)),
             dict(zip(self.names, graph.pose_uncertainties(poses, edges, self.root), strict=True)),
-            {pair: self.found[pair] for pair in pairs},
+            {pair: self.registered[pair] for pair in pairs},
             tuple(sorted(loops, key=lambda loop: -loop.before.shift_mm)),
-            told,
+            dropped,
             {pair: str(error) for pair, error in self.refused.items()},
         )
 
-    def _fits(self, edge: Edge, T: np.ndarray) -> bool:
-        """Whether the two scans of an edge also lie well on each other where ``T`` puts them."""
+    def _is_good_fit(self, edge: Edge, T: np.ndarray) -> bool:
+        """Whether ICP of an edge's scans from the pose ``T`` (4, 4) succeeds and stays within its gate."""
         try:
-            found = register_prepared(
+            result = register_prepared(
                 self.scans[edge.scan], self.scans[edge.onto], size=self.size, initial=Candidate(T, "initial")
             )
         except Refused:
             return False
-        one = replace(edge, T=found.T_reference_scan)
-        left = graph.residuals([replace(one, scan=0, onto=1)], np.stack([T, np.eye(4)]))[0]
-        return bool(np.linalg.norm(left[3:]) < found.gate_mm)
+        refined = replace(edge, T=result.T_reference_scan, scan=0, onto=1)
+        residual = graph.edge_residuals([refined], np.stack([T, np.eye(4)]))[0]
+        return bool(np.linalg.norm(residual[3:]) < result.gate_mm)
 
 
-def _side_by_side(do: Callable[[Given], Made], each: Sequence[Given]) -> list[Made]:
-    """What ``do`` makes of each, in their order; on all cores, for most of it runs outside the interpreter."""
-    with ThreadPoolExecutor(max(1, min(len(each), os.cpu_count() or 1))) as pool:
-        return list(pool.map(do, each))
+def _map_parallel(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Map a function over items in threads on all cores; the results are in the order of the items."""
+    with ThreadPoolExecutor(max(1, min(len(items), os.cpu_count() or 1))) as pool:
+        return list(pool.map(function, items))
 
 
-def _overlap(scan: PreparedScan, reference: PreparedScan, T: np.ndarray) -> float:
-    """Share of the scan that lies on the reference where ``T`` puts it, as far as thinned clouds tell."""
+def _estimate_overlap(scan: PreparedScan, reference: PreparedScan, T: np.ndarray) -> float:
+    """Estimate the share of the scan within a voxel of the reference at the pose ``T`` (4, 4), from thinned clouds."""
     voxel = reference.size / 80.0
     points = np.asarray(scan.thinned(voxel).points)
-    distance, _ = reference.fine_tree.query(points @ T[:3, :3].T + T[:3, 3], distance_upper_bound=voxel)
+    distance, _ = reference.fine_tree.query(move_points(T, points), distance_upper_bound=voxel)
     return float(np.count_nonzero(np.isfinite(distance)) / len(points))

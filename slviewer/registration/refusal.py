@@ -8,17 +8,17 @@ Reason = Literal["overlap", "disagree", "plane", "sphere", "cylinder", "slides",
 
 
 class Refused(SlviewerError):
-    """A registration that cannot be trusted, with its ``reason``.
+    """A refused registration, with its ``reason``.
 
-    overlap: too little of the surface is shared; disagree: no pose brings the surfaces together; plane, sphere,
-    cylinder, slides (one direction), turns (one axis): the shared shape does not hold the pose; ambiguous: two poses
-    fit alike; picks: picked points that fix no pose or contradict one another.
+    overlap: the overlap is too small; disagree: the surfaces agree at no pose; plane, sphere, cylinder, slides (along
+    one direction), turns (about one axis): the shared shape leaves the pose undetermined; ambiguous: two poses fit
+    equally well; picks: picked points that determine no pose or contradict one another.
     """
 
     def __init__(self, reason: Reason, message: str) -> None:
         super().__init__(message)
         self.reason: Reason = reason
 
-    def about(self, what: str) -> "Refused":
-        """The same with the scans it is about in front."""
-        return Refused(self.reason, f"{what} {self}")
+    def with_context(self, context: str) -> "Refused":
+        """Return a copy of the error with a sentence put in front of its message."""
+        return Refused(self.reason, f"{context} {self}")

@@ -116,7 +116,7 @@ def turned_scans(count: int, step: float) -> dict[str, Scan]:
         rng = np.random.default_rng(k)
         directions = rng.normal(size=(16_000, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        T = TABLE.turned(step * k)
+        T = TABLE.rotation(step * k)
         normals = directions @ T[:3, :3].T  # nearly: enough to say what the camera sees
         points = (knob(directions) + TABLE.point) @ T[:3, :3].T + T[:3, 3]
         points += rng.normal(0, NOISE, (len(points), 1)) * points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -132,7 +132,7 @@ def turn() -> Alignment:
 
 def test_a_turn_closes(turn: Alignment) -> None:
     for k, T in enumerate(turn.T_reference_scan.values()):
-        shift, deg = off(T, TABLE.turned(60.0 * (2 - k)))
+        shift, deg = off(T, TABLE.rotation(60.0 * (2 - k)))
         assert shift < 0.03 and deg < 0.06
     longest = max(turn.loops, key=lambda loop: len(loop.names))
     assert len(longest.names) > 3
@@ -146,22 +146,22 @@ def test_a_turn_closes(turn: Alignment) -> None:
 
 
 def test_the_axis_is_found_from_two_steps_and_a_wrong_angle_is_told() -> None:
-    steps = [TABLE.turned(-40.0)] * 2
+    steps = [TABLE.rotation(-40.0)] * 2
     axis = fit_turntable_axis(steps, 40.0)
-    np.testing.assert_allclose(axis.turned(25.0), TABLE.turned(25.0), atol=1e-9)
-    np.testing.assert_allclose(fit_turntable_axis(steps, -40.0).turned(-25.0), TABLE.turned(25.0), atol=1e-9)
+    np.testing.assert_allclose(axis.rotation(25.0), TABLE.rotation(25.0), atol=1e-9)
+    np.testing.assert_allclose(fit_turntable_axis(steps, -40.0).rotation(-25.0), TABLE.rotation(25.0), atol=1e-9)
     with pytest.raises(InputError, match=r"40\.0 .*\b30\b"):
         fit_turntable_axis(steps, 30.0)
     for angle in (0.0, 180.0):
         with pytest.raises(InputError, match="axis"):
-            fit_turntable_axis([TABLE.turned(-angle)] * 2, angle)
+            fit_turntable_axis([TABLE.rotation(-angle)] * 2, angle)
 
 
 # contradictions, and what poses are worth, on poses alone
 
 
 def ring(count: int) -> tuple[list[np.ndarray], list[Edge]]:
-    poses = [TABLE.turned(-30.0 * k) for k in range(count)]
+    poses = [TABLE.rotation(-30.0 * k) for k in range(count)]
     covariance = np.diag([1e-10] * 3 + [1e-5] * 3)
     edges = []
     for k in range(count):
