@@ -1,8 +1,8 @@
-"""Which motions the shared shape leaves free: a plane slides, a sphere turns, a cylinder does both.
+"""Degrees of freedom that the shared shape leaves undetermined: a plane slides, a sphere turns, a cylinder does both.
 
-The information matrix of point-to-plane residuals says how fast the surfaces come apart along each of the six
-directions of motion. Noise in the normals would pass for relief and hold a plane in place; so the matrix is made from
-one scan's normals on one side and the other's on the other: their noise is independent, and cancels.
+The eigenvalues of the information matrix of point-to-plane residuals measure how well each of the six motions is
+determined. Noise in the normals would act like relief; so the matrix is the product of one scan's Jacobian with the
+other's, whose noise is independent and cancels.
 """
 
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
+from slviewer.geometry.rigid import move_points
 from slviewer.registration.prepared import PreparedScan
 
 Shape = Literal["plane", "sphere", "cylinder", "slides", "turns"]
@@ -20,20 +21,22 @@ _POINTS = 20_000
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """``slack_mm`` (6,), smallest first: how far the scan would have to move in each principal direction, at the
-    overlap's rim, until the surfaces come apart by the noise; ``motions`` (6, 6): rows of the directions, a rotation
-    and a shift with lengths in units of the overlap's radius."""
+    """Principal motions of a scan on its reference, and how well the shape determines each.
+
+    ``slack_mm`` (6,), ascending: the motion at the overlap's rim that separates the surfaces by the noise (RMS).
+    ``motions`` (6, 6): a rotation and a translation per row, with lengths in units of the overlap's radius.
+    """
 
     slack_mm: np.ndarray
     motions: np.ndarray
 
     @property
     def loosest_mm(self) -> float:
-        """Slack in the loosest direction."""
+        """Slack of the least determined motion."""
         return float(self.slack_mm[-1])
 
     def shape(self, limit_mm: float) -> Shape | None:
-        """What the shape is, judged by its motions of more slack than ``limit_mm``; None where it holds the pose."""
+        """Classify the shape by its motions with more slack than ``limit_mm``; None where all are determined."""
         if not self.loosest_mm > limit_mm:
             return None
         loose = self.motions[self.slack_mm > 0.5 * limit_mm]
@@ -57,17 +60,22 @@ WORDS: dict[Shape, str] = {
 def estimate_freedom(
     scan: PreparedScan, reference: PreparedScan, T: np.ndarray, points: np.ndarray, rms: float
 ) -> Freedom:
-    """What the overlap's ``points`` (n, 3) mm, in the reference's frame, leave free; ``rms`` in mm is the noise."""
+    """Estimate which motions of the scan the overlap leaves undetermined.
+
+    ``T`` (4, 4): T_reference_scan; ``points`` (n, 3) mm: the overlap, in the reference's frame; ``rms``: noise in mm.
+    The slack is inf for fewer than 6 points.
+    """
     if len(points) < 6:
         return Freedom(np.full(6, np.inf), np.eye(6))
     points = points[:: -(-len(points) // _POINTS)]
-    (there, theirs), (here, ours) = reference.smooth, scan.smooth
-    theirs = theirs[cKDTree(there).query(points)[1]]
-    ours = ours[cKDTree(here @ T[:3, :3].T + T[:3, 3]).query(points)[1]] @ T[:3, :3].T
-    ours = np.where(np.sum(ours * theirs, axis=1, keepdims=True) < 0, -ours, ours)
+    (reference_points, reference_normals), (scan_points, scan_normals) = reference.smooth, scan.smooth
+    reference_normals = reference_normals[cKDTree(reference_points).query(points)[1]]
+    scan_normals = scan_normals[cKDTree(move_points(T, scan_points)).query(points)[1]] @ T[:3, :3].T
+    is_opposite = np.sum(scan_normals * reference_normals, axis=1, keepdims=True) < 0
+    scan_normals = np.where(is_opposite, -scan_normals, scan_normals)
     arm = points - points.mean(axis=0)
     arm /= float(np.sqrt(np.mean(np.sum(arm**2, axis=1))))
-    A, B = (np.hstack([np.cross(arm, normal), normal]) for normal in (theirs, ours))
+    A, B = (np.hstack([np.cross(arm, normals), normals]) for normals in (reference_normals, scan_normals))
     information = A.T @ B / len(points)
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     slack = rms / np.sqrt(np.maximum(values, 1e-12))

@@ -1,4 +1,4 @@
-"""The last stage of a registration, and how uncertain it leaves the pose.
+"""Final refinement of a registration by symmetric point-to-plane ICP, and the uncertainty of the pose.
 
 The residual of a pair is its distance along the mean of both normals (Rusinkiewicz, *A symmetric objective function for
 ICP*, 2019): exact where the surface is curved, so that the points' spacing does not show in the pose. The covariance is
@@ -17,22 +17,21 @@ from slviewer.registration.prepared import PreparedScan
 _STEPS = 12
 _SETTLED_MM, _NEAR_MM = 2e-3, 5e-3
 _FIRST_POINTS, _MOST_POINTS = 8_000, 40_000
-_ALIKE = 0.8  # cosine between the normals of a pair
+_MIN_COSINE = 0.8  # between the normals of a pair
+_MIN_PAIRS = 60
 _PATCHES = (16.0, 9.0, 5.0)
-"""Sides of the patches, as shares of the overlap's diameter: the coarsest that leaves enough patches sees the most of
-what is wrong together."""
+"""Diameter of the overlap over the side of a patch: coarser patches include errors of longer correlation length."""
 _LEAST_PATCHES = 20
 _UNSEEN = 1.25
-"""What residuals do not show (pairs that change with the pose, errors of normals): measured against simulated truth."""
+"""Ratio of true to estimated sigma on simulated scans: residuals do not show that pairs change with the pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How far a pose may be off, one standard deviation each.
+    """Uncertainty of a registered pose (1 sigma).
 
-    ``covariance`` (6, 6) of a small rotation vector (rad) about ``centre`` (3,), the middle of the overlap in the
-    reference's frame, and a shift (mm) there. ``shift_mm`` and ``turn_deg``: root of the expected squared length of the
-    shift and of the rotation.
+    ``covariance`` (6, 6): of a small rotation vector (rad) about ``centre`` (3,) mm, the middle of the overlap in the
+    reference's frame, and of the translation (mm) there.
     """
 
     covariance: np.ndarray
@@ -40,19 +39,21 @@ class Uncertainty:
 
     @property
     def shift_mm(self) -> float:
-        """Of the overlap's middle."""
+        """Root of the expected squared translation of the overlap's middle."""
         return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
 
     @property
     def turn_deg(self) -> float:
-        """Of the rotation, whatever its axis."""
+        """Root of the expected squared rotation angle."""
         return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """``T`` (4, 4) maps the scan into the reference's frame; ``gate_mm``: how far apart along their normals a pair's
-    points may lie."""
+    """A refined pose ``T`` (4, 4), T_reference_scan, with its uncertainty, None where it could not be estimated.
+
+    ``gate_mm``: largest distance of a pair along its normal in the last iteration.
+    """
 
     T: np.ndarray
     gate_mm: float
@@ -62,60 +63,70 @@ class RefinedPose:
 def refine_pose(
     scan: PreparedScan, reference: PreparedScan, T: np.ndarray, widest: float, narrowest: float
 ) -> RefinedPose:
-    """Symmetric point-to-plane ICP on the thinned clouds, from a pose that is right within ``widest`` mm.
+    """Refine a pose ``T`` (4, 4) by symmetric point-to-plane ICP on the thinned clouds.
 
-    The gate closes from ``widest`` to three times the residuals' noise, but not below ``narrowest``. Without enough
-    pairs to go by, the pose comes back as it was, and its uncertainty is None.
+    The gate decreases from ``widest`` mm to three times the residuals' noise, not below ``narrowest`` mm. With too few
+    pairs the current pose is returned with the uncertainty None.
     """
     gate, lateral = widest, 2.0 * max(scan.fine_spacing, reference.fine_spacing)
     stride, least = (max(1, len(scan.fine_points) // points) for points in (_FIRST_POINTS, _MOST_POINTS))
     for _ in range(_STEPS):
-        pairs = _pairs(scan, reference, T, gate, lateral, stride)
+        pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
         if pairs is None:
             return RefinedPose(T, gate, None)
-        arm, normal, residual = pairs
-        centre = arm.mean(axis=0)
+        points, normal, residual = pairs
+        centre = points.mean(axis=0)
         sigma = max(robust_sigma(residual, about=0.0), 1e-6)
-        J, weight = _jacobian(arm - centre, normal), tukey_weights(residual, sigma)
+        J, weight = _jacobian(points - centre, normal), tukey_weights(residual, sigma)
         step = -np.linalg.lstsq((J * weight[:, None]).T @ J, J.T @ (weight * residual), rcond=1e-10)[0]
         T = turn_about(step[:3], centre, step[3:]) @ T
-        closed = min(gate, max(3.0 * sigma, narrowest))
-        moved = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.linalg.norm(np.ptp(arm, axis=0))
-        if closed > 0.99 * gate and moved < (_SETTLED_MM if stride == least else _NEAR_MM):
+        next_gate = min(gate, max(3.0 * sigma, narrowest))
+        motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.linalg.norm(np.ptp(points, axis=0))
+        if next_gate > 0.99 * gate and motion < (_SETTLED_MM if stride == least else _NEAR_MM):
             if stride == least:
                 break
-            stride = least  # the last steps are of many more points
-        gate = closed
-    pairs = _pairs(scan, reference, T, gate, lateral, stride)
-    return RefinedPose(T, gate, None if pairs is None else _uncertainty(*pairs))
+            stride = least  # the last iterations use many more points
+        gate = next_gate
+    pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
+    return RefinedPose(T, gate, None if pairs is None else _estimate_uncertainty(*pairs))
 
 
-def _pairs(
-    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, gate: float, lateral: float, stride: int = 1
+def _match_pairs(
+    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, gate: float, lateral: float, stride: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Scan points in the reference's frame (n, 3), the pairs' mean normals (n, 3) and residuals (n,) in mm."""
+    """Match every ``stride``-th point of the scan, moved by ``T`` (4, 4), with the nearest point of the reference.
+
+    Pairs differ by less than ``gate`` mm along their mean normal and ``lateral`` mm across it, and have similar
+    normals. Returns the scan points (n, 3) in the reference's frame, mean normals (n, 3), and residuals (n,) in mm;
+    None for fewer than 60 pairs.
+    """
     points = move_points(T, scan.fine_points[::stride])
     distance, nearest = reference.fine_tree.query(
         points, distance_upper_bound=float(np.hypot(gate, lateral)), workers=-1
     )
     near = np.isfinite(distance)
     points, nearest = points[near], nearest[near]
-    theirs, ours = reference.fine_normals[nearest], scan.fine_normals[::stride][near] @ T[:3, :3].T
-    alike = np.sum(theirs * ours, axis=1) > _ALIKE
+    reference_normals, scan_normals = reference.fine_normals[nearest], scan.fine_normals[::stride][near] @ T[:3, :3].T
+    is_pair = np.sum(reference_normals * scan_normals, axis=1) > _MIN_COSINE
     gap = points - reference.fine_points[nearest]
-    normal = theirs + ours
+    normal = reference_normals + scan_normals
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     residual = np.sum(gap * normal, axis=1)
-    aside = np.sqrt(np.maximum(np.sum(gap**2, axis=1) - residual**2, 0.0))
-    kept = alike & (np.abs(residual) < gate) & (aside < lateral)  # beyond the rim, the nearest lies far aside
-    return (points[kept], normal[kept], residual[kept]) if np.count_nonzero(kept) >= 60 else None
+    across = np.sqrt(np.maximum(np.sum(gap**2, axis=1) - residual**2, 0.0))
+    is_pair &= (np.abs(residual) < gate) & (across < lateral)  # beyond the rim the nearest point is far across
+    return (points[is_pair], normal[is_pair], residual[is_pair]) if np.count_nonzero(is_pair) >= _MIN_PAIRS else None
 
 
 def _jacobian(arm: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return the derivatives (n, 6) of point-to-plane residuals by a small rotation (rad) and translation (mm).
+
+    ``arm`` (n, 3) mm: the points less the centre of rotation.
+    """
     return np.hstack([np.cross(arm, normal), normal])
 
 
-def _uncertainty(points: np.ndarray, normal: np.ndarray, residual: np.ndarray) -> Uncertainty | None:
+def _estimate_uncertainty(points: np.ndarray, normal: np.ndarray, residual: np.ndarray) -> Uncertainty | None:
+    """Estimate the uncertainty of a pose from its pairs by a cluster-robust covariance; None for too few patches."""
     centre = points.mean(axis=0)
     arm = points - centre
     sigma = max(robust_sigma(residual, about=0.0), 1e-6)
@@ -123,23 +134,23 @@ def _uncertainty(points: np.ndarray, normal: np.ndarray, residual: np.ndarray) -
     H = (J * weight[:, None]).T @ J
     gradient = J * (weight * residual)[:, None]
     diameter = 2.0 * float(np.sqrt(np.mean(np.sum(arm**2, axis=1))))
-    found = None
+    largest = None
     for share in _PATCHES:
-        patches = _summed(gradient, arm, diameter / share)
-        if len(patches) < _LEAST_PATCHES and found is not None:
+        patches = _sum_by_cube(gradient, arm, diameter / share)
+        if len(patches) < _LEAST_PATCHES and largest is not None:
             break
         meat = patches.T @ patches * len(patches) / max(len(patches) - 6, 1)
         inverse = np.linalg.pinv(H, rcond=1e-12, hermitian=True)
         covariance = inverse @ meat @ inverse
-        # what is wrong together over more than one patch only shows in the larger ones
-        if found is None or np.trace(covariance[3:, 3:]) > np.trace(found[3:, 3:]):
-            found = covariance
-    return None if found is None else Uncertainty(_UNSEEN**2 * (found + found.T) / 2, centre)
+        # errors that are correlated over more than one patch show in larger patches only
+        if largest is None or np.trace(covariance[3:, 3:]) > np.trace(largest[3:, 3:]):
+            largest = covariance
+    return None if largest is None else Uncertainty(_UNSEEN**2 * (largest + largest.T) / 2, centre)
 
 
-def _summed(values: np.ndarray, places: np.ndarray, side: float) -> np.ndarray:
-    """The sums of ``values`` (n, k) over each cube of ``side`` mm that holds any of the ``places`` (n, 3)."""
-    cell = np.floor(places / side).astype(np.int64)
+def _sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndarray:
+    """Return the sums (m, k) of ``values`` (n, k) over the m occupied cubes of ``side`` mm of ``points`` (n, 3)."""
+    cell = np.floor(points / side).astype(np.int64)
     _, which = np.unique(cell, axis=0, return_inverse=True)
     sums = np.zeros((int(which.max()) + 1, values.shape[1]))
     np.add.at(sums, which.ravel(), values)

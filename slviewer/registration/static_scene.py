@@ -1,8 +1,7 @@
-"""What of several scans stands still while the object moves, and what of them contradicts.
+"""Segmentation of a static background from a moving object in several scans, by free-space violations.
 
-A scan sees along its rays: a point of another scan, carried over by a pose, that lies in front of its surface lies
-where it saw through (a free-space violation). Where an object was turned before a background, the background's points
-contradict under the object's motion, and agree where the scans are laid on each other unmoved.
+A point of another scan that is in front of a scan's surface violates its free space. Where an object was turned before
+a background, the background's points violate free space under the object's motion, and agree without motion.
 """
 
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Alignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d
@@ -21,46 +21,51 @@ from slviewer.registration.prepared import LEAST_POINTS
 from slviewer.registration.refusal import Refused
 
 SIGMAS = 5.0
-"""A point contradicts another scan's surface where it lies so many standard deviations of the pair's own scatter off:
-of a normal distribution, one in two million does."""
+"""A point violates free space where its height exceeds this many standard deviations of the pair's own scatter."""
 LEAST_SHARE = 0.01
-"""Share of a scan's samples from which on a background that stands still is separated; less is scatter."""
+"""Least share of static samples in a scan with a static background; fewer are scatter."""
 LEAST_PART = 0.05
-"""Share of every scan that must agree unmoved for a search of what moved apart from it."""
+"""Least share of every scan that must agree without motion for an initial segmentation."""
 QUARTILE = 0.3186
-"""Of a normal distribution: the absolute value that a quarter stays below, in standard deviations."""
+"""Lower quartile of the absolute value of a normal variable, in standard deviations."""
 ROUNDS = 3
-"""Times that points are assigned to a motion and the object is registered anew, ..."""
+"""Largest number of alternations between segmentation and registration."""
 SETTLED = 0.002
-"""... unless fewer than this share of the pixels changed sides."""
+"""The alternation ends where fewer than this share of the pixels changed."""
 LEAST_SAMPLES = 50
-_FINENESS = 250.0
+_SAMPLES_PER_SIDE = 250.0
 """Samples along the longest side of a scan."""
 _NORMAL_POINTS = 20
-_SLOPE = 0.25
-"""Cosine between a surface's normal and the line of sight below which heights are not compared."""
+_MIN_COSINE = 0.25
+"""Least cosine between a sample's normal and its viewing direction."""
 _NEIGHBOURS = 15
-"""Nearest samples by which one that shows nothing itself is decided."""
+"""Decided samples that vote on an undecided one."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """A scan thinned: ``points`` (n, 3) mm, unit ``normals`` (n, 3) towards the camera, a ``tree`` of its
-    rays (x/z, y/z), the distance ``apart`` (n,) to the fourth nearest of them, the ``own`` tree of the points, and the
-    ``neighbours`` (n, 8) of each."""
+    """A downsampled scan in its camera's frame, with search trees.
+
+    ``points`` (n, 3) mm, unit ``normals`` (n, 3) towards the camera, ``ray_tree`` of the rays (x/z, y/z),
+    ``ray_distance`` (n,) from each ray to the fourth nearest other one, ``point_tree`` of the points, and the indices
+    ``neighbours`` (n, 8) of each point's nearest ones.
+    """
 
     points: np.ndarray
     normals: np.ndarray
-    tree: cKDTree
-    apart: np.ndarray
-    own: cKDTree
+    ray_tree: cKDTree
+    ray_distance: np.ndarray
+    point_tree: cKDTree
     neighbours: np.ndarray
 
 
 @dataclass(frozen=True)
 class SceneContradiction:
-    """Of the samples of two scans that the other's view covers (``compared``), the ``share`` that lies in front of the
-    other's surface by more than ``gate_mm``: it would have had to see them."""
+    """Free-space violations between two scans.
+
+    ``compared``: number of samples in the other scan's view; ``share`` of them that are more than ``gate_mm`` in front
+    of the other scan's surface.
+    """
 
     compared: int
     share: float
@@ -69,10 +74,10 @@ class SceneContradiction:
 
 @dataclass(frozen=True, eq=False)
 class ObjectAlignment:
-    """Where the scans of an object lie (``alignment``), by the points that moved with it.
+    """The alignment of the scans of a moved object, without the static background.
 
-    ``clouds``: the scans without the points that stand still; ``static``: (h, w) bool by scan, those points;
-    ``contradictions``: of each registered pair, how much of what is left contradicts.
+    ``clouds``: the scans without static points; ``static``: (h, w) bool by scan, the static points;
+    ``contradictions``: the free-space violations that remain, of each registered pair.
     """
 
     alignment: Alignment
@@ -84,139 +89,138 @@ class ObjectAlignment:
 def register_object(
     clouds: Mapping[str, Cloud], reference: str, starts: Starts | None = None, progress: Progress | None = None
 ) -> ObjectAlignment:
-    """``register_all`` of organised clouds, of which what stands still while the object moves is taken away first.
+    """Register the organised clouds of an object by ``register_all``, after removal of a static background.
 
-    A background that fills more of the image than the object would hold the scans where they are. So where a part of
-    them agrees unmoved, the rest is registered; each point then belongs to the motion that it agrees with, and the
-    object alone is registered again. Raises as ``register_all`` does.
+    A background that fills more of the image than the object would keep the scans where they are. So where parts of the
+    scans agree without motion, the other parts are registered first; each point is then assigned to the motion that it
+    agrees with, and the object's points alone are registered again. Raises as ``register_all`` does.
 
-    ``progress`` receives the share of the work done, 0 to 1, and may raise to cancel.
+    ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
     """
-    say = progress or (lambda share: None)
-    views = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
-    alignment, static = None, _unmoved(clouds, views)
+    report = progress or (lambda share: None)
+    all_samples = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
+    alignment, static = None, _detect_unmoved_points(clouds, all_samples)
     if any(mask.any() for mask in static.values()):
-        alignment, static = _moving(clouds, views, static, reference, starts, lambda done: say(0.5 * done))
+        alignment = _try_register(remove_points(clouds, static), reference, starts, lambda share: report(0.5 * share))
+        if alignment is not None:
+            static = detect_static_points(clouds, all_samples, alignment)
+            if not any(mask.any() for mask in static.values()):
+                alignment = None
     if alignment is None:
-        alignment = register_all(clouds, reference, starts, lambda done: say(0.5 + 0.2 * done))
-        static = detect_static_points(clouds, views, alignment)
-    begun = {pair: found.start for pair, found in alignment.pairs.items()}
-    whole, every = clouds, views
+        alignment = register_all(clouds, reference, starts, lambda share: report(0.5 + 0.2 * share))
+        static = detect_static_points(clouds, all_samples, alignment)
+    first_start = {pair: registration.start for pair, registration in alignment.pairs.items()}
+    moving, samples = clouds, all_samples
     for _ in range(ROUNDS):
         if not any(mask.any() for mask in static.values()):
             break
-        moving = remove_points(whole, static)
-        again = _registered(moving, reference, Starts(poses=alignment.T_reference_scan), lambda done: say(0.9))
-        if again is None:  # too little is left of a scan: what moved with it may be needed to hold it
+        candidate = remove_points(clouds, static)
+        refined = _try_register(
+            candidate, reference, Starts(poses=alignment.T_reference_scan), lambda share: report(0.9)
+        )
+        if refined is None:  # too few points remain of a scan: its background may be needed to determine its pose
             static = {name: np.zeros_like(mask) for name, mask in static.items()}
-            clouds, views = whole, every
+            moving, samples = clouds, all_samples
             break
-        pairs = {pair: replace(found, start=begun.get(pair, found.start)) for pair, found in again.pairs.items()}
-        alignment, clouds = replace(again, pairs=pairs), moving
-        views = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
-        before, static = static, detect_static_points(whole, every, alignment)
+        pairs = {pair: replace(r, start=first_start.get(pair, r.start)) for pair, r in refined.pairs.items()}
+        alignment, moving = replace(refined, pairs=pairs), candidate
+        samples = {name: sample_surface(cloud.measured) for name, cloud in moving.items()}
+        before, static = static, detect_static_points(clouds, all_samples, alignment)
         if all(np.count_nonzero(static[n] ^ before[n]) < SETTLED * before[n].size for n in static):
             static = before
             break
-    poses = alignment.T_reference_scan
+    T = alignment.T_reference_scan
     contradictions = {
-        (one, other): contradiction(views[one], views[other], np.linalg.inv(poses[other]) @ poses[one], found.gate_mm)
-        for (one, other), found in alignment.pairs.items()
+        (a, b): measure_contradiction(samples[a], samples[b], np.linalg.inv(T[b]) @ T[a], registration.gate_mm)
+        for (a, b), registration in alignment.pairs.items()
     }
-    say(1.0)
-    return ObjectAlignment(alignment, clouds, static, contradictions)
+    report(1.0)
+    return ObjectAlignment(alignment, moving, static, contradictions)
 
 
 def remove_points(clouds: Mapping[str, Cloud], static: Mapping[str, np.ndarray]) -> dict[str, Cloud]:
-    """The clouds less the points at ``static`` (h, w) bool."""
+    """Return the clouds with the points at ``static`` (h, w) bool replaced by NaN."""
     return {
         name: replace(cloud, points=np.where(static[name][..., None], np.float32(np.nan), cloud.points))
         for name, cloud in clouds.items()
     }
 
 
-def _registered(
+def _try_register(
     clouds: Mapping[str, Cloud], reference: str, starts: Starts | None, progress: Progress
 ) -> Alignment | None:
+    """Return ``register_all`` of the clouds, or None where it refuses."""
     try:
         return register_all(clouds, reference, starts, progress)
     except (Refused, InputError):
         return None
 
 
-def _moving(
-    clouds: Mapping[str, Cloud],
-    views: Mapping[str, SurfaceSamples],
-    unmoved: Mapping[str, np.ndarray],
-    reference: str,
-    starts: Starts | None,
-    progress: Progress,
-) -> tuple[Alignment | None, dict[str, np.ndarray]]:
-    """The motion of what does not agree ``unmoved``, and what stands still beside it; None where there is none."""
-    alignment = _registered(remove_points(clouds, unmoved), reference, starts, progress)
-    if alignment is None:
-        return None, {}
-    static = detect_static_points(clouds, views, alignment)
-    return (alignment, static) if any(mask.any() for mask in static.values()) else (None, {})
+def _detect_unmoved_points(clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples]) -> dict[str, np.ndarray]:
+    """Detect the points, (h, w) bool by scan, that agree with the next scan's or the previous one's without any motion.
 
-
-def _unmoved(clouds: Mapping[str, Cloud], views: Mapping[str, SurfaceSamples]) -> dict[str, np.ndarray]:
-    """By scan, (h, w) bool: the points that agree with the next scan's where neither is moved; all False where these
-    are nearly none of a scan, or too little is left."""
-    votes = {name: np.zeros(len(view.points)) for name, view in views.items()}
+    All False where they are less than LEAST_PART of a scan, or leave too few points to register.
+    """
+    votes = {name: np.zeros(len(s.points)) for name, s in samples.items()}
     sigma = {name: float(np.nanmedian(cloud.sigma_z[cloud.mask])) for name, cloud in clouds.items()}
-    for one, other in pairwise(clouds):
-        gate = SIGMAS * float(np.hypot(np.nan_to_num(sigma[one]), np.nan_to_num(sigma[other])))
-        for scan, onto in ((one, other), (other, one)):
-            height = np.abs(heights_above(views[scan], views[onto], np.eye(4)))
+    for first, second in pairwise(clouds):
+        gate = SIGMAS * float(np.hypot(np.nan_to_num(sigma[first]), np.nan_to_num(sigma[second])))
+        for scan, onto in ((first, second), (second, first)):
+            height = np.abs(heights_above(samples[scan], samples[onto], np.eye(4)))
             with np.errstate(invalid="ignore"):
                 votes[scan] += (height <= gate).astype(float) - (height > gate)
-    static = {name: _static_pixels(clouds[name], views[name], votes[name]) for name in clouds}
-    measured = {name: int(cloud.mask.sum()) for name, cloud in clouds.items()}
-    still = {name: int(mask.sum()) for name, mask in static.items()}
-    if any(still[name] < LEAST_PART * n or n - still[name] < 2 * LEAST_POINTS for name, n in measured.items()):
-        return {name: np.zeros_like(mask) for name, mask in static.items()}
+    static = {name: _classify_pixels(clouds[name], samples[name], votes[name]) for name in clouds}
+    for name, cloud in clouds.items():
+        measured, unmoved = int(cloud.mask.sum()), int(static[name].sum())
+        if unmoved < LEAST_PART * measured or measured - unmoved < 2 * LEAST_POINTS:
+            return {name: np.zeros_like(mask) for name, mask in static.items()}
     return static
 
 
 def sample_surface(points: np.ndarray) -> SurfaceSamples:
-    """The measured points (n, 3) mm of a scan, in its camera's frame, as the comparisons below take them."""
+    """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are removed."""
     o3d = open3d()
     points = np.asarray(points, np.float64)
     low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud = cloud.voxel_down_sample(float((high - low).max()) / _FINENESS)
+    cloud = cloud.voxel_down_sample(float((high - low).max()) / _SAMPLES_PER_SIDE)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
-    thin, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
-    facing = -np.sum(thin * normals, axis=1) > _SLOPE * np.linalg.norm(thin, axis=1)
-    thin, normals = thin[facing & (thin[:, 2] > 0)], normals[facing & (thin[:, 2] > 0)]
-    tree, own = cKDTree(thin[:, :2] / thin[:, 2:]), cKDTree(thin)
-    apart = tree.query(tree.data, k=min(5, len(thin)))[0][:, -1]
-    neighbours = own.query(thin, k=min(8, len(thin)))[1]
-    return SurfaceSamples(thin, normals, tree, apart, own, neighbours)
+    samples, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    facing = -np.sum(samples * normals, axis=1) > _MIN_COSINE * np.linalg.norm(samples, axis=1)
+    facing &= samples[:, 2] > 0
+    samples, normals = samples[facing], normals[facing]
+    ray_tree, point_tree = cKDTree(samples[:, :2] / samples[:, 2:]), cKDTree(samples)
+    ray_distance = ray_tree.query(ray_tree.data, k=min(5, len(samples)))[0][:, -1]
+    neighbours = point_tree.query(samples, k=min(8, len(samples)))[1]
+    return SurfaceSamples(samples, normals, ray_tree, ray_distance, point_tree, neighbours)
 
 
 def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> np.ndarray:
-    """(n,) mm: how far a scan's samples, carried over by ``T`` (4, 4), lie in front of another scan's surface
-    (negative: behind, hidden by it), along that surface's normal; NaN where the other saw nothing.
+    """Return the heights (n,) mm of a scan's samples, moved by ``T`` (4, 4), above another scan's surface.
 
-    The median of each sample's neighbourhood, which averages noise.
+    Heights are along that surface's normal, positive in front of it as seen from its camera, and medians over each
+    sample's neighbourhood; NaN outside the other scan's view.
     """
-    points = scan.points @ T[:3, :3].T + T[:3, 3]
-    before = points[:, 2] > 0
-    distance, nearest = onto.tree.query(points[:, :2] / np.where(before, points[:, 2], 1.0)[:, None], workers=-1)
-    seen = before & (distance < onto.apart[nearest])
+    points = move_points(T, scan.points)
+    in_front = points[:, 2] > 0
+    rays = points[:, :2] / np.where(in_front, points[:, 2], 1.0)[:, None]
+    distance, nearest = onto.ray_tree.query(rays, workers=-1)
+    in_view = in_front & (distance < onto.ray_distance[nearest])
     height = np.sum(onto.normals[nearest] * (points - onto.points[nearest]), axis=1)
-    around = np.where(seen[scan.neighbours], height[scan.neighbours], np.nan)
-    out = np.full(len(points), np.nan)
-    out[seen] = np.nanmedian(around[seen], axis=1)
-    return out
+    neighbourhood = np.where(in_view[scan.neighbours], height[scan.neighbours], np.nan)
+    heights = np.full(len(points), np.nan)
+    heights[in_view] = np.nanmedian(neighbourhood[in_view], axis=1)
+    return heights
 
 
-def contradiction(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray, widest_mm: float) -> SceneContradiction:
-    """How much of two scans contradicts where ``T`` (4, 4) puts the first on the second, seen from either; points of
-    one surface lie within ``widest_mm``."""
+def measure_contradiction(
+    scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray, widest_mm: float
+) -> SceneContradiction:
+    """Measure the free-space violations between two scans with ``T_onto_scan`` (4, 4), in both directions.
+
+    ``widest_mm``: upper bound of the gate.
+    """
     height = np.concatenate([heights_above(scan, onto, T), heights_above(onto, scan, np.linalg.inv(T))])
     gate = estimate_gate(height, widest_mm)
     known = height[np.isfinite(height)]
@@ -224,50 +228,52 @@ def contradiction(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray, wid
 
 
 def estimate_gate(height: np.ndarray, widest_mm: float) -> float:
-    """mm: ``SIGMAS`` times the scatter of heights that lie on each other, by the least quarter of those within
-    ``widest_mm``: up to half of these may belong to another motion."""
+    """Estimate the gate in mm, SIGMAS times the scatter of heights (n,) of overlapping surfaces, up to ``widest_mm``.
+
+    The scatter is estimated by the lower quartile of the heights within ``widest_mm``, as up to half of these may
+    belong to points with another motion. NaN heights do not count.
+    """
     near = np.abs(height[np.abs(height) < widest_mm])
     scatter = float(np.quantile(near, 0.25)) / QUARTILE if len(near) >= LEAST_SAMPLES else widest_mm
     return min(SIGMAS * scatter, widest_mm)
 
 
 def detect_static_points(
-    clouds: Mapping[str, Cloud], views: Mapping[str, SurfaceSamples], alignment: Alignment
+    clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples], alignment: Alignment
 ) -> dict[str, np.ndarray]:
-    """By scan, (h, w) bool: the points that stand still in the camera's frame while the rest moves as ``alignment``
-    says.
+    """Detect the points, (h, w) bool by scan, that are static in the camera's frame while the object moves.
 
-    A sample counts that contradicts another scan under the estimated motion and agrees with it unmoved; where it agrees
-    with both or with neither, the nearest that count decide. All False where nothing stands still, or where scans did
-    not move: then nothing distinguishes the two.
+    A sample votes for static where it disagrees with another scan under the ``alignment`` and agrees without motion,
+    and against it in the opposite case; otherwise the nearest votes decide. All False without a static part, and where
+    the scans did not move, so that the two cases cannot be distinguished.
     """
-    votes = {name: np.zeros(len(view.points)) for name, view in views.items()}
+    votes = {name: np.zeros(len(s.points)) for name, s in samples.items()}
     poses = alignment.T_reference_scan
-    for (one, other), found in alignment.pairs.items():
-        for scan, onto in ((one, other), (other, one)):
+    for (first, second), registration in alignment.pairs.items():
+        for scan, onto in ((first, second), (second, first)):
             T = np.linalg.inv(poses[onto]) @ poses[scan]
-            moved, unmoved = (
-                heights_above(views[scan], views[onto], T),
-                heights_above(views[scan], views[onto], np.eye(4)),
-            )
-            gate = estimate_gate(moved, found.gate_mm)
+            moved = heights_above(samples[scan], samples[onto], T)
+            unmoved = heights_above(samples[scan], samples[onto], np.eye(4))
+            gate = estimate_gate(moved, registration.gate_mm)
             with np.errstate(invalid="ignore"):
-                static = (np.abs(unmoved) <= gate) & (np.abs(moved) > gate)
-                moving = (np.abs(moved) <= gate) & (np.abs(unmoved) > gate)
-            votes[scan] += static.astype(float) - moving
-    return {name: _static_pixels(clouds[name], views[name], votes[name]) for name in clouds}
+                is_static = (np.abs(unmoved) <= gate) & (np.abs(moved) > gate)
+                is_moving = (np.abs(moved) <= gate) & (np.abs(unmoved) > gate)
+            votes[scan] += is_static.astype(float) - is_moving
+    return {name: _classify_pixels(clouds[name], samples[name], votes[name]) for name in clouds}
 
 
-def _static_pixels(cloud: Cloud, view: SurfaceSamples, votes: np.ndarray) -> np.ndarray:
-    """(h, w) bool at the cloud's own resolution: what stands still, by the votes (n,) of the samples."""
-    mask = cloud.mask
-    out = np.zeros(mask.shape, bool)
-    decided = np.flatnonzero(votes)
+def _classify_pixels(cloud: Cloud, samples: SurfaceSamples, votes: np.ndarray) -> np.ndarray:
+    """Return the static pixels (h, w) bool of a cloud, by the majority of the votes (n,) nearest to each sample.
+
+    A positive vote is for static, 0 none. All False for too few positive votes.
+    """
+    static = np.zeros(cloud.mask.shape, bool)
+    voting = np.flatnonzero(votes)
     if np.count_nonzero(votes > 0) < max(LEAST_SAMPLES, LEAST_SHARE * len(votes)):
-        return out
-    near = min(_NEIGHBOURS, len(decided))
-    _, nearest = cKDTree(view.points[decided]).query(view.points, k=near, workers=-1)
-    still = np.sign(votes[decided])[np.reshape(nearest, (len(votes), near))].mean(axis=1) > 0
-    _, sample = view.own.query(cloud.measured, workers=-1)
-    out[mask] = still[sample]
-    return out
+        return static
+    k = min(_NEIGHBOURS, len(voting))
+    _, nearest = cKDTree(samples.points[voting]).query(samples.points, k=k, workers=-1)
+    is_static = np.sign(votes[voting])[np.reshape(nearest, (len(votes), k))].mean(axis=1) > 0
+    _, sample = samples.point_tree.query(cloud.measured, workers=-1)
+    static[cloud.mask] = is_static[sample]
+    return static

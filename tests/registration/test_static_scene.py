@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import register_all
 from slviewer.registration.scan import away_from_edges
-from slviewer.registration.static_scene import contradiction, register_object, sample_surface
+from slviewer.registration.static_scene import measure_contradiction, register_object, sample_surface
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.scenes import Surface
 from slviewer.simulation.turning import AXIS, AXIS_POINT, turning
@@ -113,9 +113,9 @@ def test_contradictions_are_counted_where_one_scan_sees_through_the_others_point
     views = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
     share = float(wall["b"].sum() / clouds["b"].mask.sum())
     T = np.linalg.inv(turned(2.0))
-    moved = contradiction(views["b"], views["a"], T, 1.0).share
+    moved = measure_contradiction(views["b"], views["a"], T, 1.0).share
     assert 0.2 * share < moved < 0.8 * share  # half of the turned wall lies before itself, the other half behind
-    still = contradiction(views["b"], views["a"], np.eye(4), 1.0).share
+    still = measure_contradiction(views["b"], views["a"], np.eye(4), 1.0).share
     assert 0.001 < still < 0.5 * (1 - share)
 
 
