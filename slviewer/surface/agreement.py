@@ -1,4 +1,4 @@
-"""How scans that overlap agree: in place, which says within which distance they are one surface, and in brightness."""
+"""Agreement of overlapping scans: their distances, the gate within which they are one surface, and brightness gains."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -6,21 +6,26 @@ from itertools import permutations
 
 import numpy as np
 
-from slviewer.surface.meeting_kernels import compare
+from slviewer.geometry.rigid import move_points
+from slviewer.geometry.robust import robust_sigma
+from slviewer.surface.overlap_kernels import measure_heights
 from slviewer.surface.view import View
 
 _SAMPLES = 20_000
 _LEAST_PLACES = 30
-_WINDOW_SPACINGS = 6.0  # nothing further away is taken for the same surface
-_WINDOW_SIGMAS = 12.0
+_WINDOW_SPACINGS = 6.0  # largest distance of points that may be of one surface, in point spacings
+_WINDOW_SIGMAS = 12.0  # and in standard deviations, whichever is larger
 _GATE_SIGMAS = 6.0
 
 
 @dataclass(frozen=True)
 class SurfaceAgreement:
-    """Two scans where they overlap: ``places`` compared; ``rms_mm``, ``bias_mm`` (median), of the distance of the
-    second's surface above the first's along the normal; ``gate_mm``, within which they are one; ``log_gain``, the
-    median logarithm of the second's brightness over the first's, or None without colours."""
+    """Comparison of two scans where they overlap.
+
+    ``places``: number of compared points; ``rms_mm`` and ``bias_mm`` (median): height of the second scan's surface
+    above the first's along the normal; ``gate_mm``: height within which both are one surface; ``log_gain``: median
+    logarithm of the second's brightness over the first's, None without colours.
+    """
 
     places: int
     rms_mm: float
@@ -29,54 +34,59 @@ class SurfaceAgreement:
     log_gain: float | None
 
 
-def agreements(views: Mapping[str, View], say: Callable[[float], None]) -> dict[tuple[str, str], SurfaceAgreement]:
-    """Every ordered pair of scans of which the first meets the second in enough places."""
-    found: dict[tuple[str, str], SurfaceAgreement] = {}
-    ways = list(permutations(views, 2))
-    for i, (a, b) in enumerate(ways):
-        say(i / len(ways))
-        agreement = _compared(views[a], views[b])
+def compare_views(
+    views: Mapping[str, View], progress: Callable[[float], None]
+) -> dict[tuple[str, str], SurfaceAgreement]:
+    """Compare every ordered pair of scans; pairs that overlap in too few points are missing from the result."""
+    agreements: dict[tuple[str, str], SurfaceAgreement] = {}
+    pairs = list(permutations(views, 2))
+    for i, (a, b) in enumerate(pairs):
+        progress(i / len(pairs))
+        agreement = _compare_pair(views[a], views[b])
         if agreement is not None:
-            found[a, b] = agreement
-    return found
+            agreements[a, b] = agreement
+    return agreements
 
 
-def _compared(here: View, there: View) -> SurfaceAgreement | None:
-    mask = here.mask
-    every = slice(None, None, max(1, int(mask.sum()) // _SAMPLES))
-    T = np.linalg.inv(there.T) @ here.T
-    points = np.ascontiguousarray(here.points[mask][every] @ T[:3, :3].T + T[:3, 3])
-    normals = np.ascontiguousarray(here.normals[mask][every] @ T[:3, :3].T)
-    spacing = max(here.spacing, there.spacing)
-    noise = float(np.median(here.noise[mask][every])) + float(np.median(there.noise[there.mask]))
+def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
+    """Compare a subset of the first scan's points with the second scan's surface; None for too small an overlap."""
+    mask = first.mask
+    subset = slice(None, None, max(1, int(mask.sum()) // _SAMPLES))
+    T = np.linalg.inv(second.T) @ first.T
+    points = np.ascontiguousarray(move_points(T, first.points[mask][subset]))
+    normals = np.ascontiguousarray(first.normals[mask][subset] @ T[:3, :3].T)
+    spacing = max(first.spacing, second.spacing)
+    noise = float(np.median(first.noise[mask][subset])) + float(np.median(second.noise[second.mask]))
     window = max(_WINDOW_SPACINGS * spacing, _WINDOW_SIGMAS * noise)
-    out = np.empty((len(points), 2))
-    compare(
-        points, normals, spacing, window, there.points, there.normals, there.noise, there.lasting, there.inner,
-        there.to_pixel, out,
+    heights = np.empty((len(points), 2))
+    measure_heights(
+        points, normals, spacing, window, second.points, second.normals, second.noise, second.lasting, second.inner,
+        second.to_pixel, heights,
     )  # fmt: skip
-    height, met = out[:, 0], out[:, 1] >= 0
-    if met.sum() < _LEAST_PLACES:
+    height, overlaps = heights[:, 0], heights[:, 1] >= 0
+    if overlaps.sum() < _LEAST_PLACES:
         return None
-    height = height[met]
-    scatter = 1.4826 * float(np.median(np.abs(height)))
-    gate = min(max(_GATE_SIGMAS * scatter, 3.0 * noise, 0.25 * spacing), window)
+    height = height[overlaps]
+    gate = min(max(_GATE_SIGMAS * robust_sigma(height, about=0.0), 3.0 * noise, 0.25 * spacing), window)
     return SurfaceAgreement(
-        places=int(met.sum()),
+        places=int(overlaps.sum()),
         rms_mm=float(np.sqrt(np.mean(height[np.abs(height) <= gate] ** 2))),
         bias_mm=float(np.median(height)),
         gate_mm=gate,
-        log_gain=_log_gain(here, there, mask, every, out[met, 1].astype(int), met),
+        log_gain=None
+        if first.colours is None or second.colours is None
+        else _estimate_log_gain(
+            first.colours[mask][subset][overlaps], second.colours.reshape(-1, 3)[heights[overlaps, 1].astype(int)]
+        ),
     )
 
 
-def _log_gain(
-    here: View, there: View, mask: np.ndarray, every: slice, pixel: np.ndarray, met: np.ndarray
-) -> float | None:
-    if here.colours is None or there.colours is None:
-        return None
-    first = here.colours[mask][every][met].mean(axis=1, dtype=float)
-    second = there.colours.reshape(-1, 3)[pixel].mean(axis=1, dtype=float)
+def _estimate_log_gain(first: np.ndarray, second: np.ndarray) -> float | None:
+    """Return the median logarithm of the second colours' brightness over the first's, (n, 3) uint8 each.
+
+    None where too few are neither dark nor saturated.
+    """
+    first, second = first.mean(axis=1, dtype=float), second.mean(axis=1, dtype=float)
     exposed = (first > 8) & (first < 250) & (second > 8) & (second < 250)
     if exposed.sum() < _LEAST_PLACES:
         return None
@@ -86,19 +96,16 @@ def _log_gain(
 def colour_gains(
     views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement]
 ) -> dict[str, float] | None:
-    """What each scan's colours are multiplied by so that overlapping ones agree; their mean logarithm is 0.
+    """Estimate the factor of each scan's colours that makes overlapping scans agree, least squares of the logarithms.
 
-    None where a scan has no colours.
+    The mean logarithm is 0. None where a scan has no colours.
     """
     if any(view.colours is None for view in views.values()):
         return None
     names = list(views)
-    rows, values = [np.full(len(names), 1e-3)], [0.0]  # the mean, and 0 for a scan that meets none
-    for k in range(len(names)):
-        row = np.zeros(len(names))
-        row[k] = 1e-6
-        rows.append(row)
-        values.append(0.0)
+    # weak equations for a mean of 0, and for 0 of a scan without overlap
+    rows = [np.full(len(names), 1e-3), *(1e-6 * np.eye(len(names)))]
+    values = [0.0] * len(rows)
     for (a, b), pair in pairs.items():
         if pair.log_gain is not None:
             row = np.zeros(len(names))

@@ -1,4 +1,4 @@
-"""What of an organised cloud is no surface: edge pixels that fly between two depths, grazing ones, small groups."""
+"""Cleaning of organised clouds: flying pixels at depth edges, grazing pixels, and small or distant groups."""
 
 from dataclasses import dataclass
 
@@ -10,21 +10,21 @@ from scipy.spatial import cKDTree
 from slviewer.reconstruction.cloud import Cloud
 
 STEEPEST = 6.0
-"""Steps between neighbours, in their own distance across the line of sight, from which they are two surfaces (80°)."""
-FLATTEST_SIGHT = 0.12
-"""The cosine between a surface's normal and the line of sight below which it is not measured, but guessed (83°)."""
+"""Largest depth step between neighbours of one surface, over their distance across the viewing direction (80°)."""
+MIN_VIEWING_COSINE = 0.12
+"""Least cosine between normal and viewing direction of a measured surface (83°)."""
 FAR_SPACINGS = 20.0
 FAR_SHARE = 0.005
-"""A cluster that lies so many times the distance of neighbouring points away from all others, and has less than this
-share of them, is no part of the object."""
+"""A cluster is excluded where it is more than 20 point spacings away from all others and has less than 0.5 % of the
+points."""
 LEAST_GROUP = 2e-4
-"""Share of a scan's pixels below which a group without neighbours is no part of the object."""
+"""Least share of a scan's pixels in a connected group."""
 
 
 @dataclass(frozen=True)
 class ExcludedPixels:
-    """What of a scan is left out, in pixels: at its rim and at depth jumps, seen grazing or without a normal, in small
-    groups, far from everything else."""
+    """Numbers of excluded pixels: ``edges`` (border and depth jumps), ``grazing`` or without a normal, in small
+    ``groups``, and in ``far`` clusters."""
 
     edges: int
     grazing: int
@@ -33,46 +33,46 @@ class ExcludedPixels:
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Number of all excluded pixels."""
         return self.edges + self.grazing + self.groups + self.far
 
 
 def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels]:
-    """(h, w) bool: the pixels of a cloud that lie on a surface, and what was left out.
+    """Select the pixels of a cloud on a surface, (h, w) bool, and count the excluded ones.
 
-    ``normals``: (h, w, 3), towards the camera.
+    ``normals``: (h, w, 3), towards the camera, NaN where unknown.
     """
     mask = cloud.mask
-    kept = mask & ~detect_jumps(cloud.points, cloud.sigma_z)
-    # a pixel at the rim sees the surface with a part of its area only, in half a shadow, or with what lies behind
-    kept &= cv2.erode(close_pinholes(kept), np.ones((3, 3), np.uint8), borderValue=1).astype(bool)
-    edges = int(mask.sum() - kept.sum())
-    seen = kept & (np.abs(sight_cosines(cloud.points, normals)) > FLATTEST_SIGHT)  # False where the normal is NaN
-    grazing = int(kept.sum() - seen.sum())
-    large = _large_groups(seen)
-    near = large & ~detect_far_clusters(cloud.points, large)
-    groups, far = int(seen.sum() - large.sum()), int(large.sum() - near.sum())
-    return near, ExcludedPixels(edges, grazing, groups, far)
+    inside = mask & ~detect_jumps(cloud.points, cloud.sigma_z)
+    # the area of a pixel at the border is covered in part only, half in shadow, or mixed with the background
+    inside &= cv2.erode(close_pinholes(inside), np.ones((3, 3), np.uint8), borderValue=1).astype(bool)
+    edges = int(mask.sum() - inside.sum())
+    facing = inside & (np.abs(viewing_cosines(cloud.points, normals)) > MIN_VIEWING_COSINE)  # False for NaN
+    grazing = int(inside.sum() - facing.sum())
+    grouped = _select_large_groups(facing)
+    surface = grouped & ~detect_far_clusters(cloud.points, grouped)
+    groups, far = int(facing.sum() - grouped.sum()), int(grouped.sum() - surface.sum())
+    return surface, ExcludedPixels(edges, grazing, groups, far)
 
 
-def sight_cosines(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(h, w) cosine between the normals (h, w, 3) and the lines of sight to points (h, w, 3) in the camera's frame."""
+def viewing_cosines(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(h, w): cosine between normals (h, w, 3) and directions from points (h, w, 3) to the camera at the origin."""
     away = np.linalg.norm(points, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(-np.einsum("ijk,ijk->ij", points, normals) / away)
 
 
 def close_pinholes(mask: np.ndarray) -> np.ndarray:
-    """(h, w) uint8, 0 or 1: the mask with gaps of up to four pixels closed."""
+    """Close gaps of up to four pixels in a mask (h, w) bool; returns (h, w) uint8, 0 or 1."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     return np.asarray(cv2.morphologyEx(np.pad(mask, 2).astype(np.uint8), cv2.MORPH_CLOSE, disc)[2:-2, 2:-2])
 
 
 def detect_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
-    """(h, w) bool: the pixels (h, w, 3) mm whose depth leaps to a neighbour's: there one pixel sees two surfaces.
+    """Detect the pixels (h, w) bool of organised points (h, w, 3) mm on either side of a depth jump.
 
-    A leap is larger than ``STEEPEST`` times the distance of the neighbours across the line of sight and six times their
-    noise ``sigma_z`` (h, w) (where it is known) together.
+    A jump exceeds ``STEEPEST`` times the neighbours' distance across the viewing direction plus six times their noise
+    ``sigma_z`` (h, w) mm, where that is known.
     """
     noise = 6 * np.nan_to_num(sigma_z, nan=0.0, posinf=0.0, neginf=0.0)
     jumps = np.zeros(points.shape[:2], bool)
@@ -81,36 +81,37 @@ def detect_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
     for here, there in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         step = np.abs(points[there] - points[here])
         across = np.hypot(step[..., 0], step[..., 1])
-        # along a line of sight that is oblique to the camera's axis, depth itself leads aside
-        leap = step[..., 2] > STEEPEST * across.clip(max=2 * np.nanmedian(across)) + np.maximum(
+        # on an oblique ray a depth jump moves the point across as well: limit that distance
+        is_jump = step[..., 2] > STEEPEST * across.clip(max=2 * np.nanmedian(across)) + np.maximum(
             noise[here], noise[there]
         )
-        jumps[here] |= leap
-        jumps[there] |= leap
+        jumps[here] |= is_jump
+        jumps[there] |= is_jump
     return jumps
 
 
-def detect_far_clusters(points: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """(h, w) bool: of the points (h, w, 3) mm ``kept`` (h, w), those in small clusters far from everything else."""
-    far = np.zeros(kept.shape, bool)
-    places = points[kept].astype(np.float64)
-    if len(places) < 2:
+def detect_far_clusters(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(h, w) bool: of the points (h, w, 3) mm in a ``mask`` (h, w), those in small clusters far from all others."""
+    far = np.zeros(mask.shape, bool)
+    chosen = points[mask].astype(np.float64)
+    if len(chosen) < 2:
         return far
-    every = places[:: max(1, len(places) // 5000)]
-    spacing = float(np.median(cKDTree(places).query(every, k=2)[0][:, 1]))
+    subset = chosen[:: max(1, len(chosen) // 5000)]
+    spacing = float(np.median(cKDTree(chosen).query(subset, k=2)[0][:, 1]))
     if not spacing > 0:
         return far
     cells, which, counts = np.unique(
-        np.floor(places / (FAR_SPACINGS * spacing)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+        np.floor(chosen / (FAR_SPACINGS * spacing)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
-    joined = cKDTree(cells).sparse_distance_matrix(cKDTree(cells), 1.8).tocsr()  # all 26 neighbours
-    _, cluster = connected_components(joined, directed=False)
-    small = np.bincount(cluster, counts) < FAR_SHARE * len(places)
-    far[kept] = small[cluster][which.ravel()]
+    adjacent = cKDTree(cells).sparse_distance_matrix(cKDTree(cells), 1.8).tocsr()  # all 26 neighbours
+    _, cluster = connected_components(adjacent, directed=False)
+    is_small = np.bincount(cluster, counts) < FAR_SHARE * len(chosen)
+    far[mask] = is_small[cluster][which.ravel()]
     return far
 
 
-def _large_groups(mask: np.ndarray) -> np.ndarray:
+def _select_large_groups(mask: np.ndarray) -> np.ndarray:
+    """Select the connected groups of a mask (h, w) bool with at least 20 pixels and a share of LEAST_GROUP."""
     least = max(20.0, LEAST_GROUP * np.count_nonzero(mask))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= least

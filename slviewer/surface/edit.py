@@ -1,4 +1,4 @@
-"""Changes of a mesh, each with what it did in numbers: small parts dropped, holes filled, smoothed, thinned."""
+"""Mesh editing: removal of small parts, hole filling, smoothing and decimation; each returns figures of its change."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ _THINNED_AT = 1000.0
 
 @dataclass(frozen=True)
 class DroppedParts:
-    """Parts that were dropped, and the largest of them in mm2."""
+    """Number of removed parts, and the area of the largest one in mm2."""
 
     parts: int
     largest_mm2: float
@@ -23,7 +23,7 @@ class DroppedParts:
 
 @dataclass(frozen=True)
 class FilledHoles:
-    """Holes that were filled, the largest in mm across, and how many openings are left."""
+    """Number of filled holes, the extent of the largest one in mm, and the number of openings that remain (``left``)."""
 
     holes: int
     largest_mm: float
@@ -32,7 +32,7 @@ class FilledHoles:
 
 @dataclass(frozen=True)
 class SurfaceShift:
-    """How far a change moved the surface (of the vertices before, to the surface after), and its triangles."""
+    """Distances from the vertices before a change to the surface after it, and the numbers of triangles."""
 
     rms_mm: float
     max_mm: float
@@ -41,7 +41,7 @@ class SurfaceShift:
 
 
 def drop_small_parts(mesh: Mesh, most_mm2: float) -> tuple[Mesh, DroppedParts]:
-    """The mesh without the parts of up to so many mm2 that have less than 1 % of the largest part's area."""
+    """Remove the connected parts of at most ``most_mm2`` that have less than 1 % of the largest part's area."""
     if not len(mesh.faces):
         return mesh, DroppedParts(0, 0.0)
     groups = face_groups(mesh.faces, len(mesh.vertices))
@@ -52,7 +52,7 @@ def drop_small_parts(mesh: Mesh, most_mm2: float) -> tuple[Mesh, DroppedParts]:
 
 
 def fill_holes(mesh: Mesh, size_mm: float) -> tuple[Mesh, FilledHoles]:
-    """The mesh with the openings that are up to ``size_mm`` across closed, each by a fan around its middle."""
+    """Fill the holes with an extent of at most ``size_mm``, each by a triangle fan around its centroid."""
     if not size_mm >= 0:
         raise InputError(f"Holes of up to {size_mm} mm cannot be filled: give 0 or more.")
     vertices, faces, sizes, left = [mesh.vertices], [mesh.faces], [], 0
@@ -76,7 +76,7 @@ def fill_holes(mesh: Mesh, size_mm: float) -> tuple[Mesh, FilledHoles]:
 
 
 def smooth(mesh: Mesh, rounds: int) -> tuple[Mesh, SurfaceShift]:
-    """The mesh after rounds of Taubin's smoothing, which does not shrink it."""
+    """Smooth the mesh by iterations of Taubin's filter, which does not shrink it."""
     if rounds < 1:
         raise InputError(f"{rounds} rounds of smoothing were asked for: give 1 or more.")
     calm = to_open3d_mesh(mesh).filter_smooth_taubin(number_of_iterations=rounds)
@@ -85,12 +85,12 @@ def smooth(mesh: Mesh, rounds: int) -> tuple[Mesh, SurfaceShift]:
 
 
 def decimate(mesh: Mesh, triangles: int) -> tuple[Mesh, SurfaceShift]:
-    """The mesh with no more than a number of triangles, merged where that moves the surface least."""
+    """Simplify the mesh to at most a number of triangles by quadric error decimation."""
     if triangles < 4:
         raise InputError(f"{triangles} triangles make no mesh: ask for at least 4.")
     if len(mesh.faces) <= triangles:
         return mesh, SurfaceShift(0.0, 0.0, len(mesh.faces), len(mesh.faces))
-    # below an absolute size Open3D no longer solves for the best place of a vertex: small parts lost twice as much
+    # Open3D places vertices well only in meshes of a large absolute size: the error of small parts was doubled
     middle, size = mesh.vertices.mean(axis=0, dtype=np.float64), float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
     enlarged = to_open3d_mesh(mesh).translate(-middle).scale(_THINNED_AT / size, np.zeros(3))
     fewer = enlarged.simplify_quadric_decimation(triangles)

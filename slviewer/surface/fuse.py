@@ -1,38 +1,40 @@
-"""Several scans of one object made one surface: what they measure in common is averaged, not stacked.
+"""Fusion of registered scans to one set of points, with overlapping surfaces averaged.
 
-Every point of a scan is moved along its normal to the weighted mean of all scans' surfaces there; of the scans that
-see a place the one that knows it best keeps its points, the others' go. Weights are 1 / sigma2, and fall to nothing
-towards each scan's border, so that no step shows where a scan ends. Another scan's surface is taken from the pixels
-next to the place, and counts less where it bends between them: nothing is smoothed beyond what one scan resolves.
+Every point of a scan is moved along its normal to the weighted mean of all scans' surfaces; of overlapping scans, only
+the points of the one with the highest quality are kept. Weights are 1 / sigma2 and decrease to 0 at each scan's border,
+so that no step shows where a scan ends. Another scan's surface is interpolated between pixels, with a lower weight
+where it is curved, so that nothing is smoothed beyond one scan's resolution.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.surface.agreement import SurfaceAgreement, agreements, colour_gains
-from slviewer.surface.meeting_kernels import FIELDS, gather, vote
+from slviewer.surface.agreement import SurfaceAgreement, colour_gains, compare_views
+from slviewer.surface.clean import viewing_cosines
+from slviewer.surface.overlap_kernels import FIELDS, add_surface, count_votes
 from slviewer.surface.shapes import PointSet
 from slviewer.surface.view import View, prepare_view
 
 Progress = Callable[[float], None]
 
-SURE = 0.3
-"""How far inside its border (as a weight, 0 to 1) a pixel must lie to deny another scan's point."""
+MIN_WITNESS_WEIGHT = 0.3
+"""Least border weight of a pixel whose free space can contradict another scan's points."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """The one surface of several scans, in the frame of their poses.
+    """The fused surface of several scans, in the frame of their poses.
 
-    ``surface``: its points, with normals towards the cameras, the sigma along them, colours where every scan has some.
-    ``source`` (n,) uint8 says which of ``names`` a point's place across the normal comes from; ``seen_by`` (n,) uint8
-    how many scans it is the mean of. ``excluded``: pixels of each scan that lie on no surface, and why; ``pairs``: how
-    scans that overlap agree, by their names.
+    ``surface``: points with normals towards the cameras, sigmas along the normals, and colours if every scan has them.
+    ``source`` (n,) uint8: index in ``names`` of the scan that a point is from; ``seen_by`` (n,) uint8: number of scans
+    averaged in it. ``excluded``: numbers of excluded pixels of each scan by reason; ``pairs``: agreement of overlapping
+    scans, by their names.
     """
 
     surface: PointSet
@@ -44,7 +46,7 @@ class Fused:
 
     @property
     def shared(self) -> float:
-        """The share of the points that more than one scan measured."""
+        """Share of the points that are averages of more than one scan."""
         return float((self.seen_by > 1).mean())
 
 
@@ -53,41 +55,34 @@ def fuse(
 ) -> Fused:
     """Fuse organised clouds, each in its camera's frame, with the pose (4, 4) of each by the same name.
 
-    ``progress`` receives the share of the work done, 0 to 1, and may raise to cancel. A single scan is cleaned only.
+    ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel. A single scan is only
+    cleaned.
     Raises InputError for a scan without a pose, without a surface, or whose points are not those of one camera.
     """
     if not 1 <= len(scans) <= 255:
         raise InputError(f"{len(scans)} scans were given: fusing takes 1 to 255.")
     for name in scans:
         if name not in T_reference_scan:
-            raise InputError(f"{name} has no pose: register it first, or leave it out.")
-    say = progress or (lambda share: None)
+            raise InputError(f"{name} has no pose: register it first, or exclude it.")
+    report = progress or (lambda share: None)
     views = {}
     for i, (name, cloud) in enumerate(scans.items()):
-        say(0.3 * i / len(scans))
+        report(0.3 * i / len(scans))
         views[name] = prepare_view(name, cloud, T_reference_scan[name])
     names = tuple(views)
-    pairs = agreements(views, lambda share: say(0.3 + 0.1 * share))
-    excluded = {
-        name: {
-            "edges": v.cleaned.edges,
-            "grazing": v.cleaned.grazing,
-            "groups": v.cleaned.groups,
-            "far": v.cleaned.far,
-        }
-        for name, v in views.items()
-    }
-    for name, denied in _denied(views, pairs, lambda share: say(0.4 + 0.1 * share)).items():
-        excluded[name]["unconfirmed"] = int(denied.sum())
-        views[name] = views[name].without(denied)
+    pairs = compare_views(views, lambda share: report(0.3 + 0.1 * share))
+    excluded = {name: asdict(view.cleaned) for name, view in views.items()}
+    for name, violations in _detect_violations(views, pairs, lambda share: report(0.4 + 0.1 * share)).items():
+        excluded[name]["unconfirmed"] = int(violations.sum())
+        views[name] = views[name].without(violations)
     gains = colour_gains(views, pairs)
     parts = []
     for i, name in enumerate(names):
-        say(0.5 + 0.5 * i / len(names))
-        parts.append(_fused_points(name, views, pairs, gains))
-    say(1.0)
+        report(0.5 + 0.5 * i / len(names))
+        parts.append(_fuse_scan(name, views, pairs, gains))
+    report(1.0)
     return Fused(
-        surface=_joined([part[0] for part in parts]),
+        surface=_concatenate([part[0] for part in parts]),
         source=np.repeat(np.arange(len(names), dtype=np.uint8), [len(part[0]) for part in parts]),
         seen_by=np.concatenate([part[1] for part in parts]),
         names=names,
@@ -96,47 +91,55 @@ def fuse(
     )
 
 
-def _denied(
-    views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement], say: Progress
+def _detect_violations(
+    views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement], progress: Progress
 ) -> dict[str, np.ndarray]:
-    """By scan, (h, w) bool: the points that more scans see through than see."""
-    sure = {name: _sure(view) for name, view in views.items()}
-    denied = {}
+    """Detect the points, (h, w) bool by scan, in the free space of more scans than the number that confirm them."""
+    witnesses = {name: _select_witnesses(view) for name, view in views.items()}
+    violations = {}
     for i, (name, view) in enumerate(views.items()):
-        say(i / len(views))
+        progress(i / len(views))
         mask = view.mask
         points = view.points[mask]
-        seen, through = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
+        confirming, contradicting = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
         for other, there in views.items():
             if other != name:
                 T = np.linalg.inv(there.T) @ view.T
-                # along the line of sight a surface may lie further off than along its normal
-                gate = max(2.0 * _gate(pairs, name, other, view, there), 2.0 * max(view.spacing, there.spacing))
-                vote(_moved(points, T), gate, there.points, sure[other], there.to_pixel, seen, through)
-        denied[name] = np.zeros(mask.shape, bool)
-        denied[name][mask] = through > seen
-    return denied
+                # along the viewing direction two surfaces may be farther apart than along their normal
+                gate = 2.0 * max(_gate_mm(pairs, name, other, view, there), view.spacing, there.spacing)
+                count_votes(
+                    move_points(T, points), gate, there.points, witnesses[other], there.to_pixel, confirming,
+                    contradicting,
+                )  # fmt: skip
+        violations[name] = np.zeros(mask.shape, bool)
+        violations[name][mask] = contradicting > confirming
+    return violations
 
 
-def _sure(view: View) -> np.ndarray:
-    """Pixels that can deny: inside, with all their neighbours, and not seen too much from the side."""
-    whole = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
-    towards = -np.einsum("ijk,ijk->ij", view.normals, view.points) / np.linalg.norm(view.points, axis=-1)
-    return np.asarray(whole & (view.inner > SURE) & (towards > 0.25))
+def _select_witnesses(view: View) -> np.ndarray:
+    """Select the pixels (h, w) bool whose free space is certain: inside the surface, and not at grazing angles."""
+    inside = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    facing = viewing_cosines(view.points, view.normals) > 0.25
+    return np.asarray(inside & (view.inner > MIN_WITNESS_WEIGHT) & facing)
 
 
-def _gate(pairs: Mapping[tuple[str, str], SurfaceAgreement], a: str, b: str, here: View, there: View) -> float:
+def _gate_mm(pairs: Mapping[tuple[str, str], SurfaceAgreement], a: str, b: str, first: View, second: View) -> float:
+    """Return the gate of two scans by their agreement, or the larger of their point spacings without one."""
     pair = pairs.get((a, b)) or pairs.get((b, a))
-    return pair.gate_mm if pair else max(here.spacing, there.spacing)
+    return pair.gate_mm if pair else max(first.spacing, second.spacing)
 
 
-def _fused_points(
+def _fuse_scan(
     name: str,
     views: Mapping[str, View],
     pairs: Mapping[tuple[str, str], SurfaceAgreement],
     gains: Mapping[str, float] | None,
 ) -> tuple[PointSet, np.ndarray]:
-    """The points that a scan keeps, in the reference's frame, and how many scans each is the mean of."""
+    """Average a scan's points with the other scans' surfaces.
+
+    Returns the points at which the scan has the highest quality, in the reference's frame, and the number of scans (n,)
+    uint8 averaged in each.
+    """
     view, order = views[name], list(views)
     mask = view.mask
     points, normals = view.points[mask], view.normals[mask]
@@ -153,19 +156,19 @@ def _fused_points(
         sums[:, 8] = share
         sums[:, 9:] = share[:, None] * gains[name] * own_colours
     scans = np.ones(len(points), np.uint8)
-    lost = np.zeros(len(points), bool)
+    inferior = np.zeros(len(points), bool)
     for other, there in views.items():
         if (name, other) not in pairs and (other, name) not in pairs:
             continue
         T = np.linalg.inv(there.T) @ view.T
-        here = (np.ascontiguousarray(_moved(points, T)), np.ascontiguousarray(normals @ T[:3, :3].T))
-        meeting = np.zeros((len(points), FIELDS))
-        gather(
-            *here,
+        overlap = np.zeros((len(points), FIELDS))
+        add_surface(
+            np.ascontiguousarray(move_points(T, points)),
+            np.ascontiguousarray(normals @ T[:3, :3].T),
             view.quality[mask],
             np.ascontiguousarray(there.T[:3, :3]),
             max(view.spacing, there.spacing),
-            _gate(pairs, name, other, view, there),
+            _gate_mm(pairs, name, other, view, there),
             there.points,
             there.normals,
             there.noise,
@@ -176,19 +179,20 @@ def _fused_points(
             1.0 if gains is None else gains[other],
             order.index(other) < order.index(name),
             there.to_pixel,
-            meeting,
-            lost,
+            overlap,
+            inferior,
         )
-        scans += (meeting[:, 7] > 0).astype(np.uint8)
-        sums += meeting
-    kept = ~lost
-    return _settled(view, points[kept], normals[kept], sums[kept], own_colours is not None), scans[kept]
+        scans += (overlap[:, 7] > 0).astype(np.uint8)
+        sums += overlap
+    best = ~inferior
+    return _average(view, points[best], normals[best], sums[best], own_colours is not None), scans[best]
 
 
-def _settled(view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarray, coloured: bool) -> PointSet:
+def _average(view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarray, coloured: bool) -> PointSet:
+    """Return the averages of a scan's points (n, 3) in the reference's frame from their ``sums`` (n, FIELDS)."""
     total = sums[:, 0]
     height = sums[:, 1] / total
-    moved = _moved(points + height[:, None] * normals, view.T)
+    moved = move_points(view.T, points + height[:, None] * normals)
     mean_normals = sums[:, 4:7] / np.linalg.norm(sums[:, 4:7], axis=1, keepdims=True)
     sigma = np.hypot(np.sqrt(sums[:, 2]) / total, sums[:, 3] / total)
     colours = None
@@ -197,14 +201,13 @@ def _settled(view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarr
     return PointSet(moved, mean_normals, colours, sigma)
 
 
-def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+def _concatenate(parts: list[PointSet]) -> PointSet:
+    """Concatenate point sets; attributes that one of them lacks are None."""
 
-
-def _joined(parts: list[PointSet]) -> PointSet:
-    def each(field: str) -> np.ndarray | None:
+    def join(field: str) -> np.ndarray | None:
+        """Concatenate one attribute."""
         values = [getattr(part, field) for part in parts]
         return None if any(value is None for value in values) else np.concatenate(values)
 
-    whole = PointSet(np.concatenate([part.points for part in parts]))
-    return replace(whole, normals=each("normals"), colours=each("colours"), sigma_mm=each("sigma_mm"))
+    points = np.concatenate([part.points for part in parts])
+    return PointSet(points, join("normals"), join("colours"), join("sigma_mm"))

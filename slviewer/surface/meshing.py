@@ -12,7 +12,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.surface.clean import clean, sight_cosines
+from slviewer.surface.clean import clean, viewing_cosines
 from slviewer.surface.edit import (
     DroppedParts,
     FilledHoles,
@@ -210,7 +210,7 @@ def grid_mesh(cloud: Cloud) -> Mesh:
     faces = triangulate_grid(points, JUMP * float(np.median(points[..., 2][kept]))) if kept.any() else np.zeros((0, 3))
     if not len(faces):
         raise InputError("No two neighbouring pixels of this scan lie on a surface: reconstruct it again.")
-    along = sight_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]
+    along = viewing_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]
     sigma = (cloud.sigma * along)[kept]
     colours = None if cloud.texture is None else cloud.texture[kept]
     if colours is not None and colours.ndim == 1:

@@ -1,4 +1,4 @@
-"""One surface through the points of merged scans, by screened Poisson, and kept only where something was measured."""
+"""Screened Poisson surface reconstruction, trimmed to the measured region."""
 
 from dataclasses import dataclass
 
@@ -14,17 +14,20 @@ from slviewer.surface.topology import extent_across, face_areas, face_groups, op
 
 LEAST_POINTS = 100
 DEEPEST = 11
-"""Halvings of the box around the points: 2048 cells along its longest side, 80 um of 150 mm."""
+"""Largest depth of the octree: 2048 cells along the longest side, 80 um of 150 mm."""
 REACH = 3.0
-"""Spacings of the points beyond which the surface is not measured, but imagined."""
+"""Distance from the points, in point spacings, beyond which the surface is extrapolated."""
 BULGE = 1.3
-"""Times the flat area within its rim that an imagined patch may have."""
+"""Largest area of an extrapolated patch over the flat area within its rim."""
 
 
 @dataclass(frozen=True)
 class TrimmedPatches:
-    """What became of the surface where nothing was measured: ``filled`` patches stayed (the largest ``largest_mm``
-    across, together the share ``imagined`` of the whole area), of which ``flattened`` had bulged; ``cut`` went."""
+    """Figures of the extrapolated patches of a surface.
+
+    ``filled``: number of patches that remain, of which ``flattened`` were replaced by flat ones; ``largest_mm``: extent
+    of the largest; ``imagined``: their share of the whole area; ``cut``: number of removed patches.
+    """
 
     filled: int
     flattened: int
@@ -34,9 +37,9 @@ class TrimmedPatches:
 
 
 def poisson_surface(points: PointSet, cell_mm: float) -> Mesh:
-    """A closed surface through points with normals, no finer than cells of ``cell_mm``, also where there are none.
+    """Reconstruct a closed surface from points with normals, with cells of ``cell_mm`` or larger.
 
-    Raises InputError for points without normals, or too few.
+    It is extrapolated where there are no points. Raises InputError for points without normals, or too few.
     """
     if points.normals is None:
         raise InputError("These points have no normals: a surface through them needs to know its outside; merge again.")
@@ -57,10 +60,9 @@ def poisson_surface(points: PointSet, cell_mm: float) -> Mesh:
 
 
 def trim_far_patches(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> tuple[Mesh, TrimmedPatches]:
-    """The mesh without the patches that lie far from all points and whose rims are more than ``fill_mm`` across.
+    """Remove the patches far from all points whose rim has an extent of more than ``fill_mm``.
 
-    Smaller ones stay: holes filled by the surface that fits around them best. One that bulges, as where the object
-    stood on its foot, is laid flat: nothing that was measured says otherwise.
+    Smaller patches remain as filled holes; one that bulges, as below an object on a table, is replaced by a flat fan.
     """
     distance, _ = cKDTree(points.points).query(mesh.vertices, distance_upper_bound=REACH * spacing_mm)
     far = ~np.isfinite(distance)
@@ -94,7 +96,7 @@ def trim_far_patches(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: f
 
 
 def _flat_area(vertices: np.ndarray, patch: np.ndarray) -> float:
-    """Area in mm2 of the fan about the middle of a patch's rim; infinite where the patch joins several rims."""
+    """Return the area in mm2 of the fan within the rim of a ``patch`` of faces (k, 3); inf for several rims."""
     loops = opening_loops(patch)
     longest = max(loops, key=len, default=np.empty(0, int))
     if len(longest) < 0.8 * sum(map(len, loops)):

@@ -1,4 +1,4 @@
-"""A surface as points and as triangles, without the camera's grid."""
+"""Unorganised point sets and triangle meshes."""
 
 from dataclasses import dataclass
 
@@ -21,8 +21,8 @@ class PointSet:
     sigma_mm: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        _settle(self, "points", self.points, np.float32, (len(self.points), 3))
-        _settle_each(self, len(self.points))
+        _set_array(self, "points", self.points, np.float32, (len(self.points), 3))
+        _set_attributes(self, len(self.points))
 
     def __len__(self) -> int:
         return len(self.points)
@@ -43,26 +43,28 @@ class Mesh:
     sigma_mm: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        _settle(self, "vertices", self.vertices, np.float32, (len(self.vertices), 3))
-        _settle(self, "faces", self.faces, np.int32, (len(self.faces), 3))
+        _set_array(self, "vertices", self.vertices, np.float32, (len(self.vertices), 3))
+        _set_array(self, "faces", self.faces, np.int32, (len(self.faces), 3))
         if len(self.faces) and not (self.faces.min() >= 0 and self.faces.max() < len(self.vertices)):
             raise InputError(f"Faces name vertices outside the {len(self.vertices)} that there are.")
-        _settle_each(self, len(self.vertices))
+        _set_attributes(self, len(self.vertices))
 
 
-def _settle_each(shape: "PointSet | Mesh", n: int) -> None:
-    for name, dtype, wanted in (
+def _set_attributes(shape: "PointSet | Mesh", n: int) -> None:
+    """Convert the optional attributes of ``n`` points to their dtypes, and check their shapes."""
+    for name, dtype, expected in (
         ("normals", np.float32, (n, 3)),
         ("colours", np.uint8, (n, 3)),
         ("sigma_mm", np.float32, (n,)),
     ):
         value = getattr(shape, name)
         if value is not None:
-            _settle(shape, name, value, dtype, wanted)
+            _set_array(shape, name, value, dtype, expected)
 
 
-def _settle(shape: "PointSet | Mesh", name: str, value: np.ndarray, dtype: type, wanted: tuple[int, ...]) -> None:
+def _set_array(shape: "PointSet | Mesh", name: str, value: np.ndarray, dtype: type, expected: tuple[int, ...]) -> None:
+    """Set an attribute to an array of a dtype; raises InputError where its shape is not the expected one."""
     array: np.ndarray = np.asarray(value, dtype=dtype)
-    if array.shape != wanted:
-        raise InputError(f"The {name} have shape {array.shape}: {wanted} is needed.")
+    if array.shape != expected:
+        raise InputError(f"The {name} have shape {array.shape}: {expected} is needed.")
     object.__setattr__(shape, name, array)

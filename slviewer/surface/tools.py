@@ -1,4 +1,4 @@
-"""What every change of a mesh needs: colours and sigmas carried along, unused vertices dropped, normals, distances."""
+"""Mesh utilities: transfer of colours and sigmas, selection of faces, vertex normals, and distances."""
 
 from dataclasses import replace
 from typing import Any
@@ -11,8 +11,10 @@ from slviewer.surface.shapes import Mesh, PointSet
 
 
 def transfer_attributes(known: Mesh | PointSet, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """A mesh of new vertices (n, 3) and faces (m, 3) with the colours and sigmas of the nearest known points, and its
-    own normals."""
+    """Return a mesh of vertices (n, 3) mm and faces (m, 3) with colours and sigmas of the nearest known points.
+
+    Normals are computed from the faces.
+    """
     mesh = Mesh(vertices, faces)
     points = known.vertices if isinstance(known, Mesh) else known.points
     colours = sigma = None
@@ -23,9 +25,9 @@ def transfer_attributes(known: Mesh | PointSet, vertices: np.ndarray, faces: np.
     return replace(mesh, colours=colours, sigma_mm=sigma, normals=vertex_normals(mesh))
 
 
-def select_faces(mesh: Mesh, kept: np.ndarray) -> Mesh:
-    """The faces ``kept`` (m,) bool, and the vertices that they use."""
-    faces = mesh.faces[kept]
+def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
+    """Return the faces selected by a mask (m,) bool and the vertices that they use."""
+    faces = mesh.faces[mask]
     used = np.zeros(len(mesh.vertices), bool)
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - 1
@@ -38,7 +40,7 @@ def select_faces(mesh: Mesh, kept: np.ndarray) -> Mesh:
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """(n, 3) float32: the mean normal of the faces around each vertex, by their area; 0, 0, 1 where there are none."""
+    """Return the area-weighted mean normals (n, 3) float32 of the faces around each vertex; (0, 0, 1) without faces."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     flat = np.cross(b - a, c - a)
     normals = np.stack(
@@ -53,7 +55,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 
 
 def surface_shift(before: Mesh, after: Mesh) -> tuple[float, float]:
-    """How far the vertices of a mesh lie from the surface that it became, mm: root mean square and largest."""
+    """Return (RMS, maximum) in mm of the distances from the vertices of one mesh to the surface of the other."""
     o3d = open3d()
     middle = before.vertices.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
@@ -64,7 +66,7 @@ def surface_shift(before: Mesh, after: Mesh) -> tuple[float, float]:
 
 
 def to_open3d_mesh(mesh: Mesh) -> Any:
-    """Open3D's triangle mesh of the same vertices and faces."""
+    """Convert to Open3D's triangle mesh; only vertices and faces."""
     o3d = open3d()
     return o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), o3d.utility.Vector3iVector(mesh.faces)

@@ -1,4 +1,4 @@
-"""Whether a mesh is closed, and where not: edges, openings, parts, the volume inside."""
+"""Topology of a mesh: openings, edges, connected parts, and the enclosed volume."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,11 @@ from slviewer.surface.shapes import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Topology:
-    """What holds a mesh together.
+    """Topology of a mesh.
 
-    ``openings_mm``: how far across each opening is, largest first. ``crowded``: edges of more than two triangles;
-    ``turned``: edges whose two triangles wind against each other. ``volume_mm3``: inside, if it is closed.
+    ``openings_mm``: extent of each opening, the largest first. ``crowded``: number of edges with more than two
+    triangles; ``turned``: number of edges whose two triangles have opposite orientations. ``volume_mm3``: enclosed
+    volume, valid for a closed mesh only.
     """
 
     openings_mm: tuple[float, ...]
@@ -24,26 +25,26 @@ class Topology:
 
     @property
     def watertight(self) -> bool:
-        """Closed, every edge between two triangles that wind alike, and the outside outside."""
+        """Whether the mesh is closed and consistently oriented, with normals outwards."""
         return not self.openings_mm and not self.crowded and not self.turned and self.volume_mm3 > 0
 
     def faults(self) -> str:
-        """What keeps it from being watertight, in words; empty where nothing does."""
-        found = []
+        """Describe why the mesh is not watertight; "" if it is."""
+        faults = []
         if self.openings_mm:
             n, largest = len(self.openings_mm), self.openings_mm[0]
-            found.append(f"{n} opening{'s' * (n > 1)}, the largest {largest:.1f} mm across")
+            faults.append(f"{n} opening{'s' * (n > 1)}, the largest {largest:.1f} mm across")
         if self.crowded:
-            found.append(f"{self.crowded} edges where more than two triangles meet")
+            faults.append(f"{self.crowded} edges where more than two triangles meet")
         if self.turned:
-            found.append(f"{self.turned} edges whose triangles wind against each other")
-        if not found and not self.volume_mm3 > 0:
-            found.append("its inside is outside")
-        return ", ".join(found)
+            faults.append(f"{self.turned} edges whose triangles wind against each other")
+        if not faults and not self.volume_mm3 > 0:
+            faults.append("its normals point inwards")
+        return ", ".join(faults)
 
 
 def analyse_topology(mesh: Mesh) -> Topology:
-    """Judge a mesh."""
+    """Analyse the topology of a mesh."""
     if not len(mesh.faces):
         return Topology((), 0, 0, 0.0)
     half = half_edges(mesh.faces)
@@ -65,12 +66,12 @@ def analyse_topology(mesh: Mesh) -> Topology:
 
 
 def half_edges(faces: np.ndarray) -> np.ndarray:
-    """(3 m, 2): the sides of faces (m, 3) in their own direction; all first sides, then all second, then all third."""
+    """Return the directed edges (3 m, 2) of faces (m, 3): all first edges, then all second, then all third ones."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def face_groups(faces: np.ndarray, n_vertices: int, chosen: np.ndarray | None = None) -> np.ndarray:
-    """(m,) int: to which connected part each face belongs; faces not ``chosen`` (m,) bool connect nothing: -1."""
+    """Return the connected part (m,) int of each face, of those ``chosen`` (m,) bool alone; -1 for the others."""
     picked = faces if chosen is None else faces[chosen]
     a, b = picked[:, [0, 1]].T, picked[:, [1, 2]].T
     rows, columns = np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
@@ -83,13 +84,13 @@ def face_groups(faces: np.ndarray, n_vertices: int, chosen: np.ndarray | None = 
 
 
 def face_areas(mesh: Mesh) -> np.ndarray:
-    """(m,) mm2 of each face."""
+    """Return the area (m,) mm2 of each face."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
 def extent_across(points: np.ndarray) -> float:
-    """The largest distance in mm between points (n, 3) on both sides of a loop, to within a few percent."""
+    """Return the largest extent in mm of points (n, 3) over 13 directions: their diameter to within a few percent."""
     directions = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1],
                            [0, 1, -1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)  # fmt: skip
     along = points.astype(np.float64) @ (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
@@ -97,9 +98,9 @@ def extent_across(points: np.ndarray) -> float:
 
 
 def opening_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """The loops around openings: vertices (k,) in the order in which the faces (m, 3) beside them run.
+    """Return the boundary loops of faces (m, 3): vertices (k,) each, in the direction of the faces' edges.
 
-    Where a vertex is on several openings, or on one twice, its loops are told apart; what closes no loop is left out.
+    A vertex that belongs to several openings, or to one twice, splits them into simple loops; open chains are skipped.
     """
     half = half_edges(faces)
     a, b = half[:, 0].astype(np.int64), half[:, 1].astype(np.int64)

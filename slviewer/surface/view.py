@@ -1,4 +1,4 @@
-"""A scan as fusing needs it: cleaned, with its errors along the normals, and a way from a place to its pixel."""
+"""Preparation of a scan for fusion: cleaning, standard deviations along the normals, weights, and a pixel map."""
 
 from dataclasses import dataclass, replace
 
@@ -9,26 +9,26 @@ from slviewer.errors import InputError
 from slviewer.geometry.polynomial import monomials
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.surface.clean import ExcludedPixels, clean, close_pinholes, sight_cosines
+from slviewer.surface.clean import ExcludedPixels, clean, close_pinholes, viewing_cosines
 
 LEAST_POINTS = 200
 FEATHER = 0.02
 """Share of the image's diagonal over which a scan's weight rises from its border inwards."""
-_DEGREE = 5
-_OFF_PX = 0.75
+_DEGREE = 5  # of the polynomial from rays to pixels
+_MAX_RMS_PX = 0.75  # of that polynomial, for points of one camera
 _LEAST_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One scan's surface, cut to the pixels that hold it.
+    """A cleaned scan, cropped to its surface.
 
-    ``T`` (4, 4) float64 is T_reference_scan. Of each pixel, (h, w, …) float32 in the camera's frame: ``points`` mm (NaN
-    where nothing is), ``normals`` of unit length towards the camera, ``noise`` and ``lasting`` (h, w) mm, the standard
-    deviations along the normal of this scan alone and of what its calibration does to every scan; ``inner`` 0 to 1,
-    rising from the scan's border inwards; ``quality``, how much the scan knows per area, smooth; ``colours``
-    (h, w, 3) uint8 or None. ``to_pixel`` maps lines of sight to pixels (see ``_fit_pixels``); ``spacing`` is the median
-    distance of neighbours in mm.
+    ``T`` (4, 4) float64: T_reference_scan. Images (h, w, ...) float32 in the camera's frame: ``points`` mm, NaN where
+    there is no surface; unit ``normals`` towards the camera; ``noise`` and ``lasting`` mm, the random and the
+    calibration's (systematic) standard deviation along the normal; ``inner``, a weight that rises from 0 at the scan's
+    border to 1; ``quality``, smoothed information per area in 1/mm^4; ``colours`` (h, w, 3) uint8 or None. ``to_pixel``
+    maps rays to pixels (see ``_fit_pixel_map``); ``spacing``: median distance of neighbouring points, mm; ``cleaned``:
+    numbers of the excluded pixels.
     """
 
     T: np.ndarray
@@ -45,38 +45,42 @@ class View:
 
     @property
     def mask(self) -> np.ndarray:
-        """(h, w) bool: where there is a point."""
+        """(h, w) bool: pixels with a point."""
         return np.isfinite(self.points[..., 2])
 
     def without(self, pixels: np.ndarray) -> "View":
-        """The view with the points at (h, w) bool left out."""
+        """Return the view without the points at ``pixels`` (h, w) bool."""
         return replace(self, points=np.where(pixels[..., None], np.float32(np.nan), self.points))
 
 
 def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
-    """Prepare a scan. Raises InputError, naming it, where too little of it is a surface seen from one place."""
+    """Prepare a scan with its pose (4, 4) for fusion.
+
+    Raises InputError with the scan's ``name`` for an invalid pose, for too few pixels on a surface, and for points that
+    were not measured by one camera at the origin.
+    """
     T = np.asarray(T_reference_scan, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError(f"{name}: its pose has shape {T.shape}: fusing needs a finite (4, 4) T_reference_scan.")
     normals = grid_normals(cloud.points)
-    kept, cleaned = clean(cloud, normals)
-    if np.count_nonzero(kept) < LEAST_POINTS:
+    surface, cleaned = clean(cloud, normals)
+    if np.count_nonzero(surface) < LEAST_POINTS:
         raise InputError(
-            f"{name}: only {np.count_nonzero(kept)} of its pixels lie on a surface: "
-            "reconstruct it again, or leave it out."
+            f"{name}: only {np.count_nonzero(surface)} of its pixels lie on a surface: "
+            "reconstruct it again, or exclude it."
         )
-    crop = _box(kept)
-    kept, normals = kept[crop], normals[crop]
-    points = np.where(kept[..., None], cloud.points[crop], np.float32(np.nan))
-    cosine = sight_cosines(points, normals)
-    noise = _known_noise(cloud.sigma_z[crop], points, cosine, kept)
+    crop = _bounding_box(surface)
+    surface, normals = surface[crop], normals[crop]
+    points = np.where(surface[..., None], cloud.points[crop], np.float32(np.nan))
+    cosine = viewing_cosines(points, normals)
+    noise = _fill_noise(cloud.sigma_z[crop], points, cosine, surface)
     lasting = np.zeros_like(noise) if cloud.sigma_lasting is None else cloud.sigma_lasting[crop]
-    # depth's error along the normal: moved by dz, a point moves by dz along its ray (x/z, y/z, 1)
+    # an error dz of depth moves the point by dz (x/z, y/z, 1) along its ray; its component along the normal
     along = cosine * np.linalg.norm(points, axis=-1) / points[..., 2]
     noise, lasting = noise * along, np.nan_to_num(lasting) * along
-    inner = _inwards(kept)
-    area = _pixel_area(points, cosine)
-    quality = np.where(kept, inner / ((noise**2 + lasting**2) * area), 0.0)
+    inner = _border_weights(surface)
+    area = _pixel_areas(points, cosine)
+    quality = np.where(surface, inner / ((noise**2 + lasting**2) * area), 0.0)
     return View(
         T=T,
         points=points,
@@ -84,76 +88,81 @@ def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
         noise=noise.astype(np.float32),
         lasting=lasting.astype(np.float32),
         inner=inner,
-        quality=_smooth(quality, kept),
-        colours=_rgb(cloud.texture, crop),
-        to_pixel=_fit_pixels(name, points, kept),
+        quality=_smooth(quality, surface),
+        colours=_crop_colours(cloud.texture, crop),
+        to_pixel=_fit_pixel_map(name, points, surface),
         spacing=float(np.sqrt(np.nanmedian(area))),
         cleaned=cleaned,
     )
 
 
-def _known_noise(sigma_z: np.ndarray, points: np.ndarray, cosine: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """The noise of depth; where it is not known, from the scan's roughness, larger far away and at grazing sight."""
-    known = kept & np.isfinite(sigma_z) & (sigma_z > 0)
-    if known.sum() == kept.sum():
+def _fill_noise(sigma_z: np.ndarray, points: np.ndarray, cosine: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Return the depth noise (h, w) mm with unknown values filled in, in proportion to z^2 / cosine.
+
+    The factor is fitted to the known values where these are the majority, else to the roughness of the surface.
+    """
+    known = surface & np.isfinite(sigma_z) & (sigma_z > 0)
+    if known.sum() == surface.sum():
         return sigma_z
     z = points[..., 2].astype(np.float64)
     shape = z**2 / np.maximum(cosine, 0.05)
-    if known.sum() > 0.5 * kept.sum():
+    if known.sum() > 0.5 * surface.sum():
         scale = float(np.median(sigma_z[known] / shape[known]))
     else:
         bend = z[1:-1, 1:-1] - 0.25 * (z[:-2, 1:-1] + z[2:, 1:-1] + z[1:-1, :-2] + z[1:-1, 2:])
         ratio = np.abs(bend / shape[1:-1, 1:-1])
         # of five equal, independent errors the difference has the standard deviation sqrt(1.25)
         scale = 1.4826 / np.sqrt(1.25) * float(np.nanmedian(ratio))
-    scale = max(scale, 1e-7 / float(np.nanmedian(z)))  # a perfect plane has none, and a weight needs one
+    scale = max(scale, 1e-7 / float(np.nanmedian(z)))  # positive for a perfect plane too, as weights divide by it
     return np.where(known, sigma_z, scale * shape)
 
 
-def _box(mask: np.ndarray) -> tuple[slice, slice]:
+def _bounding_box(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of the smallest rectangle around a mask (h, w) that is not empty."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
-def _inwards(kept: np.ndarray) -> np.ndarray:
-    """(h, w) float32: 0 outside, rising smoothly to 1; pinholes are no border."""
-    distance = cv2.distanceTransform(np.pad(close_pinholes(kept), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    width = max(4.0, FEATHER * float(np.hypot(*kept.shape)))
+def _border_weights(surface: np.ndarray) -> np.ndarray:
+    """(h, w) float32: weights that rise smoothly from 0 at the border of a mask (h, w) to 1; pinholes are closed."""
+    distance = cv2.distanceTransform(np.pad(close_pinholes(surface), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    width = max(4.0, FEATHER * float(np.hypot(*surface.shape)))
     share = np.clip((distance - 0.5) / width, 0, 1)
-    return np.where(kept, np.maximum(share * share * (3 - 2 * share), _LEAST_WEIGHT), 0).astype(np.float32)
+    return np.where(surface, np.maximum(share * share * (3 - 2 * share), _LEAST_WEIGHT), 0).astype(np.float32)
 
 
-def _pixel_area(points: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """(h, w) mm2 of surface that a pixel covers."""
+def _pixel_areas(points: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """(h, w) mm2: the area of surface that each pixel covers."""
     z = points[..., 2]
     x, y = points[..., 0] / z, points[..., 1] / z
     pitch = float(np.nanmedian(np.abs(np.diff(x, axis=1)))) * float(np.nanmedian(np.abs(np.diff(y, axis=0))))
     return np.asarray(pitch * z**2 / np.maximum(cosine, 0.05))
 
 
-def _smooth(quality: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Its mean over a window: who is best at a place shall not change from pixel to pixel."""
+def _smooth(quality: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Average the quality (h, w) over 9 by 9 pixels of the surface, so that the best scan does not change by pixel."""
     size = (9, 9)
     total = cv2.blur(quality.astype(np.float64), size)
-    share = cv2.blur(kept.astype(np.float64), size)
-    return np.where(kept, total / np.maximum(share, 1e-9), 0).astype(np.float32)
+    share = cv2.blur(surface.astype(np.float64), size)
+    return np.where(surface, total / np.maximum(share, 1e-9), 0).astype(np.float32)
 
 
-def _rgb(texture: np.ndarray | None, crop: tuple[slice, slice]) -> np.ndarray | None:
+def _crop_colours(texture: np.ndarray | None, crop: tuple[slice, slice]) -> np.ndarray | None:
+    """Return the cropped texture as RGB (h, w, 3), from grey (H, W) or RGB; None without one."""
     if texture is None:
         return None
-    cut = texture[crop]
-    return np.ascontiguousarray(np.repeat(cut[..., None], 3, axis=2) if cut.ndim == 2 else cut)
+    cropped = texture[crop]
+    return np.ascontiguousarray(np.repeat(cropped[..., None], 3, axis=2) if cropped.ndim == 2 else cropped)
 
 
-def _fit_pixels(name: str, points: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """(2 + 2 + 42,) float64: middle and half width of the lines of sight (x/z, y/z), then the coefficients of a
-    polynomial of degree 5 in the normalised ones for the column and for the row, in the order of ``monomials``.
+def _fit_pixel_map(name: str, points: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Fit the map from rays (x/z, y/z) to pixels: a polynomial of degree 5, accurate to a fraction of a pixel.
 
-    Good to a fraction of a pixel whatever the lens: what is found there is then taken for where it lies, not for where
-    it was expected.
+    Returns (46,) float64: centre (2) and half width (2) of the rays, then the coefficients (21 each) for column and row
+    in the normalised rays, in the order of ``monomials``. Raises InputError where the points are not those of one
+    camera at the origin.
     """
-    v, u = np.nonzero(kept)
+    v, u = np.nonzero(surface)
     every = slice(None, None, max(1, len(u) // 20_000))
     u, v = u[every], v[every]
     p = points[v, u].astype(np.float64)
@@ -163,10 +172,10 @@ def _fit_pixels(name: str, points: np.ndarray, kept: np.ndarray) -> np.ndarray:
     A = monomials((rays - middle) / half, _DEGREE)
     pixels = np.stack([u, v], axis=1).astype(np.float64)
     coefficients, *_ = np.linalg.lstsq(A, pixels, rcond=1e-10)
-    off = float(np.sqrt(np.mean((A @ coefficients - pixels) ** 2)))
-    if off > _OFF_PX:
+    rms = float(np.sqrt(np.mean((A @ coefficients - pixels) ** 2)))
+    if rms > _MAX_RMS_PX:
         raise InputError(
-            f"{name}: its points do not lie on the lines of sight of one camera at the origin ({off:.1f} px off): "
+            f"{name}: its points do not lie on the lines of sight of one camera at the origin ({rms:.1f} px off): "
             "give the organised cloud in the frame of the camera that took it."
         )
     return np.concatenate([middle, half, coefficients.T.ravel()])

@@ -1,4 +1,4 @@
-"""A surface from a volume: in each cell near the points the mean height above their tangent planes, then its zeros."""
+"""Surface reconstruction by a signed distance field: mean heights above the points' tangent planes, marching cubes."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from slviewer.surface.tools import transfer_attributes
 
 BLOCK = 8
 REACH = 2.0
-"""Cells around a point in which its tangent plane counts."""
+"""Radius in cells within which a point's tangent plane contributes to the field."""
 _MOST_BLOCKS = 20_000_000
 
 
 def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
-    """The surface of points with normals, in cells of ``cell_mm``; it ends where the points end, two cells further.
+    """Reconstruct the surface of points with normals on a grid of ``cell_mm``; it extends two cells beyond the points.
 
-    Points count by 1 / sigma2 where that is known. Takes memory by the surface's area, not by the box around it.
-    Raises InputError for points without normals, or too far apart for such cells.
+    Points are weighted by 1 / sigma2 where known. Memory grows with the surface's area, not with the bounding box.
+    Raises InputError for points without normals, for a bounding box of too many cells, and without a surface.
     """
     if points.normals is None:
         raise InputError("These points have no normals: a volume needs to know its outside; merge the scans again.")
@@ -29,10 +29,10 @@ def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
     if np.prod(shape) > _MOST_BLOCKS:
         raise InputError(
             f"The points fill {np.ptp(points.points, axis=0).max():.0f} mm, too much for cells of {cell_mm:.3g} mm: "
-            "leave out stray scans."
+            "exclude stray scans."
         )
     touched = np.zeros(tuple(shape), bool)
-    _touch(at, BLOCK, REACH, touched)
+    _mark_blocks(at, BLOCK, REACH, touched)
     keys = np.argwhere(touched).astype(np.int32)
     core, kinds = o3d.core, (o3d.core.float32, o3d.core.float32)
     grid = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), kinds, ((1,), (1,)), 1.0, BLOCK, len(keys))
@@ -44,19 +44,19 @@ def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
     height[:], weight[:] = 0, 0
     sigma = points.sigma_mm
     share = np.ones(len(points)) if sigma is None else (np.median(sigma) / np.maximum(sigma, 1e-6)) ** 2
-    _spread(at, points.normals.astype(np.float64), share.astype(np.float64), BLOCK, REACH, lookup, height, weight)
+    _add_planes(at, points.normals.astype(np.float64), share.astype(np.float64), BLOCK, REACH, lookup, height, weight)
     known = weight > 0
     height[known] /= weight[known]
     weight[known] = 1.0
-    found = grid.extract_triangle_mesh(weight_threshold=0.5)
-    if not len(found.vertex.positions):
+    mesh = grid.extract_triangle_mesh(weight_threshold=0.5)
+    if not len(mesh.vertex.positions):
         raise InputError("No surface was found between the points: the cells are too fine for them.")
-    vertices, faces = _in_order(found.vertex.positions.numpy(), found.triangle.indices.numpy())
+    vertices, faces = _sort_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy())
     return transfer_attributes(points, vertices.astype(np.float64) * cell_mm + origin, faces)
 
 
-def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same triangles, whatever order the threads found them in: by place, each from its first vertex on."""
+def _sort_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sort vertices (n, 3) by position and faces (m, 3) by vertex, so that the result does not depend on threads."""
     order = np.lexsort(vertices.T)
     faces = np.argsort(order)[faces]
     first = faces.argmin(axis=1)[:, None]
@@ -65,7 +65,8 @@ def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 @kernel()
-def _touch(at, block, reach, touched):
+def _mark_blocks(at, block, reach, touched):
+    """Set ``touched`` (a, b, c) True for the blocks within ``reach`` cells of points ``at`` (n, 3), in cells."""
     for i in range(len(at)):
         x0, x1 = int(at[i, 0] - reach) // block, int(at[i, 0] + reach + 1) // block
         y0, y1 = int(at[i, 1] - reach) // block, int(at[i, 1] + reach + 1) // block
@@ -77,8 +78,12 @@ def _touch(at, block, reach, touched):
 
 
 @kernel()
-def _spread(at, normals, share, block, reach, lookup, height, weight):
-    """Adds each point's plane to the cells' corners around it, at (x, y, z) in cells from the origin."""
+def _add_planes(at, normals, share, block, reach, lookup, height, weight):
+    """Add the signed distances to each point's tangent plane to the grid nodes around it, and their weights.
+
+    ``at`` (n, 3) in cells; ``share`` (n,): the points' weights; ``lookup`` (a, b, c): index of each block; ``height``
+    and ``weight`` (blocks, block^3): sums.
+    """
     for i in range(len(at)):
         p0, p1, p2 = at[i, 0], at[i, 1], at[i, 2]
         for z in range(int(np.ceil(p2 - reach)), int(np.floor(p2 + reach)) + 1):

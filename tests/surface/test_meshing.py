@@ -165,7 +165,7 @@ def test_decimating_and_smoothing_report_how_far_they_moved_the_surface(closed: 
 def test_what_is_wrong_with_a_mesh_is_said(closed: BuiltMesh) -> None:
     faces = closed.mesh.faces
     inside_out = analyse_topology(Mesh(closed.mesh.vertices, faces[:, ::-1]))
-    assert inside_out.faults() == "its inside is outside"
+    assert inside_out.faults() == "its normals point inwards"
     turned = faces.copy()
     turned[10] = turned[10, ::-1]
     assert (

@@ -1,20 +1,23 @@
-"""Where one scan's points meet another scan's surface: compiled loops over the points of the one."""
+"""Compiled loops over the points of one scan that compare them with the surface of another."""
 
 import numba
 import numpy as np
 
 from slviewer.geometry.jit import kernel
 
-SAME_SIDE = 0.5
-"""The cosine between two normals from which they may belong to one surface."""
+MIN_NORMAL_COSINE = 0.5
+"""Least cosine between the normals of one surface."""
 FIELDS = 12
-"""Of a point's sums: weight, weight x height, (weight x noise)2, weight x lasting, weight x normal (3), number of
-scans, weight of colour, weight x colour (3)."""
+"""Number of sums per point: weight, weight x height, (weight x noise)^2, weight x lasting, weight x normal (3), number
+of scans, weight of colour, weight x colour (3)."""
 
 
 @kernel()
 def pixel_of(x, y, z, to_pixel):
-    """(column, row) that sees (x, y, z); NaN beside what the scan covers."""
+    """Return the (column, row) whose ray passes (x, y, z) mm in the camera's frame; NaN outside the scan.
+
+    ``to_pixel``: see ``view._fit_pixel_map``.
+    """
     if not z > 0.0:
         return np.nan, np.nan
     a = (x / z - to_pixel[0]) / to_pixel[2]
@@ -36,13 +39,13 @@ def pixel_of(x, y, z, to_pixel):
 
 
 @kernel()
-def meet(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
-    """How a scan's surface lies at the point ``p`` (3,) with normal ``n``, in that scan's frame; False where not there.
+def interpolate_surface(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+    """Interpolate a scan's surface at a point ``p`` (3,) mm with normal ``n`` in its frame; False where it has none.
 
-    Fills ``mean`` (8,): height above p along n, its variance, lasting, inner weight, normal (3), and the pixel
-    (v * width + u). The height is the mean of those of the tangent planes of the pixels around, within ``reach`` mm
-    across n. Where these planes differ by more than noise the surface bends within a pixel, and its mean is the less
-    sure: what exceeds twice the variance of noise is added.
+    Fills ``mean`` (8,): height above p along n, its variance, lasting sigma, border weight, normal (3), and the pixel
+    (v * width + u). The height is a weighted mean over the tangent planes of pixels within ``reach`` mm across n and
+    ``gate`` mm along n. Where these planes differ by more than their noise, the surface is curved: the variance
+    increases by what exceeds twice that of the noise.
     """
     height, width = noise.shape
     u, v = pixel_of(p[0], p[1], p[2], to_pixel)
@@ -61,7 +64,7 @@ def meet(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, me
                 continue
             q0, q1, q2 = normals[y, x, 0], normals[y, x, 1], normals[y, x, 2]
             cosine = q0 * n[0] + q1 * n[1] + q2 * n[2]
-            if cosine < SAME_SIDE:
+            if cosine < MIN_NORMAL_COSINE:
                 continue
             rise = (q0 * d0 + q1 * d1 + q2 * d2) / cosine
             if abs(rise) > gate:
@@ -75,11 +78,11 @@ def meet(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, me
             s += near * lasting[y, x]
             w += near * inner[y, x]
             m0, m1, m2 = m0 + near * q0, m1 + near * q1, m2 + near * q2
-    if not total > 0.3:  # one pixel at the rim of the reach says nothing about this place
+    if not total > 0.3:  # a single pixel at the rim of the reach is not enough
         return False
     t /= total
-    bent = max(tt / total - t * t - 2.0 * noises / total, 0.0)
-    mean[0], mean[1], mean[2], mean[3] = t, squares / (total * total) + bent, s / total, w / total
+    curvature = max(tt / total - t * t - 2.0 * noises / total, 0.0)
+    mean[0], mean[1], mean[2], mean[3] = t, squares / (total * total) + curvature, s / total, w / total
     length = np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
     mean[4], mean[5], mean[6] = m0 / length, m1 / length, m2 / length
     mean[7] = row * width + column
@@ -87,37 +90,42 @@ def meet(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, me
 
 
 @kernel(parallel=True)
-def compare(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, out):
-    """Fills ``out`` (k, 2): the height of the scan above each of the points p (k, 3), and its pixel; NaN, -1 where
-    they do not meet. Points and normals n (k, 3) in the scan's frame."""
+def measure_heights(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, heights):
+    """Measure the heights of a scan's surface above points ``p`` (k, 3) mm with normals ``n`` (k, 3) in its frame.
+
+    Fills ``heights`` (k, 2): the height in mm and the index of the pixel; (NaN, -1) without overlap.
+    """
     for i in numba.prange(len(p)):
         mean = np.empty(8)
-        out[i, 0], out[i, 1] = np.nan, -1.0
-        if meet(p[i], n[i], reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
-            out[i, 0], out[i, 1] = mean[0], mean[7]
+        heights[i, 0], heights[i, 1] = np.nan, -1.0
+        if interpolate_surface(p[i], n[i], reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+            heights[i, 0], heights[i, 1] = mean[0], mean[7]
 
 
 @kernel(parallel=True)
-def vote(p, gate, points, sure, to_pixel, agreed, denied):
-    """Adds 1 to ``agreed`` (k,) where a scan sees its surface at the points p (k, 3) of its frame, or to ``denied``
-    where it sees through them, clearly further than ``gate`` mm. Only pixels ``sure`` (h, w) say so."""
-    height, width = sure.shape
+def count_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting):
+    """Add a scan's votes on points ``p`` (k, 3) mm in its frame; only its pixels ``witnesses`` (h, w) bool vote.
+
+    Adds 1 to ``confirming`` (k,) where its surface is within ``gate`` mm in depth, or to ``contradicting`` (k,) where
+    the surface is more than 1.5 gates behind the point, which is thus in the scan's free space.
+    """
+    height, width = witnesses.shape
     for i in numba.prange(len(p)):
         u, v = pixel_of(p[i, 0], p[i, 1], p[i, 2], to_pixel)
         if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
             continue
         y, x = int(np.rint(v)), int(np.rint(u))
-        if not sure[y, x]:
+        if not witnesses[y, x]:
             continue
         behind = points[y, x, 2] - p[i, 2]
         if abs(behind) <= gate:
-            agreed[i] += 1
+            confirming[i] += 1
         elif behind > 1.5 * gate:
-            denied[i] += 1
+            contradicting[i] += 1
 
 
 @kernel(parallel=True)
-def gather(
+def add_surface(
     p,
     n,
     own,
@@ -135,17 +143,17 @@ def gather(
     earlier,
     to_pixel,
     sums,
-    lost,
+    inferior,
 ):
-    """Adds a scan's surface to the ``sums`` (k, FIELDS) of the points p (k, 3) with normals n (k, 3) in its frame.
+    """Add a scan's surface to the ``sums`` (k, FIELDS) of points ``p`` (k, 3) with normals ``n`` (k, 3) in its frame.
 
-    ``R`` (3, 3) turns its frame into the reference's. ``lost`` (k,) becomes True where the scan knows the place better
-    than ``own`` (k,), its quality for those points; of two alike the ``earlier`` wins.
+    ``R`` (3, 3): rotation from its frame to the reference's. ``inferior`` (k,) is set True where the scan's quality
+    exceeds the points' ``own`` (k,), or equals it if the scan is the ``earlier`` one.
     """
     width = noise.shape[1]
     for i in numba.prange(len(p)):
         mean = np.empty(8)
-        if not meet(p[i], n[i], reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+        if not interpolate_surface(p[i], n[i], reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
             continue
         y, x = int(mean[7]) // width, int(mean[7]) % width
         weight = mean[3] / (mean[1] + mean[2] * mean[2])
@@ -165,4 +173,4 @@ def gather(
                 sums[i, 9 + k] += share * gain * colours[y, x, k]
         rival = quality[y, x]
         if rival > own[i] or (rival == own[i] and earlier):
-            lost[i] = True
+            inferior[i] = True
