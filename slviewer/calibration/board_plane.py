@@ -1,6 +1,6 @@
 """The board plane's projector coordinates for every camera pixel; a mask of the pixels that agree with it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -8,19 +8,19 @@ import numpy as np
 MIN_FEATURES = 12
 """Nine unknowns, and some features more."""
 OUTLIER_SIGMAS = 6.0
-"""Features beyond so many robust sigma were not read on the board."""
+"""Features with a larger residual, in robust sigma, are outliers."""
 MIN_TOLERANCE_PX = 1.0
 TOLERANCE_RATIO = 4.0
-"""How far from the plane a pixel may be read: this, and so many times what its farthest feature strays. Beyond the
-outermost features, lenses bend the plane several times as much as between them."""
+"""Tolerance of a pixel's coordinate: 1 px plus four times the largest residual of a feature. Beyond the outermost
+features, lens distortion is several times as large as between them."""
 
 
 @dataclass(frozen=True)
 class BoardPlane:
-    """A homography from the camera to the projector, after the division model x / (1 + bend r^2) of the camera's lens.
+    """A homography from camera to projector, with the division model x / (1 + bend r^2) of the camera's distortion.
 
-    ``centre`` px and ``radius`` px normalise camera pixels; ``reach`` (2,) px is how far along x and y a pixel of the
-    board may lie from what this predicts.
+    ``centre`` px and ``radius`` px normalise camera pixels; ``reach`` (2,) px: tolerance of the projector's x and y
+    coordinate at a pixel of the board.
     """
 
     H: np.ndarray
@@ -31,28 +31,31 @@ class BoardPlane:
 
     @classmethod
     def fit(cls, camera: np.ndarray, projector: np.ndarray, size: tuple[int, int]) -> "BoardPlane | None":
-        """The plane of features at ``camera`` and ``projector`` pixels, (n, 2) each, in a camera of ``size``.
+        """Fit the plane robustly to features at ``camera`` and ``projector`` pixels (n, 2), NaN where unknown.
 
-        Unread features (NaN) and outliers are excluded. None where too few remain.
+        ``size``: (width, height) px of the camera. None where fewer than MIN_FEATURES inliers remain.
         """
         centre, radius = (np.array(size) - 1) / 2, float(np.hypot(*size)) / 2
-        kept = np.isfinite(projector).all(1) & np.isfinite(camera).all(1)
-        found = None
+        inlier = np.isfinite(projector).all(1) & np.isfinite(camera).all(1)
+        plane = None
         for _ in range(5):
-            if np.count_nonzero(kept) < MIN_FEATURES:
+            if np.count_nonzero(inlier) < MIN_FEATURES:
                 return None
-            found = cls._fit(camera[kept], projector[kept], centre, radius)
-            if found is None:
+            plane = cls._fit_inliers(camera[inlier], projector[inlier], centre, radius)
+            if plane is None:
                 return None
-            strays = np.linalg.norm(found.predict(camera[:, 0], camera[:, 1]) - projector, axis=1)
-            before = kept
-            kept = strays < np.maximum(OUTLIER_SIGMAS * np.median(strays[kept]) / 1.1774, 0.5)
-            if np.array_equal(kept, before):
+            residual = np.linalg.norm(plane.predict(camera[:, 0], camera[:, 1]) - projector, axis=1)
+            before = inlier
+            inlier = residual < np.maximum(OUTLIER_SIGMAS * np.median(residual[inlier]) / 1.1774, 0.5)
+            if np.array_equal(inlier, before):
                 break
-        return found
+        return plane
 
     @classmethod
-    def _fit(cls, camera: np.ndarray, projector: np.ndarray, centre: np.ndarray, radius: float) -> "BoardPlane | None":
+    def _fit_inliers(
+        cls, camera: np.ndarray, projector: np.ndarray, centre: np.ndarray, radius: float
+    ) -> "BoardPlane | None":
+        """Fit the homography for a range of distortions, refined twice, and return the plane with the smallest RMS."""
         bends, step = np.linspace(-0.5, 0.3, 9), 0.1
         best: tuple[float, BoardPlane] | None = None
         for _ in range(3):
@@ -61,13 +64,11 @@ class BoardPlane:
                 if H is None:
                     continue
                 plane = cls(H, float(bend), centre, radius, np.zeros(2))
-                strays = plane.predict(camera[:, 0], camera[:, 1]) - projector
-                rms = float(np.sqrt(np.mean(strays**2)))
+                residuals = plane.predict(camera[:, 0], camera[:, 1]) - projector
+                rms = float(np.sqrt(np.mean(residuals**2)))
                 if best is None or rms < best[0]:
-                    best = (
-                        rms,
-                        cls(H, float(bend), centre, radius, MIN_TOLERANCE_PX + TOLERANCE_RATIO * np.abs(strays).max(0)),
-                    )
+                    reach = MIN_TOLERANCE_PX + TOLERANCE_RATIO * np.abs(residuals).max(0)
+                    best = rms, replace(plane, reach=reach)
             if best is None:
                 return None
             bends = best[1].bend + np.linspace(-step, step, 7)
@@ -75,7 +76,7 @@ class BoardPlane:
         return best[1] if best else None
 
     def predict(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """(..., 2) px in the projector of the plane at camera pixels (u, v), which broadcast."""
+        """Return the plane's projector coordinates (..., 2) px at camera pixels (u, v), which broadcast."""
         x, y = (u - self.centre[0]) / self.radius, (v - self.centre[1]) / self.radius
         scale = 1 + self.bend * (x * x + y * y)
         a, b, w = (h[0] * x + h[1] * y + h[2] * scale for h in self.H)
@@ -83,9 +84,9 @@ class BoardPlane:
             return np.stack([a / w, b / w], axis=-1)
 
     def contains(self, coordinate: np.ndarray, along: int, origin: tuple[int, int]) -> np.ndarray:
-        """(h', w') bool: which projector coordinates, at camera pixels from ``origin`` = (u0, v0), lie near the plane.
+        """(h', w') bool: projector coordinates (h', w') px within the tolerance of the plane; False for NaN.
 
-        ``along`` 0: coordinates are columns; 1: rows. False for NaN.
+        ``along``: 0 for columns, 1 for rows; ``origin``: camera pixel (u0, v0) of the first coordinate.
         """
         height, width = coordinate.shape
         expected = self.predict(np.arange(width)[None] + origin[0], np.arange(height)[:, None] + origin[1])
@@ -94,4 +95,5 @@ class BoardPlane:
 
 
 def _undistort_division(normalised: np.ndarray, bend: float) -> np.ndarray:
+    """Undistort normalised pixels (n, 2) by the division model."""
     return normalised / (1 + bend * np.sum(normalised**2, axis=1, keepdims=True))

@@ -28,11 +28,11 @@ EDGE_BAND = 0.25
 
 
 def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarray:
-    """(h, w) bool: valid pixels of the board's bright parts, clear of the contrast edges.
+    """Select the valid pixels (h, w) bool of the board's bright parts at a distance from contrast edges.
 
-    Bright means more than half of the modulation found within a pitch; dark parts carry little light. How clear depends
-    on how blurred the edges are, and on what there is: between the squares and the markers of a ChArUco board run
-    strips of a few pixels.
+    ``inside`` (h, w) bool: the board's pixels; ``pitch``: px. Bright pixels have more than half of the largest
+    modulation within a pitch. The distance is 2 sigma of the edges' blur, less where few pixels would remain, as
+    between the squares and markers of a ChArUco board.
     """
     modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
     crest = _local_extreme(cv2.dilate, modulation, pitch)
@@ -53,9 +53,9 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
 
 
 def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
-    """Standard deviation, in px, of what blurs the board's contrast edges: the lens and the pixels together.
+    """Estimate the blur of the board's contrast edges by lens and pixels, standard deviation in px.
 
-    The area of what is neither dark nor bright, over the length of the edges that it accompanies.
+    It is proportional to the area of intermediate pixels over the length of the edges.
     """
     modulation = np.asarray(phase.modulation, np.float32)
     crest, trough = (_local_extreme(of, modulation, pitch) for of in (cv2.dilate, cv2.erode))
@@ -81,5 +81,5 @@ def _local_extreme(of: Callable[..., np.ndarray], modulation: np.ndarray, pitch:
     shrink = max(1, int(pitch // 12))
     small = cv2.blur(modulation, (shrink, shrink))[::shrink, ::shrink] if shrink > 1 else modulation
     reach = 2 * int(np.ceil(0.7 * pitch / shrink)) + 1
-    found = of(small, np.ones((reach, reach), np.uint8))
-    return cv2.resize(found, modulation.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    extreme = of(small, np.ones((reach, reach), np.uint8))
+    return cv2.resize(extreme, modulation.shape[::-1], interpolation=cv2.INTER_LINEAR)

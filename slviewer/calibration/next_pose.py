@@ -1,4 +1,4 @@
-"""Coverage of the poses so far, and the next pose that improves it most.
+"""Coverage of the image, depths and tilts by target poses, and the next pose that improves it most.
 
 A calibration needs the target in every part of the image, near and far, and tilted in several directions. Poses are
 T_camera_board (4, 4) mm; before a calibration they are approximate, from a nominal lens, which is good enough here.
@@ -13,6 +13,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import move_points, rigid_transform, transform_from_rvec
 from slviewer.target.board import Board
 
 COLUMNS, ROWS = 4, 3
@@ -39,7 +40,10 @@ _FINE = 5  # samples along each side of a cell
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """How many poses cover each cell of the image (3, 4), each third of the depths (3,), each of `TILTS` (5,)."""
+    """Number of poses that cover each cell of the image (3, 4), each third of the depths (3,), and each tilt (5,).
+
+    ``range_mm``: nearest and farthest recommended depth.
+    """
 
     cells: np.ndarray
     depths: np.ndarray
@@ -48,14 +52,14 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """0 ... 1: how much of the goal is reached, the image, the depths and the tilts counting alike."""
+        """Share of the goal that is reached, 0 to 1; image, depths and tilts have equal weight."""
         goals = ((self.cells, CELL_GOAL), (self.depths, GOAL_POSES), (self.tilts, GOAL_POSES))
         return float(np.mean([np.minimum(n, goal).mean() / goal for n, goal in goals]))
 
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """The next pose, T_camera_board (4, 4) mm, its outline (4, 2) in camera px, and the same in words."""
+    """A recommended pose, T_camera_board (4, 4) mm, its outline (4, 2) in camera px, and an instruction in words."""
 
     T_camera_board: np.ndarray
     outline_px: np.ndarray
@@ -63,17 +67,16 @@ class Suggestion:
 
 
 def nominal_lens(size: tuple[int, int], focal_px: float | None = None) -> Lens:
-    """A lens without distortion; `focal_px` is guessed where it is not known."""
+    """Return a lens without distortion; without `focal_px` a typical focal length is assumed."""
     width, height = size
     f = focal_px or NOMINAL_FOCAL * width
     return Lens(np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]), np.zeros(5), size)
 
 
 def estimated_lens(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]) -> Lens:
-    """A lens from features (n, 3) mm and (n, 2) px of several tilted boards; the nominal one where they do not
-    determine it.
+    """Estimate a lens of one focal length, undistorted, from points (n, 3) mm and pixels (n, 2) of several boards.
 
-    One focal length, no distortion: enough to place boards with, long before a calibration is possible.
+    Returns the nominal lens for fewer than two boards, and where the estimate is not plausible.
     """
     if len(points) >= 2:
         objects, images = ([np.asarray(a, np.float32) for a in arrays] for arrays in (points, pixels))
@@ -84,34 +87,35 @@ def estimated_lens(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], s
 
 
 def approximate_pose(points: np.ndarray, pixels: np.ndarray, lens: Lens) -> np.ndarray | None:
-    """T_camera_board (4, 4) mm from features (n, 3) mm and (n, 2) px; None where they give none."""
+    """Estimate T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None where there is no solution."""
     if len(points) < 4:
         return None
     try:
-        found, rotation, t = cv2.solvePnP(
+        success, rvec, tvec = cv2.solvePnP(
             np.asarray(points, float), np.asarray(pixels, float), lens.K, lens.D, flags=cv2.SOLVEPNP_IPPE
         )
     except cv2.error:
         return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], np.ravel(t)
-    return T if found and np.isfinite(T).all() and T[2, 3] > 0 else None
+    if not (success and np.isfinite(rvec).all() and np.isfinite(tvec).all()):
+        return None
+    T = transform_from_rvec(rvec, tvec)
+    return T if T[2, 3] > 0 else None
 
 
 def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
-    """(near, far) mm to hold the board at: from filling the image to two thirds of that."""
+    """Return the nearest and farthest recommended depth of the board in mm; at the nearest it fills the image."""
     sides = np.ptp(board.outline()[:, :2], axis=0)
     near = float(np.max(sides * lens.K[[0, 1], [0, 1]] / (_NEAR_FILL * np.array(lens.size))))
     return near, _DEPTH_RATIO * near
 
 
 def coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
-    """What `poses` cover together."""
+    """Count how often `poses`, T_camera_board (4, 4) mm each, cover the cells, depths and tilts."""
     span = depth_range(board, lens)
     cells, depths, tilts = np.zeros((ROWS, COLUMNS), int), np.zeros(3, int), np.zeros(len(TILTS), int)
     for T in poses:
-        seen, third, tilt = _classify(board, lens, T, span)
-        cells += seen
+        covered, third, tilt = _classify(board, lens, T, span)
+        cells += covered
         depths[third] += 1
         tilts[tilt] += 1
     return Coverage(cells, depths, tilts, span)
@@ -119,7 +123,7 @@ def coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
 
 def outline_px(board: Board, lens: Lens, T: np.ndarray) -> np.ndarray:
     """(4, 2) px: the board's outline in the image, NaN behind the camera."""
-    return lens.project(_place_board(T, board.outline()))
+    return lens.project(move_points(T, board.outline()))
 
 
 def suggest(
@@ -130,24 +134,25 @@ def suggest(
     illuminated: Callable[[np.ndarray], np.ndarray] | None = None,
     skip: int = 0,
 ) -> Suggestion:
-    """The pose that adds most to what `poses` cover, with the whole board in view.
+    """Suggest the pose that improves the coverage by `poses` most, with the whole board in view.
 
-    `illuminated(points (n, 3) mm) -> (n,) bool` says which points the projector reaches, where that is known
-    (`projector_reach` learns it). `skip` passes over so many of the best: those that were tried and refused.
+    `illuminated(points (n, 3) mm) -> (n,) bool`: whether the projector reaches points in the camera's frame, where that
+    is known (see `projector_reach`). `skip`: number of better suggestions to skip, which were refused before. Raises
+    InputError where no pose shows the whole board.
     """
-    have = coverage(board, lens, poses)
-    taken = [_signature(T, board, have.range_mm) for T in poses]
+    current = coverage(board, lens, poses)
+    existing = [_describe_numerically(T, board, current.range_mm) for T in poses]
     ranked = []
-    for T in _candidates(board, lens, have.range_mm, len(poses), illuminated):
-        seen, third, tilt = _classify(board, lens, T, have.range_mm)
-        lacks = (
-            (seen * np.maximum(CELL_GOAL - have.cells, 0)).sum() / (CELL_GOAL * seen.size)
-            + max(GOAL_POSES - have.depths[third], 0) / GOAL_POSES
-            + max(GOAL_POSES - have.tilts[tilt], 0) / GOAL_POSES
+    for T in _list_candidates(board, lens, current.range_mm, len(poses), illuminated):
+        covered, third, tilt = _classify(board, lens, T, current.range_mm)
+        gain = (
+            (covered * np.maximum(CELL_GOAL - current.cells, 0)).sum() / (CELL_GOAL * covered.size)
+            + max(GOAL_POSES - current.depths[third], 0) / GOAL_POSES
+            + max(GOAL_POSES - current.tilts[tilt], 0) / GOAL_POSES
         )
-        here = _signature(T, board, have.range_mm)
-        apart = min((float(np.linalg.norm(here - other)) for other in taken), default=1.0)
-        ranked.append((lacks + 0.2 * apart, T))
+        descriptor = _describe_numerically(T, board, current.range_mm)
+        distance = min((float(np.linalg.norm(descriptor - other)) for other in existing), default=1.0)
+        ranked.append((gain + 0.2 * distance, T))
     if not ranked:
         raise InputError(f"the board {board} cannot be held so that the camera sees all of it: take a smaller board")
     ranked.sort(key=lambda entry: -entry[0])
@@ -155,7 +160,7 @@ def suggest(
 
 
 def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) -> Suggestion:
-    """A pose as a suggestion: its outline and its words."""
+    """Return a suggestion for a given pose, with its outline and instruction."""
     corners = outline_px(board, lens, T_camera_board)
     _, third, tilt = _classify(board, lens, T_camera_board, depth_range(board, lens))
     return Suggestion(T_camera_board, corners, _describe_pose(third, tilt, corners.mean(0), lens.size))
@@ -164,8 +169,10 @@ def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) ->
 def projector_reach(
     points: np.ndarray, pixels: np.ndarray, size: tuple[int, int], margin: float = 0.02
 ) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Which points the projector reaches, learnt from camera-frame `points` (n, 3) mm whose projector `pixels` (n, 2)
-    are known; None where they do not tell (a single plane). Linear resection of the projector, without distortion.
+    """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and pixels (n, 2).
+
+    Points are in the camera's frame, pixels in the projector. Returns a function points (k, 3) mm -> (k,) bool, or None where the points do not
+    determine the projection, as on a single plane.
     """
     known = np.isfinite(pixels).all(1) & np.isfinite(points).all(1)
     points, pixels = points[known], pixels[known]
@@ -189,39 +196,44 @@ def projector_reach(
     return reaches if reaches(points).mean() > 0.8 else None
 
 
-def _candidates(
+def _list_candidates(
     board: Board,
     lens: Lens,
     span: tuple[float, float],
     count: int,
     illuminated: Callable[[np.ndarray], np.ndarray] | None,
 ) -> list[np.ndarray]:
-    """Poses in every third, tilt and direction, each as far out as keeps the whole board in view and in the light."""
+    """List poses (4, 4) at every depth, tilt and direction, each as far off-centre as the whole board is visible.
+
+    `span`: (near, far) mm; `count`: number of poses so far, which selects the tilt angle.
+    """
     angle = np.radians((18.0, 25.0, 14.0)[count % 3])
     near, far = span
     middle = (board.points.min(0) + board.points.max(0)) / 2
     width, height = lens.size
-    found = []
+    candidates = []
     # Before two poses have shown the projector's field of view, the middle of the image is most likely inside it.
     places = list(product((-1, 0, 1), (-1, 0, 1))) if illuminated is not None else [(0, 0)]
     for third, tilt, place in product(range(3), range(len(TILTS)), places):
         R = _tilt_rotation(tilt, angle)
         depth = near + (far - near) * (third + 0.5) / 3
-        out = np.array([place[0] * width, place[1] * height]) / 2
+        offset = np.array([place[0] * width, place[1] * height]) / 2
         for share in np.linspace(1, 0, 11) if place != (0, 0) else (0.0,):
-            u, v = np.array([(width - 1) / 2, (height - 1) / 2]) + share * out
+            u, v = np.array([(width - 1) / 2, (height - 1) / 2]) + share * offset
             ray = np.array([(u - lens.K[0, 2]) / lens.K[0, 0], (v - lens.K[1, 2]) / lens.K[1, 1], 1.0])
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = R, depth * ray - R @ middle
-            if _in_view(board, lens, T, illuminated):
+            T = rigid_transform(R, depth * ray - R @ middle)
+            if _is_visible(board, lens, T, illuminated):
                 if share > 0.15 or place == (0, 0):
-                    found.append(T)
+                    candidates.append(T)
                 break
-    return found
+    return candidates
 
 
-def _in_view(board: Board, lens: Lens, T: np.ndarray, illuminated: Callable[[np.ndarray], np.ndarray] | None) -> bool:
-    corners = _place_board(T, board.outline())
+def _is_visible(
+    board: Board, lens: Lens, T: np.ndarray, illuminated: Callable[[np.ndarray], np.ndarray] | None
+) -> bool:
+    """Whether the board's outline at a pose (4, 4) is inside the image, with a margin, and illuminated."""
+    corners = move_points(T, board.outline())
     pixels = lens.project(corners)
     free = _FREE * lens.size[0]
     if not (np.isfinite(pixels).all() and (pixels > free).all() and (pixels < np.array(lens.size) - 1 - free).all()):
@@ -230,7 +242,7 @@ def _in_view(board: Board, lens: Lens, T: np.ndarray, illuminated: Callable[[np.
 
 
 def _classify(board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]) -> tuple[np.ndarray, int, int]:
-    """(cells (3, 4) bool, third, tilt) of one pose."""
+    """Return the covered cells (3, 4) bool, the third of the depths, and the index in `TILTS` of a pose (4, 4)."""
     u, v = np.meshgrid(*((np.arange(n * _FINE) + 0.5) / (n * _FINE) for n in (COLUMNS, ROWS)))
     samples = np.stack([u, v], -1).reshape(-1, 2) * np.array(lens.size)
     corners = outline_px(board, lens, T)
@@ -247,6 +259,7 @@ def _classify(board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]
 
 
 def _classify_tilt(T: np.ndarray) -> int:
+    """Return the index in `TILTS` of a pose (4, 4)."""
     normal = T[:3, 2] * (1 if T[2, 2] >= 0 else -1)
     if np.degrees(np.arccos(np.clip(normal[2], -1, 1))) < FACING_DEG:
         return 0
@@ -256,26 +269,25 @@ def _classify_tilt(T: np.ndarray) -> int:
 
 
 def _tilt_rotation(tilt: int, angle: float) -> np.ndarray:
-    turns = {0: (0, 0), 1: (-angle, 0), 2: (0, -angle), 3: (angle, 0), 4: (0, angle)}[tilt]
-    return cv2.Rodrigues(np.array([turns[0], turns[1], 0.0]))[0]
+    """Return the rotation (3, 3) of a tilt, by its index in `TILTS`, with an angle in rad."""
+    x, y = {0: (0, 0), 1: (-angle, 0), 2: (0, -angle), 3: (angle, 0), 4: (0, angle)}[tilt]
+    return cv2.Rodrigues(np.array([x, y, 0.0]))[0]
 
 
-def _signature(T: np.ndarray, board: Board, span: tuple[float, float]) -> np.ndarray:
-    """What makes two poses alike: place across, depth and tilt, each about 1 over what is of use."""
+def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]) -> np.ndarray:
+    """Return a descriptor (5,) of a pose for distances between poses: position, depth and tilt in units of about 1."""
     x, y, z = _board_middle(T, board)
     reach = np.ptp(board.points[:, 0]) / 2
     return np.array([x / reach, y / reach, (z - span[0]) / (span[1] - span[0]), *(T[:2, 2] / np.sin(np.radians(25)))])
 
 
 def _board_middle(T: np.ndarray, board: Board) -> np.ndarray:
-    return _place_board(T, ((board.points.min(0) + board.points.max(0)) / 2)[None])[0]
-
-
-def _place_board(T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ T[:3, :3].T + T[:3, 3]
+    """Return the middle (3,) mm of the board's features at a pose (4, 4), in the camera's frame."""
+    return move_points(T, ((board.points.min(0) + board.points.max(0)) / 2)[None])[0]
 
 
 def _describe_pose(third: int, tilt: int, middle_px: np.ndarray, size: tuple[int, int]) -> str:
+    """Return the instruction for a pose: its tilt, depth and position in the image in words."""
     across, down = middle_px / np.array(size) - 0.5
     where = [
         word

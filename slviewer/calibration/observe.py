@@ -23,28 +23,28 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
 READING_VERSION = 4
-"""How poses are read; what a session keeps of another reading is read anew."""
+"""Version of ``observe``; observations that a session saved with another version are computed again."""
 SAMPLES = 30_000
-"""Pixels that one smoothing fit takes; more change the result by less than the noise."""
+"""Largest number of pixels in one smoothing fit; more change the result by less than the noise."""
 AXES: tuple[Axis, ...] = ("x", "y")
 CELLS_PER_WIDTH = 14
 """Spline cells across the image: half the wavelength of the finest lens distortion worth keeping, and no finer."""
 
 
 COUNT = 4000
-"""Blocks kept of one pose: more tell of no finer distortion, and cost the adjustment its time."""
+"""Number of blocks sampled from one pose; more resolve no finer distortion and slow the joint adjustment down."""
 MAX_BLOCK_PX = 5
-"""Pixels along a block's side at most: over more, a tilted board's perspective bends the phase within the block."""
+"""Largest side of a block; over more pixels, the phase of a tilted board is not linear."""
 MIN_FILL_SHARE = 0.5
 """Share of a block's pixels that must be bright."""
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """``camera`` (n, 2) px: the mean of each block's pixels; ``projector`` (n, 2) px: the mean of their coordinates.
+    """Projector coordinates averaged over blocks of camera pixels.
 
-    ``sigma`` (n, 2) px is the latter's standard deviation from the capture's noise. Columns are the axes x and y; an
-    axis that was not captured is NaN in both.
+    ``camera`` (n, 2) px: mean pixel of each block; ``projector`` (n, 2) px: mean projector coordinates; ``sigma``
+    (n, 2) px: their standard deviations predicted from the capture's noise. An axis that was not captured is NaN.
     """
 
     camera: np.ndarray
@@ -60,23 +60,27 @@ class Samples:
 def block_samples(
     phases: Mapping[Axis, PhaseMap], bright: Mapping[Axis, np.ndarray], axes: Sequence[Axis], count: int = COUNT
 ) -> Samples:
-    """About ``count`` blocks, spread evenly over the pixels (h, w) that are ``bright`` for every captured axis."""
+    """Average the projector coordinates over at most ``count`` blocks of the pixels that are ``bright`` in every axis.
+
+    ``bright``: (h, w) bool by axis; ``axes``: the columns of the result.
+    """
     usable = np.logical_and.reduce(list(bright.values()))
     v, u = np.nonzero(usable)
     side = int(np.clip(np.sqrt(len(v) / count), 1, MAX_BLOCK_PX))
     across = usable.shape[1] // side + 1
     block = (v // side) * across + u // side
     filled = np.bincount(block)
-    kept = np.nonzero(filled >= max(1, MIN_FILL_SHARE * side * side))[0]
-    if len(kept) > count:
-        kept = np.sort(np.random.default_rng(0).choice(kept, count, replace=False))
-    inverse = 1.0 / filled[kept]
+    chosen = np.nonzero(filled >= max(1, MIN_FILL_SHARE * side * side))[0]
+    if len(chosen) > count:
+        chosen = np.sort(np.random.default_rng(0).choice(chosen, count, replace=False))
+    inverse = 1.0 / filled[chosen]
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.bincount(block, weights=values)[kept] * inverse
+        """Return the mean of the pixels' values in each chosen block."""
+        return np.bincount(block, weights=values)[chosen] * inverse
 
     camera = np.stack([mean(u), mean(v)], axis=1)
-    projector, sigma = np.full((2, len(kept), 2), np.nan)
+    projector, sigma = np.full((2, len(chosen), 2), np.nan)
     for axis, phase in phases.items():
         column, px = axes.index(axis), phase.period_px / (2 * np.pi)
         projector[:, column] = mean(phase.phase[v, u].astype(float) * px)
@@ -104,15 +108,14 @@ class Smoothing:
 
 @dataclass(frozen=True)
 class Observation:
-    """One pose of the board, seen by the camera and through it by the projector.
+    """Features and phase of one pose of the board.
 
-    ``camera`` and ``projector`` are (n, 2) px, row by row with ``points`` (n, 3) mm on the board; a projector
-    coordinate that could not be read is NaN. ``surfaces`` hold the smoothed absolute phase (rad) over the board for
-    each captured axis; ``region`` says where they hold: the board's outline where measured phase lies close by.
-    ``slopes`` (n, 2, 2): how the projector's coordinates change a camera px along u and v at each feature. Circles of
-    ``radius_mm`` are at the centroids of their images, which ``calibration.centres`` corrects; 0: at their centres.
-    ``marked``: the board's mark was seen, so that its numbering is the board's own. ``samples``: the phase at some
-    thousands of bright places of the board, not smoothed; None in an observation made before there were any.
+    ``camera`` and ``projector`` (n, 2) px correspond to ``points`` (n, 3) mm on the board; unknown projector
+    coordinates are NaN. ``surfaces``: the smoothed absolute phase (rad) over the board by captured axis, valid in
+    ``region``, the part of the board with measured phase close by. ``slopes`` (n, 2, 2): Jacobian of the projector
+    coordinates by camera pixels at each feature. ``radius_mm``: of circles, whose pixels are the centroids of their
+    images (see ``calibration.centres``); 0 where they are centres. ``marked``: whether the board's mark was detected,
+    so that the numbering is unambiguous. ``samples``: unsmoothed phase at bright blocks; None in older observations.
     """
 
     name: str
@@ -206,9 +209,9 @@ def observe(
     phases: Mapping[Axis, PhaseMap],
     smoothing: Smoothing | None = None,
 ) -> Observation:
-    """The observation of one pose from its detected board and its decoded phases.
+    """Compute the observation of one pose from its detected board and its decoded phase maps by axis.
 
-    Raises DetectionError when the projector's light does not reach enough of the board to read it.
+    Raises DetectionError where too few pixels of the board carry a usable pattern.
     """
     smoothing = smoothing or Smoothing()
     any_phase = next(iter(phases.values()))
@@ -221,10 +224,10 @@ def observe(
     projector, _ = _projector_pixels(detection, phases, bright, pitch)
     plane = BoardPlane.fit(detection.pixels, projector, (width, height))
     for axis in phases:
-        if plane:  # a hand before the board is none of it
+        if plane:  # excludes objects in front of the board
             u0, v0, u1, v1 = box
-            seen = phases[axis].coordinate[v0:v1, u0:u1]
-            bright[axis][v0:v1, u0:u1] &= plane.contains(seen, AXES.index(axis), (u0, v0))
+            coordinate = phases[axis].coordinate[v0:v1, u0:u1]
+            bright[axis][v0:v1, u0:u1] &= plane.contains(coordinate, AXES.index(axis), (u0, v0))
         if np.count_nonzero(bright[axis]) < 400:
             raise DetectionError(
                 f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis} pattern: "
@@ -256,7 +259,7 @@ def observe(
 
 
 def pitch_px(board: Board, detection: Detection) -> np.ndarray:
-    """(n,) px: the board's pitch as the camera sees it at each feature."""
+    """Return the board's pitch (n,) in camera px at each feature."""
     points = board.points[detection.ids][:, :2]
     H, _ = cv2.findHomography(points, np.asarray(detection.pixels, float))
     half = board.pitch_mm / 2
@@ -270,8 +273,10 @@ def pitch_px(board: Board, detection: Detection) -> np.ndarray:
 def _projector_pixels(
     detection: Detection, phases: Mapping[Axis, PhaseMap], bright: Mapping[Axis, np.ndarray], pitch: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) px: the projector coordinates of the features, NaN where one could not be read; (n, 2, 2): their change a
-    camera px."""
+    """Fit the projector coordinates (n, 2) px of the features, and their Jacobians (n, 2, 2) by camera pixels.
+
+    NaN where too few bright pixels surround a feature.
+    """
     projector = np.full((len(detection.ids), 2), np.nan)
     slopes = np.full((len(detection.ids), 2, 2), np.nan)
     for axis, phase in phases.items():
@@ -283,7 +288,7 @@ def _projector_pixels(
 
 
 def _phase_weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
-    """(h, w): one over the phase's variance, of the bright pixels, the largest 1."""
+    """Return weights (h, w): the inverse variance of the phase of bright pixels over its maximum, else 0."""
     weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
     return np.asarray(weight / max(float(weight.max()), 1e-30))
 
@@ -295,10 +300,12 @@ def smooth_axes(
     pitch: float,
     smoothing: Smoothing,
 ) -> dict[Axis, SplineSurface | Polynomial2D]:
-    """`smooth_phase` of each axis' (phase, weight), side by side."""
+    """Run ``smooth_phase`` on each axis' (phase, weight) in parallel threads; see there for the parameters."""
     with ThreadPoolExecutor(max(1, len(weighted))) as threads:
-        found = threads.map(lambda one: smooth_phase(one[0], one[1], box, width, pitch, smoothing), weighted.values())
-        return dict(zip(weighted, found, strict=True))
+        surfaces = threads.map(
+            lambda pair: smooth_phase(pair[0], pair[1], box, width, pitch, smoothing), weighted.values()
+        )
+        return dict(zip(weighted, surfaces, strict=True))
 
 
 def smooth_phase(
@@ -309,8 +316,11 @@ def smooth_phase(
     pitch: float,
     smoothing: Smoothing,
 ) -> SplineSurface | Polynomial2D:
-    """The smoothed phase (step 2) of a board within ``box`` = (u0, v0, u1, v1): phase rad and weight are (v1 - v0,
-    u1 - u0); the image's ``width`` and the board's ``pitch`` are in px."""
+    """Fit a smooth surface to a board's absolute phase (step 2).
+
+    ``phase`` (v1 - v0, u1 - u0) rad and its ``weight`` over the ``box`` (u0, v0, u1, v1); ``width`` of the image and
+    ``pitch`` of the board in px.
+    """
     u0, v0, u1, v1 = box
     v, u = np.nonzero(weight)
     if len(v) > SAMPLES:
@@ -338,6 +348,7 @@ def _is_near_bright(bright: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _bounding_box(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Return (u0, v0, u1, v1) px around a mask (h, w); raises DetectionError where it is empty."""
     rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
     if not len(rows):
         raise DetectionError("the board's outline lies outside the image: move the board into view")

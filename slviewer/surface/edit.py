@@ -23,7 +23,7 @@ class DroppedParts:
 
 @dataclass(frozen=True)
 class FilledHoles:
-    """Number of filled holes, the extent of the largest one in mm, and the number of openings that remain (``left``)."""
+    """Number of filled holes, extent of the largest one in mm, and number of openings that remain (``left``)."""
 
     holes: int
     largest_mm: float
