@@ -171,7 +171,7 @@ def projector_reach(
 ) -> Callable[[np.ndarray], np.ndarray] | None:
     """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and pixels (n, 2).
 
-    Points are in the camera's frame, pixels in the projector. Returns a function points (k, 3) mm -> (k,) bool, or None where the points do not
+    Points are in the camera's frame. Returns a function points (k, 3) mm -> (k,) bool, or None where the points do not
     determine the projection, as on a single plane.
     """
     known = np.isfinite(pixels).all(1) & np.isfinite(points).all(1)

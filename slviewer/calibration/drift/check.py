@@ -1,9 +1,9 @@
 """Drift check: whether a saved calibration is still valid, from one capture of its board.
 
-What is examined is the projector's place relative to the camera: a turn about its own centre, and a shift of that
-centre. Flatness would not show it: a projector turned by 0.1 mrad measures flat boards as flat as before, and bends
-space by 700 ppm. A turn or shift along the epipolar lines makes the board seem larger or smaller than it is; one across
-them moves the pattern off its epipolar lines.
+The check estimates the change of the projector's pose relative to the camera: a rotation about its own centre, and a
+translation of that centre. Flatness would not show it: a rotation of 0.1 mrad leaves flat boards flat, and distorts
+space by 700 ppm. Changes along the epipolar lines change the board's apparent scale; changes across them move the
+pattern off its epipolar lines.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ FALSE_ALARMS = 1e-4
 BOARD_PPM = 5.0
 """How much the board itself may have grown since: half a kelvin of steel."""
 MAX_MISFIT_RATIO = 3.0
-"""What no movement explains may be so many times what it was in the calibration's worst pose."""
+"""Largest RMS that no movement explains, over that of the calibration's worst pose."""
 TURN_MRAD, SHIFT_MM = 0.05, 0.010
 """Changes that must be detectable."""
 Verdict = Literal["still good", "recalibrate"]
@@ -39,11 +39,13 @@ _MOVES = (
 
 @dataclass(frozen=True)
 class Drift:
-    """Result of the drift check; sigma is one standard deviation.
+    """Result of the drift check; sigmas are standard deviations.
 
-    ``turn_mrad``, ``shift_mm``: (3) each, about and along the projector's own axes. ``chance`` that a projector which
-    has not moved seems to have moved as much. ``seen_alone``: the size of each of the six from which on it would be
-    noticed 19 times of 20 if it were the only one.
+    ``turn_mrad``, ``shift_mm`` (3,): estimated rotation about and translation along the projector's own axes.
+    ``scale_ppm``: apparent growth of the board; ``across_px``: mean offset across the epipolar lines, None with one
+    axis; ``misfit_px``: RMS that no movement explains. ``chance``: p-value of the change if nothing moved.
+    ``seen_alone`` (6,): size in mrad and mm at which each rotation and translation would be detected with 95 %
+    probability if it were the only change. ``unseen``: descriptions of changes that would not be detected.
     """
 
     capture: str
@@ -66,7 +68,7 @@ class Drift:
     unseen: tuple[str, ...]
 
     def text(self) -> str:
-        """For people: the verdict first, then what it rests on."""
+        """Return a report of several lines for the terminal: the verdict, then the figures behind it."""
         answer = self.verdict if not self.reasons else f"{self.verdict}, because {'; '.join(self.reasons)}"
         across = (
             "off its epipolar lines: not known from one axis"
@@ -92,40 +94,42 @@ class Drift:
 
 
 def check_drift(reference: DriftReference, view: DriftView) -> Drift:
-    """The verdict on a calibration from one later view of its board.
+    """Judge a calibration by one later view of its board.
 
-    Raises InputError where the view shows no axis that the calibration has.
+    Raises InputError where no axis of the pattern could be read.
     """
     if not view.axes:
         raise InputError(f"{view.name}: no axis of the pattern could be read on the board: light the whole board")
-    found = reference.estimate_change(view)
+    estimate = reference.estimate_change(view)
     own = reference.answers
     growth = BOARD_PPM * 1e-6
-    C = found.covariance(reference.sigmas) + growth**2 * np.outer(found.by_growth, found.by_growth)
+    C = estimate.covariance(reference.sigmas) + growth**2 * np.outer(estimate.by_growth, estimate.by_growth)
     information = np.linalg.inv(C)
-    about = float(found.change @ information @ found.change)
+    about = float(estimate.change @ information @ estimate.change)
     degrees = 6 * len(own) - 3  # the floor is itself an estimate, from so many numbers
     chance = float(fisher.sf(about / 6, 6, degrees))
     limit = 6 * float(fisher.isf(FALSE_ALARMS, 6, degrees))
     scale_sigma = float(np.hypot(np.sqrt(np.mean([a.scale**2 for a in own])), growth))
-    two = np.isfinite(found.across_px)
+    two = np.isfinite(estimate.across_px)
     across_sigma = float(np.sqrt(np.nanmean([a.across_px**2 for a in own]))) if two else None
     along = np.concatenate([np.zeros(3), reference.rig.t / np.linalg.norm(reference.rig.t)])
     reasons = []
     worst = max(a.misfit_px for a in own)
-    if found.misfit_px > MAX_MISFIT_RATIO * worst:
+    if estimate.misfit_px > MAX_MISFIT_RATIO * worst:
         reasons.append(
-            f"the board lies {found.misfit_px:.3f} px off what any movement of the projector explains (in the poses of "
+            f"the board lies {estimate.misfit_px:.3f} px off what any movement of the projector explains (in the poses of "
             f"the calibration {worst:.3f} px at most): was a lens refocused, the board moved, or is it another one?"
         )
     elif about > limit:
-        reasons.append(_list_movements(found, information, about, along))
-        if abs(found.scale) > 3 * scale_sigma:
+        reasons.append(_list_movements(estimate, information, about, along))
+        if abs(estimate.scale) > 3 * scale_sigma:
             reasons.append(
-                f"the board seems {1e6 * found.scale:+.0f} ppm larger than it is (+- {1e6 * scale_sigma:.0f})"
+                f"the board seems {1e6 * estimate.scale:+.0f} ppm larger than it is (+- {1e6 * scale_sigma:.0f})"
             )
-        if across_sigma is not None and abs(found.across_px) > 4 * across_sigma:
-            reasons.append(f"the pattern lies {found.across_px:+.4f} px off its epipolar lines (+- {across_sigma:.4f})")
+        if across_sigma is not None and abs(estimate.across_px) > 4 * across_sigma:
+            reasons.append(
+                f"the pattern lies {estimate.across_px:+.4f} px off its epipolar lines (+- {across_sigma:.4f})"
+            )
     sigmas = np.sqrt(np.diag(C))
     seen_alone = (np.sqrt(limit) + 1.645) / np.sqrt(np.diag(information)) * np.array([1e3] * 3 + [1.0] * 3)
     return Drift(
@@ -133,29 +137,33 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
         axes=view.axes,
         verdict="recalibrate" if reasons else "still good",
         reasons=tuple(reasons),
-        turn_mrad=_to_floats(1e3 * found.change[:3]),
+        turn_mrad=_to_floats(1e3 * estimate.change[:3]),
         turn_sigma_mrad=_to_floats(1e3 * sigmas[:3]),
-        shift_mm=_to_floats(found.change[3:]),
+        shift_mm=_to_floats(estimate.change[3:]),
         shift_sigma_mm=_to_floats(sigmas[3:]),
-        baseline_mm=float(along @ found.change),
+        baseline_mm=float(along @ estimate.change),
         baseline_sigma_mm=float(np.sqrt(along @ C @ along)),
-        scale_ppm=1e6 * found.scale,
+        scale_ppm=1e6 * estimate.scale,
         scale_sigma_ppm=1e6 * scale_sigma,
-        across_px=float(found.across_px) if two else None,
+        across_px=float(estimate.across_px) if two else None,
         across_sigma_px=across_sigma,
-        misfit_px=found.misfit_px,
+        misfit_px=estimate.misfit_px,
         chance=chance,
         seen_alone=_to_floats(seen_alone),
         unseen=(*_list_undetermined(seen_alone, view.axes), "common motion of both devices (harmless)"),
     )
 
 
-def _list_movements(found: PoseChange, information: np.ndarray, about: float, along: np.ndarray) -> str:
-    """The single movements that explain the change nearly as well as any, with their sizes."""
+def _list_movements(estimate: PoseChange, information: np.ndarray, about: float, along: np.ndarray) -> str:
+    """Describe the single movements that explain the change best, with their sizes.
+
+    ``information`` (6, 6): inverse covariance of the change; ``about``: its squared Mahalanobis distance from 0;
+    ``along`` (6,): direction of a longer baseline.
+    """
     moves = np.vstack([np.eye(6), along])  # (7, 6); a longer baseline is the last
     names = [*(name for name, _, _ in _MOVES), "change of the baseline"]
     curvature = np.einsum("ij,jk,ik->i", moves, information, moves)
-    sizes, sigmas = moves @ information @ found.change / curvature, curvature**-0.5
+    sizes, sigmas = moves @ information @ estimate.change / curvature, curvature**-0.5
     share = sizes**2 * curvature / about
     words = []
     for i in np.argsort(-share):
@@ -166,8 +174,9 @@ def _list_movements(found: PoseChange, information: np.ndarray, about: float, al
 
 
 def _list_undetermined(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str]:
+    """Describe the movements whose detection limits (6,) mrad and mm are too large, with the reason and remedy."""
     limits = [TURN_MRAD] * 3 + [SHIFT_MM] * 3
-    told = []
+    undetermined = []
     for i, ((move, lines, axis), limit) in enumerate(zip(_MOVES, limits, strict=True)):
         if seen_alone[i] > limit:
             size = f"{seen_alone[i]:.2f} mrad" if i < 3 else f"{1e3 * seen_alone[i]:.0f} um"
@@ -177,11 +186,12 @@ def _list_undetermined(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str
                 else f"at this pose it moves the pattern by too little; {'capture both axes, or ' * (len(axes) < 2)}"
                 "bring the board nearer and tilt it"
             )
-            told.append(f"a {move} of less than {size}: {why}")
-    return told
+            undetermined.append(f"a {move} of less than {size}: {why}")
+    return undetermined
 
 
 def _format_xyz(values: Sequence[float], sigmas: Sequence[float], form: str) -> str:
+    """Format values with their sigmas: "+1.0 +- 0.1, ..."."""
     return ", ".join(f"{value:+{form}} +- {sigma:{form}}" for value, sigma in zip(values, sigmas, strict=True))
 
 

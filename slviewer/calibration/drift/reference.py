@@ -20,26 +20,24 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 
 MIN_POSES = 8
-"""With fewer, leave-one-out fields do not represent a later view's."""
+"""With fewer poses, the leave-one-out fields do not represent those of a later view."""
 ROUGHNESS_PX = 0.1
-"""Typical second difference of a field's coefficients, a cell apart."""
+"""Prior sigma of the second differences of a field's coefficients."""
 HEIGHT_PX = 1.0
-"""Typical height of a field: prior where no view supports it."""
+"""Prior sigma of a field's coefficients."""
 UNSUPPORTED_PX = 0.1
-"""Pixels whose lens error is less certain than this are not used."""
+"""Largest sigma of the lens error at pixels that are used."""
 RIG_SIGMAS = np.array([3e-3] * 3 + [3.0] * 3)
-"""rad and mm: how far the calibration's own arrangement may be off."""
+"""Prior sigma of the error of the calibration's own relative pose, rad and mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseChange:
-    """How far the projector seems to have moved in one view: ``change`` (6,) rad and mm, as ``LinearView`` orders
-    it.
+    """Apparent change of the projector's pose in one view: ``change`` (6,) rad and mm, in the order of ``LinearView``.
 
-    ``spreads``: by kind (6, 6), its covariance for errors of 1 px in every observation; ``by_growth`` (6,): what it
-    would be if only the board grew, relative to that. ``scale`` is the board's apparent relative growth,
-    ``across_px`` how far off its epipolar lines on average (NaN with one axis), ``misfit_px`` the RMS that no change
-    explains.
+    ``spreads``: covariance (6, 6) of the change by kind of observation, for errors of 1 px; ``by_growth`` (6,): change
+    per relative growth of the board. ``scale``: apparent relative growth of the board; ``across_px``: mean offset
+    across the epipolar lines, NaN with one axis; ``misfit_px``: RMS residual that no change explains.
     """
 
     name: str
@@ -51,17 +49,17 @@ class PoseChange:
     misfit_px: float
 
     def covariance(self, sigmas: Mapping[str, float]) -> np.ndarray:
-        """(6, 6) of the change, from the sigma of one observation of each kind, px."""
+        """Return the covariance (6, 6) of the change from the sigma in px of each kind of observation."""
         return sum((sigmas[kind] ** 2 * spread for kind, spread in self.spreads.items()), np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, eq=False)
 class DriftReference:
-    """What the drift check needs of a calibration.
+    """Reference of the drift check for one calibration.
 
-    ``shared`` are the coefficients of the arrangement's correction and the lens errors, with their ``covariance``;
-    ``sigmas`` px by kind what one observation is worth, lens errors left over included; ``answers`` those of its own
-    poses, each excluded in turn.
+    ``shared``: corrections of the relative pose and coefficients of the lens errors, with their ``covariance``;
+    ``sigmas``: standard deviation in px of one observation by kind, remaining lens errors included; ``answers``:
+    apparent changes of the calibration's own poses, each from the other poses' lens errors.
     """
 
     rig: StereoRig
@@ -71,14 +69,14 @@ class DriftReference:
     answers: tuple[PoseChange, ...]
 
     def estimate_change(self, view: DriftView) -> PoseChange:
-        """The projector's apparent change in a later view."""
+        """Estimate the projector's apparent change in a later view."""
         equations = linearise_view(self.rig, view)
         known = _shared_design(equations)
         variance = np.asarray(known.multiply(known @ self.covariance).sum(axis=1)).ravel()
         return solve_change(equations, self.shared, self.sigmas, variance < UNSUPPORTED_PX**2)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Flat named arrays, for saving."""
+        """Return named arrays for saving."""
         answers = self.answers
         return {
             "shared": self.shared,
@@ -93,7 +91,7 @@ class DriftReference:
 
     @classmethod
     def from_arrays(cls, rig: StereoRig, arrays: Mapping[str, np.ndarray]) -> "DriftReference":
-        """The inverse of ``to_arrays``, of a calibration with this rig."""
+        """Return the reference that ``to_arrays`` saved, of a calibration with this rig."""
         each = zip(*(arrays[name] for name in ("names", "changes", "spreads", "by_growth", "figures")), strict=True)
         answers = tuple(
             PoseChange(str(name), change, dict(zip(KINDS, spreads, strict=True)), growth, *(float(f) for f in figures))
@@ -104,7 +102,10 @@ class DriftReference:
 
 
 def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReference:
-    """Lens errors and floor from a calibration's own views. Raises InputError for fewer than LEAST_POSES."""
+    """Estimate lens errors and noise floor from a calibration's own views.
+
+    Raises InputError for fewer than MIN_POSES views.
+    """
     if len(views) < MIN_POSES:
         raise InputError(
             f"the calibration has {len(views)} poses, and {MIN_POSES} are needed for a drift reference: "
@@ -131,7 +132,10 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
 
 
 def solve_change(e: LinearView, shared: np.ndarray, sigmas: Mapping[str, float], supported: np.ndarray) -> PoseChange:
-    """The projector's apparent change in one view, given lens errors ``shared``."""
+    """Estimate the projector's apparent change in one view by robust least squares, given the ``shared`` lens errors.
+
+    ``sigmas``: px by kind; ``supported`` (k,) bool: rows with certain lens errors.
+    """
     usable = e.usable & supported
     left = np.where(usable, e.residuals, 0.0) - _shared_design(e) @ shared
     both = np.hstack([e.pose, e.change])
@@ -158,11 +162,12 @@ def solve_change(e: LinearView, shared: np.ndarray, sigmas: Mapping[str, float],
 
 
 def _shared_design(e: LinearView) -> sp.csr_array:
-    """Columns of the unknowns that all views share: the rig's correction, then the lens errors."""
+    """Return the design matrix of the unknowns that all views share: the rig's correction, then the lens errors."""
     return sp.csr_array(sp.hstack([sp.csr_array(np.where(np.isfinite(e.change), e.change, 0.0)), e.shared]))
 
 
 def _prior(rig: StereoRig) -> np.ndarray:
+    """Return the prior information matrix of the shared unknowns."""
     blocks = [sp.diags(RIG_SIGMAS**-2.0)]
     for field in (DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)):
         one = field.roughness / ROUGHNESS_PX**2 + sp.eye(field.unknowns) / HEIGHT_PX**2
@@ -174,6 +179,7 @@ def _prior(rig: StereoRig) -> np.ndarray:
 def _weights(
     e: LinearView, usable: np.ndarray, left: np.ndarray, sigmas: Mapping[str, float], robust: bool = True
 ) -> np.ndarray:
+    """Return the weights (k,) 1/px^2 of residuals ``left`` (k,), times Tukey's if ``robust``; 0 where not usable."""
     w = np.zeros(len(left))
     for i, kind in enumerate(KINDS):
         these = usable & (e.kinds == i)
@@ -184,7 +190,7 @@ def _weights(
 
 
 def _gain(J: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """(unknowns, k): from residuals to unknowns, by weighted least squares; what nothing determines stays 0."""
+    """Return the matrix (unknowns, k) of weighted least squares from residuals to unknowns; 0 for undetermined ones."""
     weighted = np.where(w > 0, w, 0.0)[:, None] * np.nan_to_num(J)
     N = weighted.T @ np.nan_to_num(J)
     s = 1 / np.sqrt(np.maximum(np.diag(N), 1e-300))[:, None]
@@ -193,7 +199,7 @@ def _gain(J: np.ndarray, w: np.ndarray) -> np.ndarray:
 
 
 def _reduce_normal_equations(e: LinearView, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations of the shared unknowns, the view's own pose eliminated."""
+    """Return the normal equations of the shared unknowns with the view's own board pose eliminated."""
     D, P = _shared_design(e), np.nan_to_num(e.pose)
     r = np.where(w > 0, e.residuals, 0.0)
     weighted = sp.csr_array(sp.diags(w) @ D)
@@ -204,28 +210,31 @@ def _reduce_normal_equations(e: LinearView, w: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _remaining_residuals(e: LinearView, w: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """Return the residuals (k,) of a view after the shared unknowns and its best board pose."""
     left = np.where(e.usable, e.residuals, 0.0) - _shared_design(e) @ shared
     return left - np.nan_to_num(e.pose) @ (_gain(e.pose, w) @ left)
 
 
 def _sigma_of(equations: Sequence[LinearView], left: Sequence[np.ndarray], kind: int, otherwise: float) -> float:
+    """Return the robust sigma of all residuals of one kind, or ``otherwise`` where there are none."""
     values = np.concatenate([r[e.usable & (e.kinds == kind)] for e, r in zip(equations, left, strict=True)])
     return max(robust_sigma(values), 1e-3) if len(values) else otherwise
 
 
 def _fit_sigmas(answers: Sequence[PoseChange], start: Mapping[str, float]) -> dict[str, float]:
-    """The sigma of each kind that maximises the likelihood of the apparent changes if none is real.
+    """Fit the sigma in px of each kind by maximum likelihood of the apparent changes, whose true value is 0.
 
-    Neighbouring samples have correlated errors: the effective sigma exceeds their own scatter.
+    It exceeds the scatter of the residuals, as errors of neighbouring samples are correlated.
     """
     spreads = np.array([[a.spreads[kind] for kind in KINDS] for a in answers])  # (views, kinds, 6, 6)
     changes = np.array([a.change for a in answers])[..., None]
 
-    def unlikeliness(logs: np.ndarray) -> float:
+    def negative_log_likelihood(logs: np.ndarray) -> float:
+        """Return twice the negative log likelihood at the logarithms of the sigmas."""
         L = np.linalg.cholesky(np.tensordot(spreads, np.exp(2 * logs), (1, 0)))
         whitened = np.linalg.solve(L, changes)
         return float(2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum() + (whitened**2).sum())
 
     first = np.log([4 * start[kind] for kind in KINDS])
-    found = minimize(unlikeliness, first, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01})
-    return {kind: float(np.exp(log)) for kind, log in zip(KINDS, found.x, strict=True)}
+    result = minimize(negative_log_likelihood, first, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01})
+    return {kind: float(np.exp(log)) for kind, log in zip(KINDS, result.x, strict=True)}

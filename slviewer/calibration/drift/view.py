@@ -1,8 +1,8 @@
 """One view of the board, linearised in the board's pose, the projector's pose and the lens errors.
 
 A view is a calibration pose or a later capture of the same board: its features in the camera, and the projector's
-coordinates at a grid of the board's pixels. All that is searched for is small (tenths of a pixel), so that derivatives
-at the calibration and at the pose that the camera sees are enough.
+coordinates at a grid of the board's pixels. All unknowns are small (tenths of a pixel), so that one linearisation at
+the calibration and at the board's pose by the camera is sufficient.
 """
 
 from dataclasses import dataclass
@@ -16,15 +16,16 @@ from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import transform_from_rvec
 
 SAMPLES = 1000
-"""Pixels of the board at which the projector's coordinates are compared; the smoothed phase holds no more."""
+"""Number of pixels of the board at which the projector's coordinates are compared."""
 CELLS_PER_WIDTH = 16
-"""Spline cells across an image, for what a lens does beyond Brown's model: waves of a seventh of the width."""
+"""Spline cells across an image of the lens errors beyond Brown's model."""
 KINDS = ("camera", "x", "y")
-"""What is observed: features in the camera, projector columns, projector rows."""
+"""Kinds of observations: features in the camera, projector columns, projector rows."""
 STEPS = np.array([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])
-"""rad and mm: half the steps of the derivatives, by which pixels move by a tenth."""
+"""Half steps of the numerical derivatives, rad and mm: pixels move by about a tenth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class DriftView:
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "DriftView":
-        """The view that an observation of the board holds."""
+        """Sample an observation of the board. Raises InputError where its region is empty."""
         u0, v0, _, _ = observation.box
         v, u = np.nonzero(observation.region)
         if not len(v):
@@ -56,7 +57,7 @@ class DriftView:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """The axes along which the projector's coordinates are known."""
+        """The axes with known projector coordinates."""
         return tuple(axis for i, axis in enumerate(AXES) if np.isfinite(self.projector[:, i]).any())
 
 
@@ -72,11 +73,11 @@ class DisplacementField:
 
     @property
     def unknowns(self) -> int:
-        """Coefficients of one of its two components."""
+        """Number of coefficients of one of the two components."""
         return (self.cells[0] + 3) * (self.cells[1] + 3)
 
     def basis(self, pixels: np.ndarray) -> sp.csr_array:
-        """(n, unknowns): how the coefficients act at pixels (n, 2)."""
+        """Return the spline basis (n, unknowns) at pixels (n, 2): displacement by coefficients."""
         (i, wu), (j, wv) = (
             _splines_at((pixels[:, k] + 0.5) * self.cells[k] / self.size[k], self.cells[k]) for k in (0, 1)
         )
@@ -87,10 +88,11 @@ class DisplacementField:
 
     @cached_property
     def roughness(self) -> sp.csr_array:
-        """Squared second differences of one component's coefficients."""
+        """Quadratic form (unknowns, unknowns) of the squared second differences of one component's coefficients."""
         across, down = (n + 3 for n in self.cells)
 
         def difference(n: int) -> sp.csr_array:
+            """Return the second differences (n - 2, n) of n coefficients."""
             return sp.csr_array(sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)))
 
         u, v = sp.kron(sp.eye(down), difference(across)), sp.kron(difference(down), sp.eye(across))
@@ -99,12 +101,12 @@ class DisplacementField:
 
 @dataclass(frozen=True, eq=False)
 class LinearView:
-    """A view's equations ``residuals = pose a + change b + shared c``, a row an observed number (px).
+    """A view's linear equations ``residuals = pose a + change b + shared c``, one row per observed coordinate (px).
 
-    ``kinds`` (k,): the index into KINDS of each row. ``pose`` (k, 6): the board's; ``change`` (k, 6): the projector's
-    rotation about its own centre (rad, about its own axes) and its shift (mm); ``scale`` (k,): the board's relative
-    growth; ``shared``: (k, unknowns) lens errors of both devices, as ``LensErrors`` orders them. ``across`` (k,): each
-    projector row's share in the direction across the epipolar lines.
+    ``kinds`` (k,): index into KINDS of each row. Derivatives: ``pose`` (k, 6) by the board's pose; ``change`` (k, 6) by
+    the projector's rotation about its own centre and axes (rad) and its translation (mm); ``scale`` (k,) by the board's
+    relative growth; ``shared`` (k, unknowns) by the lens errors: u and v components of the camera's field, then of the
+    projector's. ``across`` (k,): weight of each projector coordinate in the offset across the epipolar lines.
     """
 
     name: str
@@ -123,7 +125,10 @@ class LinearView:
 
 
 def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
-    """The equations of a view, at the pose that the camera alone gives."""
+    """Linearise a view at the board's pose by the camera alone.
+
+    Raises InputError where that pose cannot be solved.
+    """
     T = _solve_pose(rig, view)
     middle = view.points.mean(0)
 
@@ -177,12 +182,12 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
 
 
 def _flatten(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
-    """Values in the order of KINDS: all of the camera's, the projector's columns, its rows."""
+    """Flatten values of features (n, 2) and of samples (m, 2) in the order of KINDS, (2 n + 2 m,)."""
     return np.concatenate([camera.ravel(), projector[:, 0], projector[:, 1]])
 
 
 def _splines_at(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Each place's cell (n,), clipped to the image, and its four cubic B-spline weights (n, 4)."""
+    """Return each position's cell (n,), clipped to the image, and its four cubic B-spline weights (n, 4)."""
     x = np.clip(x, 0.0, cells)
     cell = np.minimum(x.astype(np.int64), cells - 1)
     f = x - cell
@@ -191,14 +196,12 @@ def _splines_at(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _solve_pose(rig: StereoRig, view: DriftView) -> np.ndarray:
-    """(4, 4) T_camera_board from the camera alone."""
+    """Solve T_camera_board (4, 4) mm from the features in the camera; raises InputError without a solution."""
     rays = rig.camera.undistort(view.camera)
     try:
-        found, turn, shift = cv2.solvePnP(view.points, rays[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
+        success, rvec, tvec = cv2.solvePnP(view.points, rays[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
     except cv2.error:
-        found = False
-    if not found:
+        success = False
+    if not success:
         raise InputError(f"{view.name}: no pose of the board fits its features: is it the calibration's board?")
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    return T
+    return transform_from_rvec(rvec, tvec)
