@@ -1,9 +1,8 @@
-"""Aligning one scan with another: point-to-plane ICP, coarse to fine, and a judgement of the result.
+"""Pairwise registration: point-to-plane ICP, coarse to fine, with checks of the result.
 
-ICP always ends somewhere. Whether it ended at the truth is judged afterwards: where the aligned surfaces face each
-other they must agree, enough of the scan must have a counterpart, the overlapping shape must hold all six degrees
-of freedom (a plane slides on a plane, a sphere turns in a sphere), and no other pose may fit as well. What fails is
-refused, with the reason.
+A registration is refused, with the reason, unless the surfaces agree where they face each other, enough of the scan
+overlaps, the shape of the overlap determines all six degrees of freedom (a plane slides on a plane, a sphere turns in a
+sphere), and no other pose fits as well.
 """
 
 from collections.abc import Callable
@@ -96,8 +95,11 @@ def register_prepared(
     starts: list[Candidate] | None = None,
     progress: Progress | None = None,
 ) -> Registration:
-    """As ``register``, of scans that were made ready before; ``starts`` are those of ``searched``, where they are
-    known. ``size`` in mm is the object's, by default that of the smaller scan."""
+    """Register prepared scans; see ``register``.
+
+    ``size``: of the object in mm, by default that of the smaller scan. ``starts``: result of an earlier
+    ``search_starts``, which is run otherwise.
+    """
     say = progress or (lambda share: None)
     size = min(scan.size, reference.size) if size is None else size
     if starts is None:
@@ -122,7 +124,7 @@ def register_prepared(
 def search_starts(
     scan: PreparedScan, reference: PreparedScan, size: float, initial: np.ndarray | Candidate | None = None
 ) -> list[Candidate]:
-    """The poses to start from, the best first; ``initial`` alone, brought near, where it is given."""
+    """Return candidate initial poses after a coarse ICP, the best first; only ``initial`` where it is given."""
     if initial is not None and not isinstance(initial, Candidate):
         if np.shape(initial) != (4, 4):
             raise InputError(f"The initial pose has shape {np.shape(initial)}: give a (4, 4) matrix.")
@@ -132,7 +134,7 @@ def search_starts(
 
 
 def _judged(scan: PreparedScan, reference: PreparedScan, start: Candidate, size: float) -> Registration:
-    """ICP from a start to the end, and its figures; raises ``Refused`` where they do not convince."""
+    """Run ICP from an initial pose, and compute its figures; raises ``Refused`` where the result is not reliable."""
     scale = scale_of(size)
     T = start.T
     for voxel, gate in LEVELS_MM:
@@ -147,7 +149,7 @@ def _judged(scan: PreparedScan, reference: PreparedScan, start: Candidate, size:
 
 
 def _noise(scan: PreparedScan, reference: PreparedScan) -> float:
-    """Of the distance of two points that lie on each other, mm, as far as it is known."""
+    """Return the standard deviation in mm of the distance of two corresponding points; unknown sigmas count as 0."""
     return float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
 
 
@@ -159,7 +161,7 @@ def _figures(
     uncertainty: Uncertainty | None,
     start: Start,
 ) -> tuple[Registration, Freedom]:
-    """The figures of a pose, from up to 50,000 scan points against every reference point."""
+    """Compute the figures of a pose ``T`` (4, 4) from up to 50,000 scan points, and the freedom of the overlap."""
     spacing = reference.spacing
     gate = max(gate, 2.0 * spacing)
     points = scan.points[:: -(-len(scan.points) // _STATISTICS_POINTS)] @ T[:3, :3].T + T[:3, 3]
@@ -190,10 +192,12 @@ def _figures(
 
 
 def _rms(values: np.ndarray) -> float:
+    """Return the root mean square; NaN for an empty array."""
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
 
 
 def _refuse_if_doubtful(result: Registration, held: Freedom, size: float) -> None:
+    """Raise ``Refused`` for too small an overlap or agreement, or a shape that leaves the pose undetermined."""
     if not result.overlap >= LEAST_OVERLAP:
         raise Refused(
             "overlap",
@@ -225,7 +229,7 @@ def _refuse_rivals(
     others: list[Candidate],
     size: float,
 ) -> None:
-    """Raise where another pose fits alike."""
+    """Raise ``Refused`` where ICP from one of the ``others`` ends at a different pose that fits equally well."""
     for other in others:
         if not other.score >= RIVAL_SCORE * start.score:
             continue

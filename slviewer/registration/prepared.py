@@ -1,4 +1,4 @@
-"""A scan made ready for registration, once for all the pairs that it is part of."""
+"""Preparation of a scan for registration: downsampled clouds, normals, search trees and features, computed once."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -71,14 +71,14 @@ class PreparedScan:
         return scale_of(self.size)
 
     def features(self, voxel: float) -> Any:
-        """Open3D's FPFH features of the cloud thinned to ``voxel``; kept for the next who asks."""
+        """Return Open3D's FPFH features of the cloud thinned to ``voxel`` mm; cached."""
         if voxel not in self._features:
             pipeline, search = open3d().pipelines.registration, open3d().geometry.KDTreeSearchParamHybrid
             self._features[voxel] = pipeline.compute_fpfh_feature(self.thinned(voxel), search(5.0 * voxel, 100))
         return self._features[voxel]
 
     def thinned(self, voxel: float) -> Any:
-        """Open3D's cloud thinned further, with unit normals; kept for the next who asks."""
+        """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals; cached."""
         if voxel <= self.voxel:
             return self.fine
         key = float(f"{voxel:.3g}")
@@ -92,7 +92,7 @@ class PreparedScan:
 def prepare_scan(
     name: str, points: np.ndarray, normals: np.ndarray | None = None, sigma_mm: float | None = None
 ) -> PreparedScan:
-    """Make ready the points ``(n, 3)`` mm of one scan, in the frame of its camera.
+    """Prepare the points ``(n, 3)`` mm of one scan, in the frame of its camera, for registration.
 
     ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for errors. Raises
     ``InputError`` for points that cannot be used.
@@ -115,11 +115,12 @@ def prepare_scan(
 
 
 def scale_of(size: float) -> float:
-    """The share by which voxels and gates differ from those for objects of 75 to 300 mm."""
+    """Return the factor of voxels and gates for an object of ``size`` mm; 1 from 75 to 300 mm."""
     return 1.0 if 75.0 <= size <= 300.0 else size / (75.0 if size < 75.0 else 300.0)
 
 
 def _check(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
+    """Raise InputError for arrays of wrong shapes, too few points, or points that are not finite."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
     if len(points) < LEAST_POINTS:
@@ -131,12 +132,13 @@ def _check(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
 
 
 def _size(points: np.ndarray) -> float:
-    """The longest side in mm of the box around the points, stray ones (1 % at each end) left out."""
+    """Return the longest side in mm of the points' bounding box between their 1st and 99th percentiles."""
     low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
     return float((high - low).max())
 
 
 def _spacing(tree: cKDTree, points: np.ndarray) -> float:
+    """Return the median distance in mm of a subset of points (n, 3) to the nearest other point of the tree."""
     distance, _ = tree.query(points[:: max(1, len(points) // 2000)], k=2)
     return float(np.median(distance[:, 1]))
 

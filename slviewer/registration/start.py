@@ -26,8 +26,9 @@ _LEAST_VOTES = 0.15  # of those for the best pose
 
 @dataclass(frozen=True)
 class Candidate:
-    """A pose to start from: ``T`` (4, 4) maps the scan into the reference frame, ``start`` says how it was found.
-    ``score``, 0 to 1: how well the scan lies on the reference there, as far as thinned clouds tell; NaN if not tried.
+    """An initial pose ``T`` (4, 4), T_reference_scan, and its origin ``start``.
+
+    ``score``: 0 to 1, share of the thinned scan that fits the reference at this pose; NaN if not evaluated.
     """
 
     T: np.ndarray
@@ -64,7 +65,7 @@ def rank_starts(
 
 
 def pose_distance(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
-    """How far, in mm, two poses put some 20 of the points from each other at most."""
+    """Return the largest coordinate difference in mm of some 20 of the points (n, 3) between two poses (4, 4)."""
     probe = points[:: max(1, len(points) // 20)]
     return float(np.abs(probe @ (T - other)[:3, :3].T + (T - other)[:3, 3]).max())
 

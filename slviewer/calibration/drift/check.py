@@ -117,8 +117,8 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     worst = max(a.misfit_px for a in own)
     if estimate.misfit_px > MAX_MISFIT_RATIO * worst:
         reasons.append(
-            f"the board lies {estimate.misfit_px:.3f} px off what any movement of the projector explains (in the poses of "
-            f"the calibration {worst:.3f} px at most): was a lens refocused, the board moved, or is it another one?"
+            f"the board lies {estimate.misfit_px:.3f} px off what any movement of the projector explains (in the poses "
+            f"of the calibration {worst:.3f} px at most): was a lens refocused, the board moved, or is it another one?"
         )
     elif about > limit:
         reasons.append(_list_movements(estimate, information, about, along))

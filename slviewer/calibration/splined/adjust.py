@@ -1,4 +1,4 @@
-"""The joint adjustment: Gauss-Newton from a stereo calibration, robust, with weights and priors that the data set."""
+"""Robust bundle adjustment of devices, board and poses by Gauss-Newton, with weights and priors estimated from data."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -20,23 +20,24 @@ from slviewer.errors import CalibrationRejected, InputError
 MIN_POSES = 3
 MAX_STEPS = 30
 LEAST_DAMPING, DAMPING_STEP, MOST_DAMPING = 1e-6, 10.0, 10.0
-"""Of the information's diagonal: what is added to it where full steps fail."""
+"""Damping relative to the information's diagonal: smallest value, factor between trials, and limit."""
 CONVERGENCE_SIGMAS = 0.02
-"""Sigmas that the predictions of all observations still move by, RMS: a fiftieth of their noise."""
+"""Largest RMS change of the predicted observations at convergence, in sigmas."""
 FIRST_STRENGTH = 10.0
-"""1/px^2: displacements of some tenths of a pixel."""
+"""Initial strength of the fields' priors in 1/px^2: displacements of some tenths of a pixel."""
 STRENGTH_STEPS = 3
-"""Updates of the priors: near their fixed point after two, and inside the support the result hardly depends on them."""
+"""Number of updates of the priors' strengths, which converge after two."""
 MIN_SAMPLES = 3
-"""Of one pose in a cell of a field, and the pose has illuminated it."""
+"""Least number of samples with which a pose has illuminated a cell of a field."""
 MIN_TRUST = 0.5
-"""Of a pose's features or samples: below, the pose contradicts the others."""
+"""Least mean robust weight of a pose's features and samples; below, the pose contradicts the others."""
 
 
 def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tuple[list[str], PoseData, np.ndarray]:
-    """Names of the poses, what they observed, and the samples' predicted noise (m, 2) px.
+    """Collect the observations of the poses that the stereo calibration used and that hold both axes.
 
-    Raises InputError where poses lack an axis or were read before samples were kept.
+    Returns their names, the observations, and the samples' predicted noise (m, 2) px. Raises InputError for fewer than
+    MIN_POSES poses with both axes, and for observations without samples.
     """
     used = [o for o in observations if o.name in stereo.poses]
     both = [o for o in used if len(o.surfaces) == 2]
@@ -54,6 +55,7 @@ def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tup
     samples = [o.samples for o in both if o.samples is not None]
 
     def starts(lengths: list[int]) -> np.ndarray:
+        """Return where each pose's entries begin, and the end of the last."""
         return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
 
     data = PoseData(
@@ -72,10 +74,10 @@ def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tup
 def adjust_bundle(
     observations: Sequence[Observation], stereo: StereoModel, progress: Callable[[float], None] | None = None
 ) -> Bundle:
-    """The joint adjustment of all poses that the stereo calibration used.
+    """Adjust devices, board and poses jointly, from the observations that the stereo calibration used.
 
-    Raises InputError as ``gather_data`` does, and CalibrationRejected where it does not converge or poses contradict
-    each other.
+    Raises InputError as ``gather_data`` does, and CalibrationRejected where the adjustment does not converge, is
+    undetermined, or where too few poses agree with each other.
     """
     names, data, sample_sigma = gather_data(observations, stereo)
     state = State.from_stereo(stereo, names, len(data.points))
@@ -150,6 +152,7 @@ def adjust_bundle(
 
 
 def _residuals(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+    """Return the residuals of features (n, 2) and of samples (m, 2), px."""
     features, samples = predict_observations(state, data)
     return data.feature_px - features, data.projector_px - samples
 
@@ -161,6 +164,7 @@ def _cost(
     prior: Prior,
     strengths: Sequence[float],
 ) -> float:
+    """Return half the weighted sum of squared residuals plus the prior's cost; NaN for invisible observations."""
     total = 0.0
     for r, w in zip(residuals, weights, strict=True):
         used = w > 0
@@ -176,11 +180,11 @@ def _take_step(
     system: tuple[np.ndarray, np.ndarray, np.ndarray],
     damping: float,
 ) -> tuple[State, tuple[np.ndarray, np.ndarray], np.ndarray, float]:
-    """The state after the step, its residuals, the step, and how damped it was. ``system``: information, right side,
-    the full step.
+    """Take a Gauss-Newton step; damp it where it does not lower the cost.
 
-    Where a full step makes matters worse, devices and arrangement are held back: together with the fields they have a
-    valley that bends where lenses bend a lot, and full steps leave it.
+    ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose are damped: together
+    with the fields they have a curved valley of the cost at strong distortion. Returns the new state, its residuals,
+    the step, and the damping; the unchanged state where no damping helps.
     """
     information, b, full = system
     layout, before = state.layout, cost(state, residuals)
@@ -201,7 +205,10 @@ def _take_step(
 
 
 def _cholesky(A: np.ndarray) -> np.ndarray:
-    """The lower factor of the matrix whose upper triangle A (C order) holds; A is overwritten."""
+    """Return the lower Cholesky factor of a matrix given by its upper triangle in C order; overwrites A.
+
+    Raises CalibrationRejected where the matrix is not positive definite.
+    """
     factor, failed = lapack.dpotrf(A.T, lower=1, clean=0, overwrite_a=1)
     if failed:
         raise CalibrationRejected(
@@ -211,21 +218,24 @@ def _cholesky(A: np.ndarray) -> np.ndarray:
 
 
 def _pack_factor(factor: np.ndarray) -> np.ndarray:
+    """Return the lower triangle of a factor as a flat float32 array."""
     return np.asarray(factor[np.tri(len(factor), dtype=bool)], np.float32)
 
 
 def _inverse(factor: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """What the inverse of the matrix does to a vector or columns."""
+    """Return a function that solves the factorised system for a vector or for columns."""
     return lambda right: np.asarray(cho_solve((factor, True), right, check_finite=False))
 
 
 def _sigmas(
     residuals: tuple[np.ndarray, np.ndarray], noise: Noise, sample_sigma: np.ndarray, data: PoseData
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the standard deviations of features (n, 2) and samples (m, 2), px."""
     return pose_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
 
 
 def _zero_weights(weights: tuple[np.ndarray, np.ndarray], aside: np.ndarray, data: PoseData) -> None:
+    """Set the weights of the excluded poses (p,) bool to 0, in place."""
     for w, start in zip(weights, (data.feature_from, data.sample_from), strict=True):
         for i in np.nonzero(aside)[0]:
             w[start[i] : start[i + 1]] = 0.0
@@ -237,6 +247,7 @@ def _fit_statistics(
     sigmas: tuple[np.ndarray, np.ndarray],
     data: PoseData,
 ) -> dict[str, PoseFit]:
+    """Compute the RMS residuals and the trust of each pose, excluded ones included."""
     fresh = robust_weights(*residuals, sigmas)
     trust = pose_trust(fresh, sigmas, data)
     fits = {}
@@ -251,7 +262,7 @@ def _fit_statistics(
 
 
 def _depth_range(state: State, data: PoseData, aside: np.ndarray) -> tuple[float, float]:
-    """Nearest and farthest depth of a feature, mm."""
+    """Return the nearest and farthest depth in mm of a feature in the poses that are not excluded."""
     pose = np.repeat(np.arange(len(aside)), np.diff(data.feature_from))
     z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature]) + state.t_board[pose, 2]
     z = z[~aside[pose]]
@@ -259,18 +270,17 @@ def _depth_range(state: State, data: PoseData, aside: np.ndarray) -> tuple[float
 
 
 def _count_poses(state: State, weights: tuple[np.ndarray, np.ndarray], data: PoseData) -> tuple[np.ndarray, np.ndarray]:
-    """How many poses illuminated each cell of the camera's field and of the projector's, (rows, columns) uint16
-    each."""
+    """Count the poses that illuminated each cell (rows, columns) uint16 of the camera's and the projector's field."""
     counts = []
     for device, pixels in ((state.rig.camera, data.sample_px), (state.rig.projector, data.projector_px)):
         rows, columns = (n - 3 for n in device.coefficients.shape[1:])
         width, height = device.size
         total = np.zeros((rows, columns), np.uint16)
         for first, last in zip(data.sample_from[:-1], data.sample_from[1:], strict=True):
-            seen = (weights[1][first:last] > 0).all(axis=1)
-            u, v = pixels[first:last][seen].T
+            used = (weights[1][first:last] > 0).all(axis=1)
+            u, v = pixels[first:last][used].T
             extent = [[-0.5, height - 0.5], [-0.5, width - 0.5]]
-            found, _, _ = np.histogram2d(v, u, bins=(rows, columns), range=extent)
-            total += (found >= MIN_SAMPLES).astype(np.uint16)
+            samples, _, _ = np.histogram2d(v, u, bins=(rows, columns), range=extent)
+            total += (samples >= MIN_SAMPLES).astype(np.uint16)
         counts.append(total)
     return counts[0], counts[1]

@@ -1,8 +1,8 @@
-"""Poses whose board was numbered from its other end: a grid of circles looks the same turned by 180 degrees.
+"""Detection of poses numbered from the board's other end: a grid of circles looks the same turned by 180 degrees.
 
-Bow and twist are the same then, yet each circle's misplacement is another circle's. So what each pose says of the
-circles' places is compared with what the others say: the part that a half turn reverses, less what is smooth over the
-board and may come from lenses. It is the paper's own noise, the same in all poses, and reversed where one was turned.
+Printing errors of the circles identify the board. Each pose's estimate of them is compared with the others': of its
+part that changes sign under a half turn, less the smooth part that lens distortion may cause. That part agrees between
+poses of one numbering, and has the opposite sign in a pose numbered from the other end.
 """
 
 from dataclasses import replace
@@ -16,14 +16,14 @@ from slviewer.geometry.polynomial import monomials, scale_to_unit_square
 from slviewer.target.board import Board
 
 DECISION_SIGMAS = 5.0
-"""Sigmas of pure chance by which a pose must agree with the others' reverse before it counts as turned."""
+"""Least anticorrelation with the other poses, in sigmas of chance, of a pose that counts as turned."""
 SMOOTH_DEGREE = 4
-"""Degree of the polynomials that are no evidence."""
+"""Degree of the polynomials that are removed as possible lens distortion."""
 _STEP_MM = 0.01
 
 
 def is_numbering_ambiguous(notation: str) -> bool:
-    """Whether a board's numbering may start at either end: circles without a detected mark."""
+    """Whether a board, by its notation, looks the same turned by 180 degrees unless its mark is detected."""
     try:
         return Board.parse(notation).kind in ("circles", "acircles")
     except InputError:  # a calibration made elsewhere
@@ -31,8 +31,7 @@ def is_numbering_ambiguous(notation: str) -> bool:
 
 
 def opposite_features(points: np.ndarray) -> np.ndarray | None:
-    """(f,) where each feature of (f, 3) mm lies after half a turn of the board; None where the board is not the same
-    then."""
+    """Return the index (f,) of the feature opposite to each of ``points`` (f, 3) mm; None without that symmetry."""
     middle = (points.min(0) + points.max(0)) / 2
     away = np.linalg.norm((2 * middle - points)[:, None, :2] - points[None, :, :2], axis=2)
     partner = np.argmin(away, axis=1)
@@ -41,10 +40,9 @@ def opposite_features(points: np.ndarray) -> np.ndarray | None:
 
 
 def detect_half_turns(state: State, data: PoseData, residuals: np.ndarray, certain: np.ndarray) -> np.ndarray:
-    """(p,) bool: poses that are numbered from the other end than most, or than the ``certain`` (p,) bool ones, beyond
-    doubt.
+    """Detect the poses (p,) bool numbered from the other end than the ``certain`` (p,) bool ones, or than most.
 
-    ``residuals`` (n, 2) px: of the features.
+    ``residuals`` (n, 2) px: of the features. All False for boards without the symmetry and for fewer than three poses.
     """
     partner = opposite_features(data.points)
     count = state.layout.poses
@@ -68,7 +66,7 @@ def detect_half_turns(state: State, data: PoseData, residuals: np.ndarray, certa
 
 
 def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[State, PoseData]:
-    """Both with these ``poses`` (p,) bool numbered from the other end."""
+    """Return state and data with the given ``poses`` (p,) bool numbered from the board's other end."""
     partner = opposite_features(data.points)
     if partner is None or not poses.any():
         return state, data
@@ -105,8 +103,8 @@ def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.
 
 
 def _odd_part(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(p, 2 f): of places (p, f, 2), what half a turn of the board changes the sign of, and is not smooth."""
-    # the circle there moves the other way when the board is turned: what reverses is the mean of both
+    """Return the part (p, 2 f) of offsets (p, f, 2) that changes sign under a half turn, without its smooth part."""
+    # the opposite circle's offset is reversed by the turn: the antisymmetric part is the mean of both
     odd = (places + places[:, partner]) / 2
     basis, _ = np.linalg.qr(monomials(scale_to_unit_square(points[:, :2]), SMOOTH_DEGREE))
     odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)

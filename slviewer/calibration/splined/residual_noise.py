@@ -24,8 +24,11 @@ STRENGTH_BOUNDS = (1e-1, 1e6)
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations px: of a feature's coordinate in the camera; what a sample's x and y scatter by beyond their
-    own predicted noise; and what they scatter by in all (median)."""
+    """Standard deviations in px estimated from the residuals.
+
+    ``camera_px``: of a feature's coordinate; ``excess_px``: of a sample's x and y beyond their predicted noise;
+    ``sample_px``: of a sample's x and y in total.
+    """
 
     camera_px: float
     excess_px: tuple[float, float]
@@ -33,19 +36,19 @@ class Noise:
 
     @property
     def ratio(self) -> tuple[float, float]:
-        """How many times their own predicted noise the samples scatter by, x and y: 1 where noise explains them."""
+        """Ratio (x, y) of the samples' scatter to their predicted noise; 1 where noise explains it."""
         pairs = zip(self.sample_px, self.excess_px, strict=True)
         predicted = [np.sqrt(max(s * s - e * e, (s / MAX_RATIO) ** 2, MIN_SIGMA_PX**2)) for s, e in pairs]
         x, y = (max(1.0, float(s / p)) for s, p in zip(self.sample_px, predicted, strict=True))
         return x, y
 
     def sigmas(self, sample_sigma: np.ndarray) -> np.ndarray:
-        """(m, 2) px: of samples whose predicted noise is (m, 2)."""
+        """Return the total standard deviations (m, 2) px of samples with predicted noise (m, 2) px."""
         return np.sqrt(sample_sigma**2 + np.square(self.excess_px))
 
 
 def estimate_noise(features: np.ndarray, samples: np.ndarray, sample_sigma: np.ndarray) -> Noise:
-    """From residuals (n, 2) of features and (m, 2) of samples, robustly; what is NaN does not count."""
+    """Estimate the noise robustly from residuals of features (n, 2) and samples (m, 2) px; NaN does not count."""
     camera = 1.4826 * float(np.nanmedian(np.abs(features)))
     excess = [_excess_sigma(samples[:, k], sample_sigma[:, k]) for k in range(2)]
     total = 1.4826 * np.nanmedian(np.abs(samples), axis=0)
@@ -53,11 +56,11 @@ def estimate_noise(features: np.ndarray, samples: np.ndarray, sample_sigma: np.n
 
 
 def _excess_sigma(residuals: np.ndarray, sigma: np.ndarray) -> float:
-    """What, added to the predicted noise, makes the residuals' robust standard deviation 1."""
-    read = np.isfinite(residuals) & np.isfinite(sigma)
-    if not read.any():
+    """Solve for the sigma that, added in quadrature to the predicted one (m,), normalises the residuals (m,) to 1."""
+    known = np.isfinite(residuals) & np.isfinite(sigma)
+    if not known.any():
         return MIN_SIGMA_PX
-    r, variance = np.abs(residuals[read]), sigma[read] ** 2
+    r, variance = np.abs(residuals[known]), sigma[known] ** 2
     low, high = MIN_SIGMA_PX, max(3.0 * float(np.median(r)), MIN_SIGMA_PX)
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -67,12 +70,12 @@ def _excess_sigma(residuals: np.ndarray, sigma: np.ndarray) -> float:
 
 
 def pose_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) -> np.ndarray:
-    """(n, 2) px: each feature's noise, that of its pose where it exceeds what all have in common."""
+    """Return the sigma (n, 2) px of each feature: that of its pose, limited to 1 to 2.5 times the common one."""
     sigma = np.full_like(features, noise.camera_px)
     for first, last in pairwise(feature_from):
-        found = np.abs(features[first:last])
-        if np.isfinite(found).any():
-            own = 1.4826 * float(np.nanmedian(found))
+        residuals = np.abs(features[first:last])
+        if np.isfinite(residuals).any():
+            own = 1.4826 * float(np.nanmedian(residuals))
             sigma[first:last] = np.clip(own, noise.camera_px, MAX_POSE_NOISE_RATIO * noise.camera_px)
     return sigma
 
@@ -80,9 +83,9 @@ def pose_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) ->
 def robust_weights(
     features: np.ndarray, samples: np.ndarray, sigmas: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) and (m, 2) 1/px^2: one over the variance, times Tukey's biweight of both coordinates of one place.
+    """Return the weights of features (n, 2) and samples (m, 2) in 1/px^2: inverse variance times Tukey's biweight.
 
-    ``sigmas``: (n, 2) and (m, 2) px, of the features and of the samples.
+    The biweight is the product of both coordinates'. ``sigmas``: (n, 2) and (m, 2) px. Residuals with NaN weigh 0.
     """
     weights = []
     for r, s in zip((features, samples), sigmas, strict=True):
@@ -95,7 +98,7 @@ def robust_weights(
 def pose_trust(
     weights: tuple[np.ndarray, np.ndarray], sigmas: tuple[np.ndarray, np.ndarray], data: PoseData
 ) -> np.ndarray:
-    """(poses, 2): the mean of Tukey's biweight over each pose's features, and over its samples."""
+    """Return the mean of Tukey's biweight over each pose's features and over its samples, (poses, 2)."""
     trust = []
     for w, s, start in zip(weights, sigmas, (data.feature_from, data.sample_from), strict=True):
         each = np.nanmax(np.where(np.isfinite(s), w * s**2, 0.0), axis=1)
@@ -112,7 +115,7 @@ def update_strength(
     solve: Callable[[np.ndarray], np.ndarray],
     size: int,
 ) -> float:
-    """A prior's strength that makes the observations likelier (MacKay's fixed point).
+    """Update a prior's strength by MacKay's fixed point, which maximises the evidence.
 
     The prior is exp(-strength/2 c'Fc) for each component c of ``field`` (2, n), F = ``form`` (n, n); the coefficients
     stand at ``first`` in the vector of ``size`` unknowns, and ``solve`` applies the inverse of its normal matrix.

@@ -1,4 +1,4 @@
-"""The working volume: points at which uncertainty is evaluated, without the rigid motion that no measurement needs."""
+"""The working volume: points at which uncertainty is evaluated, and removal of their common rigid motion."""
 
 from dataclasses import dataclass
 
@@ -17,8 +17,11 @@ measured."""
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Places that camera and projector both see: camera ``pixels`` (n, 2), depths ``z`` (n,) mm, ``points`` (n, 3) mm
-    in the camera's frame, and where the ``projector`` (n, 2) px sees them."""
+    """Points in the view of camera and projector.
+
+    Camera ``pixels`` (n, 2), depths ``z`` (n,) mm, ``points`` (n, 3) mm in the camera's frame, and ``projector`` pixels
+    (n, 2).
+    """
 
     pixels: np.ndarray
     z: np.ndarray
@@ -28,7 +31,7 @@ class Volume:
     def supported(
         self, rig: Arrangement, camera_illuminated: np.ndarray, projector_illuminated: np.ndarray
     ) -> np.ndarray:
-        """(n,) bool: those seen through cells (rows, columns) bool that target poses illuminated, in both devices."""
+        """(n,) bool: points in cells (rows, columns) bool that target poses illuminated, in both devices."""
         return is_supported(rig.camera, self.pixels, camera_illuminated) & is_supported(
             rig.projector, self.projector, projector_illuminated
         )
@@ -42,10 +45,10 @@ def working_volume(
     rows: int = 7,
     depths: int = 5,
 ) -> Volume:
-    """What the projector sees of a regular grid: the whole image, its corners included, at depths evenly from
-    ``reach[0]`` of the nearest calibrated depth to ``reach[1]`` of the farthest.
+    """Return the points of a regular grid over the camera's image and depths that the projector's image contains.
 
-    Raises InputError where there is nothing: calibrated depths that are none, or no grid point that is seen.
+    ``calibrated_mm``: nearest and farthest calibrated depth, multiplied by ``reach``; ``columns``, ``rows``, ``depths``
+    of the grid. Raises InputError for an empty range of depths, and where the projector's image contains no point.
     """
     near, far = reach[0] * calibrated_mm[0], reach[1] * calibrated_mm[1]
     if not 0 < near < far:
@@ -57,14 +60,14 @@ def working_volume(
         np.linspace(near, far, depths),
         indexing="ij",
     )
-    found = select_visible(rig, np.column_stack([u.ravel(), v.ravel()]), z.ravel())
-    if not len(found.z):
+    volume = select_visible(rig, np.column_stack([u.ravel(), v.ravel()]), z.ravel())
+    if not len(volume.z):
         raise InputError(f"camera and projector share nothing they both see at {near:.0f}-{far:.0f} mm")
-    return found
+    return volume
 
 
 def select_visible(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volume:
-    """Those of camera ``pixels`` (n, 2) at depths ``z`` (n,) mm that the projector's image holds."""
+    """Select the camera ``pixels`` (n, 2) at depths ``z`` (n,) mm whose points project into the projector's image."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     points, projector = view_pixels(rig, pixels, z)
     seen = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)  # False for NaN
@@ -72,16 +75,20 @@ def select_visible(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volum
 
 
 def view_pixels(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) mm: what camera ``pixels`` (n, 2) float64 see at depths ``z`` (n,); (n, 2) px: where the projector has it,
-    inside its image or not. NaN where a lens has no answer."""
+    """Return points (n, 3) mm of camera ``pixels`` (n, 2) at depths ``z`` (n,) mm, and their projector pixels (n, 2).
+
+    Projector pixels may be outside its image; NaN where a distortion cannot be inverted or a point is behind a device.
+    """
     points, projector = np.empty((len(z), 3)), np.empty((len(z), 2))
     _view_all(rig, pixels, z, points, projector)
     return points, projector
 
 
 def is_supported(device: Device, pixels: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
-    """(n,) bool: whether the cells of ``pixels`` (n, 2) are among those (rows, columns) bool that target poses
-    illuminated; beyond the image, those at its edge. False for NaN."""
+    """(n,) bool: whether ``pixels`` (n, 2) are in cells (rows, columns) bool that target poses illuminated.
+
+    Pixels outside the image count to the cell at its edge; False for NaN.
+    """
     shape = np.array([illuminated.shape[1], illuminated.shape[0]])
     known = np.isfinite(pixels).all(axis=1)
     place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
@@ -90,7 +97,7 @@ def is_supported(device: Device, pixels: np.ndarray, illuminated: np.ndarray) ->
 
 
 def depth_axis(rig: Arrangement, volume: Volume) -> Axis:
-    """The projector coordinate that depth moves more, in the median over the volume."""
+    """Return the projector axis whose coordinate changes more with depth, in the median over the volume."""
     _, later = view_pixels(rig, volume.pixels, 1.001 * volume.z)
     across, down = np.nanmedian(np.abs(later - volume.projector), axis=0)
     return "y" if down > across else "x"
@@ -98,8 +105,11 @@ def depth_axis(rig: Arrangement, volume: Volume) -> Axis:
 
 @dataclass(frozen=True, eq=False)
 class BestMotion:
-    """The small rigid motion that fits errors of some points best: errors (3 n,) times ``weights`` (3 n, 6) are three
-    shifts, and three turns about ``centre`` times ``arm`` mm."""
+    """Least-squares estimator of a small rigid motion from errors of points.
+
+    Errors (3 n,) times ``weights`` (3 n, 6) are three translations (mm), and three rotations about ``centre`` (3,) mm
+    times ``arm`` mm.
+    """
 
     weights: np.ndarray
     centre: np.ndarray
@@ -107,9 +117,9 @@ class BestMotion:
 
     @classmethod
     def fit(cls, points: np.ndarray, fitted: np.ndarray | None = None) -> "BestMotion":
-        """For errors of ``points`` (n, 3), or of those that are ``fitted`` (n,) bool; the others weigh nothing.
+        """Build the estimator for ``points`` (n, 3) mm; only those in ``fitted`` (n,) bool have weights.
 
-        Raises InputError where these are fewer than three.
+        Raises InputError for fewer than three points.
         """
         chosen = np.ones(len(points), bool) if fitted is None else np.asarray(fitted, bool)
         if np.count_nonzero(chosen) < 3:
@@ -120,7 +130,7 @@ class BestMotion:
         return cls(np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T, centre, arm)
 
     def displace(self, points: np.ndarray) -> np.ndarray:
-        """(3 n, 6): how points (n, 3) move; x, y, z of the first, then of the next."""
+        """Return the displacements (3 n, 6) of points (n, 3) mm by the six motions; x, y, z of each point in turn."""
         return _motion_basis(points, self.centre, self.arm)
 
 
@@ -137,7 +147,7 @@ def motion_free(whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | N
 
 
 def sigma_3d(whitened: np.ndarray) -> np.ndarray:
-    """(n,) mm: the standard deviation of each point, in all directions together, from its whitened factor (m, 3 n)."""
+    """Return the 3D standard deviation (n,) mm of each point from a factor (m, 3 n) of the points' covariance."""
     squares = np.einsum("mn,mn->n", whitened, whitened, dtype=np.float64)
     return np.asarray(np.sqrt(squares.reshape(-1, 3).sum(axis=1)))
 
