@@ -173,7 +173,7 @@ def _data(
         plane_outlines={name: _outline(c, stereo.rig.camera.rays()) for name, c in result.planes.items()},
         clouds=clouds,
         merged=CloudView("merged", whole.surface.points, whole.surface.normals, whole.source, whole.names),
-        poses_left_out=stereo.left_out,
+        poses_left_out=stereo.excluded,
         letter_points=letter.EXPERIMENT_3_POINTS,
     )
 
