@@ -33,7 +33,7 @@ DOMINANT_AREA_RATIO = 2.0
 
 
 @dataclass(frozen=True)
-class _Attempt:
+class _Binarisation:
     """The blobs of one binarisation, in pixels of the full image, and the lattices among them."""
 
     blobs: Blobs
@@ -42,14 +42,14 @@ class _Attempt:
 
 @dataclass(frozen=True)
 class _Grid:
-    """All circles of a board: the equally valid ``numberings`` (n,) of ``blobs``."""
+    """A detected board: its blobs and the equally valid ``numberings``, (n,) indices into them."""
 
     blobs: Blobs
     numberings: list[np.ndarray]
 
     @property
     def area_px(self) -> float:
-        """Of the quadrilateral that the grid covers in the image."""
+        """Area of the grid's convex hull in the image."""
         hull = cv2.convexHull(np.asarray(self.blobs.centres[self.numberings[0]], np.float32))
         return float(cv2.contourArea(hull))
 
@@ -57,7 +57,7 @@ class _Grid:
 def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float, bool]:
     """((n, 2) float64 px of every circle, their radius in mm, whether the board's mark was detected); raises
     DetectionError with how many circles were."""
-    tried: list[_Attempt] = []
+    tried: list[_Binarisation] = []
     for attempt in _binarise_all(board, image.grey):
         tried.append(attempt)
         grids = [grid for lattice in attempt.lattices if (grid := _match_board(board, lattice, attempt.blobs, image))]
@@ -75,14 +75,16 @@ def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float, 
 
 
 def _count_nodes(lattice: Lattice) -> int:
+    """Return the number of nodes of a lattice."""
     return len(lattice.nodes)
 
 
-def _size_of_largest(attempt: _Attempt) -> int:
+def _size_of_largest(attempt: _Binarisation) -> int:
+    """Return the number of nodes of the largest lattice; 0 without one."""
     return max((len(lattice.nodes) for lattice in attempt.lattices), default=0)
 
 
-def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Attempt]:
+def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
     """Binarisations at the search resolution, then coarser, where noise averages out, then in the full image; at last
     twice as large, if circles of a few pixels were detected.
 
@@ -105,13 +107,16 @@ def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Attempt]:
                     if len(lattice.nodes) > CLUTTER_FREE_SHARE * len(board.points):
                         colours = [inverted]
                         resolved |= float(np.median(blobs.areas[lattice.blobs])) > RESOLVED_AREA_PX
-                yield _Attempt(blobs.rescale(scale), lattices)
+                yield _Binarisation(blobs.rescale(scale), lattices)
             if colours == [inverted]:
                 break
 
 
 def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage) -> _Grid | None:
-    """The board in a lattice, if all of it is there; raises DetectionError where the grid is larger than the board."""
+    """Match a lattice with the board; None unless all circles are there.
+
+    Raises DetectionError where the grid of circles is larger than the board.
+    """
     if len(lattice.nodes) <= CLUTTER_FREE_SHARE * len(board.points):
         return None
     for candidate in (lattice, complete_lattice(lattice, blobs)):
@@ -135,7 +140,7 @@ def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage
 
 
 def _fit_map(board: Board, blobs: Blobs) -> GridMap | None:
-    """The map from board to image, if these blobs form a grid and are alike in size; else None."""
+    """Fit the map from board to image; None unless the blobs, in the board's order, form a grid of equal circles."""
     points = board.points[:, :2] / board.pitch_mm
     try:
         seen = fit_grid_map(points, blobs.centres, robust=True)
@@ -184,7 +189,7 @@ def _neighbouring_rows(board: Board) -> list[np.ndarray]:
 
 
 def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
-    """The grid that is the board; raises DetectionError where two may be."""
+    """Select the grid with the largest area in the image; raises DetectionError where two are of similar area."""
     grids = sorted(grids, key=lambda grid: -grid.area_px)
     if len(grids) > 1 and grids[0].area_px < DOMINANT_AREA_RATIO * grids[1].area_px:
         (a, b), (c, d) = (grid.blobs.centres[grid.numberings[0]].mean(0) for grid in grids[:2])
@@ -196,6 +201,7 @@ def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
 
 
 def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[np.ndarray, float, bool]:
+    """Number the grid and refine its centres; returns (pixels (n, 2), radius in mm, whether the mark was detected)."""
     marked = numbering_by_mark(board, image.deep, grid.blobs.centres, grid.numberings)
     order = select_upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
     blobs = grid.blobs.select(order)
@@ -204,6 +210,7 @@ def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[np.ndarray, 
 
 
 def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
+    """Raise DetectionError where blobs are squares or partly covered circles."""
     large = blobs.areas > MIN_SHAPE_AREA_PX
     if large.all() and np.median(blobs.roundness) < SQUARE_LIMIT_ROUNDNESS:
         raise DetectionError(f"a grid of squares detected where {board} has circles: check the board's kind")
@@ -216,6 +223,7 @@ def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
 
 
 def _refine_centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:
+    """Return the sub-pixel centres (n, 2) px; raises DetectionError where one cannot be measured or fits no grid."""
     pixels = refine_centres(image.deep, blobs)
     lost = np.isnan(pixels).any(1)
     if lost.any():
@@ -228,14 +236,14 @@ def _refine_centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray
 
 
 def _measure_radius(board: Board, blobs: Blobs) -> float:
-    """Radius in mm, from the areas of the blobs and the local scale of the board's map."""
+    """Estimate the circles' radius in mm from the blobs' areas and the scale of the homography."""
     points = board.points[:, :2]
     scale = np.linalg.det(jacobians(fit_homography(points, blobs.centres), points))
     return float(np.sqrt(np.median(blobs.areas / scale) / np.pi))
 
 
 def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
-    """The blobs of several binarisations, each circle once, as the ``first`` has it where it does."""
+    """Merge the blobs of several binarisations; of duplicates the one from the earlier binarisation remains."""
     pool = first
     for blobs in others:
         apart = np.linalg.norm(blobs.centres[:, None] - pool.centres[None], axis=2).min(1)
@@ -249,8 +257,8 @@ def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
     return pool
 
 
-def _failure(board: Board, image: BoardImage, most: _Attempt | None) -> str:
-    """Message for the operator: circles detected of how many, other blobs around them, and what to do."""
+def _failure(board: Board, image: BoardImage, most: _Binarisation | None) -> str:
+    """Return the error message: number of detected circles, other blobs, and what to do."""
     total = len(board.points)
     if most is None or _size_of_largest(most) < 6:
         return f"no grid of circles detected where {board} has {total}: {light_advice(image.grey)}"

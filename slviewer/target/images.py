@@ -1,4 +1,4 @@
-"""Images as the detectors take them."""
+"""Preparation of images for board detection."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,18 @@ SEARCH_PX = 1600
 
 @dataclass(frozen=True)
 class BoardImage:
-    """``grey`` (h, w) uint8 to search in, stretched if the image is dim; ``deep`` (h, w) float32 to measure in, in the
-    image's own grey levels."""
+    """An image prepared for board detection.
+
+    ``grey`` (h, w) uint8: for the search, with stretched contrast if the image is dim; ``deep`` (h, w) float32: for
+    sub-pixel refinement, in the image's own grey levels.
+    """
 
     grey: np.ndarray
     deep: np.ndarray
 
     @classmethod
     def from_image(cls, image: np.ndarray) -> "BoardImage":
-        """From (h, w), or (h, w, 3) RGB, uint8 or uint16; raises InputError."""
+        """Convert an image (h, w) or (h, w, 3) RGB, uint8 or uint16; raises InputError for others."""
         image = np.asarray(image)
         flat = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
         if image.dtype not in (np.uint8, np.uint16) or not flat or min(image.shape[:2]) < 32:
@@ -39,14 +42,14 @@ class BoardImage:
 
 
 def light_advice(grey: np.ndarray) -> str:
-    """What the operator should try, by how bright the image is."""
+    """Return advice on exposure and board position for an error message, by the share of saturated pixels."""
     saturated = float(np.mean(grey[::4, ::4] == 255))
     exposure = f"lower the exposure ({saturated:.0%} of the image is saturated), or " if saturated > 0.02 else ""
     return f"{exposure}move the board so that all of it is in view, evenly illuminated and in focus"
 
 
 def resize_image(image: np.ndarray, factor: float) -> np.ndarray:
-    """The image at ``factor`` of its size: averaged if smaller, interpolated if larger."""
+    """Resize an image by ``factor``, with area averaging if smaller and cubic interpolation if larger."""
     if factor == 1:
         return image
     return cv2.resize(
@@ -55,7 +58,7 @@ def resize_image(image: np.ndarray, factor: float) -> np.ndarray:
 
 
 def flatten_light(grey: np.ndarray) -> np.ndarray:
-    """(h, w) uint8: the image over the brightest of each neighbourhood, a seventh of it wide: paper becomes white."""
+    """Divide an image (h, w) uint8 by the local maximum brightness, so that paper becomes evenly white."""
     factor = 64 / max(grey.shape)
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     white = cv2.GaussianBlur(cv2.dilate(small, np.ones((9, 9), np.uint8)), (9, 9), 0)

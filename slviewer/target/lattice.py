@@ -1,7 +1,7 @@
-"""Order scattered blobs into a grid: grow a lattice from neighbour to neighbour, then lay the board's pattern on it.
+"""Grouping of scattered blobs into lattices, from neighbour to neighbour, and matching of a board's pattern to them.
 
-A board is accepted only if every one of its circles is there, in exactly one place of the lattice: a grid that could as
-well be shifted by a row is refused, not guessed.
+A board is accepted only if all of its circles match at exactly one position of the lattice: a grid that could be
+shifted by a row is refused.
 """
 
 from collections.abc import Iterator
@@ -159,11 +159,14 @@ def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.n
 
 
 def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.ndarray, second: np.ndarray) -> Lattice:
-    """The lattice around a seed: each node's four neighbours are searched where its known ones predict them."""
+    """Grow the lattice around a ``seed`` blob with steps ``first`` and ``second`` (2,) px along its two directions.
+
+    Each node's four neighbours are searched among the ``free`` (n,) bool blobs where the known nodes predict them.
+    """
     centres, areas = blobs.centres, blobs.areas
     at = {(0, 0): seed}
     steps = {(0, 0): (first, second)}
-    taken = {seed}
+    used = {seed}
     queue = [(0, 0)]
     for node in queue:
         i, j = node
@@ -183,25 +186,26 @@ def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.nd
                     diagonal = at.get((i + di + side * dj, j + dj + side * di))
                     if beside is not None and diagonal is not None:
                         step = centres[diagonal] - centres[beside]
-            found = _nearest_of_size(
-                tree, here + step, PREDICTION_RADIUS * float(np.hypot(*step)), areas, areas[at[node]], free, taken
+            neighbour = _nearest_of_size(
+                tree, here + step, PREDICTION_RADIUS * float(np.hypot(*step)), areas, areas[at[node]], free, used
             )
-            if found is None:
+            if neighbour is None:
                 continue
-            at[ahead] = found
-            taken.add(found)
-            moved = sign * (centres[found] - here)
-            steps[ahead] = (moved, steps[node][1]) if axis == 0 else (steps[node][0], moved)
+            at[ahead] = neighbour
+            used.add(neighbour)
+            measured = sign * (centres[neighbour] - here)
+            steps[ahead] = (measured, steps[node][1]) if axis == 0 else (steps[node][0], measured)
             queue.append(ahead)
     return Lattice(np.array(list(at)), np.array(list(at.values())))
 
 
 def _nearest_of_size(
-    tree: cKDTree, place: np.ndarray, reach: float, areas: np.ndarray, area: float, free: np.ndarray, taken: set[int]
+    tree: cKDTree, place: np.ndarray, reach: float, areas: np.ndarray, area: float, free: np.ndarray, used: set[int]
 ) -> int | None:
+    """Return the nearest unused blob of similar ``area`` within ``reach`` px of ``place`` (2,) px; None without one."""
     distances, indices = tree.query(place, k=3, distance_upper_bound=reach)
     for distance, index in zip(distances, indices, strict=True):
-        if not np.isfinite(distance) or not free[index] or index in taken:
+        if not np.isfinite(distance) or not free[index] or index in used:
             continue
         if 1 / AREA_RATIO < areas[index] / area < AREA_RATIO:
             return int(index)

@@ -23,23 +23,23 @@ MAX_BEND = 0.6
 
 
 def select_upright(board: Board, pixels: np.ndarray, numberings: list[np.ndarray]) -> np.ndarray:
-    """Of equally valid numberings, (n,) indices into ``pixels`` (m, 2), the one selected by the rule above."""
+    """Select one of several valid numberings, (n,) indices into ``pixels`` (m, 2), by the rule of this module."""
     preferred = np.array([1.0, 0.0] if len(numberings) == 4 else [2.0, 1.0])
     return max(numberings, key=lambda order: float(x_direction(board, pixels[order]) @ preferred))
 
 
 def x_direction(board: Board, pixels: np.ndarray) -> np.ndarray:
-    """(2,) unit vector in the image along the board's x axis, in the mean over the board."""
+    """Return the mean direction (2,) of the board's x axis in the image, a unit vector."""
     x = board.points[:, 0] - board.points[:, 0].mean()
     direction = x @ (pixels - pixels.mean(0))
     return np.asarray(direction / np.linalg.norm(direction))
 
 
 def check_grid(board: Board, pixels: np.ndarray, ids: np.ndarray, what: str) -> None:
-    """Raises DetectionError unless the features lie, one by one, where a real lens images a flat board's.
+    """Raise DetectionError unless features at ``pixels`` (n, 2) are the image of a flat board through a real lens.
 
-    A homography must explain them up to a lens's distortion, which is smooth (``planar.GridMap``). The numbering must
-    be right-handed.
+    ``ids`` (n,): indices into the board's points; ``what``: the features' name in messages. The pixels must agree with
+    a homography and a smooth distortion (``planar.GridMap``), and the numbering must be right-handed.
     """
     advice = "keep the board flat and in focus, without reflections, and take the pose again"
     points = board.points[ids][:, :2] / board.pitch_mm

@@ -1,4 +1,4 @@
-"""The homography between a flat board and its image, and what a lens adds to it."""
+"""The homography between a flat board and its image, and a polynomial model of the lens distortion."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,10 @@ HUBER_SIGMAS = 3.0
 
 
 def fit_homography(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -> np.ndarray:
-    """(3, 3) float64 from points (n, 2) mm to pixels (n, 2) px by least squares, positive in depth on the board.
+    """Fit the homography (3, 3) float64 from points (n, 2) mm to pixels (n, 2), with positive depth on the board.
 
-    ``robust``: by the least median of squares, of which up to half of the points may be wrong. Raises DetectionError
-    where they do not determine one.
+    By least squares; ``robust``: by least median of squares, with up to half outliers. Raises DetectionError where the
+    points do not determine one.
     """
     H = cv2.findHomography(points, pixels, cv2.LMEDS if robust else 0)[0] if len(points) >= 4 else None
     if H is None or abs(np.linalg.det(H)) < 1e-12:
@@ -25,12 +25,12 @@ def fit_homography(points: np.ndarray, pixels: np.ndarray, robust: bool = False)
 
 
 def to_image(H: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n, 2) px of points (n, 2) mm."""
+    """Project points (n, 2) mm to pixels (n, 2) by a homography (3, 3)."""
     return np.asarray((points @ H[:2, :2].T + H[:2, 2]) / (points @ H[2, :2] + H[2, 2])[:, None])
 
 
 def jacobians(H: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n, 2, 2) px per mm at points (n, 2) mm."""
+    """Return the Jacobians (n, 2, 2) px per mm of a homography (3, 3) at points (n, 2) mm."""
     w = points @ H[2, :2] + H[2, 2]
     return np.asarray((H[None, :2, :2] - to_image(H, points)[:, :, None] * H[2, :2]) / w[:, None, None])
 
@@ -63,10 +63,10 @@ class GridMap:
 
 
 def fit_grid_map(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -> GridMap:
-    """The map of features at points (n, 2) in pitches to pixels (n, 2).
+    """Fit the map from points (n, 2) in pitches to pixels (n, 2): a homography and a cubic polynomial.
 
-    ``robust``: up to a third of the features may be misplaced, and weigh little (Huber's weights). Raises
-    DetectionError where the features do not determine a map.
+    ``robust``: with Huber's weights, for up to a third of outliers. Raises DetectionError where the features do not
+    determine a map.
     """
     H = fit_homography(points, pixels, robust)
     low, span = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-9)

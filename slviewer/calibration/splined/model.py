@@ -29,9 +29,9 @@ NEAR, FAR = 0.7, 1.4
 
 @dataclass(frozen=True, eq=False)
 class SplinedModel:
-    """The joint adjustment, compiled when first used (about a second an axis at full size).
+    """The splined calibration: a bundle adjustment with spline displacement fields, compiled on first use.
 
-    Pixels that look through cells of camera or projector that no target pose illuminated are masked, unless asked for.
+    Pixels in cells of camera or projector that no target pose illuminated are masked by default.
     """
 
     bundle: Bundle
@@ -40,7 +40,7 @@ class SplinedModel:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Both, whichever a capture holds: the adjustment compared both."""
+        """Both axes, as the adjustment uses both."""
         return AXES
 
     @property
@@ -49,27 +49,29 @@ class SplinedModel:
 
     @property
     def depths_mm(self) -> tuple[float, float]:
-        """Nearest and farthest depth that is measured."""
+        """Nearest and farthest measurable depth."""
         near, far = self.bundle.depth_range_mm
         return NEAR * near, FAR * far
 
     @cached_property
     def pinholes(self) -> StereoRig:
-        """Both lenses without their displacement fields, and their arrangement."""
+        """Both lenses without their displacement fields, and their relative pose."""
         return StereoRig(lens_of(self.rig.camera), lens_of(self.rig.projector), self.rig.R, self.rig.t)
 
     def residuals_over_noise(self, axis: Axis) -> float:
-        """How many times their predicted noise the target poses' phases scatter by; 1 where noise explains them."""
+        """Return the ratio of the residuals of an axis to their predicted noise; 1 where noise explains them."""
         return self.bundle.noise.ratio[AXES.index(axis)]
 
     @property
     def residual_px(self) -> float:
-        """The same of both axes, whichever is larger: how far, in projector px, points miss their epipolar lines."""
+        """Standard deviation in projector px beyond noise, of the axis where it is larger (see ``excess_px``)."""
         return max(self.excess_px(axis) for axis in AXES)
 
     def undistort_pairs(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2); NaN
-        where no target pose supports one of them."""
+        """Return undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2).
+
+        NaN where no target pose illuminated the cell of one of them.
+        """
         rays = undistort(self.rig.camera, pixels), undistort(self.rig.projector, projector)
         known = is_supported(self.rig.camera, pixels, self.bundle.camera_poses > 0) & is_supported(
             self.rig.projector, projector, self.bundle.projector_poses > 0
@@ -78,7 +80,7 @@ class SplinedModel:
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """(2, h, w) float64: the undistorted normalised point that each pixel sees."""
+        """(2, h, w) float64: undistorted normalised coordinates of each pixel."""
         return pixel_rays(self.rig)
 
     @cached_property
@@ -94,21 +96,24 @@ class SplinedModel:
         return {}
 
     def fast_axis(self, axis: Axis) -> CompiledAxis:
-        """The fast form of one axis."""
+        """Return the compiled form of one axis; cached."""
         if axis not in self._compiled:
             illuminated = self.bundle.camera_poses > 0, self.bundle.projector_poses > 0
             self._compiled[axis] = compile_axis(self.rig, axis, self.rays, self.depths_mm, illuminated)
         return self._compiled[axis]
 
     def points(self, phase: PhaseMap, supported: bool = True) -> np.ndarray:
-        """(h, w, 3) float32 mm; NaN where the phase is invalid, beyond ``depths_mm`` or, if only ``supported`` points
-        are wanted, where no pose illuminated what the pixel looks through."""
+        """Return the points (h, w, 3) float32 mm of a phase map, in the camera's frame.
+
+        NaN where the phase is invalid, beyond ``depths_mm``, and, if ``supported``, in cells that no target pose
+        illuminated.
+        """
         self._check(phase)
         px_per_rad = phase.period_px / (2 * np.pi)
         return self.fast_axis(phase.axis).depth(phase.phase, px_per_rad, self._single_rays, supported)
 
     def support(self, phase: PhaseMap) -> np.ndarray:
-        """(h, w) bool: measured pixels that target poses support, in the camera and in the projector."""
+        """(h, w) bool: measured pixels in cells that target poses illuminated, in camera and projector."""
         return np.isfinite(self.points(phase)[..., 2])
 
     def depth_per_rad(self, phase: PhaseMap) -> np.ndarray:
@@ -123,21 +128,22 @@ class SplinedModel:
         return np.where(np.isfinite(points[..., 2]), sigma, np.nan).astype(np.float32)
 
     def excess_px(self, axis: Axis) -> float:
-        """Projector px that phases of the target poses scatter by beyond their predicted noise (1 sigma): what disturbs
-        the phase there disturbs it in every capture."""
+        """Return the standard deviation in projector px of the residuals beyond their predicted noise; 0 if none."""
         excess = float(self.bundle.noise.excess_px[AXES.index(axis)])
         return excess if excess > 2 * MIN_SIGMA_PX else 0.0  # the least that an estimate can be means none
 
     def sigma_map(self, axis: Axis) -> SigmaMap:
-        """What the calibration leaves uncertain of depths through one axis, wherever points are measured."""
+        """Return the map of the depth uncertainty by the calibration, for depths measured through one axis; cached."""
         if axis not in self._sigma_maps:
             self._sigma_maps[axis] = compute_sigma_map(self.bundle, axis, *self.depths_mm)
         return self._sigma_maps[axis]
 
     def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
-        """(h, w) float32 mm: standard deviation of depth that the calibration leaves, rigid motion apart; NaN where the
-        organised points (h, w, 3) are. It is the same in every scan, and averages out in none. Where residuals exceed
-        their noise it is larger by that ratio, for what they consist of then is not independent."""
+        """Return the standard deviation (h, w) float32 mm of depth by the calibration, without common rigid motion.
+
+        NaN where the organised ``points`` (h, w, 3) are. It is systematic: the same in every scan. Where residuals
+        exceed their noise it is increased by that ratio, as they are not independent then.
+        """
         return self.sigma_map(axis).interpolate(points) * np.float32(self.residuals_over_noise(axis))
 
     @cached_property
@@ -146,7 +152,7 @@ class SplinedModel:
         return summarise_volume_sigma(self.bundle)
 
     def summary(self) -> dict[str, Any]:
-        """The figures of ``text``, JSON-able."""
+        """Return the figures of ``text`` as plain values for JSON."""
         bundle = self.bundle
         fields = {
             device: float(np.sqrt(np.mean(part.coefficients[:, 1:-1, 1:-1] ** 2)))
@@ -174,7 +180,7 @@ class SplinedModel:
         }
 
     def text(self) -> str:
-        """For people."""
+        """Return a report of several lines for the terminal."""
         bundle, s = self.bundle, self.summary()
         noise, local, illuminated = s["noise_px"], s["local_distortion_rms_px"], s["cells_lit"]
         low, high = s["board_height_mm"]
@@ -227,7 +233,7 @@ class SplinedModel:
 def calibrate_splined(
     observations: Sequence[Observation], stereo: StereoModel, progress: Callable[[float], None] | None = None
 ) -> SplinedModel:
-    """The splined model from the poses that the stereo calibration used.
+    """Calibrate the splined model from the poses that the stereo calibration used.
 
     Raises InputError where poses lack an axis, and CalibrationRejected where they contradict each other.
     """
