@@ -56,6 +56,7 @@ def _solve_spd(A, b, x):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _fit_all(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (n, 3) with value and slopes of a robust quadratic fit around each pixel; NaN where not possible."""
     height, width = field.shape
     basis = np.empty((1024, 6))
     value = np.empty(1024)

@@ -190,6 +190,7 @@ def projector_reach(
     P = basis[-1].reshape(3, 4)
 
     def reaches(points: np.ndarray) -> np.ndarray:
+        """(k,) bool: whether points (k, 3) mm project into the projector's image less a margin."""
         h = np.column_stack([(points - middle) / scale, np.ones(len(points))]) @ P.T
         return (np.abs(h[:, :2] / h[:, 2:]) < 0.5 - margin).all(1)
 

@@ -58,10 +58,12 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
     seen, directions = pixels[known], rays[known]
 
     def lens(numbers: np.ndarray) -> Lens:
+        """Return the lens with these parameters: fx, fy, cx, cy, and the five distortion coefficients."""
         fx, fy, cx, cy = numbers[:4]
         return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), numbers[4:], start.size)
 
     def residuals(numbers: np.ndarray) -> np.ndarray:
+        """Return the residuals (2 n,) px of a lens with these parameters."""
         return np.nan_to_num(lens(numbers).distort(directions) - seen, nan=1e3).ravel()
 
     K = start.K
@@ -72,6 +74,7 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
 
 
 def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> PinholeFit:
+    """Measure the residuals of a lens at pixels (n, 2) with known rays (n, 2); rows with NaN do not count."""
     length = np.linalg.norm(lens.distort(rays) - pixels, axis=1)
     known = np.isfinite(length)
     if not known.any():
@@ -82,6 +85,7 @@ def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> Pinh
 
 
 def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:
+    """Fit a pinhole and Brown lens to a device over the cells (rows, columns) bool that target poses illuminated."""
     width, height = device.size
     across = np.linspace(0, width - 1, GRID)
     down = np.linspace(0, height - 1, max(2, round(GRID * height / width)))

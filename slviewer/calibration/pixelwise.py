@@ -64,6 +64,7 @@ class PixelwiseModel:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
+        """The captured axes."""
         return tuple(self.fits)
 
     def points(self, phase: PhaseMap) -> np.ndarray:
@@ -254,6 +255,7 @@ def _reference_phase(stereo: StereoModel, axis: Axis, period_px: float, z: float
 
 
 def _empty_fit(height: int, width: int) -> PixelFit:
+    """Allocate a fit for an image."""
     shape = height, width
     poses, coefficients = np.zeros(shape, np.uint16), np.empty((5, *shape))
     rms, least, most, condition = (np.empty((*n, *shape), np.float32) for n in ((3,), (), (), ()))
@@ -317,6 +319,7 @@ def _project_onto_plane(  # type: ignore[no-untyped-def]
 
 @kernel(parallel=True)
 def _evaluate(phase, ratio, c, phase_min, phase_max, reach, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (h, w, 3) with the points of phases times ``ratio``; NaN beyond the fitted range and ``reach``."""
     for v in prange(phase.shape[0]):
         for u in range(phase.shape[1]):
             p = ratio * np.float64(phase[v, u])

@@ -52,6 +52,7 @@ def _uninterrupted() -> Iterator[None]:
     came = False
 
     def keep(*_: object) -> None:
+        """Remember the signal."""
         nonlocal came
         came = True
 

@@ -76,4 +76,5 @@ _BUT_LAST, _BUT_FIRST = slice(None, -1), slice(1, None)
 
 
 def _rgb(colours: np.ndarray | None) -> np.ndarray | None:
+    """Return colours (n, 3) from grey values (n,) or colours (n, 3)."""
     return np.repeat(colours[:, None], 3, axis=1) if colours is not None and colours.ndim == 1 else colours

@@ -186,6 +186,7 @@ def spacing(points: PointSet) -> float:
 
 
 def _refuse_if_open(found: Topology, cut: TrimmedPatches | None, method: Method) -> None:
+    """Raise SlviewerError where the mesh is not watertight, or too much of it is extrapolated."""
     if not found.watertight:
         remedy = (
             "fill larger holes, or scan there" if method == "poisson" else "fill holes of that size, or use poisson"

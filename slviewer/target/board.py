@@ -69,6 +69,7 @@ class Board:
             raise InputError(f"a {self.kind} board has no markers: omit marker and dictionary")
 
     def _check_markers(self) -> None:
+        """Set the defaults of marker and dictionary, and raise InputError where they do not fit the board."""
         if not self.marker_mm:
             object.__setattr__(self, "marker_mm", DEFAULT_MARKER * self.pitch_mm)
         if not self.dictionary:
@@ -156,10 +157,12 @@ class Board:
 
 
 def _parse_number(value: float) -> str:
+    """Format a number for the notation, without a trailing ".0"."""
     return repr(float(value)).removesuffix(".0")
 
 
 def _parse_millimetres(notation: str, text: str, example: str) -> float:
+    """Parse a positive length in mm; raises InputError with an example otherwise."""
     try:
         length = float(text)
     except ValueError:

@@ -54,6 +54,7 @@ def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
 def _centroid(
     image: np.ndarray, centre: np.ndarray, covariance: np.ndarray, gap: float, inverted: bool
 ) -> tuple[float, float]:
+    """Return the sub-pixel centroid (u, v) px of one circle; NaN where it cannot be measured."""
     soft = min(EDGE_WIDTH_PX, 0.3 * gap)
     reach = 2 * np.sqrt(np.diag(covariance)) + min(EDGE_WIDTH_PX + RING_PX, gap - soft) + 1
     u0, v0 = np.maximum(np.floor(centre - reach), 0).astype(int)

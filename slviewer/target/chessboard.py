@@ -81,6 +81,7 @@ def _detect_in_largest(board: Board, grey: np.ndarray) -> np.ndarray | None:
 
 
 def _detect_larger(board: Board, grey: np.ndarray) -> bool:
+    """Whether the image shows a chessboard with more corners than the board."""
     largest = _detect_largest(grey)
     return largest is not None and largest[..., 0].size > len(board.points)
 

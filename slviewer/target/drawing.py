@@ -77,10 +77,12 @@ def _mm(value: float) -> str:
 
 
 def _curve(*coordinates: float) -> str:
+    """Return a PDF operator for a Bezier curve."""
     return " ".join(_mm(c) for c in coordinates) + " c"
 
 
 def _pdf_file(*objects: str) -> bytes:
+    """Assemble the objects of a PDF file, with its cross-reference table."""
     body, offsets = "%PDF-1.7\n", []
     for number, text in enumerate(objects, 1):
         offsets.append(len(body))

@@ -196,4 +196,5 @@ def _format_xyz(values: Sequence[float], sigmas: Sequence[float], form: str) -> 
 
 
 def _to_floats(values: np.ndarray) -> tuple[float, ...]:
+    """Convert an array (n,) to a tuple of floats."""
     return tuple(float(value) for value in values)

@@ -69,6 +69,7 @@ class DisplacementField:
 
     @property
     def cells(self) -> tuple[int, int]:
+        """Cells (across, down): square ones."""
         return CELLS_PER_WIDTH, max(1, round(CELLS_PER_WIDTH * self.size[1] / self.size[0]))
 
     @property
@@ -133,6 +134,7 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
     middle = view.points.mean(0)
 
     def model(at: np.ndarray, moved: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Predict features (n, 2) and samples (m, 2) px at changes ``at`` (13,) of board pose, projector, scale."""
         R = cv2.Rodrigues(at[:3])[0] @ T[:3, :3]
         t = T[:3, 3] + at[3:6]
         rays = np.concatenate([rig.camera.undistort(view.pixels + moved), np.ones((len(view.pixels), 1))], 1)
@@ -153,6 +155,7 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
     n, m = len(view.camera), len(view.pixels)
 
     def moved_by(row: int) -> list[sp.csr_array]:
+        """Return the derivatives of a projector coordinate by the camera's field, u and v components."""
         return [-sp.csr_array(sp.diags(np.nan_to_num(J[:, row, k])) @ at_pixels) for k in (0, 1)]
 
     nothing = sp.csr_array((n, projector.unknowns)), sp.csr_array((m, projector.unknowns))

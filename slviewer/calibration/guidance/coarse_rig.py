@@ -91,10 +91,12 @@ class GuidanceModel:
 
     @cached_property
     def frame(self) -> np.ndarray:
+        """(4,) mm: the rectangle of the board's features, as ``board_frame`` returns it."""
         return board_frame(self.board.points)
 
     @cached_property
     def layout(self) -> UnknownLayout:
+        """Order of the unknowns, without poses."""
         knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
         return UnknownLayout(0, len(self.points), knots[0], knots[1])
 

@@ -96,6 +96,7 @@ def compile_axis(
 
 
 def _split_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
+    """Run ``work`` on interleaved image rows in parallel threads."""
     lanes = max(1, min(cpu_count() or 1, rows))
     with ThreadPoolExecutor(lanes) as threads:
         list(threads.map(lambda lane: work(np.arange(lane, rows, lanes)), range(lanes)))
@@ -103,6 +104,7 @@ def _split_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
 
 @kernel()
 def _fill_rays(camera, rows, rays):
+    """Fill ``rays`` (2, h, w) with the undistorted normalised coordinates of the pixels in some ``rows``."""
     basis = np.zeros((4, 4))
     for v in rows:
         for u in range(rays.shape[2]):
@@ -190,6 +192,7 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
 
 @kernel()
 def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
+    """Fill the ``coefficients`` (3, h, w) of the rational functions of the pixels in some ``rows``; NaN without one."""
     basis = np.zeros((4, 4))
     for v in rows:
         for u in range(rays.shape[2]):

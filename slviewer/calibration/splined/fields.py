@@ -144,6 +144,7 @@ def undistort_pixel(device, u, v, basis):
 
 @kernel()
 def _undistort_all(device, pixels, rays):
+    """Fill ``rays`` (n, 2) with the undistorted normalised coordinates of pixels (n, 2); NaN where not possible."""
     basis = np.zeros((4, 4))
     for n in range(pixels.shape[0]):
         rays[n, 0], rays[n, 1] = np.nan, np.nan

@@ -45,6 +45,7 @@ class SplinedModel:
 
     @property
     def rig(self) -> Arrangement:
+        """Both devices with their displacement fields, and their relative pose."""
         return self.bundle.state.rig
 
     @property
@@ -85,14 +86,17 @@ class SplinedModel:
 
     @cached_property
     def _single_rays(self) -> np.ndarray:
+        """``rays`` in single precision."""
         return self.rays.astype(np.float32)
 
     @cached_property
     def _compiled(self) -> dict[Axis, CompiledAxis]:
+        """Cache of ``fast_axis``."""
         return {}
 
     @cached_property
     def _sigma_maps(self) -> dict[Axis, SigmaMap]:
+        """Cache of ``sigma_map``."""
         return {}
 
     def fast_axis(self, axis: Axis) -> CompiledAxis:
@@ -222,6 +226,7 @@ class SplinedModel:
         return cls(Bundle.from_arrays(data, arrays))
 
     def _check(self, phase: PhaseMap) -> None:
+        """Raise InputError for a phase map of another size than the camera's image."""
         width, height = (int(n) for n in self.rig.camera.size)
         if phase.phase.shape != (height, width):
             raise InputError(

@@ -103,6 +103,7 @@ def _split_poses(poses: int) -> list[np.ndarray]:
 
 @kernel()
 def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
+    """Fill the predicted ``features`` (n, 2) and ``samples`` (m, 2) px of some poses."""
     work = allocate_workspace()
     row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
     for i in poses:
@@ -118,6 +119,7 @@ def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
 
 @kernel()
 def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_w, sample_w, at, poses, A, b):
+    """Add the observations of some ``poses`` to the normal matrix A (upper triangle) and the right-hand side b."""
     work = allocate_workspace()
     row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
     columns = np.empty(DENSE, np.int64)  # of a row's entries, in the order of the vector

@@ -32,6 +32,7 @@ def point_rows(state: State, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> s
 
 @kernel()
 def _fill_rows(rig, row, pixels, depths, starts, values, columns):
+    """Fill ``values`` (n, 3, MAX_ENTRIES) and ``columns`` (n, MAX_ENTRIES) of the points' sparse Jacobian."""
     basis, other = np.zeros((4, 4)), np.zeros((4, 4))
     by_point, by_lens = np.zeros((2, 3)), np.zeros((2, 9))
     ray_by_lens, ray_by_field = np.zeros((2, 9)), np.zeros((2, 2))

@@ -25,6 +25,7 @@ class Prior:
 
     @classmethod
     def build(cls, state: State, data: PoseData) -> "Prior":
+        """Build the prior for the fields' knots and the board's features."""
         forms = [roughness(d.coefficients) for d in (state.rig.camera, state.rig.projector)]
         return cls((forms[0], forms[1]), offset_gauge(data.points))
 
@@ -65,6 +66,7 @@ class Prior:
         ]
 
     def _fields(self, state: State, strengths: Sequence[float]) -> Iterator[tuple[int, np.ndarray, np.ndarray, float]]:
+        """Iterate over both fields: first unknown, coefficients (2, n), quadratic form (n, n), and strength."""
         at = state.layout
         firsts = at.camera_field, at.projector_field
         fields = [device.coefficients.reshape(2, -1) for device in (state.rig.camera, state.rig.projector)]

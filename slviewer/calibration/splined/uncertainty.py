@@ -156,6 +156,7 @@ def _select_fitted(bundle: Bundle, volume: Volume) -> np.ndarray:
 
 @kernel(parallel=True)
 def _interpolate(z, logs, near, far, out):
+    """Fill ``out`` (h, w) with the exponential of ``logs`` (nv, nu, nz) interpolated linearly at depths z (h, w)."""
     height, width = z.shape
     down, across, deep = logs.shape
     per_mm, deepest = np.float32((deep - 1.0) / (far - near)), np.float32(deep - 1.0001)

@@ -43,26 +43,32 @@ class UnknownLayout:
 
     @property
     def height(self) -> int:
+        """Index of the first coefficient of the board's height."""
         return 6 * self.poses
 
     @property
     def offsets(self) -> int:
+        """Index of the first feature's offset."""
         return self.height + HEIGHT_TERMS
 
     @property
     def rig(self) -> int:
+        """Index of the first parameter of the camera's lens."""
         return self.offsets + 2 * self.features
 
     @property
     def camera_field(self) -> int:
+        """Index of the first coefficient of the camera's field."""
         return self.rig + RIG
 
     @property
     def projector_field(self) -> int:
+        """Index of the first coefficient of the projector's field."""
         return self.camera_field + 2 * self.camera_knots
 
     @property
     def size(self) -> int:
+        """Number of unknowns."""
         return self.projector_field + 2 * self.projector_knots
 
 
@@ -96,6 +102,7 @@ class State:
 
     @property
     def layout(self) -> UnknownLayout:
+        """Order of the unknowns."""
         knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
         return UnknownLayout(len(self.t_board), len(self.offsets), knots[0], knots[1])
 
@@ -134,6 +141,7 @@ def rotate_left(R: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def _step_device(device: Device, numbers: np.ndarray, coefficients: np.ndarray) -> Device:
+    """Return a device with steps added to its nine lens parameters and its spline coefficients."""
     k = device.numbers[:LENS] + numbers
     return Device(
         np.append(k, fold_radius_squared(k[4:])),

@@ -153,6 +153,7 @@ def sigma_3d(whitened: np.ndarray) -> np.ndarray:
 
 
 def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
+    """Return the displacements (3 n, 6) of points (n, 3) by translations and by rotations about ``centre``."""
     x, y, z = ((points - centre) / arm).T
     none, one = np.zeros(len(points)), np.ones(len(points))
     along = np.array(
@@ -167,6 +168,7 @@ def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndar
 
 @kernel()
 def _view_all(rig, pixels, depths, points, projector):
+    """Fill ``points`` (n, 3) mm and ``projector`` (n, 2) px of camera pixels (n, 2) at depths (n,) mm."""
     basis = np.zeros((4, 4))
     for n in range(depths.shape[0]):
         x, y = undistort_pixel(rig.camera, pixels[n, 0], pixels[n, 1], basis)
