@@ -134,7 +134,7 @@ def test_reproduce_remakes_the_letters_tables_and_figures(
     assert 0.001 < found["spacing_rms_mm"]["pixelwise"] < 1.0
     assert "0.184" in text and "0.087" in text and "2.13" in text  # the Letter's own means
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64") >= 14 and "http://" not in page.replace("http://www.w3.org", "")
+    assert page.count("data:image/webp;base64") >= 14 and "http://" not in page.replace("http://www.w3.org", "")
 
 
 def test_an_excluded_pose_is_left_out_and_named(calibrated: dict, session: Path, run: Run) -> None:
