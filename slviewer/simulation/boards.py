@@ -9,7 +9,7 @@ from slviewer.errors import InputError
 from slviewer.simulation.board_kernels import coverage, intersect
 from slviewer.simulation.scenes import Surface
 from slviewer.target.board import Board
-from slviewer.target.mark import Mark, mark_of
+from slviewer.target.mark import Mark, mark_geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ def printed_board(
         misplacement *= 0  # its corners share edges, so that they cannot move one by one
     return BoardScene(
         pose, board, (float(low[0]), float(low[1])), (float(size[0]), float(size[1])), shape, misplacement, diameter,
-        mark=mark_of(board) if marked else None,
+        mark=mark_geometry(board) if marked else None,
     )  # fmt: skip
 
 

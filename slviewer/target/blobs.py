@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 
 MIN_AREA_PX = 12
-"""Area of the smallest blob whose shape can be judged."""
+"""Smallest area of a blob whose shape can be judged."""
 MAX_ELONGATION = 4.0
-"""Length over width of a blob beyond which it is no circle at a usable slant."""
+"""Largest length over width of a circle's image at a usable tilt."""
 MIN_ROUNDNESS = 0.88
-"""Least roundness of what may be a circle."""
+"""Smallest roundness of a candidate circle."""
 
 
 @dataclass(frozen=True)
@@ -30,17 +30,17 @@ class Blobs:
         return np.asarray(self.areas / (4 * np.pi * np.sqrt(np.linalg.det(self.covariances))))
 
     def select(self, which: np.ndarray) -> "Blobs":
-        """Some of the blobs, by index or mask."""
+        """Return a subset of the blobs, by index or mask."""
         return Blobs(self.centres[which], self.areas[which], self.covariances[which], self.inverted)
 
     def rescale(self, scale: np.ndarray) -> "Blobs":
-        """The same blobs in an image that is (2,) ``scale`` times as wide and as high, by pixel centres."""
+        """Return the blobs in the pixels of an image that is ``scale`` (2,) times as wide and as high."""
         centres = (self.centres + 0.5) * scale - 0.5
         return Blobs(centres, self.areas * scale.prod(), self.covariances * np.outer(scale, scale), self.inverted)
 
 
-def find_blobs(grey: np.ndarray, pitch: float, inverted: bool) -> Iterator[Blobs]:
-    """Dark blobs of an image (h, w) uint8, or bright ones if ``inverted``, attempt by attempt.
+def detect_blobs(grey: np.ndarray, pitch: float, inverted: bool) -> Iterator[Blobs]:
+    """Yield the dark blobs of an image (h, w) uint8, or the bright ones if ``inverted``, once per threshold.
 
     ``pitch`` px is the largest distance that neighbouring circles can have. Each attempt compares pixels with the
     middle between the darkest and the brightest of a neighbourhood (or with its mean, where reflections spoil the
@@ -55,7 +55,7 @@ def find_blobs(grey: np.ndarray, pitch: float, inverted: bool) -> Iterator[Blobs
 
 
 def _threshold_by_extremes(image: np.ndarray, window: float) -> np.ndarray:
-    """(h, w) uint8: 1 where darker than the middle of the neighbourhood's darkest and brightest."""
+    """Return (h, w) uint8: 1 where darker than the mean of the neighbourhood's minimum and maximum."""
     size = image.shape[::-1]
     factor = min(1.0, 16.0 / window)
     small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
@@ -70,14 +70,14 @@ def _threshold_by_extremes(image: np.ndarray, window: float) -> np.ndarray:
 
 
 def _threshold_by_mean(image: np.ndarray, window: float) -> np.ndarray:
-    """(h, w) uint8: 1 where darker than the neighbourhood's mean by a twelfth of it and by 4 grey levels."""
+    """Return (h, w) uint8: 1 where darker than the neighbourhood's mean by a twelfth of it and by 4 grey levels."""
     reach = 2 * round(window * 0.75) + 1
     mean = cv2.blur(image, (reach, reach))
     return np.asarray(image < cv2.subtract(mean, np.maximum(mean // 12, 4)), np.uint8)
 
 
 def _select_ellipses(mask: np.ndarray, inverted: bool) -> Blobs:
-    """The blobs of a mask that fill their ellipse and do not touch the image's border."""
+    """Return the blobs of a mask (h, w) uint8 that fill their ellipse and do not touch the image's border."""
     height, width = mask.shape
     _, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=cv2.CV_32S)
     left, top, across, down, area = stats.T
@@ -97,5 +97,5 @@ def _select_ellipses(mask: np.ndarray, inverted: bool) -> Blobs:
     covariances[:, 0, 0] = np.bincount(label, du * du, count) / n + 1 / 12  # a pixel is a square, not a point
     covariances[:, 1, 1] = np.bincount(label, dv * dv, count) / n + 1 / 12
     covariances[:, 0, 1] = covariances[:, 1, 0] = np.bincount(label, du * dv, count) / n
-    found = Blobs(centres[plausible], n, covariances, inverted)
-    return found.select(found.roundness > MIN_ROUNDNESS)
+    blobs = Blobs(centres[plausible], n, covariances, inverted)
+    return blobs.select(blobs.roundness > MIN_ROUNDNESS)

@@ -1,8 +1,8 @@
-"""Boards and their notation: what features a board has, and where they lie on it.
+"""Boards and their notation: what features a board has, and their coordinates.
 
 =============================  ================================================================================
 ``circles:21x16:9``            columns x rows of circles : pitch mm
-``acircles:4x11:20``           OpenCV's asymmetric grid: circle j of row i lies at ((2 j + i % 2) pitch, i pitch)
+``acircles:4x11:20``           OpenCV's asymmetric grid: circle j of row i at ((2 j + i % 2) pitch, i pitch)
 ``chessboard:9x7:75``          columns x rows of *inner corners* : side of a square in mm
 ``charuco:8x6:30``             columns x rows of *squares* : side of a square in mm; then, if they differ from the
                                defaults, ``:marker mm`` (0.75 of the square) and ``:dictionary`` (DICT_5X5_1000).
@@ -38,7 +38,7 @@ _DICTIONARY = re.compile(r"DICT_([4-7])X\1_(50|100|250|1000)")
 class Board:
     """A flat calibration target.
 
-    Features lie at ``points``, row by row: x along a row, y along a column, so that the normal (x cross y) points
+    ``points``: the features, row by row: x along a row, y along a column, so that the normal (x cross y) points
     away from a camera that sees the printed side; the first feature is the origin. ``marker_mm`` and
     ``dictionary`` belong to ChArUco boards only.
     """
@@ -94,13 +94,13 @@ class Board:
 
     @classmethod
     def parse(cls, notation: str) -> "Board":
-        """The board that a notation such as ``circles:21x16:9`` describes; InputError otherwise."""
+        """Parse a notation such as ``circles:21x16:9``; raises InputError for others."""
         kind, *fields = notation.strip().split(":")
         kind = kind.strip().lower()
         if kind not in get_args(Kind):
             raise InputError(
-                f"board '{notation}' is not understood: it starts with none of {', '.join(EXAMPLES)}; "
-                f"write for example '{EXAMPLES['circles']}'"
+                f"board '{notation}' is not understood: start it with one of {', '.join(EXAMPLES)}, "
+                f"for example '{EXAMPLES['circles']}'"
             )
         example = EXAMPLES[kind]
         most = 4 if kind == "charuco" else 2
@@ -118,11 +118,11 @@ class Board:
         return cls(cast(Kind, kind), int(size[1]), int(size[2]), pitch, marker, dictionary)
 
     def __str__(self) -> str:
-        fields = [self.kind, f"{self.columns}x{self.rows}", _parse_number(self.pitch_mm)]
+        fields = [self.kind, f"{self.columns}x{self.rows}", _format_number(self.pitch_mm)]
         if self.kind == "charuco":
             plain = self.dictionary == DEFAULT_DICTIONARY
             if not plain or self.marker_mm != DEFAULT_MARKER * self.pitch_mm:
-                fields.append(_parse_number(self.marker_mm))
+                fields.append(_format_number(self.marker_mm))
             if not plain:
                 fields.append(self.dictionary)
         return ":".join(fields)
@@ -143,7 +143,7 @@ class Board:
         return points
 
     def outline(self, margin_mm: float | None = None) -> np.ndarray:
-        """(4, 3) float64 mm: a rectangle around the features, from top left over top right to bottom left.
+        """Return a rectangle (4, 3) float64 mm around the features, from top left over top right to bottom left.
 
         ``margin_mm`` beyond the outermost features; by default what is part of the board for certain: half a pitch
         for circles, 0.95 of a square for a chessboard's inner corners, the whole sheet of squares for ChArUco.
@@ -156,7 +156,7 @@ class Board:
         return np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
 
 
-def _parse_number(value: float) -> str:
+def _format_number(value: float) -> str:
     """Format a number for the notation, without a trailing ".0"."""
     return repr(float(value)).removesuffix(".0")
 

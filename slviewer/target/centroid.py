@@ -1,45 +1,44 @@
-"""Sub-pixel centres of circles: centroids of how much darker (or brighter) than the paper around it a circle is."""
+"""Sub-pixel centres of circles: centroids of their ink, relative to the brightness of the paper around them."""
 
 import numpy as np
 
 from slviewer.target.blobs import Blobs
 
 EDGE_WIDTH_PX = 2.5
-"""How far, in px, the camera's PSF carries a circle's edge outwards."""
+"""Distance in px by which the camera's PSF blurs a circle's edge outwards."""
 RING_PX = 5.0
 """Width of the ring beyond the soft edge from which the paper's brightness is read."""
 CORE_RADIUS = 0.6
-"""Share of a bright circle's radius that its blurred edge does not reach."""
+"""Share of a circle's radius that its blurred edge does not reach."""
 INITIAL_GATE = 0.35
-"""Share of the circle's contrast by which the ground's brightness may vary around it: light that falls by half over
-one circle."""
+"""Largest variation of the background around a circle, over its contrast: light that halves across one circle."""
 GATE_SIGMAS = 4.0
 FLATNESS = 0.04
-"""Pixels of the ring belong to the ground within so many standard deviations of it, or this share of the contrast."""
+"""Pixels of the ring are background within so many standard deviations of its plane, or this share of the contrast."""
 MIN_RING_PIXELS = 8
-"""Pixels that a plane through the ring needs."""
+"""Smallest number of pixels for a plane fit."""
 
 
 def refine_centres(image: np.ndarray, blobs: Blobs) -> np.ndarray:
-    """(n, 2) float64 px: the centroid of each circle's ink, by the image's own brightness around it.
+    """Return the centroids (n, 2) float64 px of the circles' ink, relative to the brightness around each circle.
 
     ``image`` (h, w) float32; ``blobs`` describe the circles' ellipses to some tenths of a pixel. Ink is ``1 - I / W``
     with W the plane through the paper's brightness next to the circle, so that uneven light does not move the centroid;
-    for bright circles, what they are brighter than the ground, over the plane of their own brightness. NaN where there
-    is no paper to compare with, or where the result lies outside the circle's core.
+    for bright circles, ink is the excess over the background, divided by the plane of their own brightness. NaN where
+    too little paper is visible around a circle, or where the result is too far from the initial centre.
     """
     centres, covariances, inverted = blobs.centres, blobs.covariances, blobs.inverted
     ring_px = _ring_widths(centres, covariances)
     refined = np.full(centres.shape, np.nan)
     for k, (centre, covariance) in enumerate(zip(centres, covariances, strict=True)):
-        refined[k] = _centroid(image, centre, covariance, float(ring_px[k]), inverted)
+        refined[k] = _measure_centroid(image, centre, covariance, float(ring_px[k]), inverted)
     off = np.linalg.norm(refined - centres, axis=1)
     refined[~(off < np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))] = np.nan
     return refined
 
 
 def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-    """(n,) px of paper between each circle and its nearest neighbour's soft edge."""
+    """Return the width (n,) px of the paper between each circle's edge and its nearest neighbour's."""
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     nearest = apart.argmin(1)
@@ -51,7 +50,7 @@ def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
     return np.asarray(apart.min(1) - own - other)
 
 
-def _centroid(
+def _measure_centroid(
     image: np.ndarray, centre: np.ndarray, covariance: np.ndarray, gap: float, inverted: bool
 ) -> tuple[float, float]:
     """Return the sub-pixel centroid (u, v) px of one circle; NaN where it cannot be measured."""
@@ -82,10 +81,10 @@ def _centroid(
 
 
 def _fit_paper_level(du: np.ndarray, dv: np.ndarray, patch: np.ndarray, ring: np.ndarray, ink: float) -> np.ndarray:
-    """(h, w): the plane through the brightness next to a circle, of the ring's pixels that show no edge or blob.
+    """Fit a plane (h, w) to the brightness of the ``ring`` (h, w) bool around a circle, without edges or other blobs.
 
-    Where not all of the ring lies on one plane, the ground is what differs most from the circle's own level ``ink``:
-    starting with that quarter of the ring, the pixels within the noise of one plane are fitted.
+    Where the ring does not fit one plane, the fit starts with the quarter that differs most from the circle's own level
+    ``ink`` and continues with the pixels within the noise of the plane.
     """
     plane = _fit_plane(du, dv, patch, ring)
     levels = patch[ring]
@@ -104,13 +103,13 @@ def _fit_paper_level(du: np.ndarray, dv: np.ndarray, patch: np.ndarray, ring: np
 
 
 def _quantile(values: np.ndarray, share: float) -> float:
-    """The value below which a share of some values lies; quicker for few values than NumPy's, which interpolates."""
+    """Return a quantile without interpolation, which for few values is faster than NumPy's."""
     k = int(share * (len(values) - 1))
     return float(np.partition(values, k)[k])
 
 
 def _fit_plane(du: np.ndarray, dv: np.ndarray, values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """(h, w): the plane through the chosen values, by least squares."""
+    """Fit a plane (h, w) to the ``values`` (h, w) ``where`` (h, w) bool, by least squares."""
     A = np.stack([np.ones(int(np.count_nonzero(where))), du[where], dv[where]], axis=1)
     c = np.linalg.lstsq(A, values[where], rcond=None)[0]
     return np.asarray(c[0] + c[1] * du + c[2] * dv)

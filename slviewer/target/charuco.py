@@ -10,19 +10,19 @@ from slviewer.target.numbering import check_grid
 from slviewer.target.saddle import refine_corners
 
 MIN_CORNERS = 8
-"""Corners that a pose needs."""
+"""Smallest number of corners of a pose."""
 SUFFICIENT_SHARE = 0.8
-"""Share of the corners with which the search ends; with fewer it goes on in larger images."""
+"""Share of the corners at which the search ends; below it continues at higher resolution."""
 
 
 def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """OpenCV's own description of the board."""
+    """Return the board as an OpenCV ``CharucoBoard``."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     return cv2.aruco.CharucoBoard((board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary)
 
 
 def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndarray]:
-    """((n, 2) float64 px, (n,) int ids) of the detected corners; raises DetectionError with their number."""
+    """Detect corners; returns pixels (n, 2) float64 and ids (n,) int. Raises DetectionError for too few corners."""
     detector = cv2.aruco.CharucoDetector(opencv_board(board))
     first = min(1.0, SEARCH_PX / max(image.grey.shape))
     best: tuple[np.ndarray, np.ndarray] | None = None
@@ -41,12 +41,12 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndar
         points = board.points[ids][:, :2]
         pixels, good = refine_corners(image.deep, pixels, points, board.pitch_mm, board.marker_mm)
         best = pixels[good], ids[good]
-    seen = 0 if best is None else len(best[1])
-    if best is None or seen < MIN_CORNERS:
-        there = board.columns * board.rows // 2
+    detected = 0 if best is None else len(best[1])
+    if best is None or detected < MIN_CORNERS:
+        total_markers = board.columns * board.rows // 2
         raise DetectionError(
-            f"{seen} of {len(board.points)} corners and {markers} of {there} markers of {board} detected, and "
-            f"a pose needs {MIN_CORNERS}: {light_advice(image.grey)}"
+            f"{detected} of {len(board.points)} corners and {markers} of {total_markers} markers of {board} detected, "
+            f"and a pose needs {MIN_CORNERS}: {light_advice(image.grey)}"
         )
     check_grid(board, *best, "corners")
     return best

@@ -11,25 +11,33 @@ from slviewer.target.saddle import refine_corners
 
 
 def detect_chessboard(board: Board, image: BoardImage) -> np.ndarray:
-    """(n, 2) float64 px of every inner corner; raises DetectionError with the number detected.
+    """Detect every inner corner: (n, 2) float64 px in the order of ``board.points``.
 
+    Raises DetectionError, whose message gives the number of corners detected.
     A board whose columns + rows are odd is numbered so that its top-left square is dark.
     """
-    doubt: DetectionError | None = None
-    for find in (_detect_by_sectors, _detect_in_largest, _detect_by_squares):
-        grid = find(board, image.grey)
+    first_error: DetectionError | None = None
+    for detect in (_detect_by_sectors, _detect_in_largest, _detect_by_squares):
+        grid = detect(board, image.grey)
         if grid is not None:
             try:
                 return _verify_grid(board, image, grid)
             except DetectionError as error:
-                doubt = doubt or error
-    raise (DetectionError(_failure(board, image.grey)) if doubt is None or _detect_larger(board, image.grey) else doubt)
+                first_error = first_error or error
+    raise (
+        DetectionError(_failure_message(board, image.grey))
+        if first_error is None or _shows_larger_chessboard(board, image.grey)
+        else first_error
+    )
 
 
 def _verify_grid(board: Board, image: BoardImage, grid: np.ndarray) -> np.ndarray:
-    """(n, 2) px, refined and numbered, of a grid (rows, columns, 2) that may run any way; raises DetectionError."""
+    """Refine and number a grid (rows, columns, 2) px of any orientation; returns the corners (n, 2) px.
+
+    Raises DetectionError where a corner cannot be measured or the grid is not the board's.
+    """
     # the detectors' own order may be mirrored; only the neighbourhood relation is used
-    if _orientation(grid) < 0:
+    if _grid_orientation(grid) < 0:
         grid = grid[:, ::-1]
     pixels, good = refine_corners(image.deep, grid.reshape(-1, 2), board.points[:, :2], board.pitch_mm)
     if not good.all():
@@ -46,7 +54,7 @@ def _verify_grid(board: Board, image: BoardImage, grid: np.ndarray) -> np.ndarra
 
 
 def _detect_by_sectors(board: Board, grey: np.ndarray) -> np.ndarray | None:
-    """(rows, columns, 2) px by OpenCV's sector-based search, which needs to be no more than a pixel or two right."""
+    """Detect a grid (rows, columns, 2) px, good to a pixel or two, by OpenCV's sector-based search, or None."""
     full = min(1.0, SEARCH_PX / max(grey.shape))
     even = flatten_light(grey)
     thorough = cv2.CALIB_CB_EXHAUSTIVE
@@ -57,55 +65,55 @@ def _detect_by_sectors(board: Board, grey: np.ndarray) -> np.ndarray | None:
         (even, full, thorough),
         (grey, full, 0),
     ):
-        found, corners = cv2.findChessboardCornersSB(resize_image(source, factor), board.features, flags=flags)
-        if found:
+        success, corners = cv2.findChessboardCornersSB(resize_image(source, factor), board.features, flags=flags)
+        if success:
             return _to_full_image(corners, factor).reshape(board.rows, board.columns, 2)
     return None
 
 
 def _detect_largest(grey: np.ndarray) -> np.ndarray | None:
-    """(rows, columns, 2) px: the largest grid of corners of any chessboard, if there is one of 3x3 or more."""
+    """Detect the largest grid of corners (rows, columns, 2) px of any chessboard; None below 3x3."""
     factor = min(1.0, SEARCH_PX / max(grey.shape)) / 2
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     flattened = resize_image(flatten_light(grey), factor)
-    found, corners, cells = cv2.findChessboardCornersSBWithMeta(flattened, (3, 3), flags)
-    return _to_full_image(corners, factor).reshape(*cells.shape[:2], 2) if found else None
+    success, corners, cells = cv2.findChessboardCornersSBWithMeta(flattened, (3, 3), flags)
+    return _to_full_image(corners, factor).reshape(*cells.shape[:2], 2) if success else None
 
 
 def _detect_in_largest(board: Board, grey: np.ndarray) -> np.ndarray | None:
-    """(rows, columns, 2) px: the largest grid, laid along the board's rows, if it has the board's size."""
+    """Detect the largest grid (rows, columns, 2) px, along the board's rows; None unless it has the board's size."""
     largest = _detect_largest(grey)
     if largest is None or sorted(largest.shape[:2]) != sorted(board.features):
         return None
     return largest if largest.shape[0] == board.rows else largest.transpose(1, 0, 2)
 
 
-def _detect_larger(board: Board, grey: np.ndarray) -> bool:
-    """Whether the image shows a chessboard with more corners than the board."""
+def _shows_larger_chessboard(board: Board, grey: np.ndarray) -> bool:
+    """Return whether the image shows a chessboard with more corners than the board."""
     largest = _detect_largest(grey)
     return largest is not None and largest[..., 0].size > len(board.points)
 
 
 def _detect_by_squares(board: Board, grey: np.ndarray) -> np.ndarray | None:
-    """(rows, columns, 2) px by OpenCV's older search, which goes from square to square."""
+    """Detect a grid (rows, columns, 2) px by OpenCV's older search, from square to square, or None."""
     factor = min(1.0, SEARCH_PX / max(grey.shape)) / 2
-    found, corners = cv2.findChessboardCorners(resize_image(grey, factor), board.features)
-    return _to_full_image(corners, factor).reshape(board.rows, board.columns, 2) if found else None
+    success, corners = cv2.findChessboardCorners(resize_image(grey, factor), board.features)
+    return _to_full_image(corners, factor).reshape(board.rows, board.columns, 2) if success else None
 
 
 def _to_full_image(corners: np.ndarray, factor: float) -> np.ndarray:
-    """Pixels of the full image from those of an image ``factor`` times its size."""
+    """Convert pixels of an image ``factor`` times as large to those of the full image."""
     return (corners.astype(float) + 0.5) / factor - 0.5
 
 
-def _orientation(grid: np.ndarray) -> float:
-    """Positive where the step along a row turns clockwise in the image into the step along a column."""
+def _grid_orientation(grid: np.ndarray) -> float:
+    """Return the cross product of the mean steps along rows and columns: positive for a right-handed grid (v down)."""
     (a, b), (c, d) = (np.diff(grid, axis=axis).mean((0, 1)) for axis in (1, 0))
     return float(a * d - b * c)
 
 
-def _failure(board: Board, grey: np.ndarray) -> str:
-    """Message for the operator: the largest chessboard detected, if any, and what to do."""
+def _failure_message(board: Board, grey: np.ndarray) -> str:
+    """Return the error message: the largest chessboard detected, if any, and what to do."""
     largest = _detect_largest(grey)
     if largest is None:
         return f"no chessboard detected where {board} has {len(board.points)} corners: {light_advice(grey)}"
@@ -117,7 +125,10 @@ def _failure(board: Board, grey: np.ndarray) -> str:
 
 
 def _is_first_square_dark(image: np.ndarray, grid: np.ndarray) -> bool:
-    """Whether the square beyond the first corner is dark; raises DetectionError where squares do not alternate."""
+    """Return whether the square outside the first corner is dark.
+
+    Raises DetectionError where dark and bright squares do not alternate.
+    """
     colours = corner_polarity(image, grid, np.gradient(grid, axis=1), np.gradient(grid, axis=0))
     rows, columns = colours.shape
     colours = colours * np.where(np.indices(colours.shape).sum(0) % 2, -1, 1)
@@ -131,12 +142,12 @@ def _is_first_square_dark(image: np.ndarray, grid: np.ndarray) -> bool:
 
 
 def _refuse_larger(board: Board, image: np.ndarray, grid: np.ndarray) -> None:
-    """Raises DetectionError where the squares go on beyond the grid: it may be shifted by a row."""
+    """Raise DetectionError where the squares continue outside the grid, which may then be shifted by a row."""
     for side in range(4):
-        turned = np.rot90(grid, side)
-        beyond = 3 * turned[0] - 3 * turned[1] + turned[2]
-        seen = corner_polarity(image, beyond, np.gradient(beyond, axis=0), turned[0] - beyond)
-        if np.count_nonzero(seen) > 0.5 * len(seen) and (np.diff(seen[seen != 0]) != 0).mean() > 0.5:
+        rotated = np.rot90(grid, side)
+        outside = 3 * rotated[0] - 3 * rotated[1] + rotated[2]
+        polarity = corner_polarity(image, outside, np.gradient(outside, axis=0), rotated[0] - outside)
+        if np.count_nonzero(polarity) > 0.5 * len(polarity) and (np.diff(polarity[polarity != 0]) != 0).mean() > 0.5:
             raise DetectionError(
                 f"the chessboard goes on beyond the {board.columns}x{board.rows} inner corners of {board}: "
                 "check the board's columns and rows"
@@ -144,15 +155,15 @@ def _refuse_larger(board: Board, image: np.ndarray, grid: np.ndarray) -> None:
 
 
 def _list_numberings(order: np.ndarray, first_is_dark: bool) -> list[np.ndarray]:
-    """The orders (rows, columns) of the corners, turned, that the colours of the squares allow; flattened."""
+    """Return the flattened rotations of the corners' ``order`` (rows, columns) that the squares' colours allow."""
     rows, columns = order.shape
     dark: list[np.ndarray] = []
     bright: list[np.ndarray] = []
     for turns in range(0, 4, 1 if rows == columns else 2):
-        # the square beyond the first corner, after turning, was the one beyond another corner of the grid
+        # the square outside the first corner, after the rotation, was the one outside another corner of the grid
         i, j = ((0, 0), (0, columns), (rows, columns), (rows, 0))[turns]
-        same = dark if first_is_dark == ((i + j) % 2 == 0) else bright
-        same.append(np.rot90(order, turns).ravel())
+        group = dark if first_is_dark == ((i + j) % 2 == 0) else bright
+        group.append(np.rot90(order, turns).ravel())
     return dark or bright
 
 
@@ -161,11 +172,11 @@ MIN_CONTRAST = 1.12
 
 
 def corner_polarity(image: np.ndarray, corners: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """(...,) int8: +1 where the square towards -x, -y of a corner is dark, -1 where bright, 0 where no squares meet.
+    """Return (...,) int8: 1 where the square towards -x, -y of a corner is dark, -1 if bright, 0 where no squares meet.
 
     ``corners``, ``across``, ``down`` (..., 2) px: the corner, and the steps to the next ones along x and y. The two
-    squares on one diagonal must both be brighter than the two on the other. A corner too near the image's border
-    to be judged is 0 as well.
+    squares on one diagonal must both be brighter than the two on the other. 0 also where
+    the image's border is too close.
     """
     offsets = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
     levels = np.stack([_sample_levels(image, corners + 0.3 * (a * across + b * down)) for a, b in offsets])
@@ -177,7 +188,7 @@ def corner_polarity(image: np.ndarray, corners: np.ndarray, across: np.ndarray, 
 
 
 def _sample_levels(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Grey levels of a slightly blurred image at pixels (..., 2), NaN outside."""
+    """Sample the grey levels of a slightly blurred image at pixels (..., 2); NaN outside."""
     height, width = image.shape
     flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2), np.float32)
     levels = cv2.remap(

@@ -7,29 +7,29 @@ import cv2
 import numpy as np
 
 from slviewer.errors import DetectionError
-from slviewer.target.blobs import Blobs, find_blobs
+from slviewer.target.blobs import Blobs, detect_blobs
 from slviewer.target.board import Board
 from slviewer.target.centroid import refine_centres
 from slviewer.target.images import SEARCH_PX, BoardImage, light_advice, resize_image
 from slviewer.target.lattice import AREA_RATIO, NODE_RADIUS, Lattice, complete_lattice, grow_lattices, match_pattern
-from slviewer.target.mark import numbering_by_mark
+from slviewer.target.mark import select_numbering_by_mark
 from slviewer.target.numbering import MAX_GRID_OFFSET, MAX_GRID_OFFSET_SIGMAS, check_grid, select_upright
 from slviewer.target.planar import GridMap, fit_grid_map, fit_homography, jacobians
 
 CLUTTER_FREE_SHARE = 1 / 3
-"""Share of the board's circles in one lattice that no clutter has."""
+"""Share of the board's circles in one lattice that clutter never reaches."""
 SQUARE_LIMIT_ROUNDNESS = 0.97
-"""Roundness between that of squares, 0.955, and of circles well resolved, 0.985 and more on real photographs."""
+"""Limit between the roundness of squares, 0.955, and of well-resolved circles, 0.985 and more on real photographs."""
 WHOLE_CIRCLE_ROUNDNESS = 0.96
-"""Roundness below which a piece of a circle is missing."""
+"""Roundness below which a circle is partly covered."""
 MIN_SHAPE_AREA_PX = 60.0
-"""Area of a circle from which on its roundness can be judged."""
+"""Smallest area of a circle whose roundness can be judged."""
 RESOLVED_AREA_PX = 80.0
 """Area of a circle beyond which more pixels do not improve detection."""
 CONTINUATION_SHARE = 1 / 3
-"""Share of one more row or column of circles with which the board is larger than stated."""
+"""Share of a further row or column of circles above which the board is larger than stated."""
 DOMINANT_AREA_RATIO = 2.0
-"""Area in the image over that of a second board of the same kind, from which on the larger one is selected."""
+"""Smallest ratio of the areas of two boards of the same kind at which the larger one is selected."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,11 @@ class _Grid:
 
 
 def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float, bool]:
-    """((n, 2) float64 px of every circle, their radius in mm, whether the board's mark was detected); raises
-    DetectionError with how many circles were."""
+    """Detect every circle of a board.
+
+    Returns the centres (n, 2) float64 px in the order of ``board.points``, the circles' radius in mm, and whether the
+    board's mark was detected. Raises DetectionError, whose message gives the number of circles detected.
+    """
     tried: list[_Binarisation] = []
     for attempt in _binarise_all(board, image.grey):
         tried.append(attempt)
@@ -71,7 +74,7 @@ def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float, 
         grid = _match_board(board, complete_lattice(max(most.lattices, key=_count_nodes), pool), pool, image)
         if grid:
             return _measure(board, image, grid)
-    raise DetectionError(_failure(board, image, most))
+    raise DetectionError(_failure_message(board, image, most))
 
 
 def _count_nodes(lattice: Lattice) -> int:
@@ -85,11 +88,10 @@ def _size_of_largest(attempt: _Binarisation) -> int:
 
 
 def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
-    """Binarisations at the search resolution, then coarser, where noise averages out, then in the full image; at last
-    twice as large, if circles of a few pixels were detected.
+    """Yield binarisations at the search resolution, at half of it, at the full and at twice the full resolution.
 
-    Once a third of the board is detected, its circles are known to be dark or bright, and to be large enough for
-    the search resolution or not, and what remains to be tried is little.
+    Once a third of the board is detected, the circles' polarity is fixed, and resolutions that cannot improve the
+    detection are skipped.
     """
     first = min(1.0, SEARCH_PX / max(grey.shape))
     colours = [False, True]
@@ -101,7 +103,7 @@ def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
         scale = np.array(grey.shape[::-1]) / np.array(small.shape[::-1])
         pitch = max(small.shape) / (min(board.columns, board.rows) - 1)
         for inverted in colours:
-            for blobs in find_blobs(small, pitch, inverted):
+            for blobs in detect_blobs(small, pitch, inverted):
                 lattices = list(grow_lattices(blobs))
                 for lattice in lattices:
                     if len(lattice.nodes) > CLUTTER_FREE_SHARE * len(board.points):
@@ -124,13 +126,13 @@ def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage
         for numbering in match_pattern(board, candidate):
             places.setdefault(np.sort(numbering).tobytes(), []).append(numbering)
         fitting = [
-            (numberings, seen)
+            (numberings, grid_map)
             for numberings in places.values()
-            if (seen := _fit_map(board, blobs.select(numberings[0]))) is not None
+            if (grid_map := _fit_map(board, blobs.select(numberings[0]))) is not None
         ]
         if fitting:
-            numberings, seen = fitting[0]
-            if len(fitting) > 1 or _grid_continues(board, seen, blobs, numberings[0]):
+            numberings, grid_map = fitting[0]
+            if len(fitting) > 1 or _grid_continues(board, grid_map, blobs, numberings[0]):
                 raise DetectionError(
                     f"{len(candidate.nodes)} circles in one grid detected where {board} has {len(board.points)}: "
                     "check the board's columns and rows"
@@ -143,31 +145,31 @@ def _fit_map(board: Board, blobs: Blobs) -> GridMap | None:
     """Fit the map from board to image; None unless the blobs, in the board's order, form a grid of equal circles."""
     points = board.points[:, :2] / board.pitch_mm
     try:
-        seen = fit_grid_map(points, blobs.centres, robust=True)
+        grid_map = fit_grid_map(points, blobs.centres, robust=True)
     except DetectionError:
         return None
-    pitch = seen.pitch_px(points)
+    pitch = grid_map.pitch_px(points)
     size = np.sqrt(blobs.areas) / np.maximum(pitch, 1e-9)
     alike = np.abs(np.log(size / np.median(size))) < np.log(AREA_RATIO) / 2
-    return seen if (alike & (np.linalg.norm(seen.residuals, axis=1) < NODE_RADIUS * pitch)).all() else None
+    return grid_map if (alike & (np.linalg.norm(grid_map.residuals, axis=1) < NODE_RADIUS * pitch)).all() else None
 
 
-def _grid_continues(board: Board, seen: GridMap, blobs: Blobs, numbering: np.ndarray) -> bool:
-    """Whether circles of the grid's size lie where one more row or column of it would be.
+def _grid_continues(board: Board, grid_map: GridMap, blobs: Blobs, numbering: np.ndarray) -> bool:
+    """Return whether circles of the grid's size continue it by one more row or column.
 
-    A blob is one of the grid only if it lies as near to its place as the grid's own circles do, of which the place is
-    an extrapolation; most clutter beside a board does not.
+    A blob counts only if it is as close to its extrapolated position as the grid's own circles are; most clutter next
+    to a board is not.
     """
     points = board.points[:, :2] / board.pitch_mm
-    size = float(np.median(np.sqrt(blobs.areas[numbering]) / np.maximum(seen.pitch_px(points), 1e-9)))
+    size = float(np.median(np.sqrt(blobs.areas[numbering]) / np.maximum(grid_map.pitch_px(points), 1e-9)))
     others = np.delete(np.arange(len(blobs.centres)), numbering)
     if not len(others):
         return False
     for side in _neighbouring_rows(board):
-        pitch = seen.pitch_px(side)
-        apart = np.linalg.norm(seen.to_image(side)[:, None] - blobs.centres[others][None], axis=2)
+        pitch = grid_map.pitch_px(side)
+        apart = np.linalg.norm(grid_map.to_image(side)[:, None] - blobs.centres[others][None], axis=2)
         nearest = apart.argmin(1)
-        gate = np.maximum(MAX_GRID_OFFSET * pitch, 2 * MAX_GRID_OFFSET_SIGMAS * seen.sigma_px)
+        gate = np.maximum(MAX_GRID_OFFSET * pitch, 2 * MAX_GRID_OFFSET_SIGMAS * grid_map.sigma_px)
         ratio = np.sqrt(blobs.areas[others[nearest]]) / np.maximum(size * pitch, 1e-9)
         on = (pitch > 0) & (apart.min(1) < gate) & (np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(1.25))
         if np.count_nonzero(on) >= max(2.0, CONTINUATION_SHARE * len(side)):
@@ -176,7 +178,7 @@ def _grid_continues(board: Board, seen: GridMap, blobs: Blobs, numbering: np.nda
 
 
 def _neighbouring_rows(board: Board) -> list[np.ndarray]:
-    """Where one more row or column of circles would be at each side, (k, 2) in pitches."""
+    """Return the positions (k, 2), in pitches, of one more row or column of circles at each of the four sides."""
     columns, rows = board.features
     i, j = np.arange(rows), np.arange(columns)
     if board.kind == "acircles":
@@ -202,7 +204,7 @@ def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
 
 def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[np.ndarray, float, bool]:
     """Number the grid and refine its centres; returns (pixels (n, 2), radius in mm, whether the mark was detected)."""
-    marked = numbering_by_mark(board, image.deep, grid.blobs.centres, grid.numberings)
+    marked = select_numbering_by_mark(board, image.deep, grid.blobs.centres, grid.numberings)
     order = select_upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
     blobs = grid.blobs.select(order)
     _refuse_misshapen(board, blobs)
@@ -225,11 +227,11 @@ def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
 def _refine_centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:
     """Return the sub-pixel centres (n, 2) px; raises DetectionError where one cannot be measured or fits no grid."""
     pixels = refine_centres(image.deep, blobs)
-    lost = np.isnan(pixels).any(1)
-    if lost.any():
+    unmeasured = np.isnan(pixels).any(1)
+    if unmeasured.any():
         raise DetectionError(
-            f"{np.count_nonzero(lost)} of {len(pixels)} circles are too close to their neighbours or too faint to "
-            "measure: move the board closer, or focus the camera"
+            f"{np.count_nonzero(unmeasured)} of {len(pixels)} circles are too close to their neighbours or too faint "
+            "to measure: move the board closer, or focus the camera"
         )
     check_grid(board, pixels, np.arange(len(pixels)), "circles")
     return pixels
@@ -257,23 +259,23 @@ def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
     return pool
 
 
-def _failure(board: Board, image: BoardImage, most: _Binarisation | None) -> str:
+def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None) -> str:
     """Return the error message: number of detected circles, other blobs, and what to do."""
     total = len(board.points)
     if most is None or _size_of_largest(most) < 6:
         return f"no grid of circles detected where {board} has {total}: {light_advice(image.grey)}"
     lattice = max(most.lattices, key=_count_nodes)
-    seen = len(lattice.nodes)
+    detected = len(lattice.nodes)
     longer, shorter = lattice.extent
-    others = len(most.blobs.centres) - seen
-    if seen >= total:
+    others = len(most.blobs.centres) - detected
+    if detected >= total:
         return (
-            f"{seen} circles detected in a grid of {longer}x{shorter} that does not hold all of {board}: "
+            f"{detected} circles detected in a grid of {longer}x{shorter} that does not hold all of {board}: "
             "check the board's columns and rows, and that nothing covers it"
         )
-    facts = [f"{seen} of {total} circles of {board} detected"]
+    facts = [f"{detected} of {total} circles of {board} detected"]
     if others:
-        facts.append(f"beside {others} other round blobs")
+        facts.append(f"among {others} other round blobs")
     centres = most.blobs.centres[lattice.blobs]
     spacing = float(np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / ((longer - 1) * (shorter - 1))))
     height, width = image.grey.shape

@@ -1,4 +1,4 @@
-"""Detect a board in an image, numbered as its points are, or raise an error that says why it cannot be measured."""
+"""Detect a board in an image, numbered as its points are, or raise an error with the reason."""
 
 from dataclasses import dataclass
 
@@ -16,9 +16,9 @@ from slviewer.target.planar import fit_homography, to_image
 
 @dataclass(frozen=True)
 class Detection:
-    """``pixels`` (n, 2) float64 px, and ``ids`` (n,) int: which of ``board.points`` each one is.
+    """Detected features: ``pixels`` (n, 2) float64 px, and ``ids`` (n,) int, their indices into ``board.points``.
 
-    All of them in order for grids of circles and chessboards, those that were detected for ChArUco. A circle's pixel is
+    All features in order for circles and chessboards, the detected ones for ChArUco. A circle's pixel is
     the centroid of its image, which perspective and distortion move away from the image of its centre (some hundredths
     of a pixel; it grows with the square of the radius): ``radius_mm``, 0 for corners, is there to correct that.
     ``marked``: the mark beside the first circle was detected, so that the numbering is the board's own at any turn.
@@ -31,7 +31,7 @@ class Detection:
 
 
 def detect(board: Board, image: np.ndarray) -> Detection:
-    """The board's features in an image (h, w), or (h, w, 3) RGB, uint8 or uint16.
+    """Detect a board's features in an image (h, w), or (h, w, 3) RGB, uint8 or uint16.
 
     The numbering's x axis turns clockwise into its y axis in the image, always. A symmetric board is numbered from its
     mark (``slviewer.target.mark``); where none is detected, the rule of ``slviewer.target.numbering`` selects the
@@ -50,7 +50,7 @@ def detect(board: Board, image: np.ndarray) -> Detection:
 
 
 def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> np.ndarray:
-    """(h, w) bool: pixels inside ``board.outline()``, by the homography of the detected features.
+    """Return the mask (h, w) bool of the pixels inside ``board.outline()``, by the homography of the detected features.
 
     ``shape`` is the image's, (h, w) or (h, w, 3).
     """

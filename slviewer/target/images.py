@@ -8,7 +8,7 @@ import numpy as np
 from slviewer.errors import InputError
 
 SEARCH_PX = 1600
-"""Longest side of the image in which boards are searched first; features are measured in the full image."""
+"""Longest side of the downscaled image for the first search; features are measured in the full image."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class BoardImage:
         flat = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
         if image.dtype not in (np.uint8, np.uint16) or not flat or min(image.shape[:2]) < 32:
             raise InputError(
-                f"an image of shape {image.shape} and type {image.dtype} was given: boards are found in (h, w) or "
+                f"an image of shape {image.shape} and type {image.dtype} was given: boards are detected in (h, w) or "
                 "(h, w, 3) images of uint8 or uint16, 32 pixels and more on each side"
             )
         if image.ndim == 3:

@@ -16,19 +16,19 @@ from slviewer.target.board import Board
 from slviewer.target.planar import fit_grid_map
 
 PREDICTION_RADIUS = 0.27
-"""How far, in steps, a neighbour may lie from where its predecessors point."""
+"""Largest distance, in steps, of a neighbour from its predicted position."""
 AREA_RATIO = 2.2
-"""Ratio of areas up to which neighbouring blobs count as alike."""
+"""Largest ratio of the areas of neighbouring blobs."""
 NODE_RADIUS = 0.15
-"""How far, in pitches, a blob may lie from the node that the map of the whole lattice predicts."""
+"""Largest distance, in pitches, of a blob from the node predicted by the map of the whole lattice."""
 COMPLETIONS = 4
-"""Rows that a lattice may gain at each side beyond those that it was grown to."""
+"""Largest number of rows added at each side of a grown lattice."""
 MAX_SIDE_NODES = 200
-"""Nodes of a lattice along one side."""
+"""Largest number of nodes along one side of a lattice."""
 SEEDS = 60
-"""Lattices that are grown before an attempt gives up."""
+"""Largest number of lattices grown in one attempt."""
 NEIGHBOURS = 25
-"""Blobs around one among which its neighbours of like size are sought."""
+"""Number of nearest blobs among which neighbours of similar size are searched."""
 SHEARS = np.array([[[1, 0], [0, 1]], [[1, 0], [1, 1]], [[1, 1], [0, 1]], [[1, 0], [-1, 1]], [[1, -1], [0, 1]]])
 """Changes of basis, for a strong slant where a diagonal of the grid looks shorter than its sides."""
 TURNS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
@@ -38,21 +38,24 @@ DIAGONAL = np.array([[1, 1], [-1, 1]])
 
 @dataclass(frozen=True)
 class Lattice:
-    """``nodes`` (m, 2) integer coordinates along two directions that are right-handed in the image (u right, v
-    down), and ``blobs`` (m,): which blob lies at each."""
+    """Blobs at the nodes of a lattice.
+
+    ``nodes`` (m, 2) int: coordinates along two directions that are right-handed in the image (u right, v down);
+    ``blobs`` (m,) int: index of the blob at each node.
+    """
 
     nodes: np.ndarray
     blobs: np.ndarray
 
     @property
     def extent(self) -> tuple[int, int]:
-        """Nodes along the longer and the shorter direction."""
+        """Number of nodes along the longer and the shorter direction."""
         spans = self.nodes.max(0) - self.nodes.min(0) + 1
         return int(spans.max()), int(spans.min())
 
 
 def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
-    """Lattices of like blobs, grown from the most regular neighbourhoods; each blob belongs to one at most."""
+    """Yield lattices of similar blobs, grown from the most regular neighbourhoods; each blob is in one at most."""
     if len(blobs.centres) < 6:
         return
     tree = cKDTree(blobs.centres)
@@ -70,23 +73,25 @@ def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
 
 
 def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
-    """The lattice with every blob that lies at a node predicted by its map, without those that do not.
+    """Add the blobs at nodes that the lattice's map predicts, and remove those that are not at a node.
 
-    Growing from neighbour to neighbour ends at a gap, and may follow clutter beside a grid; the map of all
-    nodes together is not.
+    Growing from neighbour to neighbour ends at a gap and may follow clutter next to a grid; the map of all nodes
+    does neither.
     """
     for _ in range(COMPLETIONS):
         try:
-            seen = fit_grid_map(lattice.nodes.astype(float), blobs.centres[lattice.blobs], robust=True)
+            grid_map = fit_grid_map(lattice.nodes.astype(float), blobs.centres[lattice.blobs], robust=True)
         except DetectionError:
             return lattice
         low, high = lattice.nodes.min(0) - 1, lattice.nodes.max(0) + 1
         if (high - low).max() > MAX_SIDE_NODES:
             return lattice
         nodes = np.stack(np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)), -1).reshape(-1, 2)
-        pitch = seen.pitch_px(nodes.astype(float))
-        typical = np.median(np.sqrt(blobs.areas[lattice.blobs]) / np.maximum(seen.pitch_px(lattice.nodes * 1.0), 1e-9))
-        apart, nearest = cKDTree(blobs.centres).query(seen.to_image(nodes.astype(float)))
+        pitch = grid_map.pitch_px(nodes.astype(float))
+        typical = np.median(
+            np.sqrt(blobs.areas[lattice.blobs]) / np.maximum(grid_map.pitch_px(lattice.nodes * 1.0), 1e-9)
+        )
+        apart, nearest = cKDTree(blobs.centres).query(grid_map.to_image(nodes.astype(float)))
         ratio = np.sqrt(blobs.areas[nearest]) / np.maximum(typical * pitch, 1e-9)
         is_alike = np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(AREA_RATIO) / 2
         on = (pitch > 0) & (apart < NODE_RADIUS * pitch) & is_alike
@@ -102,7 +107,7 @@ def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
 
 
 def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
-    """Every numbering of the board's features by the lattice's blobs, (n,) indices each; empty where some are missing.
+    """Return every numbering of the board's features, (n,) indices of blobs each; empty if blobs are missing.
 
     Numberings of the same blobs are the board's rotational symmetries; different sets of blobs mean that the lattice
     is larger than the board.
@@ -115,12 +120,12 @@ def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
         for turn in TURNS:
             nodes = lattice.nodes @ (turn @ to_board @ shear).T
             nodes = nodes - nodes.min(0)
-            room = nodes.max(0) + 1 - spans
-            if (room < 0).any():
+            excess = nodes.max(0) + 1 - spans
+            if (excess < 0).any():
                 continue
             occupied = np.full(nodes.max(0) + 1, -1)
             occupied[nodes[:, 0], nodes[:, 1]] = lattice.blobs
-            for dx, dy in np.ndindex(*(np.minimum(room, 12) + 1)):
+            for dx, dy in np.ndindex(*(np.minimum(excess, 12) + 1)):
                 chosen = occupied[pattern[:, 0] + dx, pattern[:, 1] + dy]
                 if (chosen >= 0).all():
                     numberings.append(chosen)
@@ -130,7 +135,7 @@ def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
 
 
 def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """(blob, step, step) where like neighbours lie opposite each other in two directions, the most regular first."""
+    """Return (blob, step, step) of blobs with similar neighbours opposite each other in two directions, best first."""
     centres, areas = blobs.centres, blobs.areas
     _, near = tree.query(centres, k=min(NEIGHBOURS, len(centres)))
     near = near[:, 1:]
@@ -182,11 +187,11 @@ def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.nd
                 step = here - centres[behind]
             else:
                 for side in (1, -1):
-                    beside = at.get((i + side * dj, j + side * di))
+                    lateral = at.get((i + side * dj, j + side * di))
                     diagonal = at.get((i + di + side * dj, j + dj + side * di))
-                    if beside is not None and diagonal is not None:
-                        step = centres[diagonal] - centres[beside]
-            neighbour = _nearest_of_size(
+                    if lateral is not None and diagonal is not None:
+                        step = centres[diagonal] - centres[lateral]
+            neighbour = _nearest_similar_blob(
                 tree, here + step, PREDICTION_RADIUS * float(np.hypot(*step)), areas, areas[at[node]], free, used
             )
             if neighbour is None:
@@ -199,7 +204,7 @@ def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.nd
     return Lattice(np.array(list(at)), np.array(list(at.values())))
 
 
-def _nearest_of_size(
+def _nearest_similar_blob(
     tree: cKDTree, place: np.ndarray, reach: float, areas: np.ndarray, area: float, free: np.ndarray, used: set[int]
 ) -> int | None:
     """Return the nearest unused blob of similar ``area`` within ``reach`` px of ``place`` (2,) px; None without one."""

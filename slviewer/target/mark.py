@@ -1,11 +1,10 @@
-"""The mark that orients a board of circles: a dot beside its first circle.
+"""The mark that orients a board of circles: a dot next to its first circle.
 
-A symmetric grid looks the same turned by 180 degrees. The dot lies outside the grid, on the first circle's diagonal, so
-far from it that neither detecting nor measuring circles meets it; half as wide as a circle, it is never detected as
-one.
+A symmetric grid looks the same turned by 180 degrees. The dot is outside the grid, on the first circle's diagonal, too
+far away to disturb the measurement of the circles; half as wide as a circle, it is never detected as one.
 
-Other objects beside a board (a screw, a label, a warm spot in a thermal image) are no mark: only a dot counts
-that has the place, the size, the polarity and the contrast of the printed one, on the paper of the board.
+Other objects near a board (a screw, a label, a warm spot in a thermal image) are not accepted as the mark: a dot must
+have the position, size, polarity and contrast of the printed one, and be on the board's paper.
 """
 
 from dataclasses import dataclass
@@ -19,21 +18,21 @@ from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_i
 OFFSET = 5 / 8
 RADIUS = 1 / 8
 PAPER_WIDTH = 1 / 8
-"""How far the dot lies left of and above the first circle, its radius and the paper around it, in distances between
-neighbouring circles."""
+"""Offset of the dot to the left of and above the first circle, its radius, and the width of paper around it, in
+distances between neighbouring circles."""
 PREDICTING_CIRCLES = 16
-"""Circles that predict the dot's place in the image; farther ones predict the local distortion less well."""
+"""Number of circles that predict the dot's position; farther ones predict the local distortion less well."""
 MAX_CUT_OFF = 0.3
-"""Share of the paper around a dot that may lie outside the image."""
+"""Largest share of the paper around a dot that may be outside the image."""
 PRESENT = 0.4
 ABSENT = 0.2
-"""Contrast of a dot over a circle's, above which it is there, and below which it is not."""
+"""Contrast of a dot relative to a circle's: above PRESENT there is a dot, below ABSENT there is none."""
 MAX_OFFSET = 0.4
-"""Distance of the dot's centroid from its place, in its radii: what a lens adds to a prediction over one pitch."""
+"""Largest distance of the dot's centroid from its predicted position, in its radii: lens distortion over one pitch."""
 SIZES = (0.6, 1.5)
-"""Radius at half contrast over the printed one, from the smallest to the largest that blur and ink make of it."""
+"""Smallest and largest ratio of the radius at half contrast to the printed one, after blur and ink spread."""
 MAX_PAPER_CHANGE = 0.5
-"""The paper around a dot may differ from that around the first circle by this share of the circle's contrast."""
+"""Largest brightness difference of the paper around the dot and around the first circle, over the circle's contrast."""
 _RADII = np.linspace(0.0, 2.2, 12)
 _ANGLES = 20
 
@@ -47,8 +46,8 @@ class Mark:
     radius: float
 
 
-def mark_of(board: Board) -> Mark | None:
-    """Where a board's mark is printed; None for chessboards and ChArUco."""
+def mark_geometry(board: Board) -> Mark | None:
+    """Return the position and radius of a board's printed mark; None for chessboards and ChArUco."""
     if board.kind not in ("circles", "acircles"):
         return None
     apart = neighbour_distance_mm(board)
@@ -56,19 +55,19 @@ def mark_of(board: Board) -> Mark | None:
 
 
 def neighbour_distance_mm(board: Board) -> float:
-    """Distance between a circle and its nearest neighbour."""
+    """Return the distance in mm between a circle and its nearest neighbour."""
     return board.pitch_mm * (2**0.5 if board.kind == "acircles" else 1.0)
 
 
-def numbering_by_mark(
+def select_numbering_by_mark(
     board: Board, image: np.ndarray, centres: np.ndarray, numberings: list[np.ndarray]
 ) -> np.ndarray | None:
-    """Of equally valid numberings, (n,) indices into ``centres`` (m, 2) px, the one whose first circle has
-    the mark beside it; None where none or several have.
+    """Select the one of several valid numberings whose first circle has the mark next to it.
 
-    ``image`` (h, w) float32.
+    ``image`` (h, w) float32; ``centres`` (m, 2) px; ``numberings``: (n,) indices into them. None where no numbering,
+    or more than one, has a mark.
     """
-    mark = mark_of(board)
+    mark = mark_geometry(board)
     if mark is None:
         return None
     dots = [_detect_dot(board, mark, image, centres[order]) for order in numberings]
@@ -79,8 +78,10 @@ def numbering_by_mark(
 
 
 def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray) -> tuple[float, bool]:
-    """(How much the mark's place differs from the paper around it, over how much the first circle does; whether a dot
-    lies there that may be the mark)."""
+    """Return the contrast at the mark's position over the first circle's, and whether a dot there may be the mark.
+
+    ``pixels`` (n, 2): the circles' centres in the order of ``board.points``.
+    """
     points = board.points[:, :2]
     centre = np.array([mark.x, mark.y])
     near = np.argsort(np.linalg.norm(points - centre, axis=1))[:PREDICTING_CIRCLES]
@@ -101,9 +102,12 @@ def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray)
 
 @dataclass(frozen=True)
 class _Profile:
-    """A dot's grey levels: of its middle (``ink``) and of the paper around it; their difference over the larger,
-    negative for bright dots; its centroid's distance ``off`` from where it should be and its radius at half contrast
-    (``size``), both in its radii; whether there is paper on all sides (``is_alone``)."""
+    """Radial profile of a dot.
+
+    ``ink`` and ``paper``: grey levels of its middle and of the paper around it; ``contrast``: their difference over the
+    larger, negative for bright dots. ``off``: distance of its centroid from the predicted position, and ``size``: its
+    radius at half contrast, both over its nominal radius. ``is_alone``: whether there is paper on all sides.
+    """
 
     ink: float
     paper: float
@@ -114,14 +118,14 @@ class _Profile:
 
 
 def _measure_profile(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float) -> _Profile | None:
-    """Profile around a point of the board, out to 2.2 radii; None where too little of it is in the image.
+    """Measure the profile around a point ``centre`` (2,) mm of the board, out to 2.2 radii; None where cut off.
 
-    For paper counts the fifth of the outer rings that is least like it: an edge that runs through is no dot.
+    The paper's level is the quantile of the outer rings that differs least from the dot, so that an edge is no dot.
     """
     angles = np.arange(_ANGLES) * 2 * np.pi / _ANGLES
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    places = _RADII[:, None, None] * radius * directions
-    pixels = to_image(H, centre + places.reshape(-1, 2)).astype(np.float32)
+    offsets = _RADII[:, None, None] * radius * directions
+    pixels = to_image(H, centre + offsets.reshape(-1, 2)).astype(np.float32)
     levels = cv2.remap(
         image, pixels[:, 0], pixels[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
     ).reshape(len(_RADII), _ANGLES)
@@ -138,7 +142,7 @@ def _measure_profile(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radiu
     share = np.nan_to_num((paper - levels) / difference, nan=0.0)
     middle = float(np.median(ring))
     is_alone = bool(np.abs(ring - middle).max() < 0.5 * abs(difference))
-    ink = np.clip(share, 0.0, 1.0) * (_RADII < 1.9)[:, None] * _RADII[:, None]  # the area that a sample stands for
+    ink = np.clip(share, 0.0, 1.0) * (_RADII < 1.9)[:, None] * _RADII[:, None]  # weighted by the area of each sample
     centroid = np.einsum("ra,r,ac->c", ink, _RADII, directions) / max(float(ink.sum()), 1e-9)
     means = share.mean(axis=1) / max(float(share[:2].mean()), 1e-9)
     below = np.nonzero(means < 0.5)[0]

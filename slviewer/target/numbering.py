@@ -15,11 +15,11 @@ from slviewer.target.board import Board
 from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_image
 
 MAX_GRID_OFFSET = 0.08
-"""How far, in pitches, a feature may lie from the grid that all features together describe."""
+"""Largest distance, in pitches, of a feature from the grid fitted to all features."""
 MAX_GRID_OFFSET_SIGMAS = 8.0
 """The same in robust standard deviations; hand-held paper boards reach 6."""
 MAX_BEND = 0.6
-"""How far, in pitches, a lens may bend the grid."""
+"""Largest distance, in pitches, by which a lens may distort the grid."""
 
 
 def select_upright(board: Board, pixels: np.ndarray, numberings: list[np.ndarray]) -> np.ndarray:

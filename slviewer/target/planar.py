@@ -9,7 +9,7 @@ from slviewer.errors import DetectionError
 from slviewer.geometry.polynomial import monomials
 
 HUBER_SIGMAS = 3.0
-"""Features farther from a grid's map than so many robust standard deviations weigh less in its fit."""
+"""Residuals beyond so many robust standard deviations are down-weighted in the fit of a grid's map."""
 
 
 def fit_homography(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -> np.ndarray:
@@ -37,8 +37,8 @@ def jacobians(H: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class GridMap:
-    """Map from a flat grid of features to the image: a homography ``H`` from pitches to pixels, plus a polynomial of
-    the place on the board, which is how a lens bends it.
+    """Map from a flat grid of features to the image: a homography ``H`` from pitches to pixels, plus a polynomial in
+    the board's coordinates for the lens distortion.
 
     ``residuals`` (n, 2) px of the features that it was fitted to, ``sigma_px`` the robust standard deviation of their
     lengths.
@@ -53,12 +53,12 @@ class GridMap:
     sigma_px: float
 
     def to_image(self, points: np.ndarray) -> np.ndarray:
-        """(n, 2) px of points (n, 2) in pitches; beyond the features as far as the polynomial can be trusted."""
+        """Map points (n, 2) in pitches to pixels (n, 2); extrapolates beyond the fitted features."""
         scaled = 2 * (points - self.low) / self.span - 1
         return to_image(self.H, points) + monomials(scaled, self.degree) @ self.coefficients
 
     def pitch_px(self, points: np.ndarray) -> np.ndarray:
-        """(n,) px: the side of a square of one pitch, at points (n, 2) in pitches; 0 behind the camera."""
+        """Return the pitch (n,) px in the image at points (n, 2) in pitches; 0 behind the camera."""
         return np.sqrt(np.maximum(np.linalg.det(jacobians(self.H, points)), 0.0))
 
 

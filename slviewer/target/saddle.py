@@ -13,10 +13,10 @@ from slviewer.target.planar import fit_homography, jacobians
 MAX_HALF_WIDTH_PX = 11
 """Largest half width of a window; farther pixels measure the lens rather than the corner."""
 EDGE_SHARE = 0.4
-"""How far, in squares, a corner's window follows the edges."""
+"""Half length, in squares, of a corner's window along the edges."""
 MAX_MISFIT = 0.15
 MAX_RELATIVE_MISFIT = 3.0
-"""A corner's grey levels may leave the model by this share of its contrast, or by this much more than most do."""
+"""Largest RMS misfit of a corner's grey levels: over its contrast, and over the median misfit of all corners."""
 ITERATIONS = 15
 CONVERGENCE_PX = 1e-3
 
@@ -24,10 +24,10 @@ CONVERGENCE_PX = 1e-3
 def refine_corners(
     image: np.ndarray, pixels: np.ndarray, points: np.ndarray, pitch: float, marker: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((n, 2) float64 px, (n,) bool whether the grey levels there are those of a corner).
+    """Refine corners; returns sub-pixel positions (n, 2) float64 px and whether each fits the model, (n,) bool.
 
-    ``image`` (h, w) float32; ``pixels`` (n, 2) px good to a px or two; ``points`` (n, 2), ``pitch`` and the side of
-    the ``marker`` inside bright squares in mm.
+    ``image`` (h, w) float32; ``pixels`` (n, 2) px: initial positions, good to a px or two; ``points`` (n, 2) mm: the
+    corners on the board; ``pitch`` and ``marker``: sides of the squares and of the markers in them, mm.
     """
     H = fit_homography(points, pixels)
     to_px = jacobians(H, points) * pitch
@@ -43,15 +43,19 @@ def refine_corners(
     board = np.abs(np.einsum("nij,nmj->nmi", np.linalg.inv(to_px), offset))
     free = 0.8 * (1 - marker / pitch) / 2 if marker else EDGE_SHARE
     weight = (inside & (board.max(2) < EDGE_SHARE) & (board.min(2) < free)).astype(float)
-    moved, misfit = _fit(offset, grey, weight, to_px)
+    shift, misfit = _fit_corners(offset, grey, weight, to_px)
     good = misfit < np.maximum(MAX_MISFIT, MAX_RELATIVE_MISFIT * np.median(misfit))
-    good &= np.linalg.norm(moved, axis=1) < reach
-    return pixels + moved, good
+    good &= np.linalg.norm(shift, axis=1) < reach
+    return pixels + shift, good
 
 
-def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((n, 2) px from the start to the crossing, (n,) rms misfit over the contrast), by damped Gauss-Newton on all
-    corners at once.
+def _fit_corners(
+    offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit all corners at once by damped Gauss-Newton; returns shifts (n, 2) px and RMS misfits over contrast (n,).
+
+    ``offset`` (n, m, 2) px: pixels of each window from the initial corner; ``grey`` and ``weight`` (n, m); ``to_px``
+    (n, 2, 2): px per square along the board's x and y.
 
     Unknowns of each corner: its position (2), the angles of the edges' normals (2), the blur's sigma, the plane of the
     light (3), kappa.
@@ -91,7 +95,7 @@ def _fit(offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.nda
 
 
 def _evaluate_model(q: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((n, m) grey levels, (n, m, 9) their derivatives) of corners ``q`` (n, 9) at offsets (n, m, 2) px."""
+    """Return grey levels (n, m) and derivatives (n, m, 9) of corners ``q`` (n, 9) at offsets (n, m, 2) px."""
     x, y = offset[..., 0] - q[:, 0, None], offset[..., 1] - q[:, 1, None]
     sigma = q[:, 4, None]
     light = q[:, 5, None] + q[:, 6, None] * offset[..., 0] + q[:, 7, None] * offset[..., 1]

@@ -1,4 +1,4 @@
-"""Printable boards, to exact scale."""
+"""Printable pages of boards, to exact scale."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from slviewer.errors import InputError
 from slviewer.target.board import Board
 from slviewer.target.charuco import opencv_board
 from slviewer.target.drawing import LARGEST_PDF_MM, Drawing
-from slviewer.target.mark import OFFSET, PAPER_WIDTH, RADIUS, mark_of, neighbour_distance_mm
+from slviewer.target.mark import OFFSET, PAPER_WIDTH, RADIUS, mark_geometry, neighbour_distance_mm
 
 CIRCLE_SHARE = 0.5
 """Diameter of a printed circle over the distance to its nearest neighbour."""
@@ -20,10 +20,10 @@ FOOTER_MM = 12.0
 def write_sheet(board: Board, path: Path | str, margin_mm: float | None = None) -> None:
     """Write a board as a .pdf or .svg page of the board's size, with a scale bar to check the print by.
 
-    ``margin_mm`` is the paper left around the board: by default what the mark of a board of circles needs, or half a
-    square, and 10 mm or more; in a margin that is too narrow there is no mark. The page's right and down are the
-    board's x and y. Raises InputError for other suffixes, for pages that PDF cannot hold, and where the
-    file cannot be written.
+    ``margin_mm``: width of the paper around the board; by default what the mark of a board of circles needs, or half a
+    square, but at least 10 mm. The mark is omitted where the margin is too narrow for it. The
+    page's right and down are the board's x and y. Raises InputError for other suffixes, for pages that PDF cannot
+    hold, and where the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -43,11 +43,13 @@ def write_sheet(board: Board, path: Path | str, margin_mm: float | None = None) 
 
 
 def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
-    """The board on its page."""
-    mark = mark_of(board)
+    """Draw a board on its page, with a footer; ``margin_mm`` as in ``write_sheet``."""
+    mark = mark_geometry(board)
     radius = CIRCLE_SHARE / 2 * neighbour_distance_mm(board)
-    room = (OFFSET + RADIUS + PAPER_WIDTH) * neighbour_distance_mm(board) - radius if mark else board.pitch_mm / 2
-    margin = max(10.0, room) if margin_mm is None else margin_mm
+    needed_margin = (
+        (OFFSET + RADIUS + PAPER_WIDTH) * neighbour_distance_mm(board) - radius if mark else board.pitch_mm / 2
+    )
+    margin = max(10.0, needed_margin) if margin_mm is None else margin_mm
     if not margin >= 0:
         raise InputError(f"a margin of {margin} mm is not possible: give 0 or more")
     beyond = radius if mark else board.pitch_mm
@@ -57,7 +59,7 @@ def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
     drawing = Drawing(width, bottom + FOOTER_MM)
     if mark:
         drawing.circles = [(x, y, radius) for x, y in (board.points[:, :2] + first).tolist()]
-        if margin >= room:
+        if margin >= needed_margin:
             drawing.circles.append((first[0] + mark.x, first[1] + mark.y, mark.radius))
     else:
         drawing.rectangles = [(x + first[0], y + first[1], w, h) for x, y, w, h in _black_squares(board)]
@@ -66,7 +68,7 @@ def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
 
 
 def _black_squares(board: Board) -> list[tuple[float, float, float, float]]:
-    """(x, y, width, height) mm of what is black, from the first inner corner; the top-left square is."""
+    """Return the black rectangles (x, y, width, height) mm from the first inner corner; the top-left one is black."""
     p = board.pitch_mm
     columns, rows = board.features
     dark = [((j - 1) * p, (i - 1) * p, p, p) for i in range(rows + 1) for j in range(columns + 1) if (i + j) % 2 == 0]
@@ -74,7 +76,7 @@ def _black_squares(board: Board) -> list[tuple[float, float, float, float]]:
 
 
 def _marker_cells(board: Board) -> list[tuple[float, float, float, float]]:
-    """The black cells of the markers, those side by side in one piece."""
+    """Return the black cells of the markers as rectangles (x, y, width, height) mm, neighbours in a row merged."""
     charuco = opencv_board(board)
     dictionary = charuco.getDictionary()
     cells = dictionary.markerSize + 2
@@ -92,11 +94,11 @@ def _marker_cells(board: Board) -> list[tuple[float, float, float, float]]:
 
 
 def _add_footer(board: Board, drawing: Drawing, top: float) -> None:
-    """A scale bar, of 100 mm where the page is wide enough, and printing instructions."""
-    left = 5.0
-    length = next(bar for bar in (100, 50, 20) if bar <= drawing.width - 2 * left)
+    """Add a scale bar, of 100 mm where the page is wide enough, and printing instructions below ``top`` mm."""
+    inset = 5.0
+    length = next(bar for bar in (100, 50, 20) if bar <= drawing.width - 2 * inset)
     for x in range(0, length + 1, 10):
-        drawing.rectangles.append((left + x - 0.1, top + 1.0, 0.2, 2.0))
-    drawing.rectangles.append((left, top + 2.8, float(length), 0.2))
+        drawing.rectangles.append((inset + x - 0.1, top + 1.0, 0.2, 2.0))
+    drawing.rectangles.append((inset, top + 2.8, float(length), 0.2))
     text = f"{board}   print at 100 %, without fitting to the page: the bar is {length} mm long"
-    drawing.texts.append((left, top + 7.5, min(3.5, 2 * (drawing.width - 2 * left) / len(text)), text))
+    drawing.texts.append((inset, top + 7.5, min(3.5, 2 * (drawing.width - 2 * inset) / len(text)), text))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from slviewer.target.board import Board
-from slviewer.target.mark import mark_of
+from slviewer.target.mark import mark_geometry
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class View:
 
     def albedo(self, board: Board, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         dark = dark_parts(board, x, y, self.diameter)
-        mark = mark_of(board)
+        mark = mark_geometry(board)
         if self.marked and mark is not None:
             dark |= (x - mark.x) ** 2 + (y - mark.y) ** 2 < mark.radius**2
         if self.hide is not None:

@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 from slviewer.target.drawing import Drawing
-from slviewer.target.mark import mark_of
+from slviewer.target.mark import mark_geometry
 from slviewer.target.sheet import draw_board, write_sheet
 
 NOTATIONS = ["circles:5x4:9", "acircles:4x5:20", "chessboard:6x5:12.345", "charuco:6x5:20"]
@@ -78,7 +78,7 @@ def test_distances_are_exact_to_a_micrometre(notation: str, suffix: str, tmp_pat
     if board.kind in ("circles", "acircles"):
         grid, dot = circles[:-1], circles[-1] - [*circles[0, :2], 0]
         np.testing.assert_allclose(grid[:, :2] - grid[0, :2], board.points[:, :2], atol=1e-3)
-        mark = mark_of(board)
+        mark = mark_geometry(board)
         assert mark is not None
         np.testing.assert_allclose(dot, (mark.x, mark.y, mark.radius), atol=1e-3)
 

@@ -9,7 +9,7 @@ import numpy as np
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.half_turns import opposite_features
 from slviewer.geometry.polynomial import monomials, scale_to_unit_square
-from slviewer.target.blobs import find_blobs
+from slviewer.target.blobs import detect_blobs
 from slviewer.target.board import Board
 from slviewer.target.images import SEARCH_PX, BoardImage, resize_image
 from slviewer.target.lattice import grow_lattices
@@ -95,7 +95,7 @@ def detect_grid_size(board: Board, image: np.ndarray) -> tuple[int, int] | None:
     pitch = max(small.shape) / (min(board.columns, board.rows) - 1)
     most: tuple[int, tuple[int, int]] | None = None
     for inverted in (False, True):
-        for blobs in find_blobs(small, pitch, inverted):
+        for blobs in detect_blobs(small, pitch, inverted):
             for lattice in grow_lattices(blobs):
                 longer, shorter = lattice.extent
                 count = len(lattice.nodes)
