@@ -24,9 +24,9 @@ from slviewer.errors import Cancelled, SlviewerError
 
 def describe_measurement(made: Any, **_: Any) -> str:
     """The measurement in one line."""
-    from slviewer.pipeline.measurements import in_words
+    from slviewer.pipeline import measurements
 
-    return in_words(made)
+    return measurements.describe_measurement(made)
 
 
 def describe_simulation(names: list[str], session: Path, **_: Any) -> str:

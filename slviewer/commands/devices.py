@@ -34,11 +34,11 @@ CHECKED = (
 
 def run_capture(capture: Callable[..., Any], arguments: dict[str, Any]) -> None:
     """Capture, and print what the capture holds."""
-    from slviewer.pipeline.inspect import summary
+    from slviewer.pipeline.inspect import summarise_capture
 
     with _projector_page(arguments.pop("port")) as set_up:
         saved = call(capture, set_up=set_up, **arguments)
-    print(summary(saved))
+    print(summarise_capture(saved))
 
 
 def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> None:

@@ -56,7 +56,7 @@ class MeasurementList:
             delete = lambda: operator.delete_measurement(self._choice.value)  # noqa: E731
             context.button("Delete result", delete, viser.Icon.TRASH, "red", hint="Moves it to the session's trash")
         self._restore = context.button(
-            "Restore deleted", operator.restore_measurement, viser.Icon.ARROW_BACK_UP, "orange", visible=False
+            "Restore deleted", operator.undo_delete, viser.Icon.ARROW_BACK_UP, "orange", visible=False
         )
         with gui.add_folder("All results", visible=False) as self._table_folder:
             self._table = Text(gui)
@@ -144,7 +144,7 @@ class MeasurementList:
 
     def _rename(self) -> None:
         if self._choice.value:
-            self._context.operator.rename_measurement(self._choice.value, self._rename_to.value)
+            self._context.operator.relabel_measurement(self._choice.value, self._rename_to.value)
             change(self._rename_to, value="")
 
     def _draw_deviation(self, measured: Measurement | None) -> None:

@@ -17,20 +17,21 @@ from slviewer.evaluation.budget import Contribution, ErrorBudget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.check import Checked, history
+from slviewer.pipeline.check import DriftRecord, load_drift_history
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.models import ModelName, best, check_accepted, load_model, load_stereo, warn_if_stale
+from slviewer.pipeline.models import ModelName, best_model, check_accepted, load_model, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, match_names, next_number, opened
-from slviewer.pipeline.reconstruct import board_region
+from slviewer.pipeline.reconstruct import segment_board
 from slviewer.pipeline.scale import record_scale, scale_factor
 from slviewer.session.store import Session
 
 
 @dataclass(frozen=True)
-class Accepted:
-    """What ``accept`` found. ``factor`` is the scale correction in force during the test, ``applied`` the one that it
-    put in force, or None; ``budget`` of the artefact's length, None for a plane; ``repeatability`` where still captures
-    were named."""
+class AcceptanceResult:
+    """The result of ``accept``. ``factor`` is the scale correction in force during the test, ``applied`` the one
+    that it put in force, or None; ``budget`` of the artefact's length, None for a plane; ``repeatability`` where
+    still captures were named.
+    """
 
     acceptance: Acceptance
     factor: float
@@ -71,43 +72,43 @@ def accept(
     apply_scale: bool = False,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
-) -> Accepted:
+) -> AcceptanceResult:
     """Test a calibration with a ball bar, a sphere or a plane that has a certificate, against the operator's limits.
 
     Args:
         session: Session folder.
-        artefact: TOML file with what the certificate says, the captures that show the artefact, and the limits.
+        artefact: TOML file with the values of the certificate, the captures that show the artefact, and the limits.
         model: Which calibration to test; by default the best one available.
         still: Captures (ten) of one still object, for the repeatability.
         apply_scale: Record the measured scale as a correction of later clouds.
 
     The result stays in the session as ``acceptance/1``, ``acceptance/2``, ...
     """
-    thing = read_artefact(artefact)
+    certified = read_artefact(artefact)
     with opened(session, write=True) as store:
         check_accepted(store)
-        name = model or best(store)
+        name = model or best_model(store)
         chosen, factor = load_model(store, name), scale_factor(store, name)
         warn_if_stale(store, warn)
-        if apply_scale and thing.kind == "plane":
-            raise InputError("a plane says nothing of scale: apply that of a ball bar or a sphere")
-        captures = _captures(store, thing)
+        if apply_scale and certified.kind == "plane":
+            raise InputError("the scale cannot be measured on a plane: apply that of a ball bar or a sphere")
+        captures = _match_captures(store, certified)
         check_capture_sizes(store, [*captures, *still])
         depth_range = load_stereo(store).depth_range_mm
         measuring = part(progress, 0, 0.9 if not still else 0.5)
-        found: list[Position] = []
+        positions: list[Position] = []
         for i, (shot, frames, phases) in enumerate(decode_captures(store, list(captures), warn)):
             measuring(i / len(captures), f"measuring {shot.name}")
             cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
             plate = None
-            if thing.kind == "plane" and shot.role == "calibration":
-                plate = board_region(store, shot, capture_texture(shot, frames), warn)
+            if certified.kind == "plane" and shot.role == "calibration":
+                plate = segment_board(store, shot, capture_texture(shot, frames), warn)
             try:
-                found.append(measure(thing, cloud, captures[shot.name], shot.name, depth_range, plate))
+                positions.append(measure(certified, cloud, captures[shot.name], shot.name, depth_range, plate))
             except InputError as error:
                 raise InputError(f"{shot.name}: {error}") from error
-        test = conclude_test(thing, name, found)
-        steady = None
+        test = conclude_test(certified, name, positions)
+        repeatability_mm = None
         if still:
             watching = part(progress, 0.5, 0.95)
 
@@ -117,11 +118,11 @@ def accept(
                     cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
                     yield cloud.points[..., 2], cloud.sigma_z
 
-            steady = repeatability(clouds())
+            repeatability_mm = repeatability(clouds())
         calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
-        checks = [checked for checked in history(store) if checked.calibration == calibration]
+        checks = [checked for checked in load_drift_history(store) if checked.calibration == calibration]
         applied = record_scale(store, test) if apply_scale else None
-        result = Accepted(test, factor, applied, _budget(test, applied, checks), steady)
+        result = AcceptanceResult(test, factor, applied, _length_budget(test, applied, checks), repeatability_mm)
         meta = {
             "accepted": result.to_json(),
             "time": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -144,28 +145,28 @@ def read_artefact(path: Path | str) -> Artefact:
         raise InputError(f"{path}: {error}") from error
 
 
-def _captures(store: Session, thing: Artefact) -> dict[str, str]:
-    """{capture: position}; a capture's own name where a pattern stands for several."""
-    found: dict[str, str] = {}
-    for position, pattern in thing.positions.items():
+def _match_captures(store: Session, artefact: Artefact) -> dict[str, str]:
+    """{capture: position}; the capture's own name where a pattern matches several."""
+    positions: dict[str, str] = {}
+    for position, pattern in artefact.positions.items():
         names = match_names(store.capture_names(), [pattern], "capture", InputError)
-        found |= {name: position if len(names) == 1 else name for name in names}
-    return found
+        positions |= {name: position if len(names) == 1 else name for name in names}
+    return positions
 
 
-def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) -> ErrorBudget | None:
-    """Of the artefact's length, from what the test and the drift checks found."""
+def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[DriftRecord]) -> ErrorBudget | None:
+    """Error budget of the artefact's length from the test and the drift checks; None where no length was measured."""
     scale = test.scale
     if scale is None:
         return None
-    thing, mm = test.artefact, scale.length_mm
-    name = SIZE if thing.spacing is None else SPACING
+    artefact, mm = test.artefact, scale.length_mm
+    name = SIZE if artefact.spacing is None else SPACING
     errors = np.array([f.error_mm for p in test.positions for f in p.figures if f.property == name])
     noise = float(np.sqrt(np.mean([p.noise_mm**2 for p in test.positions])))
     scatter = None if len(errors) < 2 else float(np.sqrt(max(errors.var(ddof=1) - noise**2, 0.0)))
-    left = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0  # known, and left in
-    board = mm * 1e-6 * float(np.hypot(scale.u_ppm, left))
-    warmth = mm * 1e-6 * thing.expansion.ppm_per_kelvin * thing.temperature.U_kelvin / 2
+    uncorrected_ppm = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0  # known, not removed
+    board = mm * 1e-6 * float(np.hypot(scale.u_ppm, uncorrected_ppm))
+    warmth = mm * 1e-6 * artefact.expansion.ppm_per_kelvin * artefact.temperature.U_kelvin / 2
     drift, since = None, "no drift check of this calibration: run `slviewer check`"
     if checks:
         last = checks[-1].drift
@@ -177,9 +178,12 @@ def _budget(test: Acceptance, applied: float | None, checks: Sequence[Checked]) 
             Contribution("phase noise", noise, "A", "the scatter of the points about their fits"),
             Contribution("calibration", scatter, "A", f"the errors' scatter over {len(errors)} places"),
             Contribution(
-                "board scale", board, "B", "this test's scale" + (", which was left uncorrected" if left else "")
+                "board scale",
+                board,
+                "B",
+                "this test's scale" + (", which was left uncorrected" if uncorrected_ppm else ""),
             ),
-            Contribution("temperature", warmth, "B", f"{thing.expansion.ppm_per_kelvin:g} ppm/K of the artefact"),
+            Contribution("temperature", warmth, "B", f"{artefact.expansion.ppm_per_kelvin:g} ppm/K of the artefact"),
             Contribution("drift", drift, "B", since),
         ),
     )

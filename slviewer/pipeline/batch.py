@@ -27,13 +27,13 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.verify import Shape, Verification
 
-INSTALL = "pip install 'slviewer[batch]'"
-PATIENCE_S = 10.0
+INSTALL_COMMAND = "pip install 'slviewer[batch]'"
+CONNECT_TIMEOUT_S = 10.0
 """How long a scheduler may take to answer, and to find a worker."""
 BYTES_PER_WORKER = 3 << 30
 """What reconstructing a capture of two megapixels may need, with every calibration loaded."""
 
-_DEAF = """
+_IGNORE_INTERRUPT = """
 import signal
 
 def dask_setup(worker):
@@ -44,7 +44,7 @@ def dask_setup(worker):
 
 @dataclass(frozen=True)
 class Batch:
-    """What came of every capture, in the order of the sessions. ``broken``: {session: why} of those without any."""
+    """The result of every capture, in the order of the sessions. ``broken``: {session: why} of those without any."""
 
     done: tuple[TaskResult, ...]
     broken: Mapping[str, str]
@@ -59,7 +59,7 @@ class Batch:
     @property
     def failure(self) -> str:
         """How many captures and sessions failed; empty where none did."""
-        return f"{len(self.failed)} of the batch failed: the summary says which, and why" if self.failed else ""
+        return f"{len(self.failed)} of the batch failed: the summary names them, and why" if self.failed else ""
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``batch --json``."""
@@ -130,7 +130,7 @@ def batch(
     try:
         with _start_cluster() if scheduler is None else _connect(scheduler) as client:
             listing = {address: (list_captures, address, tuple(captures), task.version) for address in addresses}
-            plans = _gather(client, listing, ignore_progress, warn)
+            plans = _gather_results(client, listing, ignore_progress, warn)
             broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
             wanted = [(a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan]
             done = _run_tasks(client, wanted, task, progress, warn)
@@ -145,10 +145,11 @@ def batch(
 def _run_tasks(
     client: Any, wanted: Sequence[tuple[str, str]], task: Task, progress: Progress, warn: Warn
 ) -> tuple[TaskResult, ...]:
-    """What came of each (session, capture)."""
-    found = _gather(client, {(a, name): (run_task, a, name, task) for a, name in wanted}, progress, warn)
+    """The result of the task for each (session, capture), in their order."""
+    outcomes = _gather_results(client, {(a, name): (run_task, a, name, task) for a, name in wanted}, progress, warn)
     done = tuple(
-        came if isinstance(came, TaskResult) else TaskResult(a, name, failed=came) for (a, name), came in found.items()
+        came if isinstance(came, TaskResult) else TaskResult(a, name, failed=came)
+        for (a, name), came in outcomes.items()
     )
     for sentence in dict.fromkeys(f"{one.session}: {words}" for one in done for words in one.warnings):
         warn(sentence)
@@ -162,7 +163,7 @@ def _write_verifications(client: Any, done: Sequence[TaskResult], task: Task, wa
         if one.verification is not None:
             parts.setdefault(one.session, []).append(one.verification)
     writing = {address: (write_verification, address, tuple(verified), task) for address, verified in parts.items()}
-    return {address: why for address, why in _gather(client, writing, ignore_progress, warn).items() if why}
+    return {address: why for address, why in _gather_results(client, writing, ignore_progress, warn).items() if why}
 
 
 @contextmanager
@@ -172,7 +173,7 @@ def _connect(scheduler: str) -> Iterator[Any]:
     from distributed import Client
 
     try:
-        client = Client(scheduler, timeout=PATIENCE_S, set_as_default=False)
+        client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise SlviewerError(
             f"no Dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`, or leave "
@@ -180,7 +181,7 @@ def _connect(scheduler: str) -> Iterator[Any]:
         ) from error
     with client:
         try:
-            client.wait_for_workers(1, timeout=PATIENCE_S)
+            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
         except TimeoutError as error:
             raise SlviewerError(
                 f"the scheduler at {scheduler} has no workers: start some with `dask worker {scheduler}`"
@@ -208,7 +209,7 @@ def _start_cluster() -> Iterator[Any]:
             threads_per_worker=1,
             memory_limit=MEMORY_LIMIT // workers,
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-            preload=_DEAF,
+            preload=_IGNORE_INTERRUPT,
             security=True,  # whoever reaches a scheduler runs what they like as its user; others share this machine
             silence_logs="ERROR",
         ) as cluster,
@@ -220,13 +221,15 @@ def _start_cluster() -> Iterator[Any]:
 def _check_installed() -> None:
     for package in ("distributed", "fsspec", "cryptography"):
         if find_spec(package) is None:
-            raise SlviewerError(f"a batch needs the package {package}, which is missing: {INSTALL}")
+            raise SlviewerError(f"a batch needs the package {package}, which is missing: {INSTALL_COMMAND}")
 
 
-def _gather(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progress, warn: Warn) -> dict[Any, Any]:
+def _gather_results(
+    client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progress, warn: Warn
+) -> dict[Any, Any]:
     """What each call (function, arguments ...) returned, in their order; the reason as text where a worker could not.
 
-    What is left of them is given up if this raises.
+    The remaining calls are cancelled if this raises.
     """
     from distributed import as_completed
 
@@ -239,12 +242,12 @@ def _gather(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progres
             ready = ahead.next_batch(block=False)
             for future in ready:
                 key = futures[future]
-                answers[key] = _result_of(future)
+                answers[key] = _result_or_error(future)
                 name = " ".join(key) if isinstance(key, tuple) else key
                 progress(len(answers) / len(futures), f"{len(answers)} of {len(futures)}: {name}")
             if not ready:
                 time.sleep(0.05)
-                if time.monotonic() - warned > PATIENCE_S:
+                if time.monotonic() - warned > CONNECT_TIMEOUT_S:
                     warned = time.monotonic()
                     if not client.scheduler_info()["workers"]:
                         warn("the scheduler has no workers at the moment: waiting for some")
@@ -253,8 +256,8 @@ def _gather(client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progres
     return {key: answers[key] for key in calls}
 
 
-def _result_of(future: Any) -> Any:
-    """Its result, or why there is none."""
+def _result_or_error(future: Any) -> Any:
+    """The result of a finished future, or the reason as text where the worker could not compute it."""
     from concurrent.futures import CancelledError
 
     from distributed import KilledWorker

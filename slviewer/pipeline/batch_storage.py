@@ -26,7 +26,7 @@ def absolute_address(session: Path | str) -> str:
 
 @contextmanager
 def fetch_session(address: str, capture: str = "") -> Iterator[Path]:
-    """A folder with the session, in which the named capture has its frames; raises SessionError where there is none.
+    """A folder with the session, in which the named capture has its frames; raises SessionError where it is missing.
 
     From an fsspec address it is copied, with the calibrations, and removed when the block ends.
     """
@@ -79,7 +79,7 @@ def export_folder(address: str, batch: str) -> Iterator[Path]:
 
 
 def remove_leftovers(address: str, batch: str) -> None:
-    """Remove what killed or cancelled workers of a batch left unfinished, as far as it can be reached from here."""
+    """Remove what killed or cancelled workers of a batch did not finish, as far as it can be reached from here."""
     with contextlib.suppress(OSError, InputError):
         fs, root = _file_system(address)
         for path in fs.ls(f"{root}/exports", detail=False):

@@ -1,4 +1,4 @@
-"""What a worker of a batch is asked to do: the commands' own functions, on one capture at a time."""
+"""The tasks that a worker of a batch runs: the commands' own functions, on one capture at a time."""
 
 import json
 import threading
@@ -21,14 +21,14 @@ from slviewer.session.store import Session
 
 Do = Literal["reconstruct", "verify", "mesh"]
 
-_ONE = threading.Lock()
+_TASK_LOCK = threading.Lock()
 """A process works on one capture at a time, however many threads its worker has: the kernels use its cores already, and
 each capture more would need as much memory again."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """The same work for all captures of a batch. ``batch``: its name, ``version``: the program's that asks."""
+    """The same work for all captures of a batch. ``batch``: its name, ``version``: the submitting program's."""
 
     do: Do
     batch: str
@@ -76,7 +76,7 @@ def run_task(address: str, capture: str, task: Task) -> TaskResult:
     started = time.perf_counter()
     try:
         _check_version(task.version)
-        with fetch_session(address, capture) as folder, _ONE, Session.open(folder) as store:
+        with fetch_session(address, capture) as folder, _TASK_LOCK, Session.open(folder) as store:
             if task.do == "verify":
                 done = _verify(store, capture, task, warnings)
             else:
@@ -112,7 +112,7 @@ def _check_version(version: str) -> None:
 
 
 def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> TaskResult:
-    found = reconstruct(
+    result = reconstruct(
         store,
         capture,
         model=task.model,
@@ -121,15 +121,15 @@ def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings:
         accept_rejected=task.accept_rejected,
         warn=warnings.append,
     )
-    name = f"{capture}_{found.cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
-    found.ply.rename(made / name)
-    sigma = float(np.median(found.cloud.sigma_z[found.cloud.mask]))
-    return TaskResult("", "", {"points": found.points, "noise mm": sigma, "file": name})
+    name = f"{capture}_{result.cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
+    result.ply.rename(made / name)
+    sigma = float(np.median(result.cloud.sigma_z[result.cloud.mask]))
+    return TaskResult("", "", {"points": result.points, "noise mm": sigma, "file": name})
 
 
 def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> TaskResult:
     assert task.shape is not None
-    found = verify(
+    verification = verify(
         store,
         (capture,),
         task.shape,
@@ -138,13 +138,13 @@ def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> Ta
         accept_rejected=task.accept_rejected,
         warn=warnings.append,
     )
-    (comparison,) = found.captures.values()
+    (comparison,) = verification.captures.values()
     figures = {f"{model} RMS mm": result.rms_mm for model, result in comparison.results.items()}
-    return TaskResult("", "", figures, verification=_without_maps(found))
+    return TaskResult("", "", figures, verification=_without_maps(verification))
 
 
-def _without_maps(found: Verification) -> Verification:
-    """All that its JSON is made of, without what has as many values as the camera has pixels."""
+def _without_maps(verification: Verification) -> Verification:
+    """A copy with the figures that its JSON needs, without the arrays of one value per pixel."""
     none = np.zeros((0, 0), bool)
     captures = {
         name: replace(
@@ -156,6 +156,6 @@ def _without_maps(found: Verification) -> Verification:
                 for model, result in comparison.results.items()
             },
         )
-        for name, comparison in found.captures.items()
+        for name, comparison in verification.captures.items()
     }
-    return replace(found, captures=captures)
+    return replace(verification, captures=captures)

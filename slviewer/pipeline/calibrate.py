@@ -14,10 +14,23 @@ from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.calibration_verdict import attempt, attempt_poses, keep_rejected, rejected, save_verdict
+from slviewer.pipeline.calibration_verdict import (
+    calibrate_poses_with_evidence,
+    calibrate_with_evidence,
+    rejection_error,
+    save_rejected,
+    save_verdict,
+)
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
-from slviewer.pipeline.models import ModelName, available, preferred, save_fitted, save_stereo, warn_if_frame_changed
+from slviewer.pipeline.models import (
+    ModelName,
+    available_models,
+    preferred_model,
+    save_fitted,
+    save_stereo,
+    warn_if_frame_changed,
+)
 from slviewer.pipeline.open_session import SessionLike, match_names, opened, opened_or_made
 from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.session.store import Session
@@ -31,7 +44,7 @@ Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], M]
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """What ``calibrate`` found."""
+    """The models that ``calibrate`` fitted, and its verdict. A model that was not fitted is None."""
 
     stereo: StereoModel
     pixelwise: PixelwiseModel | None
@@ -80,7 +93,7 @@ class CalibrationResult:
         near, far = s.depth_range_mm or (np.nan, np.nan)
         lines = [
             f"poses: {len(s.poses)} of {total} used, boards at {near:.0f}-{far:.0f} mm",
-            *(f"  left out: {name}: {why}" for name, why in s.excluded.items()),
+            *(f"  excluded: {name}: {why}" for name, why in s.excluded.items()),
             f"stereo: reprojection RMS camera {rms['camera']:.3f} px, projector {rms['projector']:.3f} px, "
             f"stereo {rms['stereo']:.3f} px",
             f"  camera focal length {fc[0, 0]:.1f}, {fc[1, 1]:.1f} px (+- {sigma['camera']:.1f}); "
@@ -88,7 +101,7 @@ class CalibrationResult:
             f"baseline {s.baseline_mm:.2f} mm",
         ]
         if s.features_excluded:
-            lines.append(f"  {s.features_excluded} features set aside beyond 6 robust sigma")
+            lines.append(f"  {s.features_excluded} features excluded beyond 6 robust sigma")
         if self.pixelwise is not None:
             for axis in self.pixelwise.axes:
                 fit = self.pixelwise.fits[axis]
@@ -140,32 +153,32 @@ def calibrate(
     step_2 = Smoothing(smoothing, degree)
     with opened(session, write=True) as store:
         excluded = store.excluded()
-        before = preferred(store) if available(store) else ""
+        before = preferred_model(store) if available_models(store) else ""
         names = store.capture_names("calibration")
         if not names:
             raise InputError(
                 f"{store.folder} holds no target poses: import some with --role calibration, or capture them first"
             )
-        left_out = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
-        left_out |= _reasons_to_exclude(names, poses, exclude)
-        names = [name for name in names if name not in left_out]
+        excluded_poses = {name: f"excluded by the operator: {why}" for name, why in excluded.items() if name in names}
+        excluded_poses |= _reasons_to_exclude(names, poses, exclude)
+        names = [name for name in names if name not in excluded_poses]
         if not names:
             raise InputError("every target pose is excluded: include some again")
-        found = attempt(store, names, board, step_2, left_out, part(progress, 0, 0.65))
-        if found.stereo is None:
-            save_verdict(store, found.verdict, names)
-            raise rejected(found.verdict, kept=False)
-        stereo = found.stereo
+        diagnosed = calibrate_with_evidence(store, names, board, step_2, excluded_poses, part(progress, 0, 0.65))
+        if diagnosed.stereo is None:
+            save_verdict(store, diagnosed.verdict, names)
+            raise rejection_error(diagnosed.verdict, is_saved=False)
+        stereo = diagnosed.stereo
         settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
-        if found.verdict.level == "rejected":
-            keep_rejected(store, stereo, settings, found.verdict)
-            save_verdict(store, found.verdict, names)
-            raise rejected(found.verdict, kept=True)
-        result = _fit_models(found, models, part(progress, 0.66, 0.97), warn, left_out)
+        if diagnosed.verdict.level == "rejected":
+            save_rejected(store, stereo, settings, diagnosed.verdict)
+            save_verdict(store, diagnosed.verdict, names)
+            raise rejection_error(diagnosed.verdict, is_saved=True)
+        result = _fit_models(diagnosed, models, part(progress, 0.66, 0.97), warn, excluded_poses)
         if result.verdict.level == "rejected":
-            keep_rejected(store, stereo, settings, result.verdict)
+            save_rejected(store, stereo, settings, result.verdict)
             save_verdict(store, result.verdict, names)
-            raise rejected(result.verdict, kept=True)
+            raise rejection_error(result.verdict, is_saved=True)
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
         _save_models(store, result, inputs, settings)
@@ -202,12 +215,12 @@ def calibrate_frames(
             texture = texture_8bit(sequence, frames)
             yield read_pose(name, sequence, frames, phases, texture, board, step_2, examine=True)
 
-    found = attempt_poses(read(), len(poses), sequence, board, {}, part(progress, 0, 0.65))
-    if found.stereo is None or found.verdict.level == "rejected":
-        raise rejected(found.verdict, kept=False)
-    result = _fit_models(found, models or DEFAULT_MODELS, part(progress, 0.66, 1.0), warn)
+    diagnosed = calibrate_poses_with_evidence(read(), len(poses), sequence, board, {}, part(progress, 0, 0.65))
+    if diagnosed.stereo is None or diagnosed.verdict.level == "rejected":
+        raise rejection_error(diagnosed.verdict, is_saved=False)
+    result = _fit_models(diagnosed, models or DEFAULT_MODELS, part(progress, 0.66, 1.0), warn)
     if result.verdict.level == "rejected":
-        raise rejected(result.verdict, kept=False)
+        raise rejection_error(result.verdict, is_saved=False)
     return result
 
 
@@ -215,7 +228,7 @@ def save_calibration(session: SessionLike, result: CalibrationResult) -> None:
     """Save the models of ``result`` in a session, which is created where there is none; those that it held before are
     moved to its trash."""
     with opened_or_made(session) as store:
-        for name in available(store):
+        for name in available_models(store):
             store.trash_result(f"calibration/{name}")
         _save_models(store, result, {}, {})
 
@@ -230,26 +243,30 @@ def _save_models(
 
 
 def _fit_models(
-    found: DiagnosedCalibration, models: Sequence[str], progress: Progress, warn: Warn, excluded: Container[str] = ()
+    diagnosed: DiagnosedCalibration,
+    models: Sequence[str],
+    progress: Progress,
+    warn: Warn,
+    excluded: Container[str] = (),
 ) -> CalibrationResult:
     """The models that follow from a stereo calibration that was not rejected, with the verdict on all of them.
 
-    Warns of poses that were left out, but for those ``excluded`` before, and of what is doubtful.
+    Warns of poses that were excluded, but for those ``excluded`` before, and of what is doubtful.
     """
-    stereo = found.stereo
+    stereo = diagnosed.stereo
     assert stereo is not None
-    if found.warning:
-        warn(found.warning)
+    if diagnosed.warning:
+        warn(diagnosed.warning)
     for name, why in stereo.excluded.items():
         if name not in excluded:
-            warn(f"{name} is left out: {why}")
-    for finding in found.verdict.findings:
+            warn(f"{name} is excluded: {why}")
+    for finding in diagnosed.verdict.findings:
         if finding.severity == "doubtful":
             warn(finding.text())
-    result = _fit(models, stereo, found.observations, progress, warn)
-    verdict = judge_splined(found.verdict, result.splined.bundle.noise) if result.splined else found.verdict
+    result = _fit_after_stereo(models, stereo, diagnosed.observations, progress, warn)
+    verdict = judge_splined(diagnosed.verdict, result.splined.bundle.noise) if result.splined else diagnosed.verdict
     for finding in verdict.findings:
-        if finding not in found.verdict.findings:
+        if finding not in diagnosed.verdict.findings:
             warn(finding.text())
     return replace(result, verdict=verdict)
 
@@ -264,16 +281,16 @@ def _reasons_to_exclude(names: Sequence[str], poses: Sequence[str], exclude: Seq
     return out | dict.fromkeys(match_names(names, exclude, "target pose"), "excluded for this calibration")
 
 
-def _fit(
+def _fit_after_stereo(
     models: Sequence[str], stereo: StereoModel, observations: Sequence[Observation], progress: Progress, warn: Warn
 ) -> CalibrationResult:
     """The models that follow from stereo; one that cannot be fitted is a warning, and stops no other."""
 
-    def fit(name: str, calibrate_model: Fit[M], begin: float, end: float, doing: str) -> M | None:
+    def fit(name: str, calibrate_model: Fit[M], start: float, end: float, doing: str) -> M | None:
         if name not in models:
             return None
         try:
-            return calibrate_model(observations, stereo, stage(progress, begin, end, doing))
+            return calibrate_model(observations, stereo, stage(progress, start, end, doing))
         except (CalibrationRejected, InputError) as error:
             if len(models) == 1:
                 raise

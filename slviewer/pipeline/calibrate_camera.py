@@ -35,7 +35,7 @@ def calibrate_camera_alone(
     the board is not detected are excluded with the reason. Raises CalibrationRejected for fewer than three.
     """
     board, source = Board.parse(target), Path(source)
-    names = _names(source)
+    names = _list_pictures(source)
     without = match_names(names, exclude, "picture")
     chosen = [name for name in (match_names(names, poses, "picture") if poses else names) if name not in without]
     detections: dict[str, Detection] = {}
@@ -43,7 +43,7 @@ def calibrate_camera_alone(
     size: tuple[int, int] | None = None
     for i, name in enumerate(chosen):
         progress(i / len(chosen), f"detecting the board in {name}")
-        image = _picture(source, name)
+        image = _read_picture(source, name)
         height, width = image.shape[:2]
         if size is not None and size != (width, height):
             raise InputError(f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}: use pictures of one size")
@@ -55,14 +55,14 @@ def calibrate_camera_alone(
             warn(f"{name} is excluded: {error}")
     if size is None:
         raise InputError(f"{source} holds no picture to calibrate from: name some")
-    found = calibrate_camera(board, detections, size, excluded)
+    calibration = calibrate_camera(board, detections, size, excluded)
     if out is not None:
-        write_calibration(Path(out), _entries(found), _MEANINGS)
+        write_calibration(Path(out), _file_entries(calibration), _MEANINGS)
     progress(1.0, "calibrated")
-    return found
+    return calibration
 
 
-def _names(source: Path) -> list[str]:
+def _list_pictures(source: Path) -> list[str]:
     if is_session(source):
         with Session.open(source) as store:
             return store.capture_names("calibration")
@@ -71,7 +71,7 @@ def _names(source: Path) -> list[str]:
     return [path.name for path in images_by_name(source)]
 
 
-def _picture(source: Path, name: str) -> np.ndarray:
+def _read_picture(source: Path, name: str) -> np.ndarray:
     if is_session(source):
         with Session.open(source) as store:
             capture = store.load_capture(name)
@@ -88,14 +88,14 @@ _MEANINGS = {
 }
 
 
-def _entries(found: CameraCalibration) -> Mapping[str, object]:
+def _file_entries(calibration: CameraCalibration) -> Mapping[str, object]:
     return {
         "program": f"slviewer {__version__}",
-        "target": found.board,
-        "camera_size": np.array(found.lens.size),
-        "K_camera": found.lens.K,
-        "D_camera": found.lens.D,
-        "focal_sigma_px": np.array(found.focal_sigma_px),
-        "reprojection_rms_px_camera": found.rms_px,
-        "verdict": found.verdict.level,
+        "target": calibration.board,
+        "camera_size": np.array(calibration.lens.size),
+        "K_camera": calibration.lens.K,
+        "D_camera": calibration.lens.D,
+        "focal_sigma_px": np.array(calibration.focal_sigma_px),
+        "reprojection_rms_px_camera": calibration.rms_px,
+        "verdict": calibration.verdict.level,
     }

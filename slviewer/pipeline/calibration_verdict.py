@@ -1,4 +1,4 @@
-"""The verdict on a session's calibration: made with it, kept beside it, and asked before it is used."""
+"""The verdict on a session's calibration: made and stored with it, and checked before it is used."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -14,44 +14,42 @@ from slviewer.errors import CalibrationRejected, InputError
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
-from slviewer.pipeline.models import VERDICT, available, save_stereo
-from slviewer.pipeline.poses import Judged, judge_all
+from slviewer.pipeline.models import VERDICT, available_models, save_stereo
+from slviewer.pipeline.poses import Judged, read_stored_poses
 from slviewer.records import from_plain
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
 
-def attempt(
+def calibrate_with_evidence(
     store: Session,
     names: Sequence[str],
     board: Board,
     smoothing: Smoothing,
-    left_out: Mapping[str, str],
+    excluded: Mapping[str, str],
     progress: Progress,
 ) -> DiagnosedCalibration:
-    """Read and examine the target poses, calibrate stereo from them, and judge it. ``left_out``: poses that the
-    operator excluded.
-    """
+    """Read and examine the target poses, calibrate stereo from them, and judge it. ``excluded``: {pose: why}."""
     sequence = store.load_capture(names[0]).sequence
-    poses = judge_all(store, names, board, smoothing, examine=True)
-    return attempt_poses(poses, len(names), sequence, board, left_out, progress)
+    poses = read_stored_poses(store, names, board, smoothing, examine=True)
+    return calibrate_poses_with_evidence(poses, len(names), sequence, board, excluded, progress)
 
 
-def attempt_poses(
+def calibrate_poses_with_evidence(
     poses: Iterable[Judged],
     count: int,
     sequence: PatternSequence,
     board: Board,
-    left_out: Mapping[str, str],
+    excluded: Mapping[str, str],
     progress: Progress,
 ) -> DiagnosedCalibration:
-    """Calibrate stereo from ``count`` target poses as they are read, and judge it; ``left_out`` as in ``attempt``."""
-    if contradiction := contradicting(sequence):
+    """Calibrate stereo from ``count`` target poses as they are read, and judge it. ``excluded``: {pose: why}."""
+    if contradiction := describe_period_conflict(sequence):
         evidence = Evidence(str(board), sequence.projector, (), contradiction=contradiction)
-        return DiagnosedCalibration(judge_evidence(evidence), evidence, None, (), dict(left_out))
+        return DiagnosedCalibration(judge_evidence(evidence), evidence, None, (), dict(excluded))
     observations: list[Observation] = []
     evidence_of_poses = []
-    refused = dict(left_out)
+    refused = dict(excluded)
     for i, pose in enumerate(poses, 1):
         progress(i / count, f"read {pose.name}")
         if pose.observation is None:
@@ -66,8 +64,8 @@ def attempt_poses(
     return replace(result, stereo=replace(result.stereo, excluded=result.excluded))
 
 
-def contradicting(sequence: PatternSequence) -> str:
-    """Why fringes and Gray code of a sequence cannot belong together; empty where they can."""
+def describe_period_conflict(sequence: PatternSequence) -> str:
+    """Why the fringe periods and the Gray code of a sequence cannot be combined; empty where they can."""
     for axis in sequence.axes:
         if sequence.periods_px(axis) and sequence.find("gray", axis):
             try:
@@ -77,28 +75,28 @@ def contradicting(sequence: PatternSequence) -> str:
     return ""
 
 
-def keep_rejected(store: Session, stereo: StereoModel, settings: Mapping[str, Any], verdict: Verdict) -> None:
-    """Make a rejected calibration the session's own, to look into; models of before, of other poses, are trashed."""
-    for name in available(store):
+def save_rejected(store: Session, stereo: StereoModel, settings: Mapping[str, Any], verdict: Verdict) -> None:
+    """Save a rejected calibration for inspection; the models of earlier poses are moved to the trash."""
+    for name in available_models(store):
         store.trash_result(f"calibration/{name}")
     save_stereo(store, stereo, store.input_hashes(*stereo.poses), settings, verdict)
 
 
 def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None:
-    """Keep what was said of an attempt to calibrate from these poses, whether or not anything came of it."""
+    """Save the verdict on an attempt to calibrate from these poses, whether or not it succeeded."""
     store.save_result(VERDICT, {"verdict": verdict.to_json(), "inputs": store.input_hashes(*poses)}, {})
 
 
-def last_verdict(store: Session) -> Verdict | None:
-    """What was said of the last calibration that was tried, also if none came of it; None where nothing was."""
+def load_last_verdict(store: Session) -> Verdict | None:
+    """The verdict on the last attempt to calibrate, also a failed one; None before the first."""
     if not store.has_result(VERDICT):
         return None
     return from_plain(store.load_result(VERDICT, only=())[0]["verdict"], Verdict)
 
 
-def rejected(verdict: Verdict, kept: bool) -> CalibrationRejected:
-    """The error to raise for a rejected calibration; ``kept``: the session holds it, to look into."""
+def rejection_error(verdict: Verdict, is_saved: bool) -> CalibrationRejected:
+    """The error to raise for a rejected calibration; ``is_saved``: the session holds it for inspection."""
     first, more = verdict.findings[0], len(verdict.findings) - 1
     others = f" (and {more} more finding{'s' * (more != 1)})" if more else ""
-    kept_words = "; the calibration is kept to look into, and not used" if kept else ""
-    return CalibrationRejected(f"{first.text()}{others}{kept_words}")
+    saved_note = "; the calibration is saved for inspection, and not used" if is_saved else ""
+    return CalibrationRejected(f"{first.text()}{others}{saved_note}")

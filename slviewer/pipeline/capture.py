@@ -1,4 +1,4 @@
-"""Captures without a browser: what is shown, what is taken, how it is kept. The wizard keeps its own the same way."""
+"""Captures without a browser: show the patterns, capture the frames, save them, as the wizard does."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -21,8 +21,8 @@ from slviewer.session.names import safe_name
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
-PATTERNS = "complementary"
-"""The sequence where nobody names one: its codes forgive blurred edges, and it is shorter than the Letter's."""
+DEFAULT_PATTERNS = "complementary"
+"""The sequence used by default: its codes forgive blurred edges, and it is shorter than the Letter's."""
 
 
 def capture(
@@ -61,7 +61,7 @@ def capture(
     then.
     """
     if exposure_ms is not None and exposures_ms:
-        raise InputError("one exposure and several were asked for: give either")
+        raise InputError("both one exposure and several were given: give either")
     exposures = check_exposures(exposures_ms) if exposures_ms else []
     target = None if board is None else Board.parse(board)
     safe_name(name)
@@ -72,11 +72,11 @@ def capture(
         target = target or (Board.parse(known) if (known := store.decision("target")) else None)
         progress(0.0, "opening the devices")
         bench = set_up(choice, target)
-        sequence = sequence_for(bench, patterns or str(store.decision("patterns") or PATTERNS))
-        _check_space(store, bench, len(sequence.frames) * max(1, len(exposures)))
+        sequence = choose_sequence(bench, patterns or str(store.decision("patterns") or DEFAULT_PATTERNS))
+        _check_disk_space(store, bench, len(sequence.frames) * max(1, len(exposures)))
         with bench.rig.opened() as devices:
             set_camera(devices, choice, exposure_ms, gain, warn)
-            taken = take(
+            captured = take(
                 devices,
                 sequence,
                 exposures,
@@ -85,7 +85,9 @@ def capture(
         progress(0.95, "saving")
         purpose = "pose" if role == "calibration" else "scan"
         shown = str(target) if target is not None and role == "calibration" else None
-        saved = keep(store, name, role, sequence, taken, source=devices.name, purpose=purpose, board=shown, force=force)
+        saved = save_frames(
+            store, name, role, sequence, captured, source=devices.name, purpose=purpose, board=shown, force=force
+        )
         try:
             for sentence in save_check(store, name).warnings():
                 warn(f"{name}: {sentence}")
@@ -96,7 +98,7 @@ def capture(
 
 
 def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn) -> None:
-    """Set the open rig's camera to what is asked for, else to what its choice says; `warn` hears what could not be."""
+    """Set the open rig's camera to the requested values, else to those of its choice; warns of those refused."""
     wanted = CameraSettings(exposure_ms or choice.get("exposure_ms"), gain or choice.get("gain"))
     if wanted != CameraSettings():
         rig.camera.apply(wanted)
@@ -104,7 +106,7 @@ def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, g
         warn(note)
 
 
-def sequence_for(bench: RigSetup, patterns: str) -> PatternSequence:
+def choose_sequence(bench: RigSetup, patterns: str) -> PatternSequence:
     """What is shown: the sequence of that name for the rig's projector, or the only one that the rig answers to."""
     if bench.reel is not None:
         return bench.reel.sequence
@@ -113,35 +115,35 @@ def sequence_for(bench: RigSetup, patterns: str) -> PatternSequence:
     return PRESETS[patterns](bench.rig.projector.size)
 
 
-def keep(
+def save_frames(
     store: Session,
     name: str,
     role: Role,
     sequence: PatternSequence,
-    taken: CapturedFrames,
+    captured: CapturedFrames,
     *,
     source: str,
     purpose: str,
     board: str | None = None,
     force: bool = False,
 ) -> Capture:
-    """Save what was taken, with all that is known of it."""
-    exposure = {} if taken.exposures_ms else {"exposure_ms": taken.settings.exposure_ms}
+    """Save captured frames with their sequence, settings and texture; returns the stored capture."""
+    exposure = {} if captured.exposures_ms else {"exposure_ms": captured.settings.exposure_ms}
     return store.save_capture(
         name,
         role,
         sequence,
-        taken.frames,
+        captured.frames,
         source=source,
-        texture=taken.texture,
-        settings={"purpose": purpose, **exposure, "gain": taken.settings.gain},
+        texture=captured.texture,
+        settings={"purpose": purpose, **exposure, "gain": captured.settings.gain},
         board=board,
-        exposures_ms=taken.exposures_ms,
+        exposures_ms=captured.exposures_ms,
         force=force,
     )
 
 
-def _check_space(store: Session, bench: RigSetup, frames: int) -> None:
+def _check_disk_space(store: Session, bench: RigSetup, frames: int) -> None:
     """Raise SessionError before anything is captured that the disk would refuse."""
     (width, height), dtype = bench.rig.camera.size, bench.rig.camera.dtype
     needed, free = frames * width * height * dtype.itemsize, shutil.disk_usage(store.folder).free

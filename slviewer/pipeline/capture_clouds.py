@@ -13,7 +13,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import Model, load_stereo
-from slviewer.pipeline.scale import scale_factor, scaled
+from slviewer.pipeline.scale import scale_cloud, scale_factor
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import reconstruct
@@ -45,7 +45,7 @@ def capture_cloud(
 
     Raises InputError where capture and calibration do not belong together: by their sizes, or by how far the axes of
     the capture miss each other, which is a warning if ``accept_rejected``. Where they miss each other by more than
-    noise explains, the cloud's sigmas are raised by that factor, and ``warn`` says so.
+    noise explains, the cloud's sigmas are raised by that factor, with a warning.
     """
     stereo = load_stereo(store)
     check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
@@ -53,7 +53,7 @@ def capture_cloud(
     check = check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
     for message in check.warnings:
         warn(message)
-    cloud = scaled(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
+    cloud = scale_cloud(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
     return raise_uncertainty(cloud, check.sigma_factor, check.excess_px, phases)
 
 
@@ -65,7 +65,7 @@ def absolute_phases(
     warn: Warn = ignore_warnings,
 ) -> dict[Axis, PhaseMap]:
     """A capture's phases, those that repeat made absolute by the depths (near, far) mm between which the scene lies; by
-    default the calibrated ones. An axis that more than one depth fits is left to the other axis, with a warning.
+    default the calibrated ones. An axis that more than one depth fits is solved by the other axis, with a warning.
 
     Raises InputError where no axis is unique in the range, and where no range is known.
     """
@@ -112,7 +112,7 @@ def raise_uncertainty(
     phases: Mapping[Axis, PhaseMap] | None = None,
 ) -> Cloud:
     """The cloud with sigmas larger by a factor, and, by tiles of the image, by an error of the projector's coordinate
-    in px beside the noise of the ``phases``."""
+    in px in addition to the noise of the ``phases``."""
     if excess_px is not None and phases is not None:
         phase = phases[cloud.axis]
         noise_px = phase.sigma_px
@@ -122,5 +122,5 @@ def raise_uncertainty(
         return replace(cloud, sigma_edges=error if known is None else np.hypot(known, error))
     if factor == 1.0:
         return cloud
-    left = None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor)
-    return replace(cloud, sigma_z=cloud.sigma_z * np.float32(factor), sigma_calibration=left)
+    sigma_calibration = None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor)
+    return replace(cloud, sigma_z=cloud.sigma_z * np.float32(factor), sigma_calibration=sigma_calibration)

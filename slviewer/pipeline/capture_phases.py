@@ -93,8 +93,8 @@ def check_capture(
             )
             shares = [np.mean(phase.reason[phase.illuminated] == reason) for reason in _REASONS]
             worst = int(np.argmax(shares))
-            seen, cure = list(_REASONS.values())[worst]
-            raise InputError(f"{name}: {share} along {axis}; {100 * shares[worst]:.0f} % of them {seen}: {cure}")
+            symptom, cure = list(_REASONS.values())[worst]
+            raise InputError(f"{name}: {share} along {axis}; {100 * shares[worst]:.0f} % of them {symptom}: {cure}")
         if unexplained := estimate_frame_light(sequence, frames).unexplained:
             raise InputError(
                 f"{name}: no pixel carries a readable {axis} pattern: {describe_disturbance(unexplained)[1]}"
@@ -160,15 +160,15 @@ def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
     choice = capture.exposure_choice
     if colour is None and choice is not None:
         return toned(radiance(image, choice, capture.exposures_ms))
-    return eight_bit(image)
+    return convert_to_8bit(image)
 
 
 def texture_8bit(sequence: PatternSequence, frames: np.ndarray) -> np.ndarray:
     """(h, w) uint8: the scene under white light, from the frames (n, h, w) of a sequence."""
-    return eight_bit(texture(sequence, frames))
+    return convert_to_8bit(texture(sequence, frames))
 
 
-def eight_bit(image: np.ndarray) -> np.ndarray:
+def convert_to_8bit(image: np.ndarray) -> np.ndarray:
     """The image in uint8, its brightest pixel 255 where it has 16 bits."""
     if image.dtype == np.uint16:
         image = cv2.convertScaleAbs(image, alpha=255.0 / max(int(image.max()), 1))

@@ -25,8 +25,8 @@ REFERENCE = "drift_reference"
 
 
 @dataclass(frozen=True)
-class Checked:
-    """One answer of the drift check: ``time`` is ISO 8601, UTC; ``calibration`` the hash of what was checked."""
+class DriftRecord:
+    """One result of the drift check: ``time`` is ISO 8601, UTC; ``calibration`` the hash of what was checked."""
 
     time: str
     calibration: str
@@ -39,18 +39,18 @@ class Checked:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What ``check`` found, and what was found before of the same calibration, the oldest first."""
+    """The ``latest`` drift check, and those ``before`` of the same calibration, the oldest first."""
 
-    found: Checked
-    before: tuple[Checked, ...]
+    latest: DriftRecord
+    before: tuple[DriftRecord, ...]
 
     @property
     def drift(self) -> Drift:
-        return self.found.drift
+        return self.latest.drift
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``check --json``."""
-        return self.found.to_json() | {"before": [checked.to_json() for checked in self.before]}
+        return self.latest.to_json() | {"before": [checked.to_json() for checked in self.before]}
 
     def text(self) -> str:
         """For people: the answer, then the history."""
@@ -61,7 +61,7 @@ class CheckResult:
         return "\n".join(lines)
 
 
-def describe_check(checked: Checked) -> str:
+def describe_check(checked: DriftRecord) -> str:
     """One line of the history."""
     d = checked.drift
     across = "" if d.across_px is None else f", {d.across_px:+.4f} px off its epipolar lines"
@@ -74,21 +74,21 @@ def describe_check(checked: Checked) -> str:
 def check(
     session: SessionLike, capture: str, *, progress: Progress = ignore_progress, warn: Warn = ignore_warnings
 ) -> CheckResult:
-    """Say from one capture of the board whether the saved calibration is still good, and why if it is not.
+    """Determine from one capture of the board whether the saved calibration is still good, and why if it is not.
 
     Args:
         session: Session folder.
         capture: Name of a capture, of any role, that shows the calibration's board.
 
     The session stores the answer as ``drift/1``, ``drift/2``, ... Raises DetectionError where the capture does not show
-    the board, InputError where the calibration has too few poses to tell, or was made elsewhere.
+    the board, InputError where the calibration has too few poses for a decision, or was made elsewhere.
     """
     with opened(session, write=True) as store:
         stereo = load_stereo(store)
         if not stereo.poses:
             raise InputError(
                 f"the calibration of {store.folder} was made elsewhere and has no poses: a drift check needs them "
-                "to know how well one board tells where the projector stands; run `slviewer calibrate` first"
+                "to know how well one board determines the projector's pose; run `slviewer calibrate` first"
             )
         warn_if_stale(store, warn)
         shot = store.load_capture(capture)
@@ -98,21 +98,23 @@ def check(
         check_capture(capture, shot.sequence, frames, phases)
         check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
         board = Board.parse(stereo.board)
-        observation = observe(capture, board, detect(board, capture_texture(shot, frames)), phases, _smoothing(store))
-        progress(0.3, "what the calibration's own poses say")
-        drift = check_drift(_reference(store, stereo, capture), DriftView.from_observation(observation))
+        observation = observe(
+            capture, board, detect(board, capture_texture(shot, frames)), phases, _calibration_smoothing(store)
+        )
+        progress(0.3, "fitting the calibration's own poses")
+        drift = check_drift(_drift_reference(store, stereo, capture), DriftView.from_observation(observation))
         progress(0.95, "saving")
         calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
-        before = tuple(checked for checked in history(store) if checked.calibration == calibration)
-        found = Checked(datetime.now(UTC).isoformat(timespec="seconds"), calibration, drift)
+        before = tuple(checked for checked in load_drift_history(store) if checked.calibration == calibration)
+        latest = DriftRecord(datetime.now(UTC).isoformat(timespec="seconds"), calibration, drift)
         inputs = store.input_hashes(capture, "calibration/stereo")
-        store.save_result(f"drift/{next_number(store, 'drift')}", {"checked": found.to_json(), "inputs": inputs}, {})
+        store.save_result(f"drift/{next_number(store, 'drift')}", {"checked": latest.to_json(), "inputs": inputs}, {})
         progress(1.0, "checked")
-    return CheckResult(found, before)
+    return CheckResult(latest, before)
 
 
-def _reference(store: Session, stereo: StereoModel, capture: str) -> DriftReference:
-    """What the calibration's poses but for the capture say; kept, for it takes many seconds and does not change."""
+def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> DriftReference:
+    """The drift reference from the calibration's poses except the capture; stored, because it takes many seconds."""
     if store.state_of(REFERENCE) == "fresh" and capture not in stereo.poses:
         return DriftReference.from_arrays(stereo.rig, store.load_result(REFERENCE)[1])
     poses = [name for name in stereo.poses if name != capture]
@@ -123,16 +125,16 @@ def _reference(store: Session, stereo: StereoModel, capture: str) -> DriftRefere
     return reference
 
 
-def history(store: Session) -> tuple[Checked, ...]:
+def load_drift_history(store: Session) -> tuple[DriftRecord, ...]:
     """Every drift check that the session remembers, the oldest first."""
-    found = []
+    records = []
     for name in numbered_results(store, "drift"):
         values = store.load_result(name, only=())[0]["checked"]
-        found.append(Checked(values["time"], values["calibration"], from_plain(values, Drift)))
-    return tuple(found)
+        records.append(DriftRecord(values["time"], values["calibration"], from_plain(values, Drift)))
+    return tuple(records)
 
 
-def _smoothing(store: Session) -> Smoothing:
+def _calibration_smoothing(store: Session) -> Smoothing:
     """The smoothing of the calibration's own poses."""
     settings = store.load_result("calibration/stereo", only=())[0]["settings"]
     return Smoothing(settings["smoothing"], settings["degree"])

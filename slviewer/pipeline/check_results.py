@@ -1,4 +1,4 @@
-"""What the checks of a rig or of a capture say."""
+"""Results of the checks of a rig or of a capture."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -11,8 +11,8 @@ _WORST_FIRST: tuple[CheckVerdict, ...] = ("bad", "warning", "good")
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at: what was found, in a sentence; what to do about it, empty where nothing is to do;
-    and the figures behind it, whose names say their units.
+    """The result of one check: the finding in a ``sentence``; the ``remedy``, empty where none is needed; and the
+    ``figures`` that it is based on, whose names contain their units.
     """
 
     name: str
@@ -40,8 +40,8 @@ class Preflight:
     @property
     def verdict(self) -> CheckVerdict:
         """The worst of all checks; what is unknown does not make a good rig worse."""
-        found = {check.verdict for check in self.checks}
-        return next((verdict for verdict in _WORST_FIRST if verdict in found), "unknown")
+        verdicts = {check.verdict for check in self.checks}
+        return next((verdict for verdict in _WORST_FIRST if verdict in verdicts), "unknown")
 
     def check(self, name: str) -> Check:
         """The check called `name`. Raises KeyError."""
@@ -66,7 +66,7 @@ class Preflight:
             if check.remedy:
                 lines.append(f"         -> {check.remedy}")
         if self.settle_ms is not None:
-            lines.append(f"settle_ms = {self.settle_ms:g} is what the rig's file should say")
+            lines.append(f"settle_ms = {self.settle_ms:g} is the value to set in the rig's file")
         if self.exposure_ms is not None:
             lines.append(f"exposure_ms = {self.exposure_ms:g} would be better")
         return "\n".join([*lines, f"{self.verdict} after {self.seconds:.1f} s"])

@@ -1,4 +1,4 @@
-"""A scan against a nominal model: aligned, compared, judged, written and kept."""
+"""A scan against a nominal model: aligned, compared, judged, written and saved."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +13,8 @@ from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import DECIDED, RULE, ToleranceVerdict, judge_deviation
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
-from slviewer.pipeline.measured_surface import MeasuredSurface, surface
-from slviewer.pipeline.measurements import triangles_of
+from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
+from slviewer.pipeline.measurements import triangulate_surface
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.records import to_plain
@@ -23,14 +23,14 @@ from slviewer.session.nominal import Nominal, Units, check_size, read_nominal
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 
-MOST_KEPT = 120_000
+MAX_STORED_POINTS = 120_000
 """Points that a session keeps of a deviation, for pictures of it; the figures are of all."""
 LIKELY_COVERAGE = 0.05
 SCALARS = "deviation"
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
+class NominalComparison:
     """A scan against a nominal model: the ``found`` deviation, the ``verdict`` where a tolerance was given, the noise
     that the scan alone has along the nominal's normals (RMS, ``noise_mm``), and where it went: ``ply``, and the
     ``measurement`` that the session keeps."""
@@ -68,11 +68,11 @@ class Compared:
         numbers = self.found.statistics()
         lines = [f"{self.scan} by {self.model} against {self.nominal.text()}"]
         lines += [f"{self.nominal.name}: {note}" for note in self.nominal.notes]
-        lines.append(render(_rows(numbers, self.noise_mm)))
+        lines.append(render(_figure_rows(numbers, self.noise_mm)))
         share = 100 * numbers["left_out"] / (numbers["points"] + numbers["left_out"])
         lines.append(
             f"{numbers['points']:,} points; {numbers['left_out']:,} ({share:.1f} %) lie farther than "
-            f"{self.found.reach_mm:.3g} mm from the nominal or face another way, and are left out"
+            f"{self.found.reach_mm:.3g} mm from the nominal or face another way, and are excluded"
         )
         lines.append(
             f"{100 * self.found.coverage:.1f} % of the nominal's area was measured; the best fit adds "
@@ -109,7 +109,7 @@ def compare(
     accept_rejected: bool = False,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
-) -> Compared:
+) -> NominalComparison:
     """Compare a scan with a nominal model after best-fit alignment: figures, coloured points, pictures in the report.
 
     Args:
@@ -131,7 +131,7 @@ def compare(
     ideal = read_nominal(nominal, units)  # a wrong file is refused before minutes of work
     with opened(session, write=True) as store:
         reading = part(progress, 0.0, 0.4)
-        on = surface(store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn)
+        on = load_surface(store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn)
         default = store.exports / f"{_safe_name(scan)}_{_safe_name(Path(ideal.name).stem)}_deviation.ply"
         return compare_surface(
             store,
@@ -158,7 +158,7 @@ def compare_surface(
     name: str = "",
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
-) -> Compared:
+) -> NominalComparison:
     """As ``compare``, of a surface that is there already, in a session open for writing. ``initial`` (4, 4), scan to
     nominal, replaces the search for a start; without ``out`` no file is written."""
     measured = on.measured
@@ -167,7 +167,7 @@ def compare_surface(
     normals = None if on.normals is None else on.normals[measured]
     sigma = on.sigma_mm[measured]
     typical = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None
-    found = deviation(
+    result = deviation(
         points,
         nominal.mesh,
         normals=normals,
@@ -176,25 +176,25 @@ def compare_surface(
         initial=initial,
         progress=stage(progress, 0.0, 0.85, "aligning"),
     )
-    if found.coverage < LIKELY_COVERAGE:
-        warn(f"only {100 * found.coverage:.1f} % of {nominal.name} were measured: see that it is the same part")
-    towards = np.nan_to_num(found.normals.astype(np.float64))
+    if result.coverage < LIKELY_COVERAGE:
+        warn(f"only {100 * result.coverage:.1f} % of {nominal.name} were measured: see that it is the same part")
+    towards = np.nan_to_num(result.normals.astype(np.float64))
     along = on.sigma_along(towards)
-    kept = found.counted
-    noise = float(np.sqrt(np.nanmean(along[kept] ** 2))) if np.isfinite(along[kept]).any() else float("nan")
-    verdict = None if tolerance is None else judge_deviation(found, on.sigma_along(towards, whole=True), tolerance)
+    counted = result.counted
+    noise = float(np.sqrt(np.nanmean(along[counted] ** 2))) if np.isfinite(along[counted]).any() else float("nan")
+    verdict = None if tolerance is None else judge_deviation(result, on.sigma_along(towards, whole=True), tolerance)
     progress(0.9, "writing")
     ply = None
     if out is not None:
         ply = Path(out)
         ply.parent.mkdir(parents=True, exist_ok=True)
-        _write(ply, on, found, nominal, tolerance)
-    measurement = _save(store, on, nominal, found, verdict, noise, points, name)
+        _write_points(ply, on, result, nominal, tolerance)
+    measurement = _save_comparison(store, on, nominal, result, verdict, noise, points, name)
     progress(1.0, "compared")
-    return Compared(on.source, on.model, nominal, found, verdict, noise, ply, measurement)
+    return NominalComparison(on.source, on.model, nominal, result, verdict, noise, ply, measurement)
 
 
-def _rows(numbers: dict[str, float], noise: float) -> list[Row]:
+def _figure_rows(numbers: dict[str, float], noise: float) -> list[Row]:
     """The table of figures, mm."""
     return [
         {"deviation, mm": words, "value": f"{value:+.4f}" if signed else f"{value:.4f}"}
@@ -211,65 +211,65 @@ def _rows(numbers: dict[str, float], noise: float) -> list[Row]:
     ]
 
 
-def _write(ply: Path, on: MeasuredSurface, found: Deviation, nominal: Nominal, tolerance: float | None) -> None:
+def _write_points(ply: Path, on: MeasuredSurface, result: Deviation, nominal: Nominal, tolerance: float | None) -> None:
     """The points that belong to the nominal, with their deviation as a scalar and as colours, and the triangles between
     them where there are any."""
-    kept = found.counted
-    signed = found.signed[kept]
+    counted = result.counted
+    signed = result.signed[counted]
     limit = colour_limit(signed, tolerance)
     faces = None
     if on.organised or on.faces is not None:
-        _, every = triangles_of(on)
-        number = np.cumsum(kept) - 1
-        faces = number[every[kept[every].all(axis=1)]]
+        _, every = triangulate_surface(on)
+        number = np.cumsum(counted) - 1
+        faces = number[every[counted[every].all(axis=1)]]
     write_ply(
         ply,
-        on.points[on.measured][kept],
+        on.points[on.measured][counted],
         colours=deviation_colours(signed, limit),
-        normals=None if on.normals is None else on.normals[on.measured][kept],
+        normals=None if on.normals is None else on.normals[on.measured][counted],
         scalars={SCALARS: signed},
         faces=faces,
         notes=[f"{on.source} against {nominal.name}", f"colours from {-limit:.4g} to {limit:.4g} mm"],
     )
 
 
-def _save(
+def _save_comparison(
     store: Session,
     on: MeasuredSurface,
     nominal: Nominal,
-    found: Deviation,
+    result: Deviation,
     verdict: ToleranceVerdict | None,
     noise: float,
     points: np.ndarray,
     name: str,
 ) -> Measurement:
-    numbers = found.statistics()
+    numbers = result.statistics()
     quantities = [
         Quantity("mean", numbers["mean"], "mm"),
         Quantity("RMS", numbers["rms"], "mm"),
         Quantity("95 % off by less than", numbers["within_95"], "mm"),
         Quantity("range of 99.7 %, lower end", numbers["p_low"], "mm"),
         Quantity("range of 99.7 %, upper end", numbers["p_high"], "mm"),
-        Quantity("area measured", 100 * found.coverage, "%"),
+        Quantity("area measured", 100 * result.coverage, "%"),
     ]
     if verdict is not None:
         quantities.append(Quantity("within tolerance", verdict.within, "%"))
-    edges, counts = found.histogram()
-    kept = np.flatnonzero(found.counted)
-    some = kept[:: -(-len(kept) // MOST_KEPT)]
+    edges, counts = result.histogram()
+    counted = np.flatnonzero(result.counted)
+    stored = counted[:: -(-len(counted) // MAX_STORED_POINTS)]
     data = {
         "quantities": quantities,
         "scale": on.scale,
         "nominal": {"name": nominal.name, "hash": nominal.hash, "units": nominal.units or "mm"},
         "noise_mm": noise,
         "verdict": verdict,
-        **found.to_json(),
+        **result.to_json(),
     }
     arrays = {
-        "points": points[some].astype(np.float32),
-        "normals": found.normals[some],
-        "signed": found.signed[some],
-        "uncovered": found.uncovered,
+        "points": points[stored].astype(np.float32),
+        "normals": result.normals[stored],
+        "signed": result.signed[stored],
+        "uncovered": result.uncovered,
         "edges": edges,
         "counts": counts,
     }

@@ -69,7 +69,7 @@ class BoardsDetected:
 
     def text(self) -> str:
         """One line for each photograph; for a single one also the table."""
-        lines = [_describe(self.board, image) for image in self.images]
+        lines = [_describe_result(self.board, image) for image in self.images]
         if len(self.images) == 1 and self.detected:
             lines.append(f"{'index':>5} {'x mm':>9} {'y mm':>9} {'u px':>10} {'v px':>10}")
             lines += [f"{index:5d} {x:9.2f} {y:9.2f} {u:10.3f} {v:10.3f}" for _, index, x, y, u, v in self.rows()]
@@ -118,22 +118,22 @@ def detect_board(
     InputError where there is no photograph at all.
     """
     board = Board.parse(target)
-    paths = _photographs([Path(image) for image in images])
+    paths = _list_photographs([Path(image) for image in images])
     results = []
     for path in paths:
         try:
             picture = read_image(path)
-            result = _detect_in(board, path, picture)
+            result = _detect_board_in(board, path, picture)
         except InputError as error:
             results.append(BoardImageResult(path, None, str(error)))
             continue
         results.append(result)
         if out is not None:
             _write_picture(_overlay_path(Path(out), path, len(paths)), draw_detection(board, picture, result.detection))
-    found = BoardsDetected(board, tuple(results))
+    detected = BoardsDetected(board, tuple(results))
     if csv_out is not None:
-        _write_csv(Path(csv_out), found)
-    return found
+        _write_csv(Path(csv_out), detected)
+    return detected
 
 
 def draw_detection(board: Board, image: np.ndarray, detection: Detection | None) -> np.ndarray:
@@ -163,7 +163,7 @@ def draw_detection(board: Board, image: np.ndarray, detection: Detection | None)
     return picture
 
 
-def _photographs(given: list[Path]) -> list[Path]:
+def _list_photographs(given: list[Path]) -> list[Path]:
     paths: list[Path] = []
     for path in given:
         if path.is_dir():
@@ -180,7 +180,7 @@ def _photographs(given: list[Path]) -> list[Path]:
     return paths
 
 
-def _detect_in(board: Board, path: Path, picture: np.ndarray) -> BoardImageResult:
+def _detect_board_in(board: Board, path: Path, picture: np.ndarray) -> BoardImageResult:
     try:
         detection = detect(board, picture[..., ::-1] if picture.ndim == 3 else picture)
     except DetectionError as error:
@@ -189,7 +189,7 @@ def _detect_in(board: Board, path: Path, picture: np.ndarray) -> BoardImageResul
     return BoardImageResult(path, detection, rms_px=float(np.sqrt((residuals**2).sum(1).mean())))
 
 
-def _describe(board: Board, image: BoardImageResult) -> str:
+def _describe_result(board: Board, image: BoardImageResult) -> str:
     if image.detection is None:
         return f"{image.path.name}: not detected: {image.refusal}"
     features = "circles" if board.kind in ("circles", "acircles") else "corners"
@@ -212,9 +212,9 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
     path.write_bytes(data.tobytes())
 
 
-def _write_csv(path: Path, found: BoardsDetected) -> None:
+def _write_csv(path: Path, detected: BoardsDetected) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(COLUMNS)
-        table.writerows((name, index, x, y, f"{u:.4f}", f"{v:.4f}") for name, index, x, y, u, v in found.rows())
+        table.writerows((name, index, x, y, f"{u:.4f}", f"{v:.4f}") for name, index, x, y, u, v in detected.rows())

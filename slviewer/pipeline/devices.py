@@ -25,7 +25,7 @@ class DriverView:
 
 def list_drivers() -> list[DriverView]:
     """All drivers, those that can be used here first."""
-    return [_view(found) for found in available()]
+    return [_view_driver(driver) for driver in available()]
 
 
 def devices() -> str:
@@ -39,12 +39,12 @@ def devices() -> str:
         if driver.trouble:
             lines.append(f"  could not look for what is connected: {driver.trouble}")
         if driver.connected is not None:
-            lines += [f"  connected: {line}" for line in driver.connected] or ["  connected: nothing was found"]
+            lines += [f"  connected: {line}" for line in driver.connected] or ["  connected: no device"]
         blocks.append("\n".join(lines))
     return "\n".join([*blocks, rigs()])
 
 
-def _view(driver: Driver) -> DriverView:
+def _view_driver(driver: Driver) -> DriverView:
     offers = tuple(part for part in ("camera", "projector", "rig") if getattr(driver, part) is not None)
     connected, trouble = None, ""
     if driver.list_connected is not None and not driver.missing:

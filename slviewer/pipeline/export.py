@@ -13,7 +13,7 @@ from slviewer.pipeline.export_documents import (
 )
 from slviewer.pipeline.export_shapes import merge_name, merge_shape, scan_shape
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.models import ModelName, check_accepted, preferred, warn_if_stale
+from slviewer.pipeline.models import ModelName, check_accepted, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
 from slviewer.session.atomic import megabytes
@@ -35,11 +35,11 @@ FORMATS: dict[What, tuple[str, ...]] = {
     "report": ("html",),
     "table": ("csv",),
 }
-"""The first is the one that is written where none is asked for."""
+"""The first is the default."""
 DOCUMENTS = {
     "yml": "OpenCV's YAML in mm and px, explained in comments",
     "xml": "OpenCV's XML in mm and px, explained in comments",
-    "json": "JSON in mm and px, explained beside the numbers",
+    "json": "JSON in mm and px, explained next to the numbers",
     "npz": "NumPy's arrays in mm, px and rad, explained in the one called about",
     "html": "one page that needs nothing else",
     "csv": "for a spreadsheet, in mm",
@@ -58,20 +58,21 @@ class Exported:
 
     def text(self) -> str:
         """For people."""
-        return f"{self.words}\n-> {self.path}, {size(self.bytes)}: {units(self.path.suffix.lower().removeprefix('.'))}"
+        content = describe_format(self.path.suffix.lower().removeprefix("."))
+        return f"{self.words}\n-> {self.path}, {format_bytes(self.bytes)}: {content}"
 
 
-def size(count: int) -> str:
-    """Bytes as people read them."""
+def format_bytes(count: int) -> str:
+    """A number of bytes as text, in MB or kB."""
     return megabytes(count) if count >= 100_000 else f"{count / 1e3:.1f} kB"
 
 
-def units(file_format: str) -> str:
+def describe_format(file_format: str) -> str:
     """What a format holds and in which units, in words."""
     return IN_WORDS.get(file_format) or DOCUMENTS.get(file_format, "")
 
 
-def foreseen_bytes(
+def estimate_file_bytes(
     what: What, file_format: str, points: int, model: str = "", triangles: int | None = None
 ) -> int | None:
     """About how large a file of a scan or a merge of so many points becomes, thinned to ``triangles`` where that is
@@ -85,7 +86,7 @@ def foreseen_bytes(
 
 
 def check_export(what: What, file_format: str) -> None:
-    """Raise InputError for something that cannot be had, or not in this format."""
+    """Raise InputError for something that cannot be exported, or not in this format."""
     if what not in get_args(What):
         raise InputError(f"{what!r} cannot be exported: choose one of {', '.join(get_args(What))}")
     if _ALIASES.get(file_format, file_format) not in FORMATS[what]:
@@ -93,8 +94,8 @@ def check_export(what: What, file_format: str) -> None:
         raise InputError(f"the {what} cannot be written as .{file_format}: choose {listed}")
 
 
-def file_name(what: What, name: str, file_format: str) -> str:
-    """How a file is called where nobody names it: ``object_1_mesh.stl``."""
+def default_file_name(what: What, name: str, file_format: str) -> str:
+    """The default name of an exported file, such as ``object_1_mesh.stl``."""
     stems = {"cloud": f"{name}_cloud", "mesh": f"{name}_mesh", "merge": f"merged_{name}", "table": "verifications"}
     stems |= {"merged-mesh": f"merged_{name}_mesh", "coefficients": f"coefficients_{name}" if name else "coefficients"}
     return f"{stems.get(what, what)}.{file_format}"
@@ -121,7 +122,7 @@ def export(
             coefficients of each pixel as .npz; poses of camera, projector, target and scans as 4x4 matrices; report as
             HTML; table of the verifications as CSV.
         name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model of coefficients.
-        out: The file, whose suffix says how it is written, or a folder; by default the session's exports.
+        out: The file, whose suffix selects the format, or a folder; by default the session's exports.
         file_format: ply, stl, obj, glb, xyz, yml, xml, json, ..., where --out is a folder or not given.
         model: Which calibration to make a cloud with, by default the one of the stored cloud, or the best; or which to
             write (of splined the pinhole and Brown lenses that come nearest, and their remaining error).
@@ -132,11 +133,11 @@ def export(
     with opened(session) as store:
         chosen = file_format.lower().removeprefix(".")
         check_export(what, chosen or FORMATS.get(what, ("",))[0])
-        name = _named(store, what, name)
-        target = _target(store, what, name, out, chosen)
+        name = _resolve_name(store, what, name)
+        target = _output_path(store, what, name, out, chosen)
         if what not in ("report", "table"):
             check_accepted(store, accept_rejected)
-        if what not in ("report", "table", "merge", "merged-mesh"):  # a merge says by itself that it is stale
+        if what not in ("report", "table", "merge", "merged-mesh"):  # reading a merge warns by itself
             warn_if_stale(store, warn)
         if what in ("mesh", "merged-mesh"):
             words = _write_shape(
@@ -177,18 +178,18 @@ def _write_shape(
 
 def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:
     if what == "calibration":
-        chosen = model or preferred(store)
+        chosen = model or preferred_model(store)
         return f"{chosen} calibration of camera and projector, {write_calibration_file(store, target, chosen)}"
     if what == "coefficients":
         return f"coefficients of each pixel by the {write_coefficients(store, name, target)} model"
     if what == "poses":
-        write_poses(store, model or preferred(store), target)
+        write_poses(store, model or preferred_model(store), target)
         return "poses of the devices, the target and the scans"
     write_table(store, target)
     return "verifications"
 
 
-def _named(store: Session, what: What, name: str) -> str:
+def _resolve_name(store: Session, what: What, name: str) -> str:
     """The name of what is meant: the scan that there is alone, the last merge."""
     if what in ("merge", "merged-mesh"):
         return merge_name(store, name)
@@ -202,11 +203,11 @@ def _named(store: Session, what: What, name: str) -> str:
     return scans[0]
 
 
-def _target(store: Session, what: What, name: str, out: Path | str | None, chosen: str) -> Path:
+def _output_path(store: Session, what: What, name: str, out: Path | str | None, chosen: str) -> Path:
     """The file to write, with a suffix that fits."""
     given = None if out is None else Path(out).expanduser()
     if given is None or given.is_dir():
-        return (given or store.exports) / file_name(what, name, chosen or FORMATS[what][0])
+        return (given or store.exports) / default_file_name(what, name, chosen or FORMATS[what][0])
     suffix = given.suffix.lower().removeprefix(".")
     if chosen and suffix != chosen:
         return given.with_name(f"{given.name}.{chosen}")

@@ -13,8 +13,8 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.export_shapes import is_fresh
-from slviewer.pipeline.models import available, frame_of, load_model, load_stereo
+from slviewer.pipeline.export_shapes import is_up_to_date
+from slviewer.pipeline.models import available_models, frame_of, load_model, load_stereo
 from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.scale import scale_factor
 from slviewer.session.atomic import arriving_file, replace_file
@@ -116,22 +116,24 @@ def write_calibration_file(store: Session, path: Path, model: str) -> str:
         entries |= {f"fit_rms_px_{device}": fit.rms_px, f"fit_max_px_{device}": fit.max_px}
     if not isinstance(fitted, SplinedModel):
         entries |= {f"reprojection_rms_px_{name}": float(value) for name, value in stereo.reprojection_rms_px.items()}
-    write_calibration(path, entries, {name: said for name, said in _CALIBRATION.items() if name in entries})
-    left = ", ".join(
+    write_calibration(path, entries, {name: meaning for name, meaning in _CALIBRATION.items() if name in entries})
+    errors = ", ".join(
         f"{fit.rms_px:.3f} px RMS and {fit.max_px:.3f} px at most in the {device}" for device, fit in fits.items()
     )
-    return f"in the frame of the {entries['frame']}" + (f"; pinhole and Brown distortion leave {left}" if left else "")
+    return f"in the frame of the {entries['frame']}" + (
+        f"; remaining error of pinhole and Brown distortion: {errors}" if errors else ""
+    )
 
 
 def write_coefficients(store: Session, name: str, path: Path) -> str:
     """Each pixel's rational function as .npz with an ``about`` in words, of the model ``name`` (pixelwise or splined;
     empty: the one there is, pixelwise first); returns which."""
-    there = [model for model in ("pixelwise", "splined") if model in available(store)]
+    there = [model for model in ("pixelwise", "splined") if model in available_models(store)]
     if not (name or there) or name == "stereo":
         raise InputError("only the pixelwise and the splined model have coefficients for each pixel: calibrate these")
     model = load_model(store, name or there[0])
     assert isinstance(model, PixelwiseModel | SplinedModel)
-    arrays = _pixelwise(model) if isinstance(model, PixelwiseModel) else _splined(model)
+    arrays = _pixelwise_arrays(model) if isinstance(model, PixelwiseModel) else _splined_arrays(model)
     factor = scale_factor(store, model.name)
     arrays |= {"scale_factor": np.array(factor)}
     with arriving_file(path, sum(array.nbytes for array in arrays.values())) as file:
@@ -139,13 +141,13 @@ def write_coefficients(store: Session, name: str, path: Path) -> str:
     return model.name
 
 
-def _pixelwise(model: PixelwiseModel) -> dict[str, np.ndarray]:
+def _pixelwise_arrays(model: PixelwiseModel) -> dict[str, np.ndarray]:
     about = (
         "slviewer, model pixelwise: for axis x or y and camera pixel (row, column), c = <axis>_coefficients[:, row, "
         "column], phi the absolute phase in rad of fringes of <axis>_period_px projector px, phi = 2 pi u/period: "
         "z = (c0 + c1 phi)/(1 + c2 phi), x = c3 z, y = c4 z, in mm in the camera's frame, all times scale_factor. "
-        "<axis>_rms_mm: the fit's RMS in z, x, y; <axis>_poses: target poses seen; <axis>_phase_min, _phase_max: the "
-        "phases seen. NaN where not fitted."
+        "<axis>_rms_mm: the fit's RMS in z, x, y; <axis>_poses: target poses used; <axis>_phase_min, _phase_max: the "
+        "phases used. NaN where not fitted."
     )
     arrays = {"about": np.array(about)}
     for axis, fit in model.fits.items():
@@ -155,7 +157,7 @@ def _pixelwise(model: PixelwiseModel) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _splined(model: SplinedModel) -> dict[str, np.ndarray]:
+def _splined_arrays(model: SplinedModel) -> dict[str, np.ndarray]:
     about = (
         "slviewer, model splined, compiled: for axis x or y and camera pixel (row, column), c = <axis>_coefficients[:, "
         "row, column], s = projector coordinate in px less <axis>_centre_px: z0 = (c0 + c1 s)/(1 + c2 s); "
@@ -184,16 +186,16 @@ def write_poses(store: Session, model: str, path: Path) -> None:
         "frames": _FRAMES,
         "model": model,
         "camera": {"T_reference_camera": np.eye(4)},
-        "projector": {"T_reference_projector": np.linalg.inv(_projector(store, model))},
+        "projector": {"T_reference_projector": np.linalg.inv(_projector_transform(store, model))},
     }
-    if targets := _targets(store, model):
+    if targets := _target_pose_entries(store, model):
         entries["targets"] = targets
     if merges := numbered_results(store, "merge"):
-        entries["merges"] = [_merge(store, name) for name in merges]
-    write_calibration(path, entries, {name: said for name, said in _POSES.items() if name in entries})
+        entries["merges"] = [_merge_entry(store, name) for name in merges]
+    write_calibration(path, entries, {name: meaning for name, meaning in _POSES.items() if name in entries})
 
 
-def _targets(store: Session, model: str) -> list[dict[str, Any]]:
+def _target_pose_entries(store: Session, model: str) -> list[dict[str, Any]]:
     fitted = load_model(store, model)
     if isinstance(fitted, SplinedModel):
         bundle = fitted.bundle
@@ -213,10 +215,10 @@ def _targets(store: Session, model: str) -> list[dict[str, Any]]:
     return targets
 
 
-def _merge(store: Session, name: str) -> dict[str, Any]:
+def _merge_entry(store: Session, name: str) -> dict[str, Any]:
     meta = store.load_result(name, only=())[0]
     used = str(meta.get("model", ""))
-    projector = np.linalg.inv(_projector(store, used if used in available(store) else "stereo"))
+    projector = np.linalg.inv(_projector_transform(store, used if used in available_models(store) else "stereo"))
     scans = []
     for scan in meta["scans"]:
         pair = meta["pairs"].get(scan)
@@ -226,7 +228,7 @@ def _merge(store: Session, name: str) -> dict[str, Any]:
     return {"name": name.removeprefix("merge/"), "reference": meta["reference"], "model": used, "scans": scans}
 
 
-def _projector(store: Session, model: str) -> np.ndarray:
+def _projector_transform(store: Session, model: str) -> np.ndarray:
     """T_projector_camera (4, 4) mm by a model, with its correction of scale."""
     if model != "splined":
         return _scaled_transform(load_stereo(store).rig.T_projector_camera, scale_factor(store, model))
@@ -257,9 +259,13 @@ def write_table(store: Session, path: Path) -> None:
     writer.writerow(["capture", "name", "shape", "model", *figures, *(f"{r}_percent" for r in ranges), "up_to_date"])
     for result in results:
         meta, name = store.load_result(result, only=())[0], result.removeprefix("verify/")
-        label, shares, fresh = _safe_text(str(labels.get(name, name))), meta["incidence"] or {}, is_fresh(store, result)
-        for model, found in meta["models"].items():
-            measured = [found.get(each) for each in figures] + [shares.get(each) for each in ranges]
+        label, shares, fresh = (
+            _safe_text(str(labels.get(name, name))),
+            meta["incidence"] or {},
+            is_up_to_date(store, result),
+        )
+        for model, measured_by_model in meta["models"].items():
+            measured = [measured_by_model.get(each) for each in figures] + [shares.get(each) for each in ranges]
             writer.writerow([name, label, meta["shape"], model, *measured, "yes" if fresh else "no"])
     replace_file(path, text.getvalue().encode())
 

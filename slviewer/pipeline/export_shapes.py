@@ -1,4 +1,4 @@
-"""Scans and merges as shapes for other programs: what is kept in the session, or what its frames give."""
+"""Scans and merges as shapes for other programs: those stored in the session, or computed from its frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, part
-from slviewer.pipeline.models import frame_of, load_model, preferred
+from slviewer.pipeline.models import frame_of, load_model, preferred_model
 from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.reconstruction.cloud import Cloud
@@ -22,8 +22,8 @@ from slviewer.surface.shapes import Mesh, PointSet
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
-    """A shape, whose it is, values of its points by name, what a file's comments say of it, and of these what was done
+class DescribedShape:
+    """A shape, whose it is, values of its points by name, the comments of its file, and of these what was done
     to make a mesh."""
 
     shape: PointSet | Mesh
@@ -39,7 +39,7 @@ class Described:
         return f"{self.whose}: {len(self.shape)} points"
 
 
-def is_fresh(store: Session, result: str) -> bool:
+def is_up_to_date(store: Session, result: str) -> bool:
     """Whether a result's inputs are as they were, and no correction of scale has changed since."""
     if store.state_of(result) != "fresh":
         return False
@@ -55,7 +55,7 @@ def scan_shape(
     progress: Progress,
     warn: Warn,
     accept_rejected: bool = False,
-) -> Described:
+) -> DescribedShape:
     """A scan's measured points with normals, colours and sigmas, or where there is a ``plan`` a mesh of them."""
     cloud = scan_cloud(store, name, model, part(progress, 0, 0.5), warn, accept_rejected)
     mask = cloud.mask
@@ -69,22 +69,22 @@ def scan_shape(
     normals, colours = grid_normals(cloud.points)[mask], cloud.colours()
     if colours is not None and colours.ndim == 1:
         colours = np.repeat(colours[:, None], 3, axis=1)
-    said = "sigma: expected error of the depth, mm"
-    return Described(PointSet(cloud.measured, normals, colours), name, cloud.sigmas(mask), (*notes, said))
+    note = "sigma: expected error of the depth, mm"
+    return DescribedShape(PointSet(cloud.measured, normals, colours), name, cloud.sigmas(mask), (*notes, note))
 
 
 def scan_cloud(
     store: Session, name: str, model: str | None, progress: Progress, warn: Warn, accept_rejected: bool = False
 ) -> Cloud:
-    """A capture's cloud: the one that is kept, where it is up to date and of the model wanted, else made now."""
-    capture, model, kept = store.load_capture(name), model or None, f"clouds/{name}"
-    if store.has_result(kept) and is_fresh(store, kept):
-        meta = store.load_result(kept, only=())[0]
+    """A capture's cloud: the stored one where it is up to date and of the requested model, else reconstructed."""
+    capture, model, stored = store.load_capture(name), model or None, f"clouds/{name}"
+    if store.has_result(stored) and is_up_to_date(store, stored):
+        meta = store.load_result(stored, only=())[0]
         if model in (None, meta["model"]):
             names = {"points", "sigma_z", "texture", "sigma_calibration", "sigma_edges"} & set(meta["arrays"])
-            arrays = store.load_result(kept, only=names)[1]
+            arrays = store.load_result(stored, only=names)[1]
             return Cloud(axis=meta["axis"], model=meta["model"], **arrays)
-    fitted = load_model(store, model or preferred(store))
+    fitted = load_model(store, model or preferred_model(store))
     progress(0.1, f"reading {name}")
     check_capture_sizes(store, [name])
     _, frames, phases = next(decode_captures(store, [name], warn))
@@ -94,7 +94,7 @@ def scan_cloud(
 
 
 def merge_name(store: Session, name: str) -> str:
-    """The merge of that number, or the last one where none is named; InputError where there is none."""
+    """The merge of that number, or the last one where none is named; raises InputError where it does not exist."""
     there = [result.removeprefix("merge/") for result in numbered_results(store, "merge")]
     if not there:
         raise InputError("there is no merge yet: merge scans first")
@@ -103,7 +103,7 @@ def merge_name(store: Session, name: str) -> str:
     return name or there[-1]
 
 
-def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: Progress, warn: Warn) -> Described:
+def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: Progress, warn: Warn) -> DescribedShape:
     """The points of a merge, or where there is a ``plan`` one mesh through them."""
     name = merge_name(store, name)
     progress(0.1, "reading the merged points")
@@ -114,26 +114,28 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
         *_model_notes(store, model),
     )
     if plan is None:
-        said = "sigma: expected error along the normal, mm"
+        note = "sigma: expected error along the normal, mm"
         points = PointSet(merged.points, merged.normals, merged.colours)
-        return Described(points, f"merge {name}", merged.scalars, (*notes, said))
-    return _describe_mesh(f"merge {name}", build_mesh(_with_normals(merged), plan, part(progress, 0.1, 1)), notes)
+        return DescribedShape(points, f"merge {name}", merged.scalars, (*notes, note))
+    return _describe_mesh(
+        f"merge {name}", build_mesh(_points_with_normals(merged), plan, part(progress, 0.1, 1)), notes
+    )
 
 
 def merged_points(store: Session, name: str, warn: Warn) -> PointSet:
     """The points of a merge whose normals are known, to make a mesh of; of the last one where none is named."""
-    return _with_normals(read_merge(store, f"merge/{merge_name(store, name)}", warn)[1])
+    return _points_with_normals(read_merge(store, f"merge/{merge_name(store, name)}", warn)[1])
 
 
 def read_merge(store: Session, result: str, warn: Warn) -> tuple[dict[str, Any], Ply]:
     """The record and the points of a merge that the session stores as ``merge/<number>``; warns of a stale one."""
-    if not is_fresh(store, result):
+    if not is_up_to_date(store, result):
         warn(f"{result} came from scans or a calibration that have changed since: merge again")
     meta = store.load_result(result, only=())[0]
     return meta, read_ply(store.exports / str(meta["ply"]))
 
 
-def _with_normals(merged: Ply) -> PointSet:
+def _points_with_normals(merged: Ply) -> PointSet:
     if merged.normals is None:
         raise InputError("the merged cloud has no normals: merge the scans again")
     known, sigma = np.isfinite(merged.normals).all(axis=1), merged.scalars.get("sigma")
@@ -147,9 +149,9 @@ def _with_normals(merged: Ply) -> PointSet:
     )
 
 
-def _describe_mesh(whose: str, made: BuiltMesh, notes: tuple[str, ...]) -> Described:
+def _describe_mesh(whose: str, made: BuiltMesh, notes: tuple[str, ...]) -> DescribedShape:
     done = tuple(made.text().splitlines())
-    return Described(made.mesh, whose, {}, (*notes, "sigma: expected error along the normal, mm", *done), done)
+    return DescribedShape(made.mesh, whose, {}, (*notes, "sigma: expected error along the normal, mm", *done), done)
 
 
 def _model_notes(store: Session, model: str) -> tuple[str, ...]:

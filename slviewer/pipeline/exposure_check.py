@@ -25,17 +25,17 @@ def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases
     rows = select_rows(*frames.shape[1:])
     coded = [i for i, frame in enumerate(sequence.frames) if frame.kind != "texture"]
     brightest = np.max([frames[i][rows] for i in coded], axis=0)
-    seen = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()
-    bright = float(np.quantile(seen, 0.995))
+    levels = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()
+    bright = float(np.quantile(levels, 0.995))
     clipped = max(float(np.mean(phase.reason[phase.illuminated] == Reason.SATURATED)) for phase in phases.values())
     figures = {"bright_share_of_full_scale": round(bright / full, 3), "saturated_share": round(clipped, 4)}
     if clipped > CLIPPED:
-        said = f"{100 * clipped:.1f} % of the illuminated pixels are saturated."
+        sentence = f"{100 * clipped:.1f} % of the illuminated pixels are saturated."
         verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         remedy = "Lower the exposure, or capture with two exposures."
-        return Check("exposure", verdict, said, remedy, figures)
-    said = f"The brightest of the scene reaches {100 * bright / full:.0f} % of the camera's range"
+        return Check("exposure", verdict, sentence, remedy, figures)
+    sentence = f"The brightest of the scene reaches {100 * bright / full:.0f} % of the camera's range"
     if bright < WEAK * full:
         verdict = "bad" if bright < TOO_WEAK * full else "warning"
-        return Check("exposure", verdict, f"{said}.", "Raise the exposure, or open the aperture.", figures)
-    return Check("exposure", "good", f"{said}; {100 * clipped:.1f} % of the pixels are saturated.", "", figures)
+        return Check("exposure", verdict, f"{sentence}.", "Raise the exposure, or open the aperture.", figures)
+    return Check("exposure", "good", f"{sentence}; {100 * clipped:.1f} % of the pixels are saturated.", "", figures)

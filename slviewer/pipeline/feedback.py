@@ -17,16 +17,16 @@ def ignore_warnings(message: str) -> None:
     """Ignore the warning."""
 
 
-def part(progress: Progress, begin: float, end: float, label: str = "") -> Progress:
-    """The progress of one stage, as a share of the whole; ``label`` stands before what is being done."""
+def part(progress: Progress, start: float, end: float, label: str = "") -> Progress:
+    """Map the progress 0 to 1 of a stage to ``start`` to ``end`` of the whole; ``label``: a prefix."""
 
     def report(done: float, doing: str) -> None:
-        progress(begin + (end - begin) * done, f"{label}: {doing}" if label else doing)
+        progress(start + (end - start) * done, f"{label}: {doing}" if label else doing)
 
     return report
 
 
-def stage(progress: Progress, begin: float, end: float, doing: str) -> Callable[[float], None]:
-    """Report that a stage begins; returns what reports the share of it that is done."""
-    progress(begin, doing)
-    return lambda done: progress(begin + (end - begin) * done, doing)
+def stage(progress: Progress, start: float, end: float, doing: str) -> Callable[[float], None]:
+    """Report the start of a stage; returns a callback for the share of it, 0 to 1, that is done."""
+    progress(start, doing)
+    return lambda done: progress(start + (end - start) * done, doing)

@@ -82,7 +82,7 @@ def save_check(session: Session, name: str) -> FrameCheck:
 
 
 def load_check(session: Session, name: str) -> FrameCheck | None:
-    """The saved check of a capture; None where there is none for its frames, or of this version."""
+    """The saved check of a capture; None where it is missing, of other frames or of another version."""
     result = f"trust/{name}"
     if session.state_of(result) != "fresh":
         return None

@@ -13,7 +13,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.models import available, load_stereo, save_imported_stereo
+from slviewer.pipeline.models import available_models, load_stereo, save_imported_stereo
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.importers import opencv_calibration
@@ -54,7 +54,7 @@ def import_opencv_calibration(
     matrices = opencv_calibration.read(path, keys)
     stated = opencv_calibration.read_sizes(path)
     with opened_or_made(session) as store:
-        there = available(store)
+        there = available_models(store)
         if there and not force:
             raise InputError(
                 f"{store.folder} holds a {' and a '.join(there)} calibration already: "
@@ -62,16 +62,16 @@ def import_opencv_calibration(
             )
         captures = store.captures()
         sizes = {
-            "camera": _size(path, "camera", camera, stated, {capture.size for capture in captures}),
-            "projector": _size(
+            "camera": _resolve_size(path, "camera", camera, stated, {capture.size for capture in captures}),
+            "projector": _resolve_size(
                 path, "projector", projector, stated, {capture.sequence.projector_size for capture in captures} - {None}
             ),
         }
-        witnessed = _check_captures(store, matrices, sizes, warn)
+        witnessed = _is_confirmed_by_captures(store, matrices, sizes, warn)
         for device, size in sizes.items():
             if size is not None and not witnessed:
                 _check_principal_point(device, matrices[f"K_{device}"], size, warn)
-        _replace(store, there, matrices, str(file), sizes)
+        _replace_calibration(store, there, matrices, str(file), sizes)
         return load_stereo(store) if None not in sizes.values() else None
 
 
@@ -80,7 +80,7 @@ def identify_calibration_keys(file: Path | str) -> dict[str, str]:
     return dict(zip(opencv_calibration.ENTRIES, opencv_calibration.identify_keys(Path(file)), strict=True))
 
 
-def _size(
+def _resolve_size(
     path: Path,
     device: str,
     given: Size | None,
@@ -94,9 +94,9 @@ def _size(
     if len(captured) == 1:
         sources["the session's captures"] = next(iter(captured))
     if len(set(sources.values())) > 1:
-        said = ", ".join(f"{width}x{height} px by {source}" for source, (width, height) in sources.items())
+        conflict = ", ".join(f"{width}x{height} px by {source}" for source, (width, height) in sources.items())
         raise InputError(
-            f"the {device} has {said}: the calibration does not belong to these captures, or one size is wrong"
+            f"the {device} has {conflict}: the calibration does not belong to these captures, or one size is wrong"
         )
     size = next(iter(sources.values()), None)
     if len(captured) > 1 and size not in captured:
@@ -104,13 +104,13 @@ def _size(
     return size
 
 
-def _check_captures(
+def _is_confirmed_by_captures(
     store: Session,
     matrices: dict[str, np.ndarray],
     sizes: dict[str, tuple[int, int] | None],
     warn: Warn,
 ) -> bool:
-    """Whether a capture with both axes confirms the calibration; False where there is none to ask. Raises InputError
+    """Whether a capture with both axes confirms the calibration; False without such a capture. Raises InputError
     where one contradicts it."""
     camera, projector = sizes["camera"], sizes["projector"]
     if camera is None or projector is None:
@@ -143,7 +143,7 @@ def _check_principal_point(device: str, K: np.ndarray, size: tuple[int, int], wa
         )
 
 
-def _replace(
+def _replace_calibration(
     store: Session,
     there: Sequence[str],
     matrices: dict[str, np.ndarray],

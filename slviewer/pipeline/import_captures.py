@@ -17,7 +17,7 @@ from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.frame_check import save_check
-from slviewer.pipeline.models import available
+from slviewer.pipeline.models import available_models
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers import guessed_description
@@ -68,7 +68,7 @@ def import_captures(
     Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason. Raises InputError where
     none is left, or, with ``strict``, for the first of them; nothing is saved then.
     """
-    found = find_captures(
+    imports = find_captures(
         source,
         layout,
         sequence,
@@ -79,7 +79,7 @@ def import_captures(
         warn=warn,
         **options,
     )
-    return _save(found, session, role, origin, force, strict, progress, warn)
+    return _save_captures(imports, session, role, origin, force, strict, progress, warn)
 
 
 def read_captures(
@@ -97,10 +97,10 @@ def read_captures(
     Of several exposures each pixel comes from the longest that did not clip it. Raises InputError where an image cannot
     be used; captures that are incomplete are skipped with a warning.
     """
-    found = find_captures(source, layout, sequence, projector=projector, channel=channel, warn=warn, **options)
-    for message in (*found.warnings, *map(str, found.skipped)):
+    imports = find_captures(source, layout, sequence, projector=projector, channel=channel, warn=warn, **options)
+    for message in (*imports.warnings, *map(str, imports.skipped)):
         warn(message)
-    return [replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in found]
+    return [replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in imports]
 
 
 def find_captures(
@@ -115,7 +115,7 @@ def find_captures(
     warn: Warn = ignore_warnings,
     **options: Any,
 ) -> Imports:
-    """The captures of a folder, not yet read; ``session`` knows the projector's size where nobody states it."""
+    """The captures of a folder, not yet read; ``session`` knows the projector's size where it is not stated."""
     source = Path(source).expanduser()
     if layout == "detect":
         layout = "frames" if sequence is not None else detect_layout(source)
@@ -127,12 +127,14 @@ def find_captures(
         if toml is None:
             raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
         options["toml"] = Path(toml)
-    elif size is None and session is not None and (size := _known_projector(session)) is not None:
-        warn(f"the projector is taken to have {size[0]}x{size[1]} px, as in the session: --projector for another size")
-    found = LAYOUTS[layout].read(source, prefix=prefix, projector=size, **options)
+    elif size is None and session is not None and (size := _known_projector_size(session)) is not None:
+        warn(
+            f"the projector is assumed to have {size[0]}x{size[1]} px, as in the session: --projector for another size"
+        )
+    imports = LAYOUTS[layout].read(source, prefix=prefix, projector=size, **options)
     if channel is not None:
-        found = replace(found, recordings=[replace(recording, channel=channel) for recording in found.recordings])
-    return found
+        imports = replace(imports, recordings=[replace(recording, channel=channel) for recording in imports.recordings])
+    return imports
 
 
 def import_frames(source: Path | str, session: SessionLike, sequence: Path | str, **options: Any) -> list[str]:
@@ -146,7 +148,7 @@ def import_frames(source: Path | str, session: SessionLike, sequence: Path | str
 def guess_description(
     folder: Path | str, *, projector: Size | None = None, channel: Channel | None = None
 ) -> GuessedDescription:
-    """The TOML of a capture that nobody described, from its images; ``doubts`` name what stays open. Nothing is saved.
+    """The TOML of a capture without a description, from its images; ``doubts`` name what stays open. Nothing is saved.
 
     Of a folder of captures, the first is read. Raises InputError where the images cannot belong to one capture.
     """
@@ -155,8 +157,8 @@ def guess_description(
     )
 
 
-def _save(
-    found: Imports,
+def _save_captures(
+    imports: Imports,
     session: SessionLike,
     role: Role,
     origin: str | None,
@@ -166,9 +168,9 @@ def _save(
     warn: Warn,
 ) -> list[str]:
     """Save what can be read and decoded, and warn of the rest; with `strict`, raise InputError for the first fault."""
-    for message in found.warnings:
+    for message in imports.warnings:
         warn(message)
-    skipped = list(found.skipped)
+    skipped = list(imports.skipped)
     if strict and skipped:
         raise InputError(str(skipped[0]))
 
@@ -180,20 +182,22 @@ def _save(
             warn(message)
 
     def read() -> Iterator[NewCapture]:
-        for i, recording in enumerate(found.recordings):
-            progress(i / len(found), f"reading {recording.name}")
+        for i, recording in enumerate(imports.recordings):
+            progress(i / len(imports), f"reading {recording.name}")
             try:
                 capture = recording.read()
-                seen = checked(replace(capture, frames=capture.merged_frames(), exposures_ms=()), warn)
+                checked_capture = check_imported_capture(
+                    replace(capture, frames=capture.merged_frames(), exposures_ms=()), warn
+                )
             except InputError as error:
                 if strict:
                     raise
                 skipped.append(Skipped(recording.name, str(error)))
                 continue
-            for message in _assumptions(recording, capture):
+            for message in _list_assumptions(recording, capture):
                 warn_once(message)
-            yield replace(capture, sequence=seen.sequence, source=origin or capture.source)
-        if len(skipped) == len(found.skipped) + len(found.recordings):
+            yield replace(capture, sequence=checked_capture.sequence, source=origin or capture.source)
+        if len(skipped) == len(imports.skipped) + len(imports.recordings):
             raise none_usable(skipped)
 
     with opened_or_made(session) as store:
@@ -208,19 +212,19 @@ def _save(
     return [capture.name for capture in saved]
 
 
-def _known_projector(session: SessionLike) -> tuple[int, int] | None:
-    """The projector's size by the session's captures, else by its imported calibration; None where neither says one."""
+def _known_projector_size(session: SessionLike) -> tuple[int, int] | None:
+    """The projector's size by the session's captures, else by its imported calibration; None where both are missing."""
     if not isinstance(session, Session) and not is_session(Path(session).expanduser()):
         return None
     with opened(session) as store:
         sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
-        if not sizes and "stereo" in available(store):
+        if not sizes and "stereo" in available_models(store):
             meta = store.load_result("calibration/stereo", only=())[0]
             return tuple(meta["projector"]) if meta.get("projector") else None
     return sizes.pop() if len(sizes) == 1 else None
 
 
-def _assumptions(recording: ImportableRecording, capture: NewCapture) -> Iterator[str]:
+def _list_assumptions(recording: ImportableRecording, capture: NewCapture) -> Iterator[str]:
     """What was assumed of a capture because nothing stated it."""
     used = capture.settings.get("channel")
     if used and recording.channel is None:
@@ -233,7 +237,7 @@ def _assumptions(recording: ImportableRecording, capture: NewCapture) -> Iterato
         )
 
 
-def checked(capture: NewCapture, warn: Warn) -> NewCapture:
+def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
     """The capture, with its Gray origin estimated if it was not given; InputError where its frames contradict its
     description.
     """
@@ -243,11 +247,11 @@ def checked(capture: NewCapture, warn: Warn) -> NewCapture:
         try:
             origins = {axis: estimate_gray_origin(sequence, capture.frames, axis) for axis in axes}
         except InputError:
-            # Frames out of order and changed light leave no common origin; say which it is.
+            # Frames out of order and changed light leave no common origin; name the cause.
             unstated = ("gray-origin", "phase-offset", "unreadable")
-            for found in check_description(sequence, capture.frames):
-                if found.cause not in unstated:
-                    raise InputError(found.message) from None
+            for contradiction in check_description(sequence, capture.frames):
+                if contradiction.cause not in unstated:
+                    raise InputError(contradiction.message) from None
             raise
         if origins:
             first = next(iter(origins.values()))

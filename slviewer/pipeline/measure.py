@@ -7,19 +7,19 @@ from typing import Literal, NoReturn
 from slviewer.errors import UsageError
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.measured_surface import Place, surface
+from slviewer.pipeline.measured_surface import Place, load_surface
 from slviewer.pipeline.measurements import (
     add_distance,
     add_fit,
     add_point,
     add_relation,
     add_section,
+    delete_measurement,
+    describe_measurement,
     export_measurements,
-    in_words,
-    measurements,
-    remove,
-    rename,
-    restore,
+    load_measurements,
+    relabel_measurement,
+    undo_delete,
 )
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -61,22 +61,22 @@ def measure(
         raise UsageError(f"a {what} needs its region: give --ball x y z radius, or --box x y z x y z, in mm")
     ends = 1 if what == "point" else 2
     if not fitted and len(at) not in (ends, 2 * ends):
-        _refuse_places(what, ends, "pixel u v")
+        _raise_place_error(what, ends, "pixel u v")
     with opened(session, write=True) as store:
-        on = surface(store, scan, model=model, accept_rejected=accept_rejected, progress=progress, warn=warn)
+        on = load_surface(store, scan, model=model, accept_rejected=accept_rejected, progress=progress, warn=warn)
         if fitted:
             region = Region.ball(ball[:3], ball[3]) if ball else Region.box(box[:3], box[3:])
             return add_fit(store, on, what, region, name)  # type: ignore[arg-type]
         numbers = 2 if on.organised else 1
         if len(at) != ends * numbers:
-            _refuse_places(what, ends, "pixel u v" if on.organised else "index")
+            _raise_place_error(what, ends, "pixel u v" if on.organised else "index")
         places: list[Place] = [(at[i], at[i + 1]) if on.organised else at[i] for i in range(0, len(at), numbers)]
         if what == "point":
             return add_point(store, on, places[0], name)
         return (add_distance if what == "distance" else add_section)(store, on, places[0], places[1], name)
 
 
-def _refuse_places(what: What, ends: int, which: str) -> NoReturn:
+def _raise_place_error(what: What, ends: int, which: str) -> NoReturn:
     example = " ".join(("180 150", "220 150")[:ends]) if which == "pixel u v" else " ".join(("1200", "3400")[:ends])
     raise UsageError(
         f"a {what} needs --at with the {which} of {'its point' if ends == 1 else 'both its ends'}, "
@@ -104,21 +104,21 @@ def edit_measurements(
         csv: Write them all to this table too.
     """
     if not (relate or name or delete or bring_back):
-        return _list(session, csv)
+        return _list_measurements(session, csv)
     with opened(session, write=True) as store:
         if relate:
             add_relation(store, *relate)
         if name:
-            rename(store, *name)
+            relabel_measurement(store, *name)
         for each in delete:
-            remove(store, each)
+            delete_measurement(store, each)
         if bring_back:
-            restore(store)
-        return _list(store, csv)
+            undo_delete(store)
+        return _list_measurements(store, csv)
 
 
-def _list(session: SessionLike, csv: Path | None) -> str:
-    lines = [in_words(each) for each in measurements(session)] or ["nothing was measured yet"]
+def _list_measurements(session: SessionLike, csv: Path | None) -> str:
+    lines = [describe_measurement(each) for each in load_measurements(session)] or ["nothing was measured yet"]
     if csv is not None:
         lines.append(f"{export_measurements(session, csv)} measurements -> {csv}")
     return "\n".join(lines)

@@ -12,7 +12,7 @@ from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
 from slviewer.pipeline.export_shapes import read_merge, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.models import Model, check_accepted, load_model, preferred, warn_if_stale
+from slviewer.pipeline.models import Model, check_accepted, load_model, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor, scale_sigma
 from slviewer.reconstruction.cloud import Cloud
@@ -29,9 +29,9 @@ class MeasuredSurface:
     """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was measured.
 
     ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along ``normals`` for a
-    merged surface; ``left_mm`` likewise: what the calibration leaves uncertain, where that is known. ``faces`` (m, 3):
+    merged surface; ``left_mm`` likewise: standard deviation from the calibration, where known. ``faces`` (m, 3):
     of a merged mesh. ``source`` is the capture or result that it came from, ``model`` the calibration, ``inputs`` the
-    hashes of both; ``shared``: how errors of that ``calibration``, by its hash, go together, where that is known.
+    hashes of both; ``shared``: the covariance of errors of that ``calibration``, by its hash, where known.
     """
 
     points: np.ndarray
@@ -54,7 +54,7 @@ class MeasuredSurface:
 
     @property
     def measured(self) -> np.ndarray:
-        """Bool like the points: those that there are."""
+        """Mask of the measured points, (h, w) or (n,) bool."""
         return np.asarray(np.isfinite(self.points).all(axis=-1))
 
     def within(self, region: Region) -> np.ndarray:
@@ -67,7 +67,7 @@ class MeasuredSurface:
         return float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else float("inf")
 
     def picked(self, place: Place) -> tuple[Feature, Spread]:
-        """A point, with its uncertainty. Raises InputError where nothing was measured there."""
+        """The point at a pixel or index, and its uncertainty. Raises InputError where nothing was measured there."""
         if self.organised != isinstance(place, tuple):
             raise InputError(
                 f"{place} is no place on {self.source}: give {'pixel (u, v)' if self.organised else 'an index'}"
@@ -100,7 +100,7 @@ class MeasuredSurface:
         return sigma * np.abs(np.sum(points / points[:, 2:] * normals, axis=1))
 
 
-def surface(
+def load_surface(
     session: SessionLike,
     scan: str,
     *,
@@ -109,19 +109,19 @@ def surface(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> MeasuredSurface:
-    """Reconstruct a capture to measure on it, or read a merge that the session keeps, named ``merge/<number>``."""
+    """Reconstruct a capture to measure on it, or read a stored merge, named ``merge/<number>``."""
     with opened(session) as store:
         if scan.startswith(MERGED):
-            return merged_surface(store, scan, warn)
+            return load_merged_surface(store, scan, warn)
         check_accepted(store, accept_rejected)
         warn_if_stale(store, warn)
-        cloud = scan_cloud(store, scan, model or preferred(store), progress, warn, accept_rejected)
-        found = surface_of(store, scan, cloud, load_model(store, cloud.model))
+        cloud = scan_cloud(store, scan, model or preferred_model(store), progress, warn, accept_rejected)
+        measured_surface = surface_from_cloud(store, scan, cloud, load_model(store, cloud.model))
         progress(1.0, "reconstructed")
-    return found
+    return measured_surface
 
 
-def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> MeasuredSurface:
+def surface_from_cloud(store: Session, scan: str, cloud: Cloud, fitted: Model) -> MeasuredSurface:
     """A capture's cloud, made with one of the session's calibrations, as a surface to measure on."""
     calibration = f"calibration/{fitted.name}"
     names = [scan, calibration]
@@ -146,8 +146,8 @@ def surface_of(store: Session, scan: str, cloud: Cloud, fitted: Model) -> Measur
     )
 
 
-def merged_surface(store: Session, merge: str, warn: Warn = ignore_warnings) -> MeasuredSurface:
-    """A merge that the session keeps as ``merge/<number>``, in the frame of its reference's camera."""
+def load_merged_surface(store: Session, merge: str, warn: Warn = ignore_warnings) -> MeasuredSurface:
+    """A stored merge ``merge/<number>``, in the frame of its reference's camera."""
     meta, points = read_merge(store, merge, warn)
     sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))
     model = str(meta.get("model", ""))

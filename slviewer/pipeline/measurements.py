@@ -39,7 +39,7 @@ from slviewer.session.measurements import (
 from slviewer.session.store import Session
 
 Shape = Literal["plane", "sphere", "cylinder"]
-ROUGH = 5.0
+MAX_RMS_TO_NOISE = 5.0
 """Times the points' noise: a fit with a larger RMS gets a warning."""
 COLUMNS = ("id", "name", "kind", "scan", "quantity", "value", "unit", "U (k = 2)", "calibration in U", "state", "time")
 
@@ -51,48 +51,48 @@ def add_point(session: SessionLike, on: MeasuredSurface, at: Place, name: str = 
     data = {"at": at, "feature": feature, "scatter": spread.scatter, "calibration": on.calibration}
     arrays = {} if spread.shared is None else {"shared": spread.shared.astype(np.float32)}
     with opened(session, write=True) as store:
-        return _saved(store, on, "point", [x, y, z], data, arrays, name)
+        return _save_measurement(store, on, "point", [x, y, z], data, arrays, name)
 
 
 def add_distance(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = "") -> Measurement:
     """The distance between two picked points."""
     (first, first_spread), (second, second_spread) = on.picked(a), on.picked(b)
-    found = distance(first.place, second.place, first_spread, second_spread)
+    length = distance(first.place, second.place, first_spread, second_spread)
     data = {"at": [a, b], "ends": [first.place.tolist(), second.place.tolist()]}
     with opened(session, write=True) as store:
-        return _saved(store, on, "distance", [found], data, {}, name)
+        return _save_measurement(store, on, "distance", [length], data, {}, name)
 
 
 def add_fit(session: SessionLike, on: MeasuredSurface, shape: Shape, region: Region, name: str = "") -> Measurement:
     """A plane, sphere or cylinder fitted to a region. Raises InputError where the region does not hold it."""
-    found = fit_feature(shape, on.within(region), on.shared, on.calibration)
+    fit = fit_feature(shape, on.within(region), on.shared, on.calibration)
     noise = on.noise(region)
-    if found.rms > ROUGH * noise:
+    if fit.rms > MAX_RMS_TO_NOISE * noise:
         warning = (
-            f"points lie {found.rms:.3g} mm (RMS) off the {shape}, and their noise is {noise:.2g} mm: see what it shows"
+            f"points lie {fit.rms:.3g} mm (RMS) off the {shape}, and their noise is {noise:.2g} mm: see what it shows"
         )
-        found = replace(found, warnings=(*found.warnings, warning))
-    arrays = {} if found.spread.shared is None else {"shared": found.spread.shared.astype(np.float32)}
-    where = f"{region.text()}: {found.used:,} used, {found.left_out:,} left out"
-    data = {"region": region, "where": where, "fit": found.to_json()}
+        fit = replace(fit, warnings=(*fit.warnings, warning))
+    arrays = {} if fit.spread.shared is None else {"shared": fit.spread.shared.astype(np.float32)}
+    where = f"{region.text()}: {fit.used:,} used, {fit.left_out:,} excluded"
+    data = {"region": region, "where": where, "fit": fit.to_json()}
     with opened(session, write=True) as store:
-        return _saved(store, on, shape, found.quantities(), data, arrays, name)
+        return _save_measurement(store, on, shape, fit.quantities(), data, arrays, name)
 
 
 def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measurement:
     """Angles and distances between two points or fits, by their ids. Raises InputError where one is neither, is stale,
-    or lies in another camera's frame."""
+    or is in another camera's frame."""
     with opened(session, write=True) as store:
         first, second = (load_measurement(store, each) for each in (a, b))
         if a == b:
             raise InputError(f"{first.name} was chosen twice: choose two measurements")
         for each in (first, second):
-            if _stale(store, each):
+            if _is_stale(store, each):
                 raise InputError(f"{each.name} is stale, what it was measured on has changed: measure it again")
-        (one, one_spread), (other, other_spread) = (feature_of(store, each) for each in (first, second))
+        (one, one_spread), (other, other_spread) = (load_feature(store, each) for each in (first, second))
         _check_frames(store, first, second)
         source = first.source if first.source == second.source else f"{first.source}, {second.source}"
-        found = relation(one, one_spread, other, other_spread)
+        quantities = relation(one, one_spread, other, other_spread)
         model = first.model if first.model == second.model else f"{first.model}, {second.model}"
         saved = save_measurement(
             store,
@@ -100,7 +100,7 @@ def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measur
             source=source,
             model=model,
             inputs={},
-            data={"quantities": found, "between": [first.name, second.name]},
+            data={"quantities": quantities, "between": [first.name, second.name]},
             arrays={},
             of=(a, b),
             name=name or f"{first.name} – {second.name}",
@@ -113,10 +113,10 @@ def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, n
     ends = [on.picked(place)[0].place for place in (a, b)]
     middle = (ends[0] + ends[1]) / 2
     plane = CutPlane.through(ends[0], ends[1], -middle)
-    vertices, faces = triangles_of(on)
+    vertices, faces = triangulate_surface(on)
     lines = section(vertices, faces, plane)
     heights = np.concatenate(lines)
-    found = [
+    quantities = [
         Quantity("length along", float(np.ptp(heights[:, 0])), "mm"),
         Quantity("height range", float(np.ptp(heights[:, 1])), "mm"),
     ]
@@ -126,7 +126,7 @@ def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, n
         "lengths": np.array([len(line) for line in lines], np.int32),
     }
     with opened(session, write=True) as store:
-        return _saved(store, on, "section", found, data, arrays, name)
+        return _save_measurement(store, on, "section", quantities, data, arrays, name)
 
 
 def section_lines(session: SessionLike, identity: str) -> tuple[CutPlane, list[np.ndarray]]:
@@ -140,37 +140,37 @@ def section_lines(session: SessionLike, identity: str) -> tuple[CutPlane, list[n
     return from_plain(measured.data["plane"], CutPlane), lines
 
 
-def measurements(session: SessionLike) -> list[Measurement]:
+def load_measurements(session: SessionLike) -> list[Measurement]:
     """All measurements, in the order in which they were made; stale where what they were made from has changed."""
     with opened(session) as store:
-        return [replace(each, stale=_stale(store, each)) for each in list_measurements(store)]
+        return [replace(each, stale=_is_stale(store, each)) for each in list_measurements(store)]
 
 
-def remove(session: SessionLike, identity: str) -> None:
+def delete_measurement(session: SessionLike, identity: str) -> None:
     """Move a measurement to the trash."""
     with opened(session, write=True) as store:
         trash_measurement(store, identity)
 
 
-def restore(session: SessionLike, identity: str = "") -> Measurement:
-    """Undo ``remove``, by default the last one."""
+def undo_delete(session: SessionLike, identity: str = "") -> Measurement:
+    """Undo ``delete_measurement``, by default the last one."""
     with opened(session, write=True) as store:
         return restore_measurement(store, identity)
 
 
-def rename(session: SessionLike, identity: str, name: str) -> Measurement:
+def relabel_measurement(session: SessionLike, identity: str, name: str) -> Measurement:
     """Give a measurement another name."""
     with opened(session, write=True) as store:
         return rename_measurement(store, identity, name)
 
 
 def quantities_of(measured: Measurement) -> list[Quantity]:
-    """What a measurement read, with units and uncertainties."""
+    """The measured quantities with units and uncertainties."""
     return from_plain(measured.data["quantities"], list[Quantity])
 
 
-def in_words(measured: Measurement) -> str:
-    """A measurement in one line."""
+def describe_measurement(measured: Measurement) -> str:
+    """A measurement as one line of text."""
     mark = "  [stale: measured on what has since changed]" if measured.stale else ""
     read = "; ".join(quantity.text() for quantity in quantities_of(measured))
     return f"{measured.id:<4} {measured.name} ({measured.kind} on {measured.source}): {read}{mark}"
@@ -181,7 +181,7 @@ def measurements_csv(session: SessionLike) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for each in measurements(session):
+    for each in load_measurements(session):
         for q in quantities_of(each):
             U = "" if q.U is None else f"{q.U:.6g}"
             whole = "" if q.U is None else ("yes" if q.whole else "no")
@@ -204,7 +204,7 @@ def export_measurements(session: SessionLike, out: Path | str) -> int:
         return len(list_measurements(store))
 
 
-def triangles_of(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
+def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) float64 and faces (m, 3) of a surface; a scan's end where its depth jumps."""
     if on.faces is not None:
         return np.asarray(on.points, np.float64), on.faces
@@ -214,8 +214,8 @@ def triangles_of(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
     return on.points[on.measured].astype(np.float64), faces
 
 
-def feature_of(store: Session, measured: Measurement) -> tuple[Feature, Spread]:
-    """The point, plane, sphere or cylinder that a measurement is, and how sure it is."""
+def load_feature(store: Session, measured: Measurement) -> tuple[Feature, Spread]:
+    """The point, plane, sphere or cylinder of a measurement, and its uncertainty."""
     if measured.kind not in ("point", "plane", "sphere", "cylinder"):
         raise InputError(f"{measured.name} is a {measured.kind}: choose a point, plane, sphere or cylinder")
     shared = measurement_arrays(store, measured.id).get("shared")
@@ -224,11 +224,11 @@ def feature_of(store: Session, measured: Measurement) -> tuple[Feature, Spread]:
     return from_plain(record["feature"], Feature), Spread(np.array(record["scatter"]), shared, record["calibration"])
 
 
-def _saved(
+def _save_measurement(
     store: Session,
     on: MeasuredSurface,
     kind: str,
-    found: list[Quantity],
+    quantities: list[Quantity],
     data: dict[str, Any],
     arrays: dict[str, np.ndarray],
     name: str,
@@ -239,18 +239,18 @@ def _saved(
         source=on.source,
         model=on.model,
         inputs=on.inputs,
-        data={"quantities": found, **data, "scale": on.scale},
+        data={"quantities": quantities, **data, "scale": on.scale},
         arrays=arrays,
         name=name,
     )
 
 
-def _stale(store: Session, measured: Measurement) -> bool:
-    """Also where a correction of scale was applied since, or taken away."""
+def _is_stale(store: Session, measured: Measurement) -> bool:
+    """Whether the inputs changed, or a correction of scale was applied or removed since."""
     if measured.stale:
         return True
     if measured.of:
-        return any(_stale(store, load_measurement(store, each)) for each in measured.of)
+        return any(_is_stale(store, load_measurement(store, each)) for each in measured.of)
     used = measured.data.get("scale")
     return used is not None and scale_factor(store, measured.model) != used
 

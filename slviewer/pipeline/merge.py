@@ -12,7 +12,7 @@ from slviewer.evaluation import letter
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, stage
-from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred, warn_if_stale
+from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, next_number, opened
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.reconstruction.cloud import Cloud
@@ -25,7 +25,7 @@ from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
 
-CONTRADICTING = 0.01
+MAX_CONTRADICTION_SHARE = 0.01
 """Share of contradicting points from which on a pair is warned about: noise alone has fewer than one in a million."""
 StartKind = Literal["features", "turntable", "identity"]
 Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
@@ -34,9 +34,9 @@ Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Merge:
-    """How scans lie on one of them, the one surface that they were fused to, and the file it went to.
+    """Scans aligned to one of them, the surface that they were fused to, and its file.
 
-    ``scale`` says, in words, what correction of scale is in it; ``kept`` names the session's result, where it is kept.
+    ``scale`` describes the correction of scale in it; ``result_name`` is the stored result, if any.
     ``static_points``: by scan, how many points stand still while the object moves; ``contradictions`` of each pair.
     In the file ``seen_by`` counts the scans that a point is the mean of, and ``source`` numbers the one that its place
     comes from, 0 for the first of ``fused.names``.
@@ -47,7 +47,7 @@ class Merge:
     clouds: Mapping[str, Cloud]
     out: Path
     scale: str = ""
-    kept: str = ""
+    result_name: str = ""
     static_points: Mapping[str, int] = field(default_factory=dict)
     contradictions: Mapping[Pair, SceneContradiction] = field(default_factory=dict)
 
@@ -58,7 +58,7 @@ class Merge:
 
     @property
     def pairs(self) -> Mapping[str, Registration]:
-        """How every scan but the reference lies on it, by name."""
+        """The registration of every scan but the reference to it, by name."""
         return self.alignment.on_reference()
 
     def to_json(self) -> dict[str, Any]:
@@ -67,8 +67,10 @@ class Merge:
         alignment = self.alignment
         return {
             "reference": alignment.reference,
-            "pairs": {name: _figures(pair) for name, pair in self.pairs.items()},
-            "registered": [{"scan": a, "onto": b, **_figures(pair)} for (a, b), pair in alignment.pairs.items()],
+            "pairs": {name: _registration_figures(pair) for name, pair in self.pairs.items()},
+            "registered": [
+                {"scan": a, "onto": b, **_registration_figures(pair)} for (a, b), pair in alignment.pairs.items()
+            ],
             "loops": [
                 {
                     "scans": list(loop.names),
@@ -83,8 +85,14 @@ class Merge:
             "refused": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.refused.items()],
             "static_points": dict(self.static_points),
             "contradictions": [
-                {"scan": a, "onto": b, "share": found.share, "compared": found.compared, "gate_mm": found.gate_mm}
-                for (a, b), found in self.contradictions.items()
+                {
+                    "scan": a,
+                    "onto": b,
+                    "share": contradiction.share,
+                    "compared": contradiction.compared,
+                    "gate_mm": contradiction.gate_mm,
+                }
+                for (a, b), contradiction in self.contradictions.items()
             ],
             "letter_rms_mm": dict(letter.EXPERIMENT_3_ICP_RMS_MM),
             "points": len(self.fused.surface),
@@ -114,7 +122,7 @@ class Merge:
         lines += [f"excluded: {why}" for why in alignment.dropped.values()]
         lines += [f"not registered: {a} -> {b}: {why}" for (a, b), why in alignment.refused.items()]
         if self.contradictions:
-            worst_pair = max(self.contradictions.values(), key=lambda found: found.share)
+            worst_pair = max(self.contradictions.values(), key=lambda contradiction: contradiction.share)
             lines.append(
                 f"contradicting points: {100 * worst_pair.share:.2g} % at most of what both scans of a pair cover lies "
                 f"more than {worst_pair.gate_mm:.2g} mm in front of the other's surface"
@@ -125,10 +133,10 @@ class Merge:
             lines.append(f"removed as far from everything else: {counted}")
         if self.scale:
             lines.append(self.scale)
-        seen = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
-        lines.append(f"{len(self.fused.surface)} points, {seen} -> {self.out}")
-        if self.kept:
-            lines.append(f"the session stores it as {self.kept}: mesh, compare and measure know it by that name")
+        overlap_text = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
+        lines.append(f"{len(self.fused.surface)} points, {overlap_text} -> {self.out}")
+        if self.result_name:
+            lines.append(f"the session stores it as {self.result_name}: mesh, compare and measure accept that name")
         return "\n".join(lines)
 
 
@@ -167,7 +175,7 @@ def merge(
 
     Python alone: ``axis`` of the turntable, estimated where it is not given; ``poses`` (4, 4) by name, the initial
     alignment with "identity"; ``picked``, for a pair (scan, onto), three or more points (n, 3) mm on either, in their
-    cameras' frames, that these pairs start from. What stands still while the object moves is measured apart from it
+    cameras' frames, that these pairs start from. The static background is separated from the moving object
     and excluded from the surface, unless ``keep_background``.
     """
     given = list(dict.fromkeys(captures))
@@ -179,10 +187,10 @@ def merge(
         if out.suffix.lower() != ".ply":
             raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
         out.parent.mkdir(parents=True, exist_ok=True)
-    starts = _starts(names, start, angle, axis, poses, picked, warn)
+    starts = _initial_alignments(names, start, angle, axis, poses, picked, warn)
     with opened(session, write=out is None) as store:
         check_accepted(store, accept_rejected)
-        fitted = load_model(store, model or preferred(store))
+        fitted = load_model(store, model or preferred_model(store))
         warn_if_stale(store, warn)
         check_capture_sizes(store, names)
         scale, clouds = describe_scale(store, fitted.name), {}
@@ -213,51 +221,51 @@ def merge(
         path = store.exports / f"merged_{number}.ply" if out is None else out
         path.parent.mkdir(parents=True, exist_ok=True)
         write_ply(path, surface.points, surface.colours, surface.normals, scalars, notes=notes)
-        still = {name: int(mask.sum()) for name, mask in registered.static.items()}
-        kept = f"merge/{number}" if number else ""
-        found = Merge(alignment, fused, clouds, path, scale, kept, still, registered.contradictions)
-        if found.kept:
-            store.save_result(found.kept, merge_record(store, found, fitted.name), {})
+        static_points = {name: int(mask.sum()) for name, mask in registered.static.items()}
+        result_name = f"merge/{number}" if number else ""
+        result = Merge(alignment, fused, clouds, path, scale, result_name, static_points, registered.contradictions)
+        if result.result_name:
+            store.save_result(result.result_name, merge_record(store, result, fitted.name), {})
     progress(1.0, "merged")
-    return found
+    return result
 
 
 def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool) -> list[str]:
-    """What of the scans is not the object, or contradicts, and what to do."""
-    said = []
+    """Warnings of points that are not the object, or contradict another scan, with the remedy."""
+    messages = []
     still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
     if still:
         total = sum(int(clouds[name].mask.sum()) for name in still)
         counts = ", ".join(f"{count} of {name}" for name, count in still.items())
-        said.append(
+        messages.append(
             f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while the object moves: "
             + ("they are in the merge once for each scan" if keep_background else "they are not part of the merge")
         )
-    for (one, other), found in registered.contradictions.items():
-        if found.share > CONTRADICTING:
-            said.append(
-                f"{one} -> {other}: {100 * found.share:.2g} % of the points contradict, they lie more than "
-                f"{found.gate_mm:.2g} mm in front of what the other scan sees there: something moved on its own or "
-                "stands still; restrict the scans to the object, or scan again"
+    for (one, other), contradiction in registered.contradictions.items():
+        if contradiction.share > MAX_CONTRADICTION_SHARE:
+            messages.append(
+                f"{one} -> {other}: {100 * contradiction.share:.2g} % of the points contradict, they lie more than "
+                f"{contradiction.gate_mm:.2g} mm in front of what the other scan sees there: something moved alone "
+                "or stands still; restrict the scans to the object, or scan again"
             )
-    return said
+    return messages
 
 
-def merge_record(store: Session, found: Merge, model: str) -> dict[str, Any]:
+def merge_record(store: Session, merged: Merge, model: str) -> dict[str, Any]:
     """What a session keeps of a merge made with that model: its figures, its file in the exports, and its inputs."""
     calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
     return {
-        **found.to_json(),
-        "scans": list(found.fused.names),
-        "ply": found.out.name,
+        **merged.to_json(),
+        "scans": list(merged.fused.names),
+        "ply": merged.out.name,
         "model": model,
-        "scale": found.scale,
+        "scale": merged.scale,
         "scales": {model: scale_factor(store, model)},
-        "inputs": store.input_hashes(*found.fused.names, *calibrations),
+        "inputs": store.input_hashes(*merged.fused.names, *calibrations),
     }
 
 
-def _starts(
+def _initial_alignments(
     names: Sequence[str],
     start: StartKind,
     angle: float | None,
@@ -277,22 +285,22 @@ def _starts(
         picks[scan, onto], apart = fit_picked_start(there, here)
         warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
     for base in {onto for _, onto in picks} if poses is None and angle is None else ():
-        if all((name, base) in picks for name in names if name != base):  # pairs that nobody picked start there too
+        if all((name, base) in picks for name in names if name != base):  # pairs without picked points start there too
             poses = {base: np.eye(4)} | {name: picks[name, base].T for name in names if name != base}
     return Starts(poses=poses, step_deg=angle, axis=axis, picked=picks)
 
 
-def _figures(found: Registration) -> dict[str, Any]:
+def _registration_figures(registration: Registration) -> dict[str, Any]:
     return {
-        "rms_mm": found.rms_mm,
-        "point_to_point_rms_mm": found.inlier_rmse_mm,
-        "overlap": found.overlap,
-        "agreement": found.agreement,
-        "slack_mm": found.slack_mm,
-        "gate_mm": found.gate_mm,
-        "start": found.start,
-        "sigma_shift_mm": found.uncertainty.shift_mm,
-        "sigma_turn_deg": found.uncertainty.turn_deg,
-        "middle": found.uncertainty.centre.tolist(),
-        "T_reference_scan": found.T_reference_scan.tolist(),
+        "rms_mm": registration.rms_mm,
+        "point_to_point_rms_mm": registration.inlier_rmse_mm,
+        "overlap": registration.overlap,
+        "agreement": registration.agreement,
+        "slack_mm": registration.slack_mm,
+        "gate_mm": registration.gate_mm,
+        "start": registration.start,
+        "sigma_shift_mm": registration.uncertainty.shift_mm,
+        "sigma_turn_deg": registration.uncertainty.turn_deg,
+        "middle": registration.uncertainty.centre.tolist(),
+        "T_reference_scan": registration.T_reference_scan.tolist(),
     }

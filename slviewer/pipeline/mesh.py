@@ -1,4 +1,4 @@
-"""From captures, or from a merge that is kept, to a mesh in a file."""
+"""From captures, or from a stored merge, to a mesh in a file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ MERGE = "merge/"
 
 @dataclass(frozen=True, eq=False)
 class MeshResult:
-    """A mesh, what it was made of, and the file it went to. ``merged`` says how the scans were merged for it."""
+    """A mesh, what it was made of, and the file it went to. ``merged``: the merge of several scans."""
 
     meshed: BuiltMesh
     sources: tuple[str, ...]
@@ -66,7 +66,7 @@ def mesh(
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
 
-    ``merge/`` alone is the session's last merge. The points of merged scans are written beside the mesh.
+    ``merge/`` alone is the session's last merge. The points of merged scans are written next to the mesh.
     """
     sources = tuple(dict.fromkeys(names))
     if not sources:

@@ -62,7 +62,7 @@ def save_fitted(
     store.save_result(f"calibration/{model.name}", meta, model.to_arrays())
 
 
-def available(store: Session) -> tuple[str, ...]:
+def available_models(store: Session) -> tuple[str, ...]:
     """Names of the calibrations that the session holds."""
     return tuple(name for name in MODELS if store.has_result(f"calibration/{name}"))
 
@@ -75,7 +75,7 @@ def save_imported_stereo(
     camera: tuple[int, int] | None,
     projector: tuple[int, int] | None,
 ) -> None:
-    """Make matrices from elsewhere the session's stereo calibration; sizes may be left to the session's captures."""
+    """Save imported matrices as the session's stereo calibration; sizes that are None follow from its captures."""
     imported = {name: value.tolist() for name, value in matrices.items()}
     meta = {"imported": imported, "source": source, "camera": camera, "projector": projector, "inputs": {}}
     store.save_result("calibration/stereo", meta, {})
@@ -83,14 +83,14 @@ def save_imported_stereo(
 
 def load_stereo(store: Session) -> StereoModel:
     """The session's stereo calibration, without its residual arrows."""
-    if "stereo" not in available(store):
+    if "stereo" not in available_models(store):
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
     meta = store.load_result("calibration/stereo", only=())[0]
     if "model" in meta:
         return StereoModel.from_dict(meta["model"])
     captures = store.captures()
     if not captures and not (meta["camera"] and meta["projector"]):
-        raise InputError(f"{store.folder} holds no capture that tells the camera's size: import the scans first")
+        raise InputError(f"{store.folder} holds no capture that states the camera's size: import the scans first")
     camera = tuple(meta["camera"] or captures[0].size)
     projector = tuple(meta["projector"] or captures[0].sequence.projector)
     m = {name: np.array(value) for name, value in meta["imported"].items()}
@@ -106,12 +106,12 @@ def load_calibration(session: SessionLike, model: str | None = None, *, accept_r
     Raises InputError where there is none, CalibrationRejected for one that was rejected, unless that is accepted.
     """
     with opened(session) as store:
-        return load_model(store, model or best(store, accept_rejected))
+        return load_model(store, model or best_model(store, accept_rejected))
 
 
 def load_stereo_if_complete(store: Session) -> StereoModel | None:
-    """The session's stereo calibration; None where there is none, or an imported one whose sizes nothing tells yet."""
-    if "stereo" not in available(store):
+    """The session's stereo calibration; None where there is none, or an imported one whose sizes are still unknown."""
+    if "stereo" not in available_models(store):
         return None
     meta = store.load_result("calibration/stereo", only=())[0]
     sized = "model" in meta or (meta["camera"] and meta["projector"]) or store.capture_names()
@@ -130,8 +130,8 @@ def load_model(store: Session, name: str) -> Model:
     The last ``MAX_LOADED`` stay in memory: a splined model compiles its per-pixel maps and its uncertainty when they
     are first used, which takes seconds.
     """
-    if name not in available(store):
-        there = ", ".join(available(store))
+    if name not in available_models(store):
+        there = ", ".join(available_models(store))
         raise InputError(
             f"{store.folder} holds no {name} calibration ({f'there is {there}' if there else 'there is none'}): "
             "run `slviewer calibrate` first"
@@ -157,29 +157,29 @@ def load_model(store: Session, name: str) -> Model:
         return _LOADED.setdefault(content, model)
 
 
-def best(store: Session, accept_rejected: bool = False) -> str:
-    """The calibration to use where none is named: see ``preferred``.
+def best_model(store: Session, accept_rejected: bool = False) -> str:
+    """The calibration to use where none is named: see ``preferred_model``.
 
     Raises CalibrationRejected, with the reason, for one that was rejected, unless that is accepted.
     """
     check_accepted(store, accept_rejected)
-    return preferred(store)
+    return preferred_model(store)
 
 
-def preferred(store: Session) -> str:
-    """The calibration that the operator has chosen, while there is one of that name; else the one ``recommended``."""
+def preferred_model(store: Session) -> str:
+    """The calibration that the operator has chosen, while it exists; else ``recommended_model``."""
     decided = store.decision("model")
-    return str(decided) if decided and decided in available(store) else recommended(store)
+    return str(decided) if decided and decided in available_models(store) else recommended_model(store)
 
 
-def recommended(store: Session) -> str:
+def recommended_model(store: Session) -> str:
     """The calibration that cross-validation recommends, where it was made for these; else splined or pixelwise, if it
-    had 8 poses or more; else stereo.
+    has 8 poses or more; else stereo.
     """
-    there = available(store)
+    there = available_models(store)
     if not there:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    compared = validation(store)
+    compared = load_validation(store)
     if compared is not None and compared.recommended in there:
         return compared.recommended
     for name in ("splined", "pixelwise"):
@@ -188,17 +188,17 @@ def recommended(store: Session) -> str:
     return there[0]
 
 
-def validation(store: Session) -> CrossValidation | None:
-    """How the session's calibrations compare on poses that they were not made from; None where nobody has compared
+def load_validation(store: Session) -> CrossValidation | None:
+    """How the session's calibrations compare on poses that they were not made from; None where they were not compared
     them as they are now."""
     if store.state_of(VALIDATION) != "fresh":
         return None
     return from_plain(store.load_result(VALIDATION, only=())[0]["validation"], CrossValidation)
 
 
-def rejection(store: Session) -> str:
+def rejection_reason(store: Session) -> str:
     """Why the session's calibration was rejected; empty where it was not, or was never judged."""
-    if "stereo" not in available(store):
+    if "stereo" not in available_models(store):
         return ""
     judged = store.load_result("calibration/stereo", only=())[0].get("verdict")
     verdict = from_plain(judged, Verdict) if judged else Verdict()
@@ -207,26 +207,26 @@ def rejection(store: Session) -> str:
 
 def check_accepted(store: Session, accept_rejected: bool = False) -> None:
     """Raise CalibrationRejected, with the reason, where the calibration was rejected and that is not accepted."""
-    reason = rejection(store)
+    reason = rejection_reason(store)
     if reason and not accept_rejected:
         raise CalibrationRejected(f"the calibration was rejected, and is not used without --accept-rejected: {reason}")
 
 
 def accept_rejected_calibration(store: Session, on: bool) -> None:
-    """Remember whether the calibration at hand is to be used although it was rejected; another one is asked anew."""
+    """Remember whether the present calibration is to be used although rejected; a new one needs a new decision."""
     store.decide("use_anyway", store.input_hashes("calibration/stereo")["calibration/stereo"] if on else None)
 
 
 def accepts_rejected(store: Session) -> bool:
-    """Whether that was decided of the calibration at hand."""
+    """Whether the operator decided to use the present calibration although it was rejected."""
     decided = store.decision("use_anyway")
-    if not decided or "stereo" not in available(store):
+    if not decided or "stereo" not in available_models(store):
         return False
     return bool(decided == store.input_hashes("calibration/stereo")["calibration/stereo"])
 
 
 def frame_family(name: str) -> str:
-    """The calibration whose camera frame a model's clouds are in: splined has its own, the others stand on stereo's."""
+    """The calibration whose camera frame a model's clouds are in: splined has its own, the others that of stereo."""
     return "splined" if name == "splined" else "stereo"
 
 
@@ -240,8 +240,8 @@ def frame_of(store: Session, name: str) -> str:
 
 
 def warn_if_frame_changed(store: Session, before: str, warn: Warn) -> None:
-    """Say so where another model is used than ``before`` (empty: none was), whose clouds lie in another frame."""
-    after = preferred(store) if available(store) else ""
+    """Warn where another model is used than ``before`` (empty: none was), whose clouds lie in another frame."""
+    after = preferred_model(store) if available_models(store) else ""
     if before and after and frame_family(before) != frame_family(after):
         warn(
             f"the {after} calibration is used from now on instead of {before}, and its clouds lie in another frame: "
@@ -252,12 +252,12 @@ def warn_if_frame_changed(store: Session, before: str, warn: Warn) -> None:
 def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:
     """Calibrations by name; all there are where none is named."""
     load_stereo(store)
-    return {name: load_model(store, name) for name in names or available(store)}
+    return {name: load_model(store, name) for name in names or available_models(store)}
 
 
 def warn_if_stale(store: Session, warn: Warn) -> None:
-    """Say so when target poses have changed since the calibration was made."""
-    stale = [name for name in available(store) if store.state_of(f"calibration/{name}") == "stale"]
+    """Warn when target poses have changed since the calibration was made."""
+    stale = [name for name in available_models(store) if store.state_of(f"calibration/{name}") == "stale"]
     if stale:
         *others, last = stale
         which = f"{', '.join(others)} and {last} calibrations were" if others else f"{last} calibration was"

@@ -1,4 +1,4 @@
-"""What one target pose says of itself, computed once and kept in the session as `evidence/<name>`."""
+"""Evidence of one target pose, computed once and stored in the session as `evidence/<name>`."""
 
 from collections.abc import Mapping
 
@@ -17,11 +17,11 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
-LOOK = 3
-"""How poses are examined; what a session keeps of another look is looked at anew."""
+EVIDENCE_VERSION = 3
+"""Version of the examination; evidence that was stored by another version is computed again."""
 
 
-def examine(
+def gather_evidence(
     name: str,
     sequence: PatternSequence,
     frames: np.ndarray,
@@ -29,47 +29,47 @@ def examine(
     board: Board,
     texture: np.ndarray,
     check: FrameCheck,
-    found: Detection | None,
-    seen: Observation | None,
+    detection: Detection | None,
+    observation: Observation | None,
     refused: str = "",
 ) -> PoseEvidence:
-    """What the decoded frames (n, h, w) of a pose say. ``found`` and ``seen``: its board and its phase, where they
-    could be read; ``refused``: why not; ``check``: of its frames.
+    """Evidence from the decoded frames (n, h, w) of a pose. ``detection`` and ``observation``: its board and its phase,
+    None where they could not be read, for the reason ``refused``; ``check``: of its frames.
     """
-    on_board = board_mask(board, found, texture.shape) if found is not None else None
+    on_board = board_mask(board, detection, texture.shape) if detection is not None else None
     suspects = {suspect.frame: suspect for suspect in check.suspects}
     return PoseEvidence(
         name=name,
         refused=refused,
-        grid=detect_grid_size(board, texture) if found is None else None,
+        grid=detect_grid_size(board, texture) if detection is None else None,
         axes={axis: measure_axis(sequence, frames, phase, on_board) for axis, phase in phases.items()},
         suspects=tuple(suspects[i] for i in sorted(suspects)),
         displaced=measure_white_delay(sequence, frames),
         moved_px=np.nan
-        if found is None
-        else measure_motion_px(sequence, frames, found.pixels, float(np.median(pitch_px(board, found)))),
-        turn=None if seen is None else fit_mean_turn(seen.camera, seen.projector),
+        if detection is None
+        else measure_motion_px(sequence, frames, detection.pixels, float(np.median(pitch_px(board, detection)))),
+        turn=None if observation is None else fit_mean_turn(observation.camera, observation.projector),
         contradictions=check.contradictions if refused else (),
     )
 
 
-def keep_evidence(store: Session, capture: Capture, board: Board, evidence: PoseEvidence) -> None:
-    """Keep it in the session."""
+def save_evidence(store: Session, capture: Capture, board: Board, evidence: PoseEvidence) -> None:
+    """Save the evidence of a pose in the session."""
     meta = {
         "target": str(board),
-        "look": LOOK,
+        "look": EVIDENCE_VERSION,
         "evidence": to_plain(evidence),
         "inputs": {capture.name: capture.hash},
     }
     store.save_result(f"evidence/{capture.name}", meta, {})
 
 
-def known_evidence(store: Session, name: str, board: Board) -> PoseEvidence | None:
-    """What is kept of a pose, if it is for these frames and this board."""
+def load_evidence(store: Session, name: str, board: Board) -> PoseEvidence | None:
+    """The stored evidence of a pose; None where it is missing, or of other frames or another board."""
     result = f"evidence/{name}"
     if store.state_of(result) != "fresh":
         return None
     meta = store.load_result(result, only=())[0]
-    if (meta["target"], meta.get("look")) != (str(board), LOOK):
+    if (meta["target"], meta.get("look")) != (str(board), EVIDENCE_VERSION):
         return None
     return PoseEvidence.from_json(meta["evidence"])

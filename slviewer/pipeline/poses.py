@@ -1,4 +1,4 @@
-"""What each target pose says, computed once and kept in the session beside the frames it came from."""
+"""The observation of each target pose, computed once and stored in the session with its frames."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,8 +12,8 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_captures
 from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_check
-from slviewer.pipeline.pose_evidence import examine as examine_frames
-from slviewer.pipeline.pose_evidence import keep_evidence, known_evidence
+from slviewer.pipeline.pose_evidence import gather_evidence as examine_frames
+from slviewer.pipeline.pose_evidence import load_evidence, save_evidence
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -22,7 +22,7 @@ from slviewer.target.detect import Detection, detect
 
 @dataclass(frozen=True)
 class Judged:
-    """A pose's observation, or why there is none."""
+    """A pose's observation, or None and the reason (``refused``)."""
 
     name: str
     observation: Observation | None
@@ -46,24 +46,26 @@ def read_pose(
     ``texture`` (h, w) or (h, w, 3) uint8 shows the board. ``examine``: with the evidence of its frames (n, h, w).
     ``check``: of its frames; computed if None.
     """
-    found: Detection | None = None
-    seen: Observation | None = None
+    detection: Detection | None = None
+    observation: Observation | None = None
     refused = ""
     if examine:
         check = check or check_frames(sequence, frames)
     try:
-        found = detect(board, texture)
-        seen = observe(name, board, found, phases, smoothing)
+        detection = detect(board, texture)
+        observation = observe(name, board, detection, phases, smoothing)
         check_capture(name, sequence, frames, phases, check)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
     evidence = None
     if examine and check:
-        evidence = examine_frames(name, sequence, frames, phases, board, texture, check, found, seen, refused)
-    return Judged(name, None if refused else seen, refused, evidence)
+        evidence = examine_frames(
+            name, sequence, frames, phases, board, texture, check, detection, observation, refused
+        )
+    return Judged(name, None if refused else observation, refused, evidence)
 
 
-def judge(
+def read_stored_pose(
     store: Session,
     capture: Capture,
     frames: np.ndarray,
@@ -77,7 +79,7 @@ def judge(
     check = load_check(store, capture.name)
     judged = read_pose(capture.name, capture.sequence, frames, phases, texture, board, smoothing, examine, check)
     if judged.evidence is not None:
-        keep_evidence(store, capture, board, judged.evidence)
+        save_evidence(store, capture, board, judged.evidence)
     meta = {
         "target": str(board),
         "smoothing": _settings(smoothing),
@@ -90,8 +92,8 @@ def judge(
     return judged
 
 
-def known(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
-    """What ``judge`` kept of a pose, if it was for these frames, this board and this smoothing."""
+def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
+    """The stored reading of a pose; None where it is of other frames, another board or another smoothing."""
     result = f"poses/{name}"
     if store.state_of(result) != "fresh":
         return None
@@ -103,7 +105,7 @@ def known(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judg
     return Judged(name, Observation.from_arrays(name, store.load_result(result)[1]))
 
 
-def judge_all(
+def read_stored_poses(
     store: Session, names: Sequence[str], board: Board, smoothing: Smoothing, examine: bool = False
 ) -> Iterator[Judged]:
     """Every pose in order; frames are read only where a pose is not known yet.
@@ -120,25 +122,25 @@ def judge_all(
                 f"{first.name} {_wxh(first.size)} and {_wxh(first.sequence.projector)}: "
                 "calibrate poses of one rig at one resolution"
             )
-    kept = {name: known(store, name, board, smoothing) for name in names}
+    cached = {name: load_judged(store, name, board, smoothing) for name in names}
     if examine:
-        for name, judged in kept.items():
-            evidence = known_evidence(store, name, board)
-            kept[name] = replace(judged, evidence=evidence) if judged and evidence else None
-    fresh = decode_captures(store, [name for name in names if kept[name] is None])
+        for name, judged in cached.items():
+            evidence = load_evidence(store, name, board)
+            cached[name] = replace(judged, evidence=evidence) if judged and evidence else None
+    decoded = decode_captures(store, [name for name in names if cached[name] is None])
     for name in names:
-        yield kept[name] or judge(store, *next(fresh), board, smoothing, examine)
+        yield cached[name] or read_stored_pose(store, *next(decoded), board, smoothing, examine)
 
 
 def load_observations(store: Session, names: Sequence[str]) -> list[Observation]:
-    """Observations that the session keeps, of poses by name."""
-    found = []
+    """The stored observations of the named poses."""
+    observations = []
     for name in names:
         if store.has_result(f"poses/{name}"):
             meta, arrays = store.load_result(f"poses/{name}")
             if not meta["refused"]:
-                found.append(Observation.from_arrays(name, arrays))
-    return found
+                observations.append(Observation.from_arrays(name, arrays))
+    return observations
 
 
 def _settings(smoothing: Smoothing) -> list[str | int]:

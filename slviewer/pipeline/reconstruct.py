@@ -21,7 +21,7 @@ from slviewer.pipeline.models import (
     frame_of,
     load_models,
     load_stereo,
-    preferred,
+    preferred_model,
     warn_if_stale,
 )
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -35,14 +35,14 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
 
-SAID_FROM = 1.2
-"""Times its predicted noise that a calibration's residual is, from which raising sigma is worth a sentence."""
+REPORTED_RAISE = 1.2
+"""Times its predicted noise that a calibration's residual is, from which raising sigma is reported."""
 
 
 @dataclass(frozen=True)
 class Reconstruction:
     """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
-    measures the board. ``scale`` says, in words, what correction of scale is in it; ``masked`` is the share of the
+    measures the board. ``scale`` describes the correction of scale in it; ``masked`` is the share of the
     pixels that were masked because no target pose illuminated what they look through, None for models that mask none.
     ``frame``: the one that the points are in, in words. ``raised``: the calibration's residuals over their predicted
     noise, by which sigmas are raised.
@@ -67,12 +67,12 @@ class Reconstruction:
             f"{np.percentile(z, 99):.0f} mm, predicted depth noise {np.median(sigma):.3f} mm -> {self.ply}"
         ]
         if cloud.sigma_calibration is not None:
-            left = cloud.sigma_calibration[cloud.mask]
+            sigma_z = cloud.sigma_calibration[cloud.mask]
             lines.append(
-                f"apart from a rigid motion, the calibration leaves {np.median(left):.4f} mm of depth uncertain in the "
-                f"median, {np.percentile(left, 95):.4f} mm at 95 % (1 sigma)"
+                f"apart from a rigid motion, the calibration leaves {np.median(sigma_z):.4f} mm of depth uncertain in "
+                f"the median, {np.percentile(sigma_z, 95):.4f} mm at 95 % (1 sigma)"
             )
-        if self.raised > SAID_FROM:
+        if self.raised > REPORTED_RAISE:
             lines.append(
                 f"sigma was raised: the calibration's residuals in {cloud.axis} are {self.raised:.1f} times their "
                 "predicted noise, and what disturbs its phases disturbs this capture's as well"
@@ -102,7 +102,7 @@ def reconstruct(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Reconstruction:
-    """Reconstruct a capture as a cloud; a board pose also says how flat each model measures the board.
+    """Reconstruct a capture as a cloud; for a board pose also how flat each model measures the board.
 
     Args:
         session: Session folder.
@@ -119,7 +119,7 @@ def reconstruct(
     """
     with opened(session) as store:
         check_accepted(store, accept_rejected)
-        name = model or preferred(store)
+        name = model or preferred_model(store)
         warn_if_stale(store, warn)
         check_capture_sizes(store, [capture])
         progress(0.1, "reading and decoding")
@@ -136,13 +136,13 @@ def reconstruct(
             for n, m in chosen.items()
         }
         cloud = clouds[name]
-        region = board_region(store, shot, texture, warn) if is_pose else None
+        region = segment_board(store, shot, texture, warn) if is_pose else None
         board = None
         if region is not None:
             depth_range = load_stereo(store).depth_range_mm
             board = compare("plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depth_range)
-        keep = cloud.mask if region is None else cloud.mask & region
-        if not keep.any():
+        mask = cloud.mask if region is None else cloud.mask & region
+        if not mask.any():
             raise InputError(
                 f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong to this camera "
                 "and projector, and is the scene within its depths?"
@@ -150,35 +150,35 @@ def reconstruct(
         ply = Path(out) if out is not None else store.exports / f"{capture}_{name}{'_mesh' if mesh else ''}.ply"
         progress(0.8, "writing")
         ply.parent.mkdir(parents=True, exist_ok=True)
-        faces = triangles(cloud.points, keep) if mesh else None
+        faces = triangulate_points(cloud.points, mask) if mesh else None
         notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}")
-        write_ply(ply, cloud.points[keep], texture[keep], scalars=cloud.sigmas(keep), faces=faces, notes=notes)
+        write_ply(ply, cloud.points[mask], texture[mask], scalars=cloud.sigmas(mask), faces=faces, notes=notes)
         if grid is not None:
             write_grid(Path(grid), cloud.points)
         scale, fitted, frame = describe_scale(store, name), chosen[name], frame_of(store, name)
         masked = masked_share(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
         raised = fitted.residuals_over_noise(cloud.axis) if isinstance(fitted, SplinedModel) else 1.0
         progress(1.0, "reconstructed")
-    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(keep)), board, scale, masked, frame, raised)
+    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(mask)), board, scale, masked, frame, raised)
 
 
-def triangles(points: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    """Faces (m, 3) int32 over the pixels ``keep`` (h, w) bool of organised points; surfaces end where depth jumps."""
-    kept = np.where(keep[..., None], points, np.float32(np.nan))
-    return triangulate_grid(kept, JUMP * float(np.median(points[..., 2][keep])))
+def triangulate_points(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Faces (m, 3) int32 over the pixels ``mask`` (h, w) bool of organised points; surfaces end where depth jumps."""
+    masked_points = np.where(mask[..., None], points, np.float32(np.nan))
+    return triangulate_grid(masked_points, JUMP * float(np.median(points[..., 2][mask])))
 
 
-def board_region(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
-    """(h, w) bool: the board's outline in a target pose; None, with a warning, where no board is found."""
+def segment_board(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
+    """(h, w) bool: the board's outline in a target pose; None, with a warning, where no board is detected."""
     board = load_stereo(store).board
     if not board:
         return None
     try:
-        found = detect(Board.parse(board), texture)
+        detection = detect(Board.parse(board), texture)
     except DetectionError as error:
         warn(f"{shot.name}: {error}")
         return None
-    return board_mask(Board.parse(board), found, texture.shape[:2])
+    return board_mask(Board.parse(board), detection, texture.shape[:2])
 
 
 def illuminated_pixels(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:

@@ -11,7 +11,7 @@ from slviewer.devices.replay import Recording, replayed
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import ignore_warnings
-from slviewer.pipeline.import_captures import checked, find_captures
+from slviewer.pipeline.import_captures import check_imported_capture, find_captures
 from slviewer.session.importers.imported import ImportableRecording
 from slviewer.session.store import Session, is_session
 
@@ -81,8 +81,8 @@ def _imported(
     folder: Path, layout: str | None, sequence: Path | str | None, projector: str | None
 ) -> dict[str, Callable[[], Shot]]:
     def read(recording: ImportableRecording) -> Shot:
-        found = checked(recording.read(), ignore_warnings)
-        return found.frames, found.sequence
+        capture = check_imported_capture(recording.read(), ignore_warnings)
+        return capture.frames, capture.sequence
 
     recordings = find_captures(folder, layout or "detect", sequence, projector=projector).recordings
     return {recording.name: partial(read, recording) for recording in recordings}

@@ -14,19 +14,19 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.calibration_verdict import last_verdict
-from slviewer.pipeline.check import history
+from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.check import load_drift_history
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.measurements import measurements, section_lines
+from slviewer.pipeline.measurements import load_measurements, section_lines
 from slviewer.pipeline.models import (
-    available,
+    available_models,
     load_model,
     load_residuals,
     load_stereo,
     load_stereo_if_complete,
-    preferred,
-    recommended,
-    validation,
+    load_validation,
+    preferred_model,
+    recommended_model,
 )
 from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
 from slviewer.pipeline.poses import load_observations
@@ -87,16 +87,16 @@ def _data(store: Session) -> SessionData:
     observations = {o.name: o for o in load_observations(store, list(stereo.poses))} if stereo and stereo.poses else {}
     stale = [
         f"The {name} calibration was made from target poses that have since changed: run calibrate again."
-        for name in available(store)
+        for name in available_models(store)
         if store.state_of(f"calibration/{name}") == "stale"
     ]
     fits: list[PixelFitView] = []
-    if stereo is not None and "pixelwise" in available(store):
+    if stereo is not None and "pixelwise" in available_models(store):
         model = load_model(store, "pixelwise")
         assert isinstance(model, PixelwiseModel)
         fits = [PixelFitView(axis, fit.rms_mm, fit.poses) for axis, fit in model.fits.items()]
     excluded = store.excluded()
-    verdict = last_verdict(store)
+    verdict = load_last_verdict(store)
     judged = store.load_result("calibration/stereo", only=())[0].get("verdict") if stereo is not None else None
     views, spacings = _verifications(store)
     return SessionData(
@@ -117,33 +117,33 @@ def _data(store: Session) -> SessionData:
 
 
 def _models(store: Session) -> ModelsView | None:
-    there = available(store)
+    there = available_models(store)
     if not there:
         return None
     splined = load_model(store, "splined") if "splined" in there else None
     assert splined is None or isinstance(splined, SplinedModel)
     return ModelsView(
-        used=preferred(store),
-        recommended=recommended(store),
-        comparison=validation(store),
+        used=preferred_model(store),
+        recommended=recommended_model(store),
+        comparison=load_validation(store),
         splined=None if splined is None else splined.summary(),
         scales={name: words for name in there if (words := describe_scale(store, name))},
     )
 
 
 def _acceptances(store: Session) -> list[AcceptanceView]:
-    found = []
+    views = []
     for name in numbered_results(store, "acceptance"):
         meta = store.load_result(name, only=())[0]
-        found.append(AcceptanceView(meta["accepted"], meta["time"], store.state_of(name) == "stale"))
-    return found
+        views.append(AcceptanceView(meta["accepted"], meta["time"], store.state_of(name) == "stale"))
+    return views
 
 
 def _drifts(store: Session) -> list[DriftRow]:
-    if "stereo" not in available(store):
+    if "stereo" not in available_models(store):
         return []
     now = store.input_hashes("calibration/stereo")["calibration/stereo"]
-    return [DriftRow(each.drift, each.time, each.calibration == now) for each in history(store)]
+    return [DriftRow(each.drift, each.time, each.calibration == now) for each in load_drift_history(store)]
 
 
 def _verifications(store: Session) -> tuple[list[VerificationView], list[SpacingRow]]:
@@ -233,7 +233,7 @@ MOST_DRAWN = 6
 
 def measured_views(store: Session) -> dict[str, Any]:
     """``measurements``, ``sections`` and ``deviations`` of a report's data."""
-    every = measurements(store)
+    every = load_measurements(store)
     sections = [each for each in every if each.kind == "section"]
     deviations = [each for each in every if each.kind == "deviation"]
     return {

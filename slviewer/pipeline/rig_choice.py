@@ -20,14 +20,14 @@ from slviewer.target.board import Board
 
 Choice = Mapping[str, Any]
 
-ABOUT = ("name", "settle_ms", "focal_px", "exposure_ms", "gain")
-"""What a choice may say of any rig: its name, the delay of its light, the nominal focal length of its lens in camera
-px, and what its camera is set to where nobody asks for anything else."""
+COMMON_KEYS = ("name", "settle_ms", "focal_px", "exposure_ms", "gain")
+"""Keys that a choice may hold for any rig: its name, the delay of its light, the nominal focal length of its lens
+in camera px, and what its camera is set to by default."""
 
 
 @dataclass(frozen=True)
 class RigSetup:
-    """A rig that can be opened; `world` is what stands before a simulated one, `focal_px` the lens's nominal focal
+    """A rig that can be opened; `world` is the scene of a simulated one, `focal_px` the lens's nominal focal
     length in camera px, where it is known, `reel` what is played back.
     """
 
@@ -41,16 +41,16 @@ SetUp = Callable[[Choice, Board | None], RigSetup]
 
 
 def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = None) -> RigSetup:
-    """The devices of a choice, not opened yet; `board` is what stands before a simulated rig, `channel` leads to the
+    """The devices of a choice, not opened yet; `board` is in front of a simulated rig, `channel` leads to the
     projector page where one is served.
 
-    Raises InputError for a choice that is none, DeviceError for a driver that cannot be used here.
+    Raises InputError for an invalid choice, DeviceError for a driver that cannot be used here.
     """
-    options = {key: value for key, value in choice.items() if key not in (*ABOUT, "driver")}
+    options = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
     focal, settle_ms = choice.get("focal_px"), float(choice.get("settle_ms", 0.0))
     try:
         if choice.get("driver") == "simulated":
-            bench = _simulated(board, **options)
+            bench = _simulated_setup(board, **options)
             return replace(bench, rig=replace(bench.rig, settle_ms=settle_ms))
         if choice.get("driver") == "replay":
             played = reel(**options)
@@ -59,7 +59,7 @@ def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = Non
             chosen = driver(str(choice["driver"]))
             if chosen.rig is None:
                 raise InputError(f"the driver {choice['driver']} offers no whole rig: choose a camera and a projector")
-            rig = chosen.rig(**options, **_wired(chosen, channel))
+            rig = chosen.rig(**options, **_channel_option(chosen, channel))
             return RigSetup(replace(rig, settle_ms=settle_ms or rig.settle_ms), focal_px=focal)
         camera, projector = (dict(options.pop(which)) for which in ("camera", "projector"))
         eye, lamp = driver(camera.pop("driver")), driver(projector.pop("driver"))
@@ -67,8 +67,8 @@ def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = Non
             raise InputError("one of the drivers offers no such device: choose others")
         rig = Rig(
             str(choice.get("name", "rig")),
-            eye.camera(**camera, **_wired(eye, channel)),
-            lamp.projector(**projector, **_wired(lamp, channel)),
+            eye.camera(**camera, **_channel_option(eye, channel)),
+            lamp.projector(**projector, **_channel_option(lamp, channel)),
             settle_ms,
         )
         return RigSetup(rig, focal_px=focal)
@@ -82,17 +82,18 @@ def needs_page(choice: Choice) -> bool:
     return any(drivers()[str(part["driver"])].channel for part in parts if str(part.get("driver")) in drivers())
 
 
-def rig_factory(found: Driver) -> Callable[..., Any] | None:
-    """What the options of a choice go to that names `found` as the driver of its whole rig; None if it drives none."""
-    own: dict[str, Callable[..., Any]] = {"simulated": _simulated, "replay": reel}
-    return own.get(found.name, found.rig)
+def rig_factory(driver: Driver) -> Callable[..., Any] | None:
+    """The function that builds the whole rig of a driver from its options; None if it drives no whole rig."""
+    own: dict[str, Callable[..., Any]] = {"simulated": _simulated_setup, "replay": reel}
+    return own.get(driver.name, driver.rig)
 
 
-def _wired(driver: Driver, channel: Channel | None) -> dict[str, Channel | None]:
+def _channel_option(driver: Driver, channel: Channel | None) -> dict[str, Channel | None]:
+    """The keyword argument ``channel`` for a driver that needs one."""
     return {"channel": channel} if driver.channel else {}
 
 
-def _simulated(board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0) -> RigSetup:
+def _simulated_setup(board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0) -> RigSetup:
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     rig = letter(scale, seed)

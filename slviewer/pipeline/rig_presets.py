@@ -1,6 +1,6 @@
 """Rigs by name: choices of devices as TOML files, shipped in ``assets/rigs`` or the operator's own in the session.
 
-A file holds what `pipeline.rig_choice.set_up` takes, and `what`, a sentence about it. Whatever a file says is checked
+A file holds what `pipeline.rig_choice.set_up` takes, and `what`, a sentence about it. The content of a file is checked
 before a device is touched, so that a mistyped option is named and not ignored.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 from slviewer.devices.drivers import Driver, driver, drivers
 from slviewer.errors import InputError
-from slviewer.pipeline.rig_choice import ABOUT, Choice, rig_factory
+from slviewer.pipeline.rig_choice import COMMON_KEYS, Choice, rig_factory
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
 from slviewer.simulation.assets import asset_folder
@@ -26,7 +26,7 @@ _NUMBERS = ("settle_ms", "focal_px", "exposure_ms", "gain")
 
 @dataclass(frozen=True)
 class Preset:
-    """A rig with a name: `what` it is in a sentence, the `choice` it stands for, the file that says so, and `problem`,
+    """A rig with a name: `what` it is in a sentence, the `choice` it stands for, its file, and `problem`,
     why it cannot be used here and how to correct that, empty if it can.
     """
 
@@ -41,7 +41,7 @@ def presets(session: Session | None = None) -> list[Preset]:
     """The session's own rigs, then those that are shipped; a session's hides a shipped one of the same name."""
     own = {} if session is None else session.rigs()
     shipped = {path.stem: path for path in sorted(asset_folder(FOLDER).glob("*.toml")) if path.stem not in own}
-    return [_described(name, path) for name, path in {**own, **shipped}.items()]
+    return [_read_preset_or_problem(name, path) for name, path in {**own, **shipped}.items()]
 
 
 def rigs(session: Session | None = None) -> str:
@@ -62,27 +62,27 @@ def load_rig(path_or_name: Path | str, session: Session | None = None) -> dict[s
     if path.suffix.lower() == ".toml" or path.is_file():
         if not path.is_file():
             raise InputError(
-                f"there is no file {path}: name a TOML file that describes a rig, or one of {_names(session)}"
+                f"there is no file {path}: name a TOML file that describes a rig, or one of {_list_names(session)}"
             )
-        found = _read(path.stem, path)
+        preset = _read_preset(path.stem, path)
     else:
         named = {preset.name: preset for preset in presets(session)}
         if str(path_or_name) not in named:
-            raise InputError(f"no rig is called {str(path_or_name)!r}: use {_names(session)}, or name a TOML file")
-        found = _read(str(path_or_name), named[str(path_or_name)].source)
-    for name in _driver_names(found.choice):
+            raise InputError(f"no rig is called {str(path_or_name)!r}: use {_list_names(session)}, or name a TOML file")
+        preset = _read_preset(str(path_or_name), named[str(path_or_name)].source)
+    for name in _driver_names(preset.choice):
         driver(name)  # raises where it cannot be used
-    return dict(found.choice)
+    return dict(preset.choice)
 
 
 def save_rig(session: Session, name: str, choice: Choice, what: str = "") -> Preset:
-    """Keep a choice in the session under a name, in place of an older one. Raises InputError for one that is none."""
+    """Save a choice in the session under a name, in place of an older one. Raises InputError for an invalid one."""
     check_choice(choice, f"the rig {name}")
-    return _read(name, session.save_rig(name, to_toml({"what": what, **choice} if what else choice)))
+    return _read_preset(name, session.save_rig(name, to_toml({"what": what, **choice} if what else choice)))
 
 
 def check_choice(choice: Choice, where: str) -> None:
-    """Raise InputError, with `where` the mistake stands, unless `choice` names devices and only options they know."""
+    """Raise InputError, which names the place `where`, unless `choice` names devices and only options they know."""
     for key in _NUMBERS:
         value = choice.get(key, 1)
         if (
@@ -95,23 +95,23 @@ def check_choice(choice: Choice, where: str) -> None:
     if not isinstance(choice.get("name", ""), str):
         raise InputError(f"{where}: name = {choice['name']!r} is no text: correct it")
     if "driver" in choice:
-        given = {key: value for key, value in choice.items() if key not in (*ABOUT, "driver")}
+        given = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
         if {"camera", "projector"} & set(given):
-            raise InputError(f"{where} names a driver of a whole rig and a camera or a projector: keep one of both")
+            raise InputError(f"{where} names a driver of a whole rig and a camera or a projector: remove one of both")
         _check_options(str(choice["driver"]), "rig", given, where)
         return
-    unknown = sorted(set(choice) - {*ABOUT, "camera", "projector"})
+    unknown = sorted(set(choice) - {*COMMON_KEYS, "camera", "projector"})
     if unknown:
-        raise InputError(f"{where} has the unknown key {unknown[0]!r}: use camera, projector, {', '.join(ABOUT)}")
+        raise InputError(f"{where} has the unknown key {unknown[0]!r}: use camera, projector, {', '.join(COMMON_KEYS)}")
     for part in ("camera", "projector"):
         device = choice.get(part)
         if not isinstance(device, Mapping) or "driver" not in device:
-            raise InputError(f'{where} does not say which {part}: add [{part}] with driver = "…", or a driver of a rig')
+            raise InputError(f'{where} names no {part}: add [{part}] with driver = "…", or a driver of a rig')
         options = {key: value for key, value in device.items() if key != "driver"}
         _check_options(str(device["driver"]), part, options, f"{where}, {part}")
 
 
-def _read(name: str, path: Path) -> Preset:
+def _read_preset(name: str, path: Path) -> Preset:
     try:
         choice = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -123,41 +123,41 @@ def _read(name: str, path: Path) -> Preset:
     return Preset(name, what, choice, path)
 
 
-def _described(name: str, path: Path) -> Preset:
-    """The preset in a file whatever is wrong with it, which its `problem` says."""
+def _read_preset_or_problem(name: str, path: Path) -> Preset:
+    """The preset in a file its `problem` where it cannot be used."""
     try:
-        found = _read(name, path)
-        needed = (drivers()[driver_name] for driver_name in dict.fromkeys(_driver_names(found.choice)))
-        return replace(found, problem="; ".join(each.missing for each in needed if each.missing))
+        preset = _read_preset(name, path)
+        needed = (drivers()[driver_name] for driver_name in dict.fromkeys(_driver_names(preset.choice)))
+        return replace(preset, problem="; ".join(each.missing for each in needed if each.missing))
     except InputError as error:
         return Preset(name, "", {}, path, str(error))
 
 
 def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:
     if name not in drivers():
-        offering = sorted(d.name for d in drivers().values() if _factory(d, part) is not None)
+        offering = sorted(d.name for d in drivers().values() if _driver_factory(d, part) is not None)
         raise InputError(f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}")
-    make = _factory(drivers()[name], part)
+    make = _driver_factory(drivers()[name], part)
     if make is None:
         raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
     parameters = inspect.signature(make).parameters.values()
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
-    # what the program supplies nobody writes into a file
+    # the program supplies these; they are no entries of a file
     provided = ("board", *(("channel",) if drivers()[name].channel else ()))
     known = [parameter for parameter in parameters if parameter.name not in provided]
-    taken = [parameter.name for parameter in known]
-    unknown = sorted(set(options) - set(taken))
+    accepted = [parameter.name for parameter in known]
+    unknown = sorted(set(options) - set(accepted))
     if unknown:
-        use = f"use {', '.join(taken)}" if taken else "it takes none"
+        use = f"use {', '.join(accepted)}" if accepted else "it takes none"
         raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}: {use}")
     required = [p.name for p in known if p.default is p.empty and p.name not in options]
     if required:
         raise InputError(f"{where}: the driver {name} needs {required[0]}: add it")
 
 
-def _factory(found: Driver, part: str) -> Any:
-    return rig_factory(found) if part == "rig" else getattr(found, part)
+def _driver_factory(driver: Driver, part: str) -> Any:
+    return rig_factory(driver) if part == "rig" else getattr(driver, part)
 
 
 def _driver_names(choice: Choice) -> list[str]:
@@ -166,5 +166,5 @@ def _driver_names(choice: Choice) -> list[str]:
     return [str(choice[part]["driver"]) for part in ("camera", "projector")]
 
 
-def _names(session: Session | None) -> str:
+def _list_names(session: Session | None) -> str:
     return ", ".join(preset.name for preset in presets(session))

@@ -1,4 +1,4 @@
-"""A scale that an acceptance test found and the operator applied: what later clouds are multiplied by."""
+"""A scale that an acceptance test measured and the operator applied: what later clouds are multiplied by."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -11,7 +11,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.store import Session
 
 
-def correction(store: Session, model: str) -> dict[str, Any] | None:
+def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
     """What was applied to a calibration, as ``record_scale`` stored it; None where it was made anew."""
     name = f"scale/{model}"
     return store.load_result(name, only=())[0] if store.state_of(name) == "fresh" else None
@@ -19,27 +19,27 @@ def correction(store: Session, model: str) -> dict[str, Any] | None:
 
 def scale_factor(store: Session, model: str) -> float:
     """What a calibration's clouds are multiplied by: 1 where no correction was applied."""
-    applied = correction(store, model)
+    applied = load_scale_correction(store, model)
     return 1.0 if applied is None else float(applied["factor"])
 
 
 def scale_sigma(store: Session, model: str) -> float:
-    """The standard uncertainty of ``scale_factor``, as the test found it that it comes from; 0 without a correction,
+    """The standard uncertainty of ``scale_factor``, from the acceptance test; 0 without a correction,
     whose scale is the target's."""
-    applied = correction(store, model)
+    applied = load_scale_correction(store, model)
     return 0.0 if applied is None else 1e-6 * float(applied["U_ppm"]) / 2
 
 
 def describe_scale(store: Session, model: str) -> str:
     """What was applied to a calibration, in words; empty where nothing was."""
-    applied = correction(store, model)
+    applied = load_scale_correction(store, model)
     if applied is None:
         return ""
     ppm = f"{1e6 * (applied['factor'] - 1):+.0f}".replace("-", "−")
     return f"scale corrected by {ppm} ppm, by certificate {applied['certificate']}"
 
 
-def scaled(cloud: Cloud, factor: float) -> Cloud:
+def scale_cloud(cloud: Cloud, factor: float) -> Cloud:
     """The cloud, larger by a factor, its noise with it."""
     if factor == 1.0:
         return cloud
@@ -53,25 +53,25 @@ def scaled(cloud: Cloud, factor: float) -> Cloud:
     )
 
 
-def record_scale(store: Session, found: Acceptance) -> float:
-    """Record that the calibration's clouds are to be corrected by the scale that a test found; returns the new factor.
+def record_scale(store: Session, acceptance: Acceptance) -> float:
+    """Record that the calibration's clouds are to be corrected by a test's scale; returns the new factor.
 
     A correction that was in force during the test stays in it.
     """
-    assert found.scale is not None
-    before = scale_factor(store, found.model)
-    factor = before / (1 + 1e-6 * found.scale.ppm)
-    calibration = f"calibration/{found.model}"
+    assert acceptance.scale is not None
+    before = scale_factor(store, acceptance.model)
+    factor = before / (1 + 1e-6 * acceptance.scale.ppm)
+    calibration = f"calibration/{acceptance.model}"
     meta = {
         "factor": factor,
-        "ppm": found.scale.ppm,
-        "U_ppm": found.scale.U_ppm,
+        "ppm": acceptance.scale.ppm,
+        "U_ppm": acceptance.scale.U_ppm,
         "before": before,
-        "artefact": found.artefact.name,
-        "certificate": found.artefact.certificate,
-        "captures": [position.capture for position in found.positions],
+        "artefact": acceptance.artefact.name,
+        "certificate": acceptance.artefact.certificate,
+        "captures": [position.capture for position in acceptance.positions],
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "inputs": store.input_hashes(calibration),
     }
-    store.save_result(f"scale/{found.model}", meta, {})
+    store.save_result(f"scale/{acceptance.model}", meta, {})
     return factor

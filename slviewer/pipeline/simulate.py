@@ -47,7 +47,7 @@ def simulate(
 ) -> list[str]:
     """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object at three depths.
 
-    The preset turn has, beside target poses, the object turned by up to 15 degrees between its three depths, and
+    The preset turn has, besides target poses, the object turned by up to 15 degrees between its three depths, and
     another on a turntable, in twelve steps round.
 
     Args:
@@ -64,7 +64,7 @@ def simulate(
     if preset not in get_args(Preset):
         raise InputError(f"no rig preset is called {preset!r}: use {' or '.join(get_args(Preset))}")
     if not MIN_POSES <= poses <= 200:
-        raise InputError(f"{poses} target poses cannot be simulated: ask for {MIN_POSES} to 200")
+        raise InputError(f"{poses} target poses cannot be simulated: choose {MIN_POSES} to 200")
     board = Board.parse(TARGET)
     rig = letter(scale, seed)
     plan = letter_plan(rig, board, poses) if preset == "letter" else turn_plan(rig, board, poses)

@@ -23,9 +23,9 @@ from slviewer.pipeline.models import (
     MODELS,
     VALIDATION,
     ModelName,
-    available,
+    available_models,
     load_stereo,
-    preferred,
+    preferred_model,
     warn_if_frame_changed,
     warn_if_stale,
 )
@@ -64,25 +64,25 @@ def validate(
         stereo = load_stereo(store)
         if not stereo.poses:
             raise InputError("this calibration was made elsewhere, without target poses to leave out")
-        names = [name for name in MODELS if name in (models or available(store))]
+        names = [name for name in MODELS if name in (models or available_models(store))]
         if not names:
             raise UsageError(f"no model is called {', '.join(models)}: use {', '.join(MODELS)}")
         warn_if_stale(store, warn)
-        kept = load_observations(store, list(stereo.poses))
-        if missing := sorted(set(stereo.poses) - {o.name for o in kept}):
+        observations = load_observations(store, list(stereo.poses))
+        if missing := sorted(set(stereo.poses) - {o.name for o in observations}):
             raise InputError(
-                f"the session no longer holds what {', '.join(missing)} said: run `slviewer calibrate` again"
+                f"the session no longer holds the observations of {', '.join(missing)}: run `slviewer calibrate` again"
             )
-        found = cross_validate(move_to_centres(kept, stereo), stereo, names, folds, progress)
-        for model, why in found.failed.items():
+        validated = cross_validate(move_to_centres(observations, stereo), stereo, names, folds, progress)
+        for model, why in validated.failed.items():
             warn(f"{model} is not judged: {why}")
-        judged = [f"calibration/{name}" for name in found.models if name in available(store)]
+        judged = [f"calibration/{name}" for name in validated.models if name in available_models(store)]
         inputs = store.input_hashes(*stereo.poses, *dict.fromkeys(["calibration/stereo", *judged]))
-        before = preferred(store)
-        store.save_result(VALIDATION, {"validation": found.to_json(), "inputs": inputs}, {})
+        before = preferred_model(store)
+        store.save_result(VALIDATION, {"validation": validated.to_json(), "inputs": inputs}, {})
         warn_if_frame_changed(store, before, warn)
         progress(1.0, "validated")
-    return found
+    return validated
 
 
 def cross_validate(
@@ -105,8 +105,8 @@ def cross_validate(
             without = calibrate_stereo(training, stereo.rig.projector.size, stereo.board)
         except CalibrationRejected as error:
             raise InputError(
-                f"without {', '.join(fold)} the rig cannot be calibrated, and nothing can be told of poses that are "
-                f"left out ({error}): capture more poses"
+                f"without {', '.join(fold)} the rig cannot be calibrated, and no poses can be "
+                f"excluded from the fit ({error}): capture more poses"
             ) from error
         fitted: dict[str, Model] = {}
         for i, name in enumerate(n for n in models if n not in failed):

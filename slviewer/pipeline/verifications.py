@@ -14,14 +14,14 @@ def read_verification(capture: str, meta: Mapping[str, Any], label: str, stale: 
     figures = meta["models"]
 
     def by_model(key: str) -> dict[str, float]:
-        return {m: np.nan if found[key] is None else float(found[key]) for m, found in figures.items()}
+        return {m: np.nan if value[key] is None else float(value[key]) for m, value in figures.items()}
 
     return VerificationView(
         name=label,
         shape=meta["shape"],
         incidence=meta["incidence"] or {},
-        points=max(int(found["points"]) for found in figures.values()),
-        set_aside={model: int(found["set_aside"]) for model, found in figures.items()},
+        points=max(int(measured["points"]) for measured in figures.values()),
+        set_aside={model: int(measured["set_aside"]) for model, measured in figures.items()},
         coverage=by_model("coverage"),
         rms_mm=by_model("rms_mm"),
         noise_floor_mm=by_model("noise_floor_mm"),

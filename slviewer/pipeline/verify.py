@@ -18,7 +18,7 @@ from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName, check_accepted, load_models, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.reconstruct import board_region, illuminated_pixels, masked_share, reconstruct_models
+from slviewer.pipeline.reconstruct import illuminated_pixels, masked_share, reconstruct_models, segment_board
 from slviewer.pipeline.scale import describe_scale
 
 Shape = Literal["plane", "sphere"]
@@ -38,7 +38,7 @@ class Verification:
 
     def centre_distances_mm(self) -> dict[tuple[str, str], dict[str, float]]:
         """{(capture, capture): {model: mm}}: distances between the spheres' centres; empty for planes."""
-        found = {}
+        by_pair = {}
         for (a, one), (b, other) in combinations(self.captures.items(), 2):
             distances = {
                 model: float(np.linalg.norm(result.sphere.centre - partner.sphere.centre))
@@ -46,14 +46,14 @@ class Verification:
                 if isinstance(result, SphereResult) and isinstance(partner := other.results[model], SphereResult)
             }
             if distances:
-                found[a, b] = distances
-        return found
+                by_pair[a, b] = distances
+        return by_pair
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``verify --json``, and for spheres the distances between their centres."""
         data: dict[str, Any] = {"captures": {name: comparison.to_json() for name, comparison in self.captures.items()}}
         if distances := self.centre_distances_mm():
-            data["centre_distances_mm"] = {f"{a} - {b}": found for (a, b), found in distances.items()}
+            data["centre_distances_mm"] = {f"{a} - {b}": by_model for (a, b), by_model in distances.items()}
         return data
 
     def text(self) -> str:
@@ -61,8 +61,8 @@ class Verification:
         blocks = [f"{name}:\n{comparison.text()}" for name, comparison in self.captures.items()]
         if distances := self.centre_distances_mm():
             table = [
-                {"centres": f"{a} - {b}"} | {f"{model} mm": mm for model, mm in found.items()}
-                for (a, b), found in distances.items()
+                {"centres": f"{a} - {b}"} | {f"{model} mm": mm for model, mm in by_model.items()}
+                for (a, b), by_model in distances.items()
             ]
             blocks.append(f"distances between the centres:\n{render(table)}")
         for name, shares in self.masked.items():
@@ -120,7 +120,7 @@ def verify(
             clouds = reconstruct_models(store, chosen, shot, phases, axis, accept_rejected=accept_rejected, warn=warn)
             region: np.ndarray | None = None
             if shape == "plane" and shot.role == "calibration":
-                region = board_region(store, shot, capture_texture(shot, frames), warn)
+                region = segment_board(store, shot, capture_texture(shot, frames), warn)
             try:
                 result = compare(
                     shape, clouds, illuminated_pixels(phases, clouds), region=region, depth_range=reach, radius=radius

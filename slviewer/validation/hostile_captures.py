@@ -16,7 +16,7 @@ from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.residual import capture_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.calibrate import calibrate
-from slviewer.pipeline.calibration_verdict import last_verdict
+from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.import_captures import import_frames
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.verify import verify
@@ -142,7 +142,7 @@ class HostileBench:
             calibrate(session, str(BOARD), models=self.models, warn=report.warnings.append)
         finally:
             with Session.open(session) as store:
-                verdict = last_verdict(store)
+                verdict = load_last_verdict(store)
             report.named += [frozenset({cause}) for cause in verdict.causes] if verdict else []
 
     def measure(self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: CaseReport) -> MeasuredScan:

@@ -10,7 +10,7 @@ from slviewer.devices.capture import CapturedFrames
 from slviewer.errors import DeviceError, InputError, SessionError
 from slviewer.fringe.sequence import Axis, PatternSequence, one_axis
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.capture import keep, sequence_for
+from slviewer.pipeline.capture import choose_sequence, save_frames
 from slviewer.session.atomic import megabytes
 from slviewer.wizard.acquisition import CaptureRequest
 from slviewer.wizard.engine import Engine
@@ -64,7 +64,9 @@ class CaptureRequests(ResultRequests):
         sequence, source = pose_sequence(engine), engine.acquisition.view().name
 
         def save(taken: CapturedFrames) -> None:
-            keep(store, name, "calibration", sequence, taken, source=source, purpose="pose", board=target, force=retake)
+            save_frames(
+                store, name, "calibration", sequence, taken, source=source, purpose="pose", board=target, force=retake
+            )
             if retake and name in store.excluded():
                 store.include(name)
 
@@ -82,7 +84,7 @@ class CaptureRequests(ResultRequests):
         name, source = self._next_name(purpose), engine.acquisition.view().name
 
         def save(taken: CapturedFrames) -> None:
-            keep(store, name, "scan", sequence, taken, source=source, purpose=purpose)
+            save_frames(store, name, "scan", sequence, taken, source=source, purpose=purpose)
             self._set_label(name, label)
 
         self._queue(name, sequence, save, lambda: follow(name))
@@ -135,7 +137,7 @@ def pose_sequence(engine: Engine) -> PatternSequence:
     """Both axes of the session's pattern sequence for the rig's projector, or the sequence of a recording."""
     if engine.bench is None:
         raise DeviceError("no rig is chosen: choose one in the step Rig")
-    sequence = sequence_for(engine.bench, engine.reader.patterns())
+    sequence = choose_sequence(engine.bench, engine.reader.patterns())
     levels = engine.reader.levels()
     return sequence if levels is None else replace(sequence, levels=levels)
 

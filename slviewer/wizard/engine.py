@@ -19,7 +19,7 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.frame_check import load_check, save_check
-from slviewer.pipeline.poses import judge_all
+from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, needs_page
 from slviewer.pipeline.rig_presets import save_rig
 from slviewer.session.capture import Capture
@@ -279,7 +279,7 @@ class Engine:
             for sentence in save_check(session, capture.name).warnings():
                 self.notices.add("warning", f"{capture.name}: {sentence}")
         if reader.needs_judging(capture, target):
-            judged = next(judge_all(session, [capture.name], Board.parse(target), Smoothing(), examine=True))
+            judged = next(read_stored_poses(session, [capture.name], Board.parse(target), Smoothing(), examine=True))
             if judged.observation is None:
                 self.notices.add("warning", f"{capture.name} cannot be used: {judged.refused}")
             self.publisher.mark_changed(session=True)

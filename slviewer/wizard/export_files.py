@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from slviewer.pipeline.export import What, export, file_name
+from slviewer.pipeline.export import What, default_file_name, export
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.models import accepts_rejected
 from slviewer.session import atomic
@@ -31,7 +31,7 @@ def export_file(
     session: Session, what: What, name: str, file_format: str, plan: MeshingPlan | None, report: Reporter, warn: Warn
 ) -> str:
     """Write one file, as `pipeline.export.export` does; returns a sentence that begins with its name."""
-    with staged_export(session, file_name(what, name, file_format), report) as path:
+    with staged_export(session, default_file_name(what, name, file_format), report) as path:
         accepts, progress = accepts_rejected(session), report.within(0, 0.98)
         found = export(session, what, name, out=path, plan=plan, accept_rejected=accepts, progress=progress, warn=warn)
     report(1.0, "exported")

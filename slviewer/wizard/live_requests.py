@@ -6,7 +6,7 @@ from dataclasses import replace
 from slviewer.devices.capture import CapturedFrames
 from slviewer.errors import InputError
 from slviewer.fringe.presets import short
-from slviewer.pipeline.capture import keep
+from slviewer.pipeline.capture import save_frames
 from slviewer.wizard.capture_requests import CaptureRequests, depth_axis
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.requests import request
@@ -53,7 +53,7 @@ class LiveRequests(CaptureRequests):
         self._check_space(name, len(shot.frames))
         taken = CapturedFrames(shot.frames, shot.settings)
         source = engine.acquisition.view().name
-        keep(store, name, "scan", live.stream.sequence, taken, source=source, purpose="scan")
+        save_frames(store, name, "scan", live.stream.sequence, taken, source=source, purpose="scan")
         self._set_label(name, label)
         engine.queue_processing()
         self.reconstruct(name)

@@ -16,7 +16,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.models import accepts_rejected, check_accepted, load_model, load_stereo, preferred
+from slviewer.pipeline.models import accepts_rejected, check_accepted, load_model, load_stereo, preferred_model
 from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.onepass import OnePass, PassResult
@@ -196,7 +196,7 @@ class LiveCalibration:
     def _load(self) -> LiveModel:
         store = self._store
         self._loaded = time.monotonic()
-        name = preferred(store)
+        name = preferred_model(store)
         factor = scale_factor(store, name)
         key = (name, factor, accepts_rejected(store), *sorted(store.input_hashes(f"calibration/{name}").items()))
         if key == self._key:

@@ -10,7 +10,7 @@ from typing import Concatenate, ParamSpec
 from slviewer.errors import InputError
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline import measurements
-from slviewer.pipeline.compare import Compared, compare_surface
+from slviewer.pipeline.compare import NominalComparison, compare_surface
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.session import atomic
 from slviewer.session.measurements import Measurement
@@ -93,7 +93,7 @@ class MeasureRequests(RequestHandler):
         if not path.is_file():
             raise InputError(f"there is no nominal model {nominal!r} in the session: upload it first")
 
-        def work(report: Reporter) -> Compared:
+        def work(report: Reporter) -> NominalComparison:
             report(0.0, f"reading {nominal}")
             ideal, surface = read_nominal(path, units), self._surfaces.load(store, on)
             name = f"{on.replace('/', '_')}_{path.stem}_deviation.ply"
@@ -115,19 +115,19 @@ class MeasureRequests(RequestHandler):
         self._submit(COMPARING, work, describe_comparison)
 
     @request("Renaming")
-    def rename_measurement(self, identity: str, name: str) -> None:
+    def relabel_measurement(self, identity: str, name: str) -> None:
         """Rename a measurement; an empty name restores the first one."""
-        measurements.rename(self._engine.store, identity, name)
+        measurements.relabel_measurement(self._engine.store, identity, name)
 
     @request("Deleting")
     def delete_measurement(self, identity: str) -> None:
         """Move a measurement to the trash; results made from it are stale until it is restored."""
-        measurements.remove(self._engine.store, identity)
+        measurements.delete_measurement(self._engine.store, identity)
 
     @request("Restoring")
-    def restore_measurement(self) -> None:
+    def undo_delete(self) -> None:
         """Restore the measurement that was deleted last."""
-        measurements.restore(self._engine.store)
+        measurements.undo_delete(self._engine.store)
 
     @request("Writing the table")
     def export_measurements_table(self) -> None:
@@ -158,7 +158,7 @@ def describe_measurement(measured: Measurement) -> str:
     return f"{measured.name}: {values}"
 
 
-def describe_comparison(result: Compared) -> str:
+def describe_comparison(result: NominalComparison) -> str:
     """A comparison in one sentence."""
     text = f"{result.scan} against {result.nominal.name}: RMS {result.found.statistics()['rms']:.4f} mm"
     if result.verdict is None:

@@ -6,7 +6,7 @@ from functools import partial
 from slviewer.errors import InputError
 from slviewer.pipeline.calibrate import CalibrationResult
 from slviewer.pipeline.export import FORMATS, What, check_export
-from slviewer.pipeline.models import accept_rejected_calibration, accepts_rejected, available, check_accepted
+from slviewer.pipeline.models import accept_rejected_calibration, accepts_rejected, available_models, check_accepted
 from slviewer.pipeline.verify import Shape
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard import diagnostics, tasks
@@ -77,7 +77,7 @@ class ResultRequests(RequestHandler):
     def choose_model(self, name: str) -> None:
         """Use this model from now on; empty: the recommended one."""
         store = self._engine.store
-        if name and name not in (models := available(store)):
+        if name and name not in (models := available_models(store)):
             raise InputError(f"the session has no {name} calibration: choose one of {', '.join(models)}")
         store.decide("model", name or None)
 

@@ -14,17 +14,17 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, SessionError
 from slviewer.fringe.presets import PRESETS
-from slviewer.pipeline.calibration_verdict import last_verdict
-from slviewer.pipeline.capture import PATTERNS
+from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
     accepts_rejected,
-    available,
+    available_models,
     load_model,
     load_stereo_if_complete,
-    preferred,
-    recommended,
-    rejection,
-    validation,
+    load_validation,
+    preferred_model,
+    recommended_model,
+    rejection_reason,
 )
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.verifications import centre_spacings, read_verification
@@ -104,7 +104,7 @@ class SessionReader:
 
     def patterns(self) -> str:
         """The name of the pattern sequence."""
-        return str(self.session.decision("patterns") or PATTERNS)
+        return str(self.session.decision("patterns") or DEFAULT_PATTERNS)
 
     def has_thumbnail(self, capture: Capture) -> bool:
         """Whether its thumbnail is stored."""
@@ -147,7 +147,7 @@ class SessionReader:
         inputs = _Inputs(captures, session.decision("names") or {}, hashes, factors)
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
         verifications = self._read_verifications(inputs)
-        verdict = last_verdict(session)
+        verdict = load_last_verdict(session)
         of_calibration = calibration is not None and _is_verdict_of(verdict, self._meta("calibration/stereo"))
         merges = [name for name in self._results("merge/") if set(self._meta(name)["scans"]) <= set(captures)]
         return SessionView(
@@ -272,7 +272,7 @@ class SessionReader:
 
     def _read_calibration(self, captures: Mapping[str, Capture]) -> CalibrationView | None:
         session = self.session
-        models = available(session)
+        models = available_models(session)
         if "stereo" not in models:
             return None
         hashes = {model: self._meta(f"calibration/{model}")["hash"] for model in models}
@@ -292,15 +292,15 @@ class SessionReader:
         return CalibrationView(
             stereo=stereo,
             models=models,
-            best=preferred(session),
+            best=preferred_model(session),
             stale=foreign or self._describe_changes(self._meta("calibration/stereo")["inputs"], captures),
             fit_rms_mm=fit_rms or {},
-            recommended=recommended(session),
+            recommended=recommended_model(session),
             chosen=str(decided) if (decided := session.decision("model")) in models else "",
-            rejected=rejection(session),
+            rejected=rejection_reason(session),
             is_pinned=accepts_rejected(session),
             splined=splined,
-            comparison=validation(session),
+            comparison=load_validation(session),
             scales={model: words for model in models if (words := describe_scale(session, model))},
             missing="" if "splined" in models or not stereo.poses else missing_for_splined(session),
         )

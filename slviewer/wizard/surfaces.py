@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place, merged_surface, surface_of
+from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place, load_merged_surface, surface_from_cloud
 from slviewer.pipeline.models import load_model
 from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.cloud import Cloud
@@ -41,7 +41,7 @@ class Surfaces:
         key = (str(store.folder), result, str(meta["hash"]))
         with self._lock:
             if self._key != key or self._cached is None:
-                self._cached = merged_surface(store, name) if result == name else _load_scan(store, name)
+                self._cached = load_merged_surface(store, name) if result == name else _load_scan(store, name)
                 self._key = key
             return self._cached
 
@@ -51,7 +51,7 @@ def _load_scan(store: Session, name: str) -> MeasuredSurface:
     systematic = arrays.get("sigma_calibration")
     points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
     cloud = Cloud(points, meta["axis"], meta["model"], sigma, texture, systematic, arrays.get("sigma_edges"))
-    return surface_of(store, name, cloud, load_model(store, meta["model"]))
+    return surface_from_cloud(store, name, cloud, load_model(store, meta["model"]))
 
 
 def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> Place | None:

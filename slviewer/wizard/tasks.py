@@ -18,7 +18,7 @@ from slviewer.evaluation.sphere import SphereResult
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record
-from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available, best
+from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models, best_model
 from slviewer.pipeline.open_session import next_number
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.scale import scale_factor
@@ -39,7 +39,7 @@ def calibrate_session(session: Session, target: str, report: Reporter, warn: War
     else:
         models.append("splined")
     made = calibrate(guarded, target, models=models, progress=report, warn=warn)
-    for name in available(session):
+    for name in available_models(session):
         if getattr(made, name) is None:
             guarded.trash_result(f"calibration/{name}")
     return made
@@ -79,7 +79,7 @@ def describe_comparison(compared: CrossValidation) -> str:
 def reconstruct_capture(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
     """Reconstruct a capture, save its cloud, and write its PLY into the exports; returns the number of points."""
     accepts = accepts_rejected(session)
-    model = model or best(session, accepts)
+    model = model or best_model(session, accepts)
     with staged_export(session, f"{name}_{model}.ply", report) as ply:
         progress = report.within(0, 0.9)
         made = reconstruct(session, name, model=model, out=ply, accept_rejected=accepts, progress=progress, warn=warn)
@@ -135,7 +135,7 @@ def verify_captures(
             warn=warn,
         )
         result = measured.captures[name]
-        models = available(session)
+        models = available_models(session)
         meta = {
             **result.to_json(),
             "centres_mm": {m: r.sphere.centre for m, r in result.results.items() if isinstance(r, SphereResult)},
@@ -173,7 +173,7 @@ def merge_scans(
     """Register scans to a reference, save the alignment, and write the merged PLY into the exports."""
     number = next_number(session, "merge")
     accepts = accepts_rejected(session)
-    model = best(session, accepts)
+    model = best_model(session, accepts)
     with staged_export(session, f"merged_{number}.ply", report) as ply:
         result = merge(
             session, names, reference, ply, model=model, start=start, angle=angle, picked=picked,

@@ -190,7 +190,7 @@ def test_what_cannot_be_begun_is_said(session: Path, monkeypatch: pytest.MonkeyP
         batch([session], "verify")
     with pytest.raises(UsageError, match="--do verify"):
         batch([session], "mesh", shape="plane")
-    monkeypatch.setattr("slviewer.pipeline.batch.PATIENCE_S", 0.2)
+    monkeypatch.setattr("slviewer.pipeline.batch.CONNECT_TIMEOUT_S", 0.2)
     with pytest.raises(SlviewerError, match="tcp://127"):
         batch([session], "reconstruct", scheduler="tcp://127.0.0.1:9")
     monkeypatch.setattr("slviewer.pipeline.batch.find_spec", lambda package: None)

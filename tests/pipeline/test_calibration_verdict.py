@@ -11,9 +11,9 @@ import pytest
 
 from slviewer.calibration.observe import Smoothing
 from slviewer.pipeline.calibrate import calibrate
-from slviewer.pipeline.calibration_verdict import last_verdict
-from slviewer.pipeline.models import available, rejection
-from slviewer.pipeline.poses import known
+from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.models import available_models, rejection_reason
+from slviewer.pipeline.poses import load_judged
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.validation.faulty_captures import BOARD, FaultBench
@@ -62,7 +62,7 @@ def test_a_verdict_is_told_and_kept(session: Path, tmp_path: Path, run: Run) -> 
     assert "verdict: good" in run("inspect", session)[1]
     with Session.open(session) as store:
         assert store.state_of("calibration/verdict") == "fresh" and store.state_of("evidence/pose_00") == "fresh"
-        assert rejection(store) == ""
+        assert rejection_reason(store) == ""
 
 
 def test_a_rejected_calibration_is_kept_and_refused(bench: FaultBench, session: Path, tmp_path: Path, run: Run) -> None:
@@ -71,10 +71,10 @@ def test_a_rejected_calibration_is_kept_and_refused(bench: FaultBench, session: 
     status, _, error = run("calibrate", session, "--target", BOARD)
     assert status == 3 and "16 px" in error
     with Session.open(session) as store:
-        verdict = last_verdict(store)
+        verdict = load_last_verdict(store)
         assert verdict is not None and verdict.level == "rejected" and verdict.causes[0] == "fringe-period"
-        assert available(store) == ("stereo",)  # those of the poses before do not belong to it
-        assert "period_px" in rejection(store)
+        assert available_models(store) == ("stereo",)  # those of the poses before do not belong to it
+        assert "period_px" in rejection_reason(store)
     pose = ("pose_00", "--out", ply)
     for command in (
         ("reconstruct", session, *pose),
@@ -99,10 +99,10 @@ def test_where_nothing_came_of_it_the_session_keeps_what_it_had(session: Path, t
     status, _, error = run("calibrate", session, "--target", "circles:20x16:9")
     assert status == 3 and "21x16" in error and "20x16" in error
     with Session.open(session) as store:
-        assert available(store) == ("stereo", "pixelwise")
-        verdict = last_verdict(store)
+        assert available_models(store) == ("stereo", "pixelwise")
+        verdict = load_last_verdict(store)
         assert verdict is not None and verdict.causes[0] == "board-size"
-        again = known(store, "pose_00", BOARD, Smoothing())
+        again = load_judged(store, "pose_00", BOARD, Smoothing())
         assert again is None  # the pose was read for the other board
     assert run("reconstruct", session, "pose_00", "--out", tmp_path / "cloud.ply")[0] == 0
 
@@ -113,7 +113,7 @@ def test_a_description_that_contradicts_itself(bench: FaultBench, tmp_path: Path
     status, _, error = run("calibrate", session, "--target", BOARD)
     assert status == 3 and "128 periods" in error
     with Session.open(session) as store:
-        verdict = last_verdict(store)
+        verdict = load_last_verdict(store)
         assert verdict is not None and verdict.causes == ("fringe-period",)
 
 
@@ -142,7 +142,7 @@ def test_gamma_below_five_steps_is_named_and_not_taken_for_another_period() -> N
 def test_calibrate_from_some_poses(session: Path, run: Run) -> None:
     chosen = ("--models", "stereo", "--poses", "pose_0[0-5]", "--exclude", "pose_05")
     status, text, error = run("calibrate", session, "--target", BOARD, *chosen)
-    assert status == 0 and "poses: 5 of 7 used" in text and error.count("left out") == 0
+    assert status == 0 and "poses: 5 of 7 used" in text and error.count("is excluded") == 0
     assert "pose_05: " in text and "pose_06: " in text
     status, _, error = run("calibrate", session, "--target", BOARD, "--exclude", "pose_9")
     assert status == 2 and "'pose_9'" in error and "pose_06" in error

@@ -177,7 +177,7 @@ def test_devices_says_what_is_connected_and_what_is_missing(run: Run, monkeypatc
     for line in (
         "  cannot be used here, the package no_such_package is missing: pip install it",
         "  connected: the camera A\n  connected: the camera B",
-        "empty (camera): nothing\n  can be used\n  connected: nothing was found",
+        "empty (camera): nothing\n  can be used\n  connected: no device",
         "  could not look for what is connected: no producer is installed: install one",
     ):
         assert line in text

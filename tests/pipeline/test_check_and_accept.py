@@ -13,7 +13,7 @@ from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.accept import accept
 from slviewer.pipeline.calibrate import calibrate
-from slviewer.pipeline.check import REFERENCE, check, history
+from slviewer.pipeline.check import REFERENCE, check, load_drift_history
 from slviewer.pipeline.models import load_stereo, save_imported_stereo
 from slviewer.pipeline.scale import scale_factor
 from slviewer.session.store import Session
@@ -143,8 +143,8 @@ def test_check_answers_and_remembers(calibrated):
     single = check(calibrated, "one_axis")
     assert single.drift.verdict == "still good" and any("axis x alone" in s for s in single.drift.unseen)
     with Session.open(calibrated) as store:
-        assert [c.drift.capture for c in history(store)] == ["same", "panned", "one_axis"]
-        assert history(store)[1] == panned.found
+        assert [c.drift.capture for c in load_drift_history(store)] == ["same", "panned", "one_axis"]
+        assert load_drift_history(store)[1] == panned.latest
         assert store.state_of(REFERENCE) == "fresh"
     assert json.loads(json.dumps(single.to_json()))["before"][1]["verdict"] == "recalibrate"
 

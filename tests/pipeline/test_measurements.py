@@ -17,7 +17,7 @@ from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline import measurements
-from slviewer.pipeline.measured_surface import MeasuredSurface, surface
+from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.report import report
 from slviewer.session.ply import read_ply, write_ply
@@ -59,7 +59,7 @@ def made(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def balls(made) -> MeasuredSurface:
-    return surface(made, "balls")
+    return load_surface(made, "balls")
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_p
     assert len(lines) >= 2 and max(np.ptp(line[:, 0]) for line in lines) < 2 * RADIUS
     assert np.allclose(plane.drawn(balls.points[a[1], a[0]][None].astype(float)), 0, atol=1e-3)
 
-    listed = measurements.measurements(folder)
+    listed = measurements.load_measurements(folder)
     assert [each.id for each in listed] == ["m1", "m2", "m3", "m4", "m5", "m6", "m7"]
     assert not any(each.stale for each in listed) and listed[2].name == "L – R"
     status, said, _ = run("inspect", folder)
@@ -130,33 +130,33 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
     a, b = tops
     one = measurements.add_distance(folder, balls, a, b)
     assert one.name == "distance 1"
-    assert measurements.rename(folder, one.id, "=width").name == "=width"
+    assert measurements.relabel_measurement(folder, one.id, "=width").name == "=width"
     assert ",'=width," in measurements.measurements_csv(folder).replace("m1,'", "m1,'")  # no formula for a spreadsheet
-    assert measurements.rename(folder, one.id, "").name == "distance 1"
+    assert measurements.relabel_measurement(folder, one.id, "").name == "distance 1"
     two = measurements.add_distance(folder, balls, b, a, "back")
-    measurements.remove(folder, two.id)
+    measurements.delete_measurement(folder, two.id)
     three = measurements.add_distance(folder, balls, a, b)
     assert three.id == "m3"  # an id that was deleted can come back
-    assert measurements.restore(folder).name == "back"
-    assert [each.id for each in measurements.measurements(folder)] == ["m1", "m2", "m3"]
+    assert measurements.undo_delete(folder).name == "back"
+    assert [each.id for each in measurements.load_measurements(folder)] == ["m1", "m2", "m3"]
     with pytest.raises(InputError):
-        measurements.restore(folder)
+        measurements.undo_delete(folder)
     with pytest.raises(InputError, match=r"'m9'.*m1, m2, m3"):
-        measurements.rename(folder, "m9", "x")
+        measurements.relabel_measurement(folder, "m9", "x")
 
 
 def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls, regions) -> None:
     fits = [measurements.add_fit(folder, balls, "sphere", ball_about(balls, region)) for region in regions]
     measurements.add_relation(folder, fits[0].id, fits[1].id)
-    measurements.remove(folder, fits[1].id)
-    assert [each.stale for each in measurements.measurements(folder)] == [False, True]
-    measurements.restore(folder, fits[1].id)
-    assert not any(each.stale for each in measurements.measurements(folder))
+    measurements.delete_measurement(folder, fits[1].id)
+    assert [each.stale for each in measurements.load_measurements(folder)] == [False, True]
+    measurements.undo_delete(folder, fits[1].id)
+    assert not any(each.stale for each in measurements.load_measurements(folder))
     with Session.open(folder, write=True) as store:
         other = store.load_capture("object")
         store.save_capture("balls", "scan", other.sequence, other.frames[::1], source="again", force=True)
-    assert all(each.stale for each in measurements.measurements(folder))
-    assert "[stale" in measurements.in_words(measurements.measurements(folder)[0])
+    assert all(each.stale for each in measurements.load_measurements(folder))
+    assert "[stale" in measurements.describe_measurement(measurements.load_measurements(folder)[0])
     with pytest.raises(InputError, match="stale"):
         measurements.add_relation(folder, fits[0].id, fits[1].id)
 
@@ -176,7 +176,7 @@ def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls, r
     with pytest.raises(InputError, match="point, plane, sphere"):
         point = measurements.add_point(folder, balls, tops[0])
         measurements.add_relation(folder, one.id, point.id)
-    assert len(measurements.measurements(folder)) == 2
+    assert len(measurements.load_measurements(folder)) == 2
 
 
 def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: Run, tmp_path, balls, tops) -> None:
@@ -208,7 +208,7 @@ def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: 
     (tmp_path / "broken.stl").write_bytes(b"\0" * 300)
     status, _, wrong = run("compare", folder, "object", tmp_path / "broken.stl")
     assert status == 1 and "broken.stl" in wrong
-    assert len(measurements.measurements(folder)) == 3
+    assert len(measurements.load_measurements(folder)) == 3
 
 
 def test_a_damaged_measurement_is_told_not_guessed(folder, balls, tops) -> None:
@@ -246,7 +246,7 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
         write_ply(store.exports / "merged_1.ply", points, normals=balls.normals[chosen], scalars={"sigma": sigma})
         meta = {"ply": "merged_1.ply", "model": "stereo", "inputs": store.input_hashes("balls")}
         store.save_result("merge/1", meta, {})
-    on = surface(folder, "merge/1")
+    on = load_surface(folder, "merge/1")
     region = regions[0]
     one = measurements.add_fit(folder, on, "sphere", ball_about(balls, region))
     assert abs(measurements.quantities_of(one)[0].value - RADIUS) < 0.05 and one.source == "merge/1"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slviewer.errors import InputError, SessionError
-from slviewer.pipeline.models import available, load_model, preferred, warn_if_stale
+from slviewer.pipeline.models import available_models, load_model, preferred_model, warn_if_stale
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 
@@ -25,7 +25,7 @@ def test_a_calibration_of_a_model_that_is_no_more_is_ignored(recorded: Path, tmp
     with Session.open(folder, write=True) as store:
         store.save_result("calibration/anchored", {"model": {"axes": ["x"]}, "inputs": {}}, {"z": np.eye(2)})
         store.decide("model", "anchored")
-        assert available(store) == ("stereo", "pixelwise", "splined") and preferred(store) == "splined"
+        assert available_models(store) == ("stereo", "pixelwise", "splined") and preferred_model(store) == "splined"
         with pytest.raises(InputError, match=r"anchored .*stereo, pixelwise, splined"):
             load_model(store, "anchored")
     with Operator(folder) as operator:

@@ -89,10 +89,10 @@ def test_a_choice_as_toml_is_the_same_choice():
         ({"camera": {"driver": "fake"}}, "needs source"),
         ({"camera": {"driver": "fale", "source": "0"}}, "no driver is called 'fale': use one of fake, .*lacking"),
         ({"camera": {"driver": "browser"}}, "the driver browser offers no camera"),
-        ({"camera": {"source": "0"}}, "does not say which camera"),
-        ({"projector": "browser"}, "does not say which projector"),
+        ({"camera": {"source": "0"}}, "names no camera"),
+        ({"projector": "browser"}, "names no projector"),
         ({"projector": {"driver": "fake", "size": [1, 1], "channel": 1}}, "no option 'channel'"),
-        ({"driver": "simulated"}, "keep one of both"),
+        ({"driver": "simulated"}, "remove one of both"),
     ],
 )
 def test_mistakes_are_named(fake: None, change: dict, message: str, tmp_path: Path):

@@ -13,7 +13,7 @@ from test_acquisition import FRAMES, SEQUENCE, Bench, bench
 from slviewer.devices.protocols import CameraSettings
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.presets import complementary
-from slviewer.pipeline.capture import keep
+from slviewer.pipeline.capture import save_frames
 from slviewer.session.store import Session
 from slviewer.wizard.acquisition import CaptureRequest
 
@@ -106,7 +106,7 @@ def test_a_capture_in_several_exposures_is_saved_whole(bench: Bench, tmp_path: P
             CaptureRequest(
                 "pose_01",
                 SEQUENCE,
-                lambda taken: keep(store, "pose_01", "calibration", SEQUENCE, taken, source="x", purpose="pose"),
+                lambda taken: save_frames(store, "pose_01", "calibration", SEQUENCE, taken, source="x", purpose="pose"),
                 lambda: None,
                 (4.0, 0.5),
             )
@@ -145,7 +145,7 @@ def test_a_colour_camera_leaves_its_texture_in_the_session(bench: Bench, tmp_pat
             CaptureRequest(
                 "scan_01",
                 SEQUENCE,
-                lambda taken: keep(store, "scan_01", "scan", SEQUENCE, taken, source="x", purpose="scan"),
+                lambda taken: save_frames(store, "scan_01", "scan", SEQUENCE, taken, source="x", purpose="scan"),
                 lambda: None,
             )
         )

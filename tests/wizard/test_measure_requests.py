@@ -12,7 +12,14 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measurements import add_distance, add_fit, add_point, add_section, measurements, quantities_of
+from slviewer.pipeline.measurements import (
+    add_distance,
+    add_fit,
+    add_point,
+    add_section,
+    load_measurements,
+    quantities_of,
+)
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
@@ -57,7 +64,7 @@ def now(operator: Operator) -> SessionView:
     """The session, once all is done; what it says of measurements is what `measurements` says."""
     session = operator.wait_until_idle(60).session
     assert session is not None and operator.session is not None
-    assert list(session.measurements) == measurements(operator.session)
+    assert list(session.measurements) == load_measurements(operator.session)
     return session
 
 
@@ -88,11 +95,11 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     assert [each.kind for each in (cut, point, apart)] == ["section", "point", "relation"]
     assert operator.snapshot().step("measure").state == "done"
 
-    assert operator.rename_measurement(width.id, "Width <b>") and operator.delete_measurement(right.id)
+    assert operator.relabel_measurement(width.id, "Width <b>") and operator.delete_measurement(right.id)
     session = now(operator)
     assert [each.stale for each in session.measurements if each.id == apart.id] == [True]
     assert session.deleted_measurements == 1 and "measure again" in operator.snapshot().step("measure").problems[0]
-    assert operator.restore_measurement() and not any(each.stale for each in now(operator).measurements)
+    assert operator.undo_delete() and not any(each.stale for each in now(operator).measurements)
     assert operator.export_measurements_table()
     made = next(each for each in now(operator).exports if each.name == "measurements.csv")
     rows = list(csv.DictReader(made.path.read_text("utf-8-sig").splitlines()))

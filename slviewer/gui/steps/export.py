@@ -11,7 +11,14 @@ from slviewer.errors import SlviewerError
 from slviewer.gui.inputs import Choice, change, display_name
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.widgets import Html, Text, coloured, link, paragraph, table, to_html
-from slviewer.pipeline.export import FORMATS, What, file_name, foreseen_bytes, size, units
+from slviewer.pipeline.export import (
+    FORMATS,
+    What,
+    default_file_name,
+    describe_format,
+    estimate_file_bytes,
+    format_bytes,
+)
 from slviewer.surface.meshing import MeshingPlan, Method
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import ExportView, SessionView, Snapshot
@@ -180,8 +187,10 @@ class Panel(StepPanel):
         self._shape_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[what]])
         if name:
             chosen = self._shape_format.value
-            file = _existing(session, file_name(what, name, chosen))
-            predicted = foreseen_bytes(what, chosen, *_points(session, name), self._mesh.triangles if mesh else None)
+            file = _existing(session, default_file_name(what, name, chosen))
+            predicted = estimate_file_bytes(
+                what, chosen, *_points(session, name), self._mesh.triangles if mesh else None
+            )
             seen: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
             self._shape_note.write(describe_shape_file(session, seen, name, chosen, None if file else predicted), "dim")
             self._shape_link.set(self._link_html(file))
@@ -196,8 +205,8 @@ class Panel(StepPanel):
         numbers: What = self._numbers.value or "calibration"  # type: ignore[assignment]
         self._number_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[numbers]])
         chosen = self._number_format.value
-        self._number_note.write(f"{NUMBERS[numbers][1]}. {units(chosen)}.", "dim")
-        file = _existing(session, file_name(numbers, "", chosen))
+        self._number_note.write(f"{NUMBERS[numbers][1]}. {describe_format(chosen)}.", "dim")
+        file = _existing(session, default_file_name(numbers, "", chosen))
         self._number_link.set(self._link_html(file))
         label = f"Write {numbers} again" if file else f"Write {numbers}"
         change(self._write_numbers, label=label, color=_button_colour(file))
@@ -252,7 +261,7 @@ class Panel(StepPanel):
         rows = [
             (
                 Html(f'<span style="overflow-wrap:anywhere">{to_html(export.name)}</span>'),
-                Html(f'<span style="white-space:nowrap">{size(export.bytes)}</span>'),
+                Html(f'<span style="white-space:nowrap">{format_bytes(export.bytes)}</span>'),
                 self._link(export, "Download", quiet=True),
             )
             for export in sorted(exports, key=_rank)
@@ -267,7 +276,11 @@ class Panel(StepPanel):
 
     def _link_html(self, export: ExportView | None) -> str:
         """A link to an existing file; empty where there is none."""
-        return "" if export is None else paragraph(self._link(export, f"Download {export.name}, {size(export.bytes)}"))
+        return (
+            ""
+            if export is None
+            else paragraph(self._link(export, f"Download {export.name}, {format_bytes(export.bytes)}"))
+        )
 
     def _link(self, export: ExportView, words: str, quiet: bool = False) -> Html:
         try:
@@ -290,7 +303,8 @@ def describe_shape_file(session: SessionView, what: What, name: str, file_format
         "mesh": "Triangles between neighbouring pixels, open at depth edges",
         "merged-mesh": "One surface through the points, cut off where nothing was measured",
     }[what]
-    return f"{content}. Unit: {units(file_format)}.{'' if size_bytes is None else f' About {size(size_bytes)}.'}"
+    about = "" if size_bytes is None else f" About {format_bytes(size_bytes)}."
+    return f"{content}. Unit: {describe_format(file_format)}.{about}"
 
 
 def _points(session: SessionView, name: str) -> tuple[int, str]:
