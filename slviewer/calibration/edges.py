@@ -1,10 +1,10 @@
 """Mask of a board's pixels with undisturbed phase: bright ones, clear of the contrast edges.
 
-The camera's lens and pixels mix bright and dark across an edge, and what a bright pixel there says of its phase comes
-from farther inside the bright part: from half a blur's sigma farther where the edge is, a tenth at 1.3 sigma, a
-fortieth at 2 and a hundredth at 2.5, whatever the blur (measured on rendered boards of known truth). Opposite sides of
-a circle err against each other, so that what is left of it in a feature or a smoothed surface is least where 2 sigma
-are excluded: beyond, the pixels that are lost cost more in noise.
+The camera's lens and pixels mix bright and dark across an edge, and the phase of a bright pixel there is that of a
+point farther inside the bright part: by half a blur's sigma at the edge, a tenth at 1.3 sigma, a fortieth at 2 and a
+hundredth at 2.5, whatever the blur (measured on rendered boards of known truth). The errors
+of opposite sides of a circle cancel, so that the error of a feature or a smoothed surface is smallest where 2 sigma are
+excluded; with more, the loss of pixels adds more noise.
 """
 
 from collections.abc import Callable
@@ -15,16 +15,16 @@ import numpy as np
 from slviewer.fringe.phase import PhaseMap
 
 CLEARANCE_SIGMAS = 2.0
-"""How far from an edge, in standard deviations of its blur, a bright pixel's phase is undisturbed."""
+"""Distance from an edge, in standard deviations of its blur, beyond which a bright pixel's phase is undisturbed."""
 MIN_CLEARANCE_PX = 1.0
-"""And at least so many px: where a mask's edge lies is not known better."""
+"""Smallest clearance: the uncertainty of a mask's edge."""
 MIN_CLEAR_SHARE = 0.25
-"""Share of the bright pixels within half a pitch that must lie clear of contrast edges, or edges are approached."""
+"""Share of the bright pixels within half a pitch that must be clear of edges; otherwise the clearance is reduced."""
 SHARPEST_PX = 12**-0.5
-"""An edge that only the pixels blur."""
+"""Blur of an edge by the pixel area alone."""
 EDGE_BAND = 0.25
-"""Pixels whose brightness lies this far from dark and from bright are an edge's; of a Gaussian blur, they lie within
-0.6745 sigma of it."""
+"""Pixels whose brightness differs by this share of the contrast from dark and from bright belong to an edge; with a
+Gaussian blur they are within 0.6745 sigma of it."""
 
 
 def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarray:

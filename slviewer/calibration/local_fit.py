@@ -5,21 +5,21 @@ import numpy as np
 from slviewer.geometry.jit import kernel
 
 MAX_OFF_CENTRE = 0.35
-"""A window whose samples lie this far off its middle, in half widths, would extrapolate. Around a chessboard's corner
-two opposite squares are bright, and their middle is the corner."""
+"""Largest distance, in half widths, between the centroid of a window's samples and its centre; beyond it, the fit would
+extrapolate. At a chessboard's corner two opposite squares are bright, and their centroid is the corner."""
 
 
 def fit_local_values(
     field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic fit around each.
+    """Fit value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic around each.
 
-    ``radius`` (n,) px is half a window's width; ``weight`` (h, w) is 0 where the field must not be used, so that a dark
-    circle's centre is read from its bright surroundings alone. Returns (n,) float64, and its change a px along u and v
-    (n, 2); NaN where the surroundings are too few (30) or lie on one side only.
+    ``radius`` (n,) px: half the width of each window; ``weight`` (h, w): 0 where the field is not used, so that the
+    value at a dark circle's centre comes from its bright surroundings alone. Returns values (n,) float64 and slopes
+    (n, 2) per px along u and v; NaN with fewer than 30 samples in the window, or samples on one side only.
     """
     out = np.full((len(pixels), 3), np.nan)
-    _fit_all(
+    _fit_windows(
         np.ascontiguousarray(field, np.float64),
         np.ascontiguousarray(weight, np.float64),
         np.ascontiguousarray(pixels, np.float64),
@@ -31,7 +31,7 @@ def fit_local_values(
 
 @kernel()
 def _solve_spd(A, b, x):  # type: ignore[no-untyped-def]
-    """x of A x = b by Cholesky, in place; a library's solver would take the compiler five seconds."""
+    """Solve A x = b by Cholesky, in place; calling a library's solver would add five seconds of compilation."""
     n = len(b)
     for i in range(n):
         for j in range(i + 1):
@@ -55,7 +55,7 @@ def _solve_spd(A, b, x):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _fit_all(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
+def _fit_windows(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n, 3) with value and slopes of a robust quadratic fit around each pixel; NaN where not possible."""
     height, width = field.shape
     basis = np.empty((1024, 6))
@@ -118,11 +118,11 @@ def _fit_all(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def
             for k in range(count):
                 t = residual[k] / scale
                 robust[k] = (1 - t * t) ** 2 if abs(t) < 1 else 0.0
-        kept = 0
+        inliers = 0
         for k in range(count):
             if robust[k] > 0.1:
-                kept += 1
-        if kept >= 0.5 * count:
+                inliers += 1
+        if inliers >= 0.5 * count:
             out[i, 0] = solution[0] + middle
             out[i, 1] = solution[1] / r
             out[i, 2] = solution[2] / r

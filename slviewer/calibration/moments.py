@@ -1,6 +1,6 @@
-"""Each pixel's ``z = (c0 + c1 phi)/(1 + c2 phi)`` through moments in float64, some image rows at a time.
+"""Fit ``z = (c0 + c1 phi)/(1 + c2 phi)`` at each pixel from moments in float64, some image rows at a time.
 
-Depth and phase are taken from a reference point of each pixel (``zeta = z - z_ref``, ``s = phi - phi_ref``), which
+Depth and phase are relative to a reference point of each pixel (``zeta = z - z_ref``, ``s = phi - phi_ref``), which
 leaves the rational family as it is, ``zeta = (a0 + a1 s)/(1 + a2 s)``, and keeps the sums well conditioned.
 """
 
@@ -12,36 +12,37 @@ from slviewer.geometry.jit import kernel
 
 @kernel(parallel=True)
 def fit_rational(phase, z, phase_ref, z_ref, min_poses, coefficients, rms, poses, phase_min, phase_max, condition):
-    """Fit pixels of some rows to their poses: phase (n, h', w) rad and depth z (n, h', w) mm, NaN where not seen.
+    """Fit pixels of some rows to their poses: phase (n, h', w) rad and depth z (n, h', w) mm, NaN where invalid.
 
     Fills ``coefficients`` (3, h', w) a0 ... a2 and ``rms`` mm, NaN at pixels of fewer than ``min_poses`` poses;
-    ``poses``, the range of ``phase`` seen, and the fit's ``condition``, (h', w) each. First the equation's own residual
-    is minimised, which is linear, ``zeta = a0 + a1 s - a2 zeta s``; then one Gauss-Newton step minimises that in depth.
+    ``poses``, the range of valid ``phase``, and the fit's ``condition``, (h', w) each. First the equation's own
+    residual is minimised, which is linear, ``zeta = a0 + a1 s - a2 zeta s``; then one Gauss-Newton step minimises the
+    residual in depth.
     """
     for v in numba.prange(phase.shape[1]):
         a = np.empty(10)
         for u in range(phase.shape[2]):
             reference = phase_ref[v, u]
-            seen, low, high = _add_linear(phase, z, v, u, reference, z_ref, a)
-            poses[v, u], phase_min[v, u], phase_max[v, u] = seen, low, high
-            a0 = a1 = a2 = left = found = np.nan
-            if seen >= min_poses:
+            count, low, high = _sum_linear_moments(phase, z, v, u, reference, z_ref, a)
+            poses[v, u], phase_min[v, u], phase_max[v, u] = count, low, high
+            a0 = a1 = a2 = residual = scaled_condition = np.nan
+            if count >= min_poses:
                 a0, a1, a2, _, _ = _solve_moments(a)
                 if not np.isnan(a0):
-                    _add_gauss_newton(phase, z, v, u, reference, z_ref, a0, a1, a2, a)
-                    b0, b1, b2, explained, found = _solve_moments(a)
+                    _sum_gauss_newton_moments(phase, z, v, u, reference, z_ref, a0, a1, a2, a)
+                    b0, b1, b2, explained, scaled_condition = _solve_moments(a)
                     a0, a1, a2 = a0 + b0, a1 + b1, a2 + b2
-                    left = np.sqrt(max(0.0, a[9] - explained) / seen)
+                    residual = np.sqrt(max(0.0, a[9] - explained) / count)
             coefficients[0, v, u], coefficients[1, v, u], coefficients[2, v, u] = a0, a1, a2
-            rms[v, u], condition[v, u] = left, found
+            rms[v, u], condition[v, u] = residual, scaled_condition
 
 
 @numba.njit
-def _add_linear(phase, z, v, u, phase_ref, z_ref, a):
-    """Sums ``a``: upper triangle of the normal matrix (6) and right-hand side (3). The poses seen, and their phases'
-    range."""
+def _sum_linear_moments(phase, z, v, u, phase_ref, z_ref, a):
+    """Fill the sums ``a``: upper triangle of the normal matrix (6) and right-hand side (3). Returns the number of valid
+    poses and the range of their phases."""
     a[:] = 0.0
-    seen, low, high = 0, np.inf, -np.inf
+    count, low, high = 0, np.inf, -np.inf
     for i in range(phase.shape[0]):
         p = phase[i, v, u]
         s, zeta = p - phase_ref, z[i, v, u] - z_ref
@@ -57,14 +58,14 @@ def _add_linear(phase, z, v, u, phase_ref, z_ref, a):
         a[6] += zeta
         a[7] += s * zeta
         a[8] += q * zeta
-        seen += 1
+        count += 1
         low, high = min(low, p), max(high, p)
-    return seen, low, high
+    return count, low, high
 
 
 @numba.njit
-def _add_gauss_newton(phase, z, v, u, phase_ref, z_ref, a0, a1, a2, a):
-    """Sums of the depth residual's linearisation at the coefficients found, and in a[9] of its squares."""
+def _sum_gauss_newton_moments(phase, z, v, u, phase_ref, z_ref, a0, a1, a2, a):
+    """Fill ``a`` with the sums of the depth residual linearised at the given coefficients; a[9]: its sum of squares."""
     a[:] = 0.0
     for i in range(phase.shape[0]):
         s = phase[i, v, u] - phase_ref
@@ -88,8 +89,10 @@ def _add_gauss_newton(phase, z, v, u, phase_ref, z_ref, a0, a1, a2, a):
 
 @numba.njit
 def _solve_moments(a):
-    """(three unknowns, the squares that they explain, condition) by Cholesky of the normalised matrix; NaN without a
-    solution."""
+    """Solve the normal equations ``a`` by Cholesky of the normalised matrix.
+
+    Returns the three unknowns, the sum of squares that they explain, and the condition; NaN without a solution.
+    """
     none = np.nan
     if a[0] <= 0 or a[3] <= 0 or a[5] <= 0:
         return none, none, none, none, none

@@ -28,7 +28,7 @@ SAMPLES = 30_000
 """Largest number of pixels in one smoothing fit; more change the result by less than the noise."""
 AXES: tuple[Axis, ...] = ("x", "y")
 CELLS_PER_WIDTH = 14
-"""Spline cells across the image: half the wavelength of the finest lens distortion worth keeping, and no finer."""
+"""Spline cells across the image: half the wavelength of the finest relevant lens distortion."""
 
 
 COUNT = 4000
@@ -54,7 +54,7 @@ class Samples:
     def __post_init__(self) -> None:
         shapes = {a.shape for a in (self.camera, self.projector, self.sigma)}
         if len(shapes) != 1 or self.camera.ndim != 2 or self.camera.shape[1] != 2:
-            raise InputError(f"samples of shapes {sorted(shapes)} do not belong together: three arrays (n, 2) do")
+            raise InputError(f"samples of shapes {sorted(shapes)} do not match: give three arrays (n, 2)")
 
 
 def block_samples(
@@ -145,7 +145,7 @@ class Observation:
         return np.where(self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Named arrays, for saving."""
+        """Return named arrays for saving."""
         arrays = {
             "points": self.points,
             "camera": self.camera,
@@ -173,7 +173,7 @@ class Observation:
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, np.ndarray]) -> "Observation":
-        """The inverse of ``to_arrays``."""
+        """Return the observation that ``to_arrays`` saved."""
         surfaces: dict[Axis, SplineSurface | Polynomial2D] = {}
         captured: list[Axis] = [axis for axis in AXES if f"{axis}_trend" in arrays]
         for axis in captured:
@@ -231,7 +231,7 @@ def observe(
         if np.count_nonzero(bright[axis]) < 400:
             raise DetectionError(
                 f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis} pattern: "
-                "light the whole board with the projector, and raise the exposure"
+                "illuminate the whole board with the projector, and raise the exposure"
             )
     projector, slopes = _projector_pixels(detection, phases, bright, pitch)
     u0, v0, u1, v1 = box
@@ -351,5 +351,5 @@ def _bounding_box(mask: np.ndarray) -> tuple[int, int, int, int]:
     """Return (u0, v0, u1, v1) px around a mask (h, w); raises DetectionError where it is empty."""
     rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
     if not len(rows):
-        raise DetectionError("the board's outline lies outside the image: move the board into view")
+        raise DetectionError("the board's outline is outside the image: move the board into view")
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

@@ -1,4 +1,4 @@
-"""The pinhole and Brown lens that comes nearest to a device known pixel by pixel: what other programs can use of it."""
+"""Approximation of a calibrated device by a pinhole with Brown's distortion, for export to other programs."""
 
 from dataclasses import dataclass
 
@@ -8,20 +8,20 @@ from scipy.optimize import least_squares
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.fields import Device, undistort
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.calibration.splined.unknowns import lens_of
+from slviewer.calibration.splined.unknowns import pinhole_lens
 from slviewer.calibration.splined.volume import is_supported
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 
 GRID = 80
-"""Pixels across the image that the fit takes: several for each cell of a displacement field."""
+"""Number of pixels across the image in the fit: several per cell of a displacement field."""
 MIN_PIXELS = 50
 
 
 @dataclass(frozen=True, eq=False)
 class PinholeFit:
-    """The ``lens``, and by how much its image of the device's rays is off: ``rms_px`` and ``max_px`` (lengths), over
-    the ``share`` of the image that target poses support."""
+    """The fitted ``lens``; ``rms_px`` and ``max_px`` of its residuals over the ``share`` of the image that target poses
+    support."""
 
     lens: Lens
     rms_px: float
@@ -30,8 +30,7 @@ class PinholeFit:
 
 
 def fit_splined(model: SplinedModel) -> tuple[PinholeFit, PinholeFit]:
-    """The fits of a splined model's camera and projector, over the cells that target poses illuminated, in its own
-    frames."""
+    """Fit lenses to a splined model's camera and projector, over the cells that target poses illuminated."""
     bundle = model.bundle
     camera, projector = (
         _fit_device(device, poses > 0)
@@ -41,7 +40,7 @@ def fit_splined(model: SplinedModel) -> tuple[PinholeFit, PinholeFit]:
 
 
 def pixelwise_residuals(model: PixelwiseModel, lens: Lens) -> PinholeFit:
-    """By how much a ``lens`` is off the rays (c3, c4) that the pixelwise model has for each camera pixel."""
+    """Measure the residuals of a ``lens`` on the pixelwise model's rays (c3, c4) of the camera pixels."""
     coefficients = model.fits[model.depth_axis].coefficients
     step = max(1, coefficients.shape[2] // GRID)
     v, u = np.mgrid[: coefficients.shape[1] : step, : coefficients.shape[2] : step]
@@ -50,12 +49,14 @@ def pixelwise_residuals(model: PixelwiseModel, lens: Lens) -> PinholeFit:
 
 
 def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
-    """The lens whose image of the undistorted normalised ``rays`` (n, 2) comes nearest to ``pixels`` (n, 2) px, least
-    squares; rows with NaN do not count. Raises InputError where fewer than 50 are left."""
+    """Fit a lens that projects undistorted normalised ``rays`` (n, 2) to ``pixels`` (n, 2) px, by least squares.
+
+    ``start``: initial lens. Rows with NaN are ignored; raises InputError where fewer than 50 remain.
+    """
     known = np.isfinite(rays).all(axis=1) & np.isfinite(pixels).all(axis=1)
     if np.count_nonzero(known) < MIN_PIXELS:
         raise InputError(f"{np.count_nonzero(known)} pixels are calibrated: a lens needs at least {MIN_PIXELS}")
-    seen, directions = pixels[known], rays[known]
+    observed, directions = pixels[known], rays[known]
 
     def lens(numbers: np.ndarray) -> Lens:
         """Return the lens with these parameters: fx, fy, cx, cy, and the five distortion coefficients."""
@@ -64,7 +65,7 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
 
     def residuals(numbers: np.ndarray) -> np.ndarray:
         """Return the residuals (2 n,) px of a lens with these parameters."""
-        return np.nan_to_num(lens(numbers).distort(directions) - seen, nan=1e3).ravel()
+        return np.nan_to_num(lens(numbers).distort(directions) - observed, nan=1e3).ravel()
 
     K = start.K
     first = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *start.D])
@@ -74,7 +75,7 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
 
 
 def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> PinholeFit:
-    """Measure the residuals of a lens at pixels (n, 2) with known rays (n, 2); rows with NaN do not count."""
+    """Measure the residuals of a lens at pixels (n, 2) with known rays (n, 2); rows with NaN are ignored."""
     length = np.linalg.norm(lens.distort(rays) - pixels, axis=1)
     known = np.isfinite(length)
     if not known.any():
@@ -92,4 +93,4 @@ def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:
     u, v = np.meshgrid(across, down)
     pixels = np.column_stack([u.ravel(), v.ravel()])
     rays = np.where(is_supported(device, pixels, illuminated)[:, None], undistort(device, pixels), np.nan)
-    return fit_lens(pixels, rays, lens_of(device))
+    return fit_lens(pixels, rays, pinhole_lens(device))

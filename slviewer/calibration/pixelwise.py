@@ -22,21 +22,21 @@ from slviewer.geometry.shapes import Plane, fit_plane
 from slviewer.geometry.triangulation import MARGIN, depth_per_px, ray_depth, triangulate_pixels
 
 PLANE_PIXELS = 30_000
-"""About how many pixels of a pose its plane is fitted to: their phase is smooth, and more do not move the plane."""
+"""Approximate number of pixels in a pose's plane fit; the phase is smooth, and more pixels do not change the plane."""
 BAND_BYTES = 2**27
-"""What the fit holds of all poses at a time: a band of image rows, the narrower the more poses there are."""
+"""Memory for the band of image rows that is fitted at a time; the band is narrower the more poses there are."""
 MIN_POSES = 4
-"""Three coefficients and one pose more, so that the fit's RMS is meaningful."""
+"""One pose more than coefficients, so that the fit's RMS is meaningful."""
 MAX_EXTRAPOLATION = 1.5
-"""How far beyond the phases it was calibrated with, in lengths of their range, a pixel still measures."""
+"""Largest extrapolation beyond a pixel's calibrated phase range, in lengths of that range."""
 
 
 @dataclass(frozen=True)
 class PixelFit:
-    """One axis: ``coefficients`` (5, h, w) float64 c0 ... c4 for phase in rad and depth in mm; NaN where not fitted.
+    """Fit of one axis: ``coefficients`` (5, h, w) float64 c0 ... c4 for phase in rad and depth in mm, or NaN.
 
-    ``rms_mm`` (3, h, w) is the fit's RMS in z, x and y; ``poses`` (h, w) how many a pixel saw; ``phase_min`` and
-    ``phase_max`` the range that it saw; ``condition`` (h, w) how nearly the three terms of eq. 9 are alike over it.
+    ``rms_mm`` (3, h, w): RMS residuals in z, x and y; ``poses`` (h, w): number of poses of each pixel; ``phase_min``
+    and ``phase_max`` (h, w) rad: their phase range; ``condition`` (h, w): condition number of the fit of eq. 9.
     """
 
     coefficients: np.ndarray
@@ -51,8 +51,8 @@ class PixelFit:
 class PixelwiseModel:
     """The Letter's calibration: a rational function of the phase for each camera pixel and captured axis.
 
-    ``periods_px`` is the fringe period that the coefficients' phase counts in; a capture of another period is
-    converted to it. ``planes`` are the ideal planes of the target poses (eq. 12), reconstructed from ``depth_axis``.
+    ``periods_px`` is the fringe period of the coefficients' phase; the phase of captures with another period is
+    converted. ``planes`` are the ideal planes of the target poses (eq. 12), reconstructed from ``depth_axis``.
     """
 
     fits: Mapping[Axis, PixelFit]
@@ -68,7 +68,7 @@ class PixelwiseModel:
         return tuple(self.fits)
 
     def points(self, phase: PhaseMap) -> np.ndarray:
-        """(h, w, 3) float32 mm; NaN where the phase is invalid, unfitted, or too far from the fitted range."""
+        """Return points (h, w, 3) float32 mm; NaN where phase or fit are invalid, or too far from the fitted range."""
         fit = self.fits[phase.axis]
         out = np.empty((*phase.phase.shape, 3), np.float32)
         ratio = phase.period_px / self.periods_px[phase.axis]
@@ -76,30 +76,30 @@ class PixelwiseModel:
         return out
 
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
-        """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``."""
+        """Return the depth noise (h, w) float32 mm predicted from the phase noise, ``|dz/dphi| sigma_phi``."""
         c0, c1, c2 = self.fits[phase.axis].coefficients[:3]
         ratio = phase.period_px / self.periods_px[phase.axis]
         per_rad = np.abs(c1 - c0 * c2) / (1 + c2 * (ratio * phase.phase)) ** 2
         return (per_rad * ratio * phase.sigma_phase).astype(np.float32)
 
     def median_rms_mm(self, axis: Axis) -> dict[str, float]:
-        """The fit's median RMS over the pixels, in z, x and y."""
+        """Return the median of the pixels' RMS residuals in z, x and y."""
         z, x, y = (float(np.nanmedian(r)) for r in self.fits[axis].rms_mm)
         return {"z": z, "x": x, "y": y}
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Flat named arrays, for saving."""
+        """Return named arrays for saving."""
         keys = PixelFit.__annotations__
         return {f"{axis}_{key}": getattr(fit, key) for axis, fit in self.fits.items() for key in keys}
 
     def to_dict(self) -> dict[str, Any]:
-        """What is not an image, JSON-able."""
+        """Return the fields that are not images, as JSON types."""
         planes = {name: [*plane.normal.tolist(), plane.offset] for name, plane in self.planes.items()}
         return {"periods_px": dict(self.periods_px), "planes": planes, "depth_axis": self.depth_axis}
 
     @classmethod
     def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "PixelwiseModel":
-        """The inverse of ``to_dict`` and ``to_arrays``."""
+        """Return the model that ``to_dict`` and ``to_arrays`` saved."""
         keys = PixelFit.__annotations__
         fits = {axis: PixelFit(**{key: arrays[f"{axis}_{key}"] for key in keys}) for axis in data["periods_px"]}
         planes = {name: Plane(np.array(values[:3]), values[3]) for name, values in data["planes"].items()}
@@ -111,9 +111,9 @@ def calibrate_pixelwise(
     stereo: StereoModel,
     progress: Callable[[float], None] | None = None,
 ) -> PixelwiseModel:
-    """Steps 3 to 5 for each captured axis, from the poses that the stereo calibration used.
+    """Fit the pixel-wise model of each captured axis (steps 3 to 5) to the poses that the stereo calibration used.
 
-    Raises CalibrationRejected when no pixel saw the board in at least 4 poses.
+    Raises CalibrationRejected when no pixel has at least 4 poses.
     """
     used = [o for o in observations if o.name in stereo.poses]
     if len(used) < MIN_POSES:
@@ -128,10 +128,10 @@ def calibrate_pixelwise(
     periods = {axis: used[0].periods_px[axis] for axis in axes}
     fits = {axis: _empty_fit(height, width) for axis in axes}
     band = max(1, min(height, BAND_BYTES // (8 * len(used) * width * (len(axes) + 1))))
-    room = np.empty((len(axes) + 1, len(used) * band * width))  # allocated once: new memory is slow at first
+    buffer = np.empty((len(axes) + 1, len(used) * band * width))  # allocated once: new memory is slow at first
     for first in range(0, height, band):
         rows = slice(first, min(first + band, height))
-        phases, z, rays = _collect_rows(used, stereo, planes, axes, periods, depth_axis, rows, room)
+        phases, z, rays = _collect_rows(used, stereo, planes, axes, periods, depth_axis, rows, buffer)
         for axis in axes:
             reference = _reference_phase(stereo, axis, periods[axis], z_ref, rows)
             _fit_rows(phases[axis], z, reference, z_ref, rays, rows, fits[axis])
@@ -139,7 +139,7 @@ def calibrate_pixelwise(
             progress(rows.stop / height)
     if not any((fit.poses >= MIN_POSES).any() for fit in fits.values()):
         raise CalibrationRejected(
-            f"no pixel saw the board in {MIN_POSES} poses or more: let the poses overlap in the image"
+            f"no pixel has a view of the board in {MIN_POSES} poses or more: let the poses overlap in the image"
         )
     return PixelwiseModel(fits, periods, planes, depth_axis)
 
@@ -147,9 +147,9 @@ def calibrate_pixelwise(
 def pixel_samples(
     observations: Sequence[Observation], stereo: StereoModel, model: PixelwiseModel, axis: Axis, pixel: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What one pixel (u, v) was fitted to: phase (n,) rad and ideal points (n, 3) mm, one of each pose that it saw.
+    """Return the samples that one pixel (u, v) was fitted to: phase (n,) rad and ideal points (n, 3) mm, one per pose.
 
-    The phase counts in the model's ``periods_px``.
+    The phase is in the model's ``periods_px``.
     """
     u, v = pixel
     phases, points = [], []
@@ -168,21 +168,23 @@ def pixel_samples(
 
 
 def mid_depth(stereo: StereoModel) -> float:
-    """Middle of the calibrated depths, mm."""
+    """Return the middle of the calibrated depths, mm; raises CalibrationRejected for an imported stereo calibration."""
     if stereo.depth_range_mm is None:
-        raise CalibrationRejected("the stereo calibration was made elsewhere, without poses to fit pixels to")
+        raise CalibrationRejected(
+            "the stereo calibration was imported, without poses to fit pixels to: calibrate from target poses"
+        )
     return float(np.mean(stereo.depth_range_mm))
 
 
 def best_axis(observations: Sequence[Observation], stereo: StereoModel) -> Axis:
-    """The axis whose coordinate moves most with depth, at mid depth."""
+    """Return the axis whose coordinate changes most with depth, at mid depth."""
     z = np.full(observations[0].size[::-1], mid_depth(stereo))
     sensitivity = {axis: float(np.nanmedian(depth_per_px(stereo.rig, axis, z))) for axis in stereo.axes}
     return min(stereo.axes, key=lambda axis: sensitivity[axis])
 
 
 def ideal_plane(observation: Observation, stereo: StereoModel, axis: Axis) -> Plane:
-    """The plane of the stereo reconstruction of a pose's smoothed phase (step 3, eq. 12)."""
+    """Fit a plane to the stereo reconstruction of a pose's smoothed phase (step 3, eq. 12)."""
     u0, v0, u1, v1 = observation.box
     step = max(1, int(((u1 - u0) * (v1 - v0) / PLANE_PIXELS) ** 0.5))
     v, u = np.nonzero(observation.region[::step, ::step])
@@ -192,7 +194,7 @@ def ideal_plane(observation: Observation, stereo: StereoModel, axis: Axis) -> Pl
     finite = points[np.isfinite(points[:, 2])]
     if len(finite) < 100:
         raise CalibrationRejected(
-            f"{observation.name}: stereo reconstructs {len(finite)} points of the board: leave this pose out"
+            f"{observation.name}: stereo reconstructs {len(finite)} points of the board: exclude this pose"
         )
     return fit_plane(finite)
 
@@ -205,18 +207,19 @@ def _collect_rows(
     periods: Mapping[Axis, float],
     depth_axis: Axis,
     rows: slice,
-    room: np.ndarray,
+    buffer: np.ndarray,
 ) -> tuple[dict[Axis, np.ndarray], np.ndarray, np.ndarray]:
-    """The samples of all poses in some image rows: each axis' phase (n, h', w) rad in ``periods``, depth (n, h', w) mm,
-    and sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11). Phases and depth lie in ``room``.
+    """Collect the samples of all poses in some image rows.
 
-    Stereo's points are moved along the plane's normal onto it (step 4, eq. 13); NaN where a pose's board is not.
+    Returns the phase (n, h', w) rad of each axis in ``periods``, the depth (n, h', w) mm, both views of ``buffer``, and
+    the sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11). Stereo's points are projected along the plane's
+    normal onto it (step 4, eq. 13); NaN outside a pose's board.
     """
     rig, width = stereo.rig, used[0].size[0]
     shape = len(used), rows.stop - rows.start, width
-    *kept, z = (each[: np.prod(shape)].reshape(shape) for each in room)
-    phases, sums = dict(zip(axes, kept, strict=True)), np.zeros((*shape[1:], 6))
-    for each in (*kept, z):
+    *axis_phases, z = (each[: np.prod(shape)].reshape(shape) for each in buffer)
+    phases, sums = dict(zip(axes, axis_phases, strict=True)), np.zeros((*shape[1:], 6))
+    for each in (*axis_phases, z):
         each.fill(np.nan)
     extent = np.array(rig.projector.size, float)
     for i, o in enumerate(used):
@@ -239,7 +242,7 @@ def _collect_rows(
 
 
 def _region_rows(o: Observation, first: int, last: int) -> np.ndarray:
-    """Rows ``first`` to ``last`` of an observation's region; only their bits are unpacked."""
+    """Unpack rows ``first`` to ``last`` of an observation's region, (last - first, width) bool."""
     width = o.box[2] - o.box[0]
     start, stop = first * width, last * width
     bits = np.unpackbits(o.packed_region[start // 8 : -(-stop // 8)])
@@ -247,7 +250,7 @@ def _region_rows(o: Observation, first: int, last: int) -> np.ndarray:
 
 
 def _reference_phase(stereo: StereoModel, axis: Axis, period_px: float, z: float, rows: slice) -> np.ndarray:
-    """(h', w) rad: the phase that stereo expects at depth z; 0 where the projector does not reach."""
+    """Return the phase (h', w) rad that stereo predicts at depth ``z`` mm; 0 outside the projector's image."""
     rays = stereo.rig.camera.rays()[rows]
     points = np.dstack([rays * z, np.full(rays.shape[:2], z)])
     coordinate = stereo.rig.project(points)[..., 0 if axis == "x" else 1]
@@ -265,7 +268,7 @@ def _empty_fit(height: int, width: int) -> PixelFit:
 def _fit_rows(
     phase: np.ndarray, z: np.ndarray, phase_ref: np.ndarray, z_ref: float, rays: np.ndarray, rows: slice, fit: PixelFit
 ) -> None:
-    """Fill the ``rows`` of a fit (step 5)."""
+    """Fill the ``rows`` of ``fit`` from the samples of ``_collect_rows`` (step 5)."""
     a, rms_z = np.empty((3, *phase.shape[1:])), np.empty(phase.shape[1:])
     poses, least, most = fit.poses[rows], fit.phase_min[rows], fit.phase_max[rows]
     fit_rational(phase, z, phase_ref, z_ref, MIN_POSES, a, rms_z, poses, least, most, fit.condition[rows])
@@ -289,8 +292,10 @@ def _fit_rows(
 def _project_onto_plane(  # type: ignore[no-untyped-def]
     phase, region, px_per_rad, rays, v0, u0, R, t, parameters, row, extent, normal, offset, z, sums, first
 ):
-    """Depths of stereo's points moved along the ``normal`` onto their plane; phase and region begin at pixel (u0, v0)
-    and, in ``z`` and ``sums``, at row ``first``."""
+    """Fill depths ``z`` and ``sums`` with stereo's points projected along the ``normal`` onto their plane.
+
+    ``phase`` and ``region`` start at pixel (u0, v0), and at row ``first`` of ``z`` and ``sums``.
+    """
     low, high = -0.5 - MARGIN * extent[row], (1.0 + MARGIN) * extent[row] - 0.5
     for i in prange(phase.shape[0]):
         shift = 0.0  # the neighbour's distortion is a guess that saves a step or two

@@ -285,7 +285,7 @@ class _Solution:
 
 
 def _check_agreement(model: StereoModel) -> None:
-    """Raise CalibrationRejected where the reprojection error is too large or a board lies behind the camera."""
+    """Raise CalibrationRejected where the reprojection error is too large or a board is behind the camera."""
     rms = model.reprojection_rms_px
     if rms["stereo"] > MAX_REPROJECTION_PX:
         raise CalibrationRejected(

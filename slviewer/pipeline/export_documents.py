@@ -171,7 +171,7 @@ def _splined_arrays(model: SplinedModel) -> dict[str, np.ndarray]:
         arrays |= {
             f"{axis}_coefficients": fast.coefficients,
             f"{axis}_centre_px": np.array(fast.centre),
-            f"{axis}_grid": fast.held,
+            f"{axis}_grid": fast.supported_grid,
             f"{axis}_grid_step_px": np.array(fast.step),
             f"{axis}_depths_mm": np.array([fast.near, fast.far]),
         }

@@ -224,6 +224,8 @@ def _splined(model: SplinedModel, axis: Axis, period_px: float) -> kernels.Depth
     """The compiled form; pixels that look where no target pose was are masked."""
     fast = model.fast_axis(axis)
     c = np.concatenate([fast.coefficients, model.rays.astype(np.float32)])
-    per_mm = (fast.held.shape[2] - 1) / (fast.far - fast.near)
+    per_mm = (fast.supported_grid.shape[2] - 1) / (fast.far - fast.near)
     bounds = np.empty((2, 0, 0), np.float32)
-    return kernels.Depths(c, period_px / (2 * np.pi), fast.centre, bounds, fast.held, fast.step, fast.near, per_mm)
+    return kernels.Depths(
+        c, period_px / (2 * np.pi), fast.centre, bounds, fast.supported_grid, fast.step, fast.near, per_mm
+    )

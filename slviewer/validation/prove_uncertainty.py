@@ -9,7 +9,14 @@ import numpy as np
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.uncertainty import volume_sigmas
 from slviewer.calibration.splined.unknowns import Arrangement
-from slviewer.calibration.splined.volume import Volume, depth_axis, motion_free, sigma_3d, view_pixels, working_volume
+from slviewer.calibration.splined.volume import (
+    Volume,
+    depth_axis,
+    remove_rigid_motion,
+    sigma_3d,
+    view_pixels,
+    working_volume,
+)
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.simulate import TARGET
@@ -113,7 +120,7 @@ def compare_with_truth(model: SplinedModel, true: SimulatedRig) -> PredictedErro
     supported = volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
     predicted = volume_sigmas(bundle, axis, volume)
     return PredictedErrors(
-        predicted, sigma_3d(motion_free(errors[known].reshape(1, -1), volume.points, supported)), supported
+        predicted, sigma_3d(remove_rigid_motion(errors[known].reshape(1, -1), volume.points, supported)), supported
     )
 
 

@@ -412,4 +412,4 @@ def _load_splined(session: Session) -> SplinedView | None:
         return None
     assert isinstance(model, SplinedModel)
     weights = {name: (fit.camera_trust, fit.projector_trust) for name, fit in model.bundle.fits.items()}
-    return SplinedView(model.summary(), weights, model.bundle.turned)
+    return SplinedView(model.summary(), weights, model.bundle.half_turned_poses)

@@ -48,7 +48,9 @@ def calibrated(seen: list[Observation], true) -> SplinedModel:
 
 def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
     as_held, found = calibrated(seen, true), calibrated(mixed, true)
-    assert as_held.bundle.turned == () and found.bundle.turned == tuple(f"pose_{i:02d}" for i in TURNED)
+    assert as_held.bundle.half_turned_poses == () and found.bundle.half_turned_poses == tuple(
+        f"pose_{i:02d}" for i in TURNED
+    )
     assert not found.bundle.excluded and "pose_01, pose_04, pose_07" in found.text()
     assert found.bundle.noise.camera_px == pytest.approx(as_held.bundle.noise.camera_px, rel=0.05)
     assert np.abs(found.bundle.state.offsets - as_held.bundle.state.offsets).max() < 0.003
@@ -60,13 +62,13 @@ def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
         assert known.sum() > 20_000
         assert np.sqrt(np.mean(aligned_error(*(cloud[known][::11] for cloud in clouds)) ** 2)) < 0.002
     again = type(found.bundle).from_arrays(found.bundle.to_dict(), found.bundle.to_arrays())
-    assert again.turned == found.bundle.turned
+    assert again.half_turned_poses == found.bundle.half_turned_poses
 
 
 def test_marked_poses_are_never_turned(mixed, true) -> None:
     marked = [replace(each, marked=i in TURNED) for i, each in enumerate(mixed)]
     found = adjust_bundle(marked, calibrate_stereo(marked, true.projector.size, str(BOARD)))
-    assert set(found.turned) == {each.name for i, each in enumerate(mixed) if i not in TURNED}
+    assert set(found.half_turned_poses) == {each.name for i, each in enumerate(mixed) if i not in TURNED}
 
 
 def test_boards_that_may_be_turned() -> None:

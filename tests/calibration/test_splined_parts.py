@@ -15,7 +15,7 @@ from slviewer.calibration.splined.fields import (
 )
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.normal import normal_equations, predict_observations
-from slviewer.calibration.splined.unknowns import State, lens_of
+from slviewer.calibration.splined.unknowns import State, pinhole_lens
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
 
@@ -106,7 +106,7 @@ def test_a_displacement_and_its_inverse(true) -> None:
 @pytest.mark.slow
 def test_the_compiled_form_is_the_exact_one(model, true) -> None:
     state = model.rig
-    camera, projector = lens_of(state.camera), lens_of(state.projector)
+    camera, projector = pinhole_lens(state.camera), pinhole_lens(state.projector)
     basis = np.zeros((4, 4))
     rng = np.random.default_rng(0)
     height, width = model.rays.shape[1:]

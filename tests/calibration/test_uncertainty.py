@@ -15,7 +15,7 @@ from slviewer.calibration.splined.uncertainty import (
 from slviewer.calibration.splined.volume import (
     BestMotion,
     depth_axis,
-    motion_free,
+    remove_rigid_motion,
     select_visible,
     sigma_3d,
     working_volume,
@@ -75,16 +75,18 @@ def test_a_rigid_motion_is_taken_away_and_nothing_else() -> None:
     moved = np.cross(turn, points) + shift
     errors = rng.normal(size=(40, 3))
     both = np.stack([moved.ravel(), errors.ravel(), (moved + errors).ravel()])
-    left = motion_free(both, points)
+    left = remove_rigid_motion(both, points)
     assert np.abs(left[0]).max() < 1e-9
     assert left[2] == pytest.approx(left[1])
     assert 0.9 < np.linalg.norm(left[1]) / np.linalg.norm(errors) < 1
     # fitted to some points that only move: the others keep all their errors
     some = np.arange(40) < 20
     errors[some] = 0
-    assert motion_free((moved + errors).reshape(1, -1), points, some)[0] == pytest.approx(errors.ravel(), abs=1e-9)
+    assert remove_rigid_motion((moved + errors).reshape(1, -1), points, some)[0] == pytest.approx(
+        errors.ravel(), abs=1e-9
+    )
     with pytest.raises(InputError):
-        motion_free(both, points, np.arange(40) < 2)
+        remove_rigid_motion(both, points, np.arange(40) < 2)
 
 
 def test_it_is_as_wrong_as_it_says(model, true) -> None:
@@ -98,7 +100,7 @@ def test_it_is_as_wrong_as_it_says(model, true) -> None:
 def test_the_frame_would_overstate_it(model) -> None:
     volume = working_volume(model.rig, model.bundle.depth_range_mm)
     whitened = model.bundle.whiten(model.bundle.point_jacobian("x", volume.pixels, volume.z))
-    shape = sigma_3d(motion_free(whitened, volume.points, volume.supported(model.rig, *illuminated(model))))
+    shape = sigma_3d(remove_rigid_motion(whitened, volume.points, volume.supported(model.rig, *illuminated(model))))
     assert np.median(sigma_3d(whitened)) > 10 * np.median(shape)
 
 

@@ -129,7 +129,7 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
         return
     if any(diagnose_mirroring(e)):  # the code is of another axis, or from its other end
         return
-    if _list_aliased_gamma_poses(e):  # gamma moves the phase at which the code begins
+    if _list_aliased_gamma_poses(e):  # gamma moves the phase at which the code starts
         return
     ordered = [pose for pose in e.poses if not classify_frame_order(pose)]
     wrong = {}
@@ -222,7 +222,7 @@ def diagnose_ripple(e: Evidence) -> Iterator[Finding]:
     steps = min((a.steps for p in e.poses for a in p.axes.values() if a.steps), default=0)
     observation = (
         f"the phase has an error that repeats {worst.waves} times a fringe period ({worst.rms_px:.2f} px RMS in "
-        f"{axis}, beside {worst.noise_px:.2f} px of predicted noise)"
+        f"{axis}, with {worst.noise_px:.2f} px of predicted noise)"
     )
     if steps and worst.waves % steps == 0:
         yield Finding(

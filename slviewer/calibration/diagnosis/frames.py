@@ -67,16 +67,16 @@ def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: 
         for m in (1, 2)
     )
     strength = np.abs(first)
-    seen = strength > max(8.0 * white / 255, 0.3 * float(np.quantile(strength, 0.95)) if strength.size else np.inf)
-    if np.count_nonzero(seen) < FEWEST:
+    modulated = strength > max(8.0 * white / 255, 0.3 * float(np.quantile(strength, 0.95)) if strength.size else np.inf)
+    if np.count_nonzero(modulated) < FEWEST:
         return np.nan
-    first, second, strength = first[seen], second[seen], strength[seen]
+    first, second, strength = first[modulated], second[modulated], strength[modulated]
     along = np.real(second * np.conj(first / strength) ** 2)
     return float(np.sum(along) / np.sum(strength))
 
 
 def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
-    """Measure the fringe period in px from the phase at which the Gray code begins.
+    """Measure the fringe period in px from the phase at which the Gray code starts.
 
     The code's origin in px is known from the sequence's description, and its phase from the code's edges. NaN without
     both a phase shift and a Gray code, where the origin is too close to phase 0, or where the edges do not agree.
@@ -87,14 +87,14 @@ def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> 
     size = stack.shape[2 if axis == "y" else 1]
     step = max(1, size // ORIGIN_ROWS)
     thin = np.ascontiguousarray(stack[:, :, ::step] if axis == "y" else stack[:, ::step])
-    begin = _measure_code_origin(layout, thin, white_level(stack, sequence.select(axis)))
+    origin = _measure_code_origin(layout, thin, white_level(stack, sequence.select(axis)))
     turns = layout.gray_origin_px / layout.period_px
-    ratio = turns / begin if np.isfinite(begin) and abs(begin) > 1e-3 else np.nan
+    ratio = turns / origin if np.isfinite(origin) and abs(origin) > 1e-3 else np.nan
     return float(layout.period_px * ratio) if 0.1 < ratio < 10 else np.nan
 
 
 def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> float:
-    """Return the phase at which the codes begin, in periods, -0.5 to 0.5; NaN where the edges do not agree.
+    """Return the phase at which the codes start, in periods, -0.5 to 0.5; NaN where the edges do not agree.
 
     An edge is at a phase between those of two neighbouring pixels. The result is the phase inside the largest number
     of these intervals, which is more precise than any one of them.
@@ -106,26 +106,26 @@ def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> flo
         digit ^= bit_heights(layout, stack, i, background) > 0
         code = 2 * code + digit
     first, second = (np.s_[:, :-1], np.s_[:, 1:]) if layout.axis == "x" else (np.s_[:-1], np.s_[1:])
-    begins, lengths = [], []
+    origins, lengths = [], []
     for here, there in ((first, second), (second, first)):
         edge = illuminated[here] & illuminated[there] & (code[there] == code[here] + 1)
         below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
-        if layout.complementary is not None:  # the cell that begins here is the second half of a period if odd
+        if layout.complementary is not None:  # the cell that starts here is the second half of a period if odd
             below = below - (code[there][edge] & 1) * np.pi
             above = above - (code[there][edge] & 1) * np.pi
-        begins.append(below)
+        origins.append(below)
         lengths.append(np.angle(np.exp(1j * (above - below))))
-    begin, length = np.concatenate(begins), np.concatenate(lengths)
-    if len(begin) < MIN_EDGES or np.mean(length > 0) < MIN_RISING:
+    origin, length = np.concatenate(origins), np.concatenate(lengths)
+    if len(origin) < MIN_EDGES or np.mean(length > 0) < MIN_RISING:
         return np.nan
-    begin, length = begin[length > 0], length[length > 0]
+    origin, length = origin[length > 0], length[length > 0]
     places = np.linspace(-np.pi, np.pi, _ORIGIN_CANDIDATES, endpoint=False)
-    start = np.mod((begin + np.pi) / (2 * np.pi), 1.0) * _ORIGIN_CANDIDATES
+    start = np.mod((origin + np.pi) / (2 * np.pi), 1.0) * _ORIGIN_CANDIDATES
     change = np.zeros(3 * _ORIGIN_CANDIDATES)
     np.add.at(change, np.ceil(start).astype(int), 1.0)
     np.add.at(change, np.floor(start + length / (2 * np.pi) * _ORIGIN_CANDIDATES).astype(int) + 1, -1.0)
     count = np.cumsum(change).reshape(3, _ORIGIN_CANDIDATES).sum(0)
-    if count.max() < MIN_CONCENTRATION * len(begin):
+    if count.max() < MIN_CONCENTRATION * len(origin):
         return np.nan
     best = np.exp(1j * places)[count > _BEST_SHARE * count.max()]
     return float(np.angle(best.mean()) / (2 * np.pi))

@@ -55,7 +55,7 @@ def describe_misnumbering(board: Board, points: np.ndarray, pixels: np.ndarray) 
 def reconcile_marks(board: Board, observations: Sequence[Observation]) -> tuple[list[Observation], str]:
     """Renumber poses of a board of circles so that all are numbered by its mark, or none; return them and a warning.
 
-    A board has a mark in all poses or in none. Marks that only a minority of poses shows are taken for clutter: these
+    A board has a mark in all poses or in none. Marks that only a minority of poses shows are treated as clutter: these
     poses are renumbered by the rule for boards without a mark (``slviewer.target.numbering``). The warning is "" where
     nothing was changed.
     """
@@ -64,8 +64,8 @@ def reconcile_marks(board: Board, observations: Sequence[Observation]) -> tuple[
         return list(observations), ""
     numbered = [_number_by_rule(board, o) if o.marked else o for o in observations]
     return numbered, (
-        f"a mark was detected in {len(doubtful)} of {len(observations)} poses ({', '.join(doubtful)}) only: taken for "
-        "clutter beside the board, these poses are numbered like the others; if the board has a mark, keep it in view "
+        f"a mark was detected in {len(doubtful)} of {len(observations)} poses ({', '.join(doubtful)}) only: treated as "
+        "clutter next to the board, these poses are numbered like the others; if the board has a mark, keep it in view "
         "and uncovered"
     )
 

@@ -76,7 +76,7 @@ def diagnose_empty_corners(e: Evidence) -> Iterator[Finding]:
 def diagnose_uncertainty(e: Evidence) -> Iterator[Finding]:
     """Yield findings on a large reprojection error, and on focal lengths that the poses leave uncertain.
 
-    Beside a large reprojection error an uncertain focal length is at most doubtful: it may be a consequence.
+    With a large reprojection error an uncertain focal length is at most doubtful: it may be a consequence.
     """
     if e.solution is None:
         return

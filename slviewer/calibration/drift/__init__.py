@@ -1,1 +1,1 @@
-"""Whether a saved calibration is still good, from one capture of its board."""
+"""Drift check of a saved calibration from one capture of its board."""

@@ -21,7 +21,7 @@ from slviewer.fringe.sequence import Axis
 FALSE_ALARMS = 1e-4
 """False-alarm probability of one check; a check precedes every day's work."""
 BOARD_PPM = 5.0
-"""How much the board itself may have grown since: half a kelvin of steel."""
+"""Thermal expansion of the board since the calibration: half a kelvin of steel."""
 MAX_MISFIT_RATIO = 3.0
 """Largest RMS that no movement explains, over that of the calibration's worst pose."""
 TURN_MRAD, SHIFT_MM = 0.05, 0.010
@@ -84,30 +84,30 @@ class Drift:
             f" baseline {1e3 * self.baseline_mm:+.0f} +- {1e3 * self.baseline_sigma_mm:.0f} um",
             "  a pan and a shift along x look nearly alike, as do a nod and a shift along y: their sum is known far "
             "better than each",
-            "  seen if it is the only change: turns from "
+            "  detectable if it is the only change: turns from "
             + ", ".join(f"{s:.4f}" for s in self.seen_alone[:3])
             + " mrad, shifts from "
             + ", ".join(f"{1e3 * s:.1f}" for s in self.seen_alone[3:])
             + " um",
         ]
-        return "\n".join(lines + [f"  not seen: {what}" for what in self.unseen])
+        return "\n".join(lines + [f"  not detectable: {what}" for what in self.unseen])
 
 
 def check_drift(reference: DriftReference, view: DriftView) -> Drift:
-    """Judge a calibration by one later view of its board.
+    """Check a calibration with one later view of its board.
 
     Raises InputError where no axis of the pattern could be read.
     """
     if not view.axes:
-        raise InputError(f"{view.name}: no axis of the pattern could be read on the board: light the whole board")
+        raise InputError(f"{view.name}: no axis of the pattern could be read on the board: illuminate the whole board")
     estimate = reference.estimate_change(view)
-    own = reference.answers
+    own = reference.pose_changes
     growth = BOARD_PPM * 1e-6
     C = estimate.covariance(reference.sigmas) + growth**2 * np.outer(estimate.by_growth, estimate.by_growth)
     information = np.linalg.inv(C)
-    about = float(estimate.change @ information @ estimate.change)
+    squared_distance = float(estimate.change @ information @ estimate.change)
     degrees = 6 * len(own) - 3  # the floor is itself an estimate, from so many numbers
-    chance = float(fisher.sf(about / 6, 6, degrees))
+    chance = float(fisher.sf(squared_distance / 6, 6, degrees))
     limit = 6 * float(fisher.isf(FALSE_ALARMS, 6, degrees))
     scale_sigma = float(np.hypot(np.sqrt(np.mean([a.scale**2 for a in own])), growth))
     two = np.isfinite(estimate.across_px)
@@ -117,18 +117,19 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     worst = max(a.misfit_px for a in own)
     if estimate.misfit_px > MAX_MISFIT_RATIO * worst:
         reasons.append(
-            f"the board lies {estimate.misfit_px:.3f} px off what any movement of the projector explains (in the poses "
-            f"of the calibration {worst:.3f} px at most): was a lens refocused, the board moved, or is it another one?"
+            f"residuals of {estimate.misfit_px:.3f} px RMS remain with any movement of the projector "
+            f"(at most {worst:.3f} px in the poses of the calibration): "
+            "was a lens refocused, the board moved, or is it another one?"
         )
-    elif about > limit:
-        reasons.append(_list_movements(estimate, information, about, along))
+    elif squared_distance > limit:
+        reasons.append(_list_movements(estimate, information, squared_distance, along))
         if abs(estimate.scale) > 3 * scale_sigma:
             reasons.append(
                 f"the board seems {1e6 * estimate.scale:+.0f} ppm larger than it is (+- {1e6 * scale_sigma:.0f})"
             )
         if across_sigma is not None and abs(estimate.across_px) > 4 * across_sigma:
             reasons.append(
-                f"the pattern lies {estimate.across_px:+.4f} px off its epipolar lines (+- {across_sigma:.4f})"
+                f"the pattern is {estimate.across_px:+.4f} px off its epipolar lines (+- {across_sigma:.4f})"
             )
     sigmas = np.sqrt(np.diag(C))
     seen_alone = (np.sqrt(limit) + 1.645) / np.sqrt(np.diag(information)) * np.array([1e3] * 3 + [1.0] * 3)
@@ -154,17 +155,17 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     )
 
 
-def _list_movements(estimate: PoseChange, information: np.ndarray, about: float, along: np.ndarray) -> str:
+def _list_movements(estimate: PoseChange, information: np.ndarray, squared_distance: float, along: np.ndarray) -> str:
     """Describe the single movements that explain the change best, with their sizes.
 
-    ``information`` (6, 6): inverse covariance of the change; ``about``: its squared Mahalanobis distance from 0;
-    ``along`` (6,): direction of a longer baseline.
+    ``information`` (6, 6): inverse covariance of the change; ``squared_distance``: its Mahalanobis
+    distance from 0, squared; ``along`` (6,): direction of a longer baseline.
     """
     moves = np.vstack([np.eye(6), along])  # (7, 6); a longer baseline is the last
     names = [*(name for name, _, _ in _MOVES), "change of the baseline"]
     curvature = np.einsum("ij,jk,ik->i", moves, information, moves)
     sizes, sigmas = moves @ information @ estimate.change / curvature, curvature**-0.5
-    share = sizes**2 * curvature / about
+    share = sizes**2 * curvature / squared_distance
     words = []
     for i in np.argsort(-share):
         if share[i] > 0.9 * share.max():

@@ -20,7 +20,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 
 MIN_POSES = 8
-"""With fewer poses, the leave-one-out fields do not represent those of a later view."""
+"""With fewer poses, the fields estimated without one pose do not represent those of a later view."""
 ROUGHNESS_PX = 0.1
 """Prior sigma of the second differences of a field's coefficients."""
 HEIGHT_PX = 1.0
@@ -58,7 +58,7 @@ class DriftReference:
     """Reference of the drift check for one calibration.
 
     ``shared``: corrections of the relative pose and coefficients of the lens errors, with their ``covariance``;
-    ``sigmas``: standard deviation in px of one observation by kind, remaining lens errors included; ``answers``:
+    ``sigmas``: standard deviation in px of one observation by kind, remaining lens errors included; ``pose_changes``:
     apparent changes of the calibration's own poses, each from the other poses' lens errors.
     """
 
@@ -66,7 +66,7 @@ class DriftReference:
     shared: np.ndarray
     covariance: np.ndarray
     sigmas: Mapping[str, float]
-    answers: tuple[PoseChange, ...]
+    pose_changes: tuple[PoseChange, ...]
 
     def estimate_change(self, view: DriftView) -> PoseChange:
         """Estimate the projector's apparent change in a later view."""
@@ -77,28 +77,28 @@ class DriftReference:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return named arrays for saving."""
-        answers = self.answers
+        pose_changes = self.pose_changes
         return {
             "shared": self.shared,
             "covariance": self.covariance,
             "sigmas": np.array([self.sigmas[kind] for kind in KINDS]),
-            "names": np.array([a.name for a in answers]),
-            "changes": np.array([a.change for a in answers]),
-            "spreads": np.array([[a.spreads[kind] for kind in KINDS] for a in answers]),
-            "by_growth": np.array([a.by_growth for a in answers]),
-            "figures": np.array([(a.scale, a.across_px, a.misfit_px) for a in answers]),
+            "names": np.array([a.name for a in pose_changes]),
+            "changes": np.array([a.change for a in pose_changes]),
+            "spreads": np.array([[a.spreads[kind] for kind in KINDS] for a in pose_changes]),
+            "by_growth": np.array([a.by_growth for a in pose_changes]),
+            "figures": np.array([(a.scale, a.across_px, a.misfit_px) for a in pose_changes]),
         }
 
     @classmethod
     def from_arrays(cls, rig: StereoRig, arrays: Mapping[str, np.ndarray]) -> "DriftReference":
         """Return the reference that ``to_arrays`` saved, of a calibration with this rig."""
         each = zip(*(arrays[name] for name in ("names", "changes", "spreads", "by_growth", "figures")), strict=True)
-        answers = tuple(
+        pose_changes = tuple(
             PoseChange(str(name), change, dict(zip(KINDS, spreads, strict=True)), growth, *(float(f) for f in figures))
             for name, change, spreads, growth, figures in each
         )
         sigmas = {kind: float(sigma) for kind, sigma in zip(KINDS, arrays["sigmas"], strict=True)}
-        return cls(rig, arrays["shared"], arrays["covariance"], sigmas, answers)
+        return cls(rig, arrays["shared"], arrays["covariance"], sigmas, pose_changes)
 
 
 def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReference:
@@ -112,23 +112,23 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
             "calibrate with more poses"
         )
     equations = [linearise_view(rig, view) for view in views]
-    prior = _prior(rig)
+    prior = _prior_information(rig)
     sigmas = dict.fromkeys(KINDS, 0.05)
-    weights = [_weights(e, e.usable, np.zeros(len(e.residuals)), sigmas, robust=False) for e in equations]
+    weights = [_compute_weights(e, e.usable, np.zeros(len(e.residuals)), sigmas, robust=False) for e in equations]
     for _ in range(3):
         parts = [_reduce_normal_equations(e, w) for e, w in zip(equations, weights, strict=True)]
         factor = cho_factor(sum((N for N, _ in parts), prior))
         shared = cho_solve(factor, sum(b for _, b in parts))
-        left = [_remaining_residuals(e, w, shared) for e, w in zip(equations, weights, strict=True)]
-        sigmas = {k: _sigma_of(equations, left, i, sigmas[k]) for i, k in enumerate(KINDS)}
-        weights = [_weights(e, e.usable, r, sigmas) for e, r in zip(equations, left, strict=True)]
+        residuals = [_remaining_residuals(e, w, shared) for e, w in zip(equations, weights, strict=True)]
+        sigmas = {k: _estimate_sigma(equations, residuals, i, sigmas[k]) for i, k in enumerate(KINDS)}
+        weights = [_compute_weights(e, e.usable, r, sigmas) for e, r in zip(equations, residuals, strict=True)]
     total, right = sum((N for N, _ in parts), prior), sum(b for _, b in parts)
     others = [cho_solve(cho_factor(total - N), right - b) for N, b in parts]
     for _ in range(2):  # the weights depend on the sigmas, and the sigmas on the changes
-        answers = tuple(solve_change(e, g, sigmas, e.usable) for e, g in zip(equations, others, strict=True))
-        sigmas = _fit_sigmas(answers, sigmas)
+        pose_changes = tuple(solve_change(e, g, sigmas, e.usable) for e, g in zip(equations, others, strict=True))
+        sigmas = _fit_sigmas(pose_changes, sigmas)
     covariance = cho_solve(factor, np.eye(len(shared)))
-    return DriftReference(rig, shared, covariance, sigmas, answers)
+    return DriftReference(rig, shared, covariance, sigmas, pose_changes)
 
 
 def solve_change(e: LinearView, shared: np.ndarray, sigmas: Mapping[str, float], supported: np.ndarray) -> PoseChange:
@@ -137,26 +137,26 @@ def solve_change(e: LinearView, shared: np.ndarray, sigmas: Mapping[str, float],
     ``sigmas``: px by kind; ``supported`` (k,) bool: rows with certain lens errors.
     """
     usable = e.usable & supported
-    left = np.where(usable, e.residuals, 0.0) - _shared_design(e) @ shared
+    residuals = np.where(usable, e.residuals, 0.0) - _shared_design(e) @ shared
     both = np.hstack([e.pose, e.change])
-    w = _weights(e, usable, left, sigmas, robust=False)
+    w = _compute_weights(e, usable, residuals, sigmas, robust=False)
     for _ in range(5):
-        solution = _gain(both, w) @ left
-        w = _weights(e, usable, left - both @ solution, sigmas)
-    gain = _gain(both, w)
-    growth = _gain(np.column_stack([e.pose, e.scale]), w)[6] @ left
-    by_camera = _gain(e.pose, np.where(e.kinds == 0, w, 0.0)) @ left
-    across = e.across * (left - e.pose @ by_camera)
+        solution = _least_squares_gain(both, w) @ residuals
+        w = _compute_weights(e, usable, residuals - both @ solution, sigmas)
+    gain = _least_squares_gain(both, w)
+    growth = _least_squares_gain(np.column_stack([e.pose, e.scale]), w)[6] @ residuals
+    by_camera = _least_squares_gain(e.pose, np.where(e.kinds == 0, w, 0.0)) @ residuals
+    across = e.across * (residuals - e.pose @ by_camera)
     samples = across[e.kinds == 1] + across[e.kinds == 2]
-    said = (w[e.kinds == 1] > 0) & (w[e.kinds == 2] > 0)
-    unexplained = (left - both @ (gain @ left))[w > 0]
+    has_both_axes = (w[e.kinds == 1] > 0) & (w[e.kinds == 2] > 0)
+    unexplained = (residuals - both @ (gain @ residuals))[w > 0]
     return PoseChange(
         e.name,
-        gain[6:] @ left,
+        gain[6:] @ residuals,
         {kind: gain[6:, e.kinds == i] @ gain[6:, e.kinds == i].T for i, kind in enumerate(KINDS)},
         gain[6:] @ e.scale,
         float(growth),
-        float(samples[said].mean()) if said.any() else float("nan"),
+        float(samples[has_both_axes].mean()) if has_both_axes.any() else float("nan"),
         float(np.sqrt(np.mean(unexplained**2))),
     )
 
@@ -166,7 +166,7 @@ def _shared_design(e: LinearView) -> sp.csr_array:
     return sp.csr_array(sp.hstack([sp.csr_array(np.where(np.isfinite(e.change), e.change, 0.0)), e.shared]))
 
 
-def _prior(rig: StereoRig) -> np.ndarray:
+def _prior_information(rig: StereoRig) -> np.ndarray:
     """Return the prior information matrix of the shared unknowns."""
     blocks = [sp.diags(RIG_SIGMAS**-2.0)]
     for field in (DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)):
@@ -176,20 +176,20 @@ def _prior(rig: StereoRig) -> np.ndarray:
     return prior
 
 
-def _weights(
-    e: LinearView, usable: np.ndarray, left: np.ndarray, sigmas: Mapping[str, float], robust: bool = True
+def _compute_weights(
+    e: LinearView, usable: np.ndarray, residuals: np.ndarray, sigmas: Mapping[str, float], robust: bool = True
 ) -> np.ndarray:
-    """Return the weights (k,) 1/px^2 of residuals ``left`` (k,), times Tukey's if ``robust``; 0 where not usable."""
-    w = np.zeros(len(left))
+    """Return the weights (k,) 1/px^2 of ``residuals`` (k,), times Tukey's if ``robust``; 0 where not usable."""
+    w = np.zeros(len(residuals))
     for i, kind in enumerate(KINDS):
         these = usable & (e.kinds == i)
         if these.any():
-            spread = max(robust_sigma(left[these]), 1e-9)
-            w[these] = (tukey_weights(left[these], spread) if robust else 1.0) / sigmas[kind] ** 2
+            spread = max(robust_sigma(residuals[these]), 1e-9)
+            w[these] = (tukey_weights(residuals[these], spread) if robust else 1.0) / sigmas[kind] ** 2
     return w
 
 
-def _gain(J: np.ndarray, w: np.ndarray) -> np.ndarray:
+def _least_squares_gain(J: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Return the matrix (unknowns, k) of weighted least squares from residuals to unknowns; 0 for undetermined ones."""
     weighted = np.where(w > 0, w, 0.0)[:, None] * np.nan_to_num(J)
     N = weighted.T @ np.nan_to_num(J)
@@ -211,23 +211,25 @@ def _reduce_normal_equations(e: LinearView, w: np.ndarray) -> tuple[np.ndarray, 
 
 def _remaining_residuals(e: LinearView, w: np.ndarray, shared: np.ndarray) -> np.ndarray:
     """Return the residuals (k,) of a view after the shared unknowns and its best board pose."""
-    left = np.where(e.usable, e.residuals, 0.0) - _shared_design(e) @ shared
-    return left - np.nan_to_num(e.pose) @ (_gain(e.pose, w) @ left)
+    residuals = np.where(e.usable, e.residuals, 0.0) - _shared_design(e) @ shared
+    return residuals - np.nan_to_num(e.pose) @ (_least_squares_gain(e.pose, w) @ residuals)
 
 
-def _sigma_of(equations: Sequence[LinearView], left: Sequence[np.ndarray], kind: int, otherwise: float) -> float:
+def _estimate_sigma(
+    equations: Sequence[LinearView], residuals: Sequence[np.ndarray], kind: int, otherwise: float
+) -> float:
     """Return the robust sigma of all residuals of one kind, or ``otherwise`` where there are none."""
-    values = np.concatenate([r[e.usable & (e.kinds == kind)] for e, r in zip(equations, left, strict=True)])
+    values = np.concatenate([r[e.usable & (e.kinds == kind)] for e, r in zip(equations, residuals, strict=True)])
     return max(robust_sigma(values), 1e-3) if len(values) else otherwise
 
 
-def _fit_sigmas(answers: Sequence[PoseChange], start: Mapping[str, float]) -> dict[str, float]:
+def _fit_sigmas(pose_changes: Sequence[PoseChange], start: Mapping[str, float]) -> dict[str, float]:
     """Fit the sigma in px of each kind by maximum likelihood of the apparent changes, whose true value is 0.
 
     It exceeds the scatter of the residuals, as errors of neighbouring samples are correlated.
     """
-    spreads = np.array([[a.spreads[kind] for kind in KINDS] for a in answers])  # (views, kinds, 6, 6)
-    changes = np.array([a.change for a in answers])[..., None]
+    spreads = np.array([[a.spreads[kind] for kind in KINDS] for a in pose_changes])  # (views, kinds, 6, 6)
+    changes = np.array([a.change for a in pose_changes])[..., None]
 
     def negative_log_likelihood(logs: np.ndarray) -> float:
         """Return twice the negative log likelihood at the logarithms of the sigmas."""

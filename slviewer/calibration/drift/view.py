@@ -45,7 +45,9 @@ class DriftView:
         u0, v0, _, _ = observation.box
         v, u = np.nonzero(observation.region)
         if not len(v):
-            raise InputError(f"{observation.name}: no pixel of the board carries a readable pattern: light the board")
+            raise InputError(
+                f"{observation.name}: no pixel of the board carries a readable pattern: illuminate the board"
+            )
         step = max(1, int(np.sqrt(len(v) / SAMPLES)))
         on_grid = (u % step == 0) & (v % step == 0)
         pixels = np.stack([u[on_grid] + u0, v[on_grid] + v0], 1).astype(float)
@@ -139,9 +141,9 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
         t = T[:3, 3] + at[3:6]
         rays = np.concatenate([rig.camera.undistort(view.pixels + moved), np.ones((len(view.pixels), 1))], 1)
         on_board = rays * ((R[:, 2] @ t) / (rays @ R[:, 2]))[:, None]
-        turned = rig.to_projector(on_board) @ cv2.Rodrigues(at[6:9])[0].T + at[9:12]
+        in_projector = rig.to_projector(on_board) @ cv2.Rodrigues(at[6:9])[0].T + at[9:12]
         points = middle + (view.points - middle) * (1 + at[12])
-        return rig.camera.project(points @ R.T + t), rig.projector.project(turned)
+        return rig.camera.project(points @ R.T + t), rig.projector.project(in_projector)
 
     steps = np.diag(np.r_[STEPS, STEPS, 1e-4])
     columns = [_flatten(*(a - b for a, b in zip(model(s), model(-s), strict=True))) / (2 * s.sum()) for s in steps]

@@ -10,10 +10,10 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 from slviewer.calibration.guidance.coarse_rig import BOARD_SAMPLES, GuidanceModel
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
 from slviewer.calibration.splined.normal import allocate_workspace
-from slviewer.calibration.splined.posterior import point_rows
+from slviewer.calibration.splined.posterior import compute_point_jacobian
 from slviewer.calibration.splined.residuals import DENSE, HEIGHT, OFFSET, feature_row, sample_row
 from slviewer.calibration.splined.unknowns import RIG, State
-from slviewer.calibration.splined.volume import Volume, depth_axis, motion_free, working_volume
+from slviewer.calibration.splined.volume import Volume, depth_axis, remove_rigid_motion, working_volume
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
 
@@ -35,12 +35,12 @@ class VolumeSensitivity:
         """Compute the Jacobian of a regular grid of points; ``depths_mm``: nearest and farthest board."""
         volume = working_volume(model.rig, depths_mm)
         state = State(model.rig, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((len(model.points), 2)))
-        by_rig = point_rows(state, depth_axis(model.rig, volume), volume.pixels, volume.z).toarray()
+        by_rig = compute_point_jacobian(state, depth_axis(model.rig, volume), volume.pixels, volume.z).toarray()
         known = np.isfinite(by_rig).all(axis=1).reshape(-1, 3).all(axis=1)
         volume = Volume(volume.pixels[known], volume.z[known], volume.points[known], volume.projector[known])
         by_rig = by_rig.reshape(len(known), 3, -1)[known].reshape(3 * len(volume.z), -1)
         jacobian = np.zeros((len(by_rig), model.layout.size))
-        jacobian[:, model.layout.rig :] = motion_free(by_rig.T, volume.points).T
+        jacobian[:, model.layout.rig :] = remove_rigid_motion(by_rig.T, volume.points).T
         return cls(volume, jacobian)
 
 
@@ -120,7 +120,7 @@ def information_rows(model: GuidanceModel, T_camera_board: Floats) -> list[Float
 def _fill_rows(rig, R, t, points, frame, pixels, feature_weight, sample_weight, at, rows):
     """Fill ``rows`` with the weighted derivatives of a board's features (two rows each), then of its sample pixels.
 
-    ``at``: where height, offsets, rig, camera field and projector field begin in a row.
+    ``at``: indices at which height, offsets, rig, camera field and projector field start in a row.
     """
     work = allocate_workspace()
     row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))

@@ -55,7 +55,7 @@ def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tup
     samples = [o.samples for o in both if o.samples is not None]
 
     def starts(lengths: list[int]) -> np.ndarray:
-        """Return where each pose's entries begin, and the end of the last."""
+        """Return where each pose's entries start, and the end of the last."""
         return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
 
     data = PoseData(
@@ -84,23 +84,23 @@ def adjust_bundle(
     layout = state.layout
     prior = Prior.build(state, data)
     strengths = [FIRST_STRENGTH, FIRST_STRENGTH]
-    aside = np.zeros(len(names), bool)
+    is_excluded = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
     certain = np.array([name in marked or not is_numbering_ambiguous(stereo.board) for name in names])
-    turned = np.zeros(len(names), bool)
+    half_turned = np.zeros(len(names), bool)
     updates, count, damping = 0, 0, 0.0
     residuals = _residuals(state, data)
     for step in range(1, MAX_STEPS + 1):
         if step == 3:  # before such poses seem to contradict the others
-            turned = detect_half_turns(state, data, residuals[0], certain)
-            state, data = renumber_poses(state, data, turned)
+            half_turned = detect_half_turns(state, data, residuals[0], certain)
+            state, data = renumber_poses(state, data, half_turned)
             residuals = _residuals(state, data)
         noise = estimate_noise(*residuals, sample_sigma)
         sigmas = _sigmas(residuals, noise, sample_sigma, data)
         weights = robust_weights(*residuals, sigmas)
         if step > 2:
-            aside |= (pose_trust(weights, sigmas, data) < MIN_TRUST).any(axis=1)
-        _zero_weights(weights, aside, data)
+            is_excluded |= (pose_trust(weights, sigmas, data) < MIN_TRUST).any(axis=1)
+        _zero_weights(weights, is_excluded, data)
         A, b = normal_equations(state, data, residuals, weights)
         prior.add(A, b, state, strengths)
         undamped = A.copy()
@@ -122,15 +122,16 @@ def adjust_bundle(
             f"the joint adjustment still moves by {moved:.2f} sigma after {MAX_STEPS} steps: check the stereo "
             "calibration's residuals, exclude poses that stand out, and add some that reach into the corners"
         )
-    if np.count_nonzero(~aside) < MIN_POSES:
+    if np.count_nonzero(~is_excluded) < MIN_POSES:
         raise CalibrationRejected(
-            f"{np.count_nonzero(aside)} of {len(names)} poses contradict the others: capture the board anew, at rest"
+            f"{np.count_nonzero(is_excluded)} of {len(names)} poses contradict the others: "
+            "capture the board again without moving it"
         )
     fits = _fit_statistics(names, residuals, _sigmas(residuals, noise, sample_sigma, data), data)
     excluded = {
         name: f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera, "
         f"{fits[name].projector_trust:.2f} in the projector): was the board moved during the capture?"
-        for name, out in zip(names, aside, strict=True)
+        for name, out in zip(names, is_excluded, strict=True)
         if out
     }
     camera_poses, projector_poses = _count_poses(state, weights, data)
@@ -142,12 +143,12 @@ def adjust_bundle(
         strengths=(strengths[0], strengths[1]),
         fits=fits,
         excluded=excluded,
-        depth_range_mm=_depth_range(state, data, aside),
+        depth_range_mm=_depth_range(state, data, is_excluded),
         camera_poses=camera_poses,
         projector_poses=projector_poses,
         packed_factor=_pack_factor(factor[layout.rig :, layout.rig :]),
         steps=step,
-        turned=tuple(name for name, over in zip(names, turned, strict=True) if over),
+        half_turned_poses=tuple(name for name, flag in zip(names, half_turned, strict=True) if flag),
     )
 
 
@@ -234,10 +235,10 @@ def _sigmas(
     return pose_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
 
 
-def _zero_weights(weights: tuple[np.ndarray, np.ndarray], aside: np.ndarray, data: PoseData) -> None:
+def _zero_weights(weights: tuple[np.ndarray, np.ndarray], is_excluded: np.ndarray, data: PoseData) -> None:
     """Set the weights of the excluded poses (p,) bool to 0, in place."""
     for w, start in zip(weights, (data.feature_from, data.sample_from), strict=True):
-        for i in np.nonzero(aside)[0]:
+        for i in np.nonzero(is_excluded)[0]:
             w[start[i] : start[i + 1]] = 0.0
 
 
@@ -261,11 +262,11 @@ def _fit_statistics(
     return fits
 
 
-def _depth_range(state: State, data: PoseData, aside: np.ndarray) -> tuple[float, float]:
+def _depth_range(state: State, data: PoseData, is_excluded: np.ndarray) -> tuple[float, float]:
     """Return the nearest and farthest depth in mm of a feature in the poses that are not excluded."""
-    pose = np.repeat(np.arange(len(aside)), np.diff(data.feature_from))
+    pose = np.repeat(np.arange(len(is_excluded)), np.diff(data.feature_from))
     z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature]) + state.t_board[pose, 2]
-    z = z[~aside[pose]]
+    z = z[~is_excluded[pose]]
     return float(z.min()), float(z.max())
 
 

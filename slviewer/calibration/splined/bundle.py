@@ -1,4 +1,4 @@
-"""The result of the joint adjustment: the unknowns, and their information."""
+"""The result of the joint adjustment: the estimated unknowns and their information matrix."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from scipy.linalg import solve_triangular
 
 from slviewer.calibration.splined.fields import Device
-from slviewer.calibration.splined.posterior import point_rows
+from slviewer.calibration.splined.posterior import compute_point_jacobian
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.splined.unknowns import Arrangement, State
 from slviewer.fringe.sequence import Axis
@@ -19,8 +19,8 @@ from slviewer.records import from_plain, to_plain
 
 @dataclass(frozen=True)
 class PoseFit:
-    """One pose: RMS px of its features in the camera and of its samples in the projector (outliers excluded), and how
-    far each is trusted, 0 ... 1; undisturbed ones reach 0.8."""
+    """Residuals of one pose: RMS px of its features in the camera and of its samples in the projector, without
+    outliers, and the trust in each, 0 ... 1; undisturbed poses reach 0.8."""
 
     camera_rms_px: float
     projector_rms_px: float
@@ -30,12 +30,12 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """The unknowns of ``poses``, and their information.
+    """Result of the joint adjustment of ``poses``.
 
-    ``points`` (f, 3) mm: the board's features, whose offsets the state has. ``strengths`` 1/px^2: of the camera's and
-    the projector's prior. ``excluded``: poses not used, with the reason. ``camera_poses`` and ``projector_poses``: how
-    many poses illuminated each cell of the fields (rows, columns). ``turned``: poses whose board was numbered from the
-    other end, and is no more.
+    ``points`` (f, 3) mm: the board's features, without the offsets in the state. ``strengths`` 1/px^2: of the camera's
+    and the projector's prior. ``excluded``: poses not used, with the reason. ``camera_poses`` and ``projector_poses``:
+    how many poses illuminated each cell of the fields (rows, columns). ``half_turned_poses``: poses whose numbering was
+    corrected by half a turn.
 
     ``packed_factor``: the lower triangle of ``factor``, row by row, float32.
     """
@@ -52,12 +52,12 @@ class Bundle:
     projector_poses: np.ndarray
     packed_factor: np.ndarray
     steps: int
-    turned: tuple[str, ...] = ()
+    half_turned_poses: tuple[str, ...] = ()
 
     @cached_property
     def factor(self) -> np.ndarray:
         """(n, n) float32, lower triangular: factor @ factor.T is the information (inverse covariance) of the rig's n
-        unknowns in the order of ``Layout`` from ``rig`` on, with poses and board marginalised out."""
+        unknowns in the order of ``UnknownLayout`` from ``rig`` on, with poses and board marginalised out."""
         layout = self.state.layout
         n = layout.size - layout.rig
         factor = np.zeros((n, n), np.float32)
@@ -65,26 +65,29 @@ class Bundle:
         return factor
 
     def point_jacobian(self, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> sp.csr_matrix:
-        """(3 n, unknowns) mm a unit: how the points measured at camera ``pixels`` (n, 2) and depths ``z`` (n,) from the
-        phase of one axis answer to the rig's unknowns; x, y, z of the first point, then of the next. NaN where the
-        projector cannot see the point.
+        """Return the Jacobian (3 n, unknowns) of measured points, mm per unit of the rig's unknowns.
+
+        The points are those at camera ``pixels`` (n, 2) and depths ``z`` (n,) mm, measured from the phase of one axis;
+        rows: x, y, z of the first point, then of the next. NaN where the projector cannot see the point.
         """
-        return point_rows(self.state, axis, pixels, z)
+        return compute_point_jacobian(self.state, axis, pixels, z)
 
     def whiten(self, jacobian: sp.csr_matrix | np.ndarray) -> np.ndarray:
-        """(unknowns, m) Y with Y.T @ Y the covariance of what has ``jacobian`` (m, unknowns) by the rig's unknowns."""
+        """Return Y (unknowns, m), where Y.T @ Y is the covariance of the values with ``jacobian`` (m, unknowns)."""
         dense = jacobian if isinstance(jacobian, np.ndarray) else jacobian.toarray()
         right = np.asarray(dense, self.factor.dtype).T
         return np.asarray(solve_triangular(self.factor, right, lower=True, check_finite=False))
 
     def to_dict(self) -> dict[str, Any]:
-        """What is not an array, JSON-able."""
-        keys = ("poses", "noise", "strengths", "fits", "depth_range_mm", "steps", "turned")
-        data: dict[str, Any] = to_plain({key: getattr(self, key) for key in keys} | {"left_out": self.excluded})
+        """Return the fields that are not arrays, as JSON types."""
+        keys = ("poses", "noise", "strengths", "fits", "depth_range_mm", "steps")
+        data: dict[str, Any] = to_plain(
+            {key: getattr(self, key) for key in keys} | {"turned": self.half_turned_poses, "left_out": self.excluded}
+        )
         return data
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Flat named arrays, for saving; the factor packed, in float32."""
+        """Return named arrays for saving; the factor packed, in float32."""
         rig = self.state.rig
         arrays = {
             f"{name}_{key}": value
@@ -106,7 +109,7 @@ class Bundle:
 
     @classmethod
     def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Bundle":
-        """The inverse of ``to_dict`` and ``to_arrays``."""
+        """Return the bundle that ``to_dict`` and ``to_arrays`` saved."""
         devices = [
             Device(*(np.ascontiguousarray(arrays[f"{name}_{key}"]) for key in Device._fields))
             for name in ("camera", "projector")
@@ -128,5 +131,5 @@ class Bundle:
             projector_poses=a["projector_poses"],
             packed_factor=a["factor"],
             steps=data["steps"],
-            turned=tuple(data.get("turned", ())),
+            half_turned_poses=tuple(data.get("turned", ())),
         )

@@ -1,8 +1,8 @@
-"""The adjustment's exact inversion, made fast: a rational function of each pixel, and a coarse grid of what it lacks.
+"""Fast inversion of the splined model: a rational function per pixel, plus a coarse grid of corrections.
 
-Along a camera ray depth is nearly a rational function of the projector's coordinate s, the Letter's eq. 9: that through
-three exact points of each pixel, ``z0 = (c0 + c1 s)/(1 + c2 s)``, is some hundredths of a millimetre off. The remainder
-varies slowly, and a grid over (u, v, z0) holds it.
+Along a camera ray depth is nearly a rational function of the projector's coordinate s, the Letter's eq. 9: the function
+through three exact points of each pixel, ``z0 = (c0 + c1 s)/(1 + c2 s)``, has errors of some hundredths of a
+millimetre. They vary slowly, and a grid over (u, v, z0) corrects them.
 """
 
 from collections.abc import Callable
@@ -20,35 +20,41 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 
 GRID_CELLS_ACROSS = 100
-"""Of the grid, over the image's width: 16 px of 1600."""
+"""Number of grid cells across the image's width: 16 px each at a width of 1600."""
 DEPTHS = 65
 MAX_CORRECTION = 0.02
-"""Of the depths between: beyond, the coordinate hardly moves with depth, or turns back, and measures none."""
+"""Largest correction over the depth range; beyond it, the coordinate is nearly constant or not monotonic in depth."""
 MIN_SLOPE = 0.005
-"""px a mm: a coordinate that moves less with depth measures no depth; the noise of a pixel would be many mm."""
+"""Smallest change of the coordinate with depth, px per mm; below it, the depth noise would be many mm."""
 MARGIN = 0.25
-"""Of the projector's size: how far beyond its image the lens model is still followed along a ray."""
+"""Distance beyond the projector's image, over its size, up to which rays are evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
 class CompiledAxis:
-    """One axis. ``coefficients`` (3, h, w) float32 for the coordinate less ``centre`` px; ``grid`` (nv, nu, nz) float32
-    mm, ``step`` px and (far - near)/(nz - 1) mm apart from pixel (0, 0) and ``near``; ``held`` is ``grid`` with NaN
-    where camera or projector cells were never illuminated. NaN where a ray meets the projector at no depth, or where
-    depth hardly moves the coordinate."""
+    """Fast inversion of one axis.
+
+    ``coefficients`` (3, h, w) float32: rational function of the coordinate minus ``centre`` px. ``grid`` (nv, nu, nz)
+    float32 mm: corrections at nodes ``step`` px and (far - near)/(nz - 1) mm apart, from pixel (0, 0) and ``near``.
+    ``supported_grid``: ``grid`` with NaN where no target pose illuminated the camera's or the projector's cell. NaN
+    where the projector does not see the ray, or where the coordinate hardly changes with depth.
+    """
 
     coefficients: np.ndarray
     centre: float
     grid: np.ndarray
-    held: np.ndarray
+    supported_grid: np.ndarray
     step: int
     near: float
     far: float
 
     def depth(self, phase: np.ndarray, px_per_rad: float, rays: np.ndarray, supported: bool) -> np.ndarray:
-        """(h, w, 3) float32 mm from absolute phase (h, w) float32; NaN where invalid or beyond near and far."""
+        """Return points (h, w, 3) float32 mm from absolute phase (h, w) rad; NaN where invalid or beyond near and far.
+
+        ``rays`` (2, h, w): from ``pixel_rays``; ``supported``: only points that target poses support.
+        """
         out = np.empty((*phase.shape, 3), np.float32)
-        grid = self.held if supported else self.grid
+        grid = self.supported_grid if supported else self.grid
         numbers = np.array(
             [px_per_rad, self.centre, self.near, (grid.shape[2] - 1) / (self.far - self.near)], np.float32
         )
@@ -56,14 +62,14 @@ class CompiledAxis:
         return out
 
     def depth_per_px(self, phase: np.ndarray, px_per_rad: float) -> np.ndarray:
-        """(h, w) float32 mm: |dz/ds| of the rational function at a phase map (h, w)."""
+        """Return |dz/ds| (h, w) float32 mm per px of the rational function at a phase map (h, w) rad."""
         c0, c1, c2 = self.coefficients
         s = phase * np.float32(px_per_rad) - np.float32(self.centre)
         return np.asarray(np.abs(c1 - c0 * c2) / (1 + c2 * s) ** 2)
 
 
 def pixel_rays(rig: Arrangement) -> np.ndarray:
-    """(2, h, w) float64: the undistorted normalised point that each camera pixel sees."""
+    """Return the undistorted normalised coordinates (2, h, w) float64 of the camera pixels."""
     width, height = (int(n) for n in rig.camera.size)
     rays = np.empty((2, height, width))
     _split_rows(height, lambda rows: _fill_rays(rig.camera, rows, rays))
@@ -77,8 +83,11 @@ def compile_axis(
     depths: tuple[float, float],
     illuminated: tuple[np.ndarray, np.ndarray],
 ) -> CompiledAxis:
-    """The fast form of one axis between two ``depths`` mm; ``illuminated``: the camera's and the projector's cells
-    (rows, columns) bool that target poses illuminated."""
+    """Compile one axis for depths between the two ``depths`` mm.
+
+    ``rays`` (2, h, w): from ``pixel_rays``; ``illuminated``: the camera's and the projector's cells (rows, columns)
+    bool that target poses illuminated.
+    """
     near, far = depths
     row = 0 if axis == "x" else 1
     width, height = (int(n) for n in rig.camera.size)
@@ -89,10 +98,10 @@ def compile_axis(
     shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
     grid, known = np.full(shape, np.nan, np.float32), np.zeros(shape, np.bool_)
     _split_rows(shape[0], lambda rows: _tabulate(rig, row, centre, near, far, step, *illuminated, rows, grid, known))
-    # a pixel needs its eight nodes: growing the known by one node gives each pixel about its own answer
+    # a pixel needs its eight nodes: dilating the known nodes by one gives each pixel about its own support
     unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
-    held = np.where(unknown, np.float32(np.nan), grid)
-    return CompiledAxis(coefficients, centre, grid, held, step, near, far)
+    supported_grid = np.where(unknown, np.float32(np.nan), grid)
+    return CompiledAxis(coefficients, centre, grid, supported_grid, step, near, far)
 
 
 def _split_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
@@ -113,7 +122,7 @@ def _fill_rays(camera, rows, rays):
 
 @kernel()
 def _project_depth(rig, x, y, z, basis):
-    """Where the projector sees (x z, y z, z); NaN far outside its image."""
+    """Return the projector pixel (u, v) of the point (x z, y z, z); NaN far outside its image."""
     X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
     X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
     X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
@@ -128,7 +137,7 @@ def _project_depth(rig, x, y, z, basis):
 
 @kernel()
 def _depth_interval(rig, x, y, near, far, basis):
-    """The depths between ``near`` and ``far`` at which a ray is near the projector's image; NaN if there are none."""
+    """Return the first and last depth from ``near`` to ``far`` at which a ray is near the projector's image, or NaN."""
     first = last = np.nan
     for k in range(33):
         z = near + (far - near) * k / 32.0
@@ -160,7 +169,7 @@ def _depth_interval(rig, x, y, near, far, basis):
 
 @kernel()
 def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
-    """(c0, c1, c2, first depth, last depth) of one ray."""
+    """Return (c0, c1, c2, first depth, last depth) of the ray (x, y, 1); NaN without a rational function."""
     first, last = near, far
     if np.isnan(_project_depth(rig, x, y, near, basis)[0]) or np.isnan(_project_depth(rig, x, y, far, basis)[0]):
         first, last = _depth_interval(rig, x, y, near, far, basis)
@@ -171,8 +180,8 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     a, b = 1.0 / last, 1.0 / first
     for k in range(3):
         z = 1.0 / (0.5 * (a + b) + 0.433 * (b - a) * (k - 1))
-        found = _project_depth(rig, x, y, z, basis)
-        s = found[row] - centre
+        projected = _project_depth(rig, x, y, z, basis)
+        s = projected[row] - centre
         if k == 0:
             z0, s0 = z, s
         elif k == 1:
@@ -202,7 +211,7 @@ def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
 
 @kernel()
 def _is_cell_supported(illuminated, u, v, size):
-    """Whether the cell of a pixel was illuminated; none is outside the image."""
+    """Return whether the cell of pixel (u, v) was illuminated; False outside the image."""
     if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
         return False
     column = min(int((u + 0.5) / size[0] * illuminated.shape[1]), illuminated.shape[1] - 1)
@@ -211,7 +220,7 @@ def _is_cell_supported(illuminated, u, v, size):
 
 @kernel()
 def _tabulate(rig, row, centre, near, far, step, camera_illuminated, projector_illuminated, rows, grid, known):
-    """What the exact depth has beyond the rational function's at the grid's nodes, and which of them poses support."""
+    """Fill ``grid`` with exact depth minus rational function at its nodes; ``known``: whether poses support them."""
     basis = np.zeros((4, 4))
     for j in rows:
         for i in range(grid.shape[1]):
@@ -220,9 +229,9 @@ def _tabulate(rig, row, centre, near, far, step, camera_illuminated, projector_i
             c0, c1, c2, first, last = _interpolate_rational(rig, row, centre, x, y, near, far, basis)
             if np.isnan(c0):
                 continue
-            # the last nodes may lie past the image's edge, and stand for it
+            # the last nodes may be outside the image, where the edge pixel's support applies
             edge_u, edge_v = min(u, rig.camera.size[0] - 1.0), min(v, rig.camera.size[1] - 1.0)
-            seen = _is_cell_supported(camera_illuminated, edge_u, edge_v, rig.camera.size)
+            camera_supported = _is_cell_supported(camera_illuminated, edge_u, edge_v, rig.camera.size)
             for k in range(grid.shape[2]):
                 target = near + (far - near) * k / (grid.shape[2] - 1.0)
                 z = min(max(target, first), last)
@@ -239,4 +248,6 @@ def _tabulate(rig, row, centre, near, far, step, camera_illuminated, projector_i
                 settled = abs(change) < 1e-3 or z in (first, last)
                 if settled and abs(correction) < MAX_CORRECTION * (last - first):
                     grid[j, i, k] = correction
-                    known[j, i, k] = seen and _is_cell_supported(projector_illuminated, pu, pv, rig.projector.size)
+                    known[j, i, k] = camera_supported and _is_cell_supported(
+                        projector_illuminated, pu, pv, rig.projector.size
+                    )

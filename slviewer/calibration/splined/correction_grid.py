@@ -9,8 +9,10 @@ from slviewer.geometry.rays import fill_points
 
 @njit(inline="always")
 def locate_layers(rational, near, per_mm, deepest):
-    """Whether a depth of the rational function lies in the grid, and between which layers: the first (-1 where it does
-    not), and how far on to the next."""
+    """Locate a depth of the rational function between two layers of the grid.
+
+    Returns whether it is inside the grid, the first layer (-1 outside), and the fraction of the way to the next.
+    """
     depth = (rational - near) * per_mm
     inside = (depth >= np.float32(0.0)) & (depth <= deepest)
     depth = depth if inside else np.float32(0.0)

@@ -1,6 +1,6 @@
 """Displacements over an image as uniform cubic B-splines: what a lens does that Brown's polynomial cannot express.
 
-A point that pinhole and Brown put at pixel p is seen at p + W(p). ``coefficients`` (2, ny + 3, nx + 3) px hold W for
+A point that pinhole and Brown put at pixel p is imaged at p + W(p). ``coefficients`` (2, ny + 3, nx + 3) px hold W for
 ny x nx equal cells of the image, from its outer edge (-0.5) on; beyond the image W stays what it is at the edge.
 """
 
@@ -117,7 +117,7 @@ def remove_displacement(device, u, v, basis):
         determinant = (1.0 + duu) * (1.0 + dvv) - duv * dvu
         x += ((1.0 + dvv) * eu - duv * ev) / determinant
         y += ((1.0 + duu) * ev - dvu * eu) / determinant
-        if abs(eu) + abs(ev) < 1e-7:  # the step just taken squares this
+        if abs(eu) + abs(ev) < 1e-7:  # the last step squares this
             break
     return x, y
 
@@ -136,7 +136,7 @@ def distort_to_pixel(device, x, y, basis):
 
 @kernel()
 def undistort_pixel(device, u, v, basis):
-    """The undistorted normalised point seen at a pixel, without derivatives; NaN where the inversion fails."""
+    """Return the undistorted normalised point imaged at a pixel, without derivatives; NaN where the inversion fails."""
     k = device.numbers
     x, y = remove_displacement(device, u, v, basis)
     return undistort_point((x - k[2]) / k[0], (y - k[3]) / k[1], k)

@@ -81,7 +81,7 @@ def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[Sta
 
 
 def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.ndarray:
-    """(p, f, 2) mm: how far off each pose sees each feature on the board; 0 where it does not see it, or badly."""
+    """Return the offset (p, f, 2) mm of each feature on the board by each pose; 0 where missing or an outlier."""
     by_place = []
     here, _ = predict_observations(state, data)
     for k in range(2):
@@ -91,12 +91,12 @@ def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.
     J = np.stack(by_place, axis=2)  # of px by mm
     usable = np.isfinite(J).all((1, 2)) & np.isfinite(residuals).all(1)
     usable[usable] &= np.abs(np.linalg.det(J[usable])) > 1e-9
-    seen = np.zeros_like(residuals)
-    seen[usable] = np.linalg.solve(J[usable], residuals[usable][..., None])[..., 0]
-    seen[usable] += state.offsets[data.feature[usable]]
+    deviations = np.zeros_like(residuals)
+    deviations[usable] = np.linalg.solve(J[usable], residuals[usable][..., None])[..., 0]
+    deviations[usable] += state.offsets[data.feature[usable]]
     places = np.zeros((state.layout.poses, len(data.points), 2))
     for i, (first, last) in enumerate(zip(data.feature_from[:-1], data.feature_from[1:], strict=True)):
-        each = seen[first:last]
+        each = deviations[first:last]
         outlying = (np.abs(each) > 6 * 1.4826 * np.median(np.abs(each), axis=0)).any(1)
         places[i, data.feature[first:last]] = np.where(outlying[:, None], 0.0, each)
     return places

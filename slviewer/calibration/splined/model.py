@@ -15,7 +15,7 @@ from slviewer.calibration.splined.compiled import CompiledAxis, compile_axis, pi
 from slviewer.calibration.splined.fields import undistort
 from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX
 from slviewer.calibration.splined.uncertainty import SigmaMap, compute_sigma_map, summarise_volume_sigma
-from slviewer.calibration.splined.unknowns import Arrangement, lens_of
+from slviewer.calibration.splined.unknowns import Arrangement, pinhole_lens
 from slviewer.calibration.splined.volume import is_supported
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
@@ -57,7 +57,7 @@ class SplinedModel:
     @cached_property
     def pinholes(self) -> StereoRig:
         """Both lenses without their displacement fields, and their relative pose."""
-        return StereoRig(lens_of(self.rig.camera), lens_of(self.rig.projector), self.rig.R, self.rig.t)
+        return StereoRig(pinhole_lens(self.rig.camera), pinhole_lens(self.rig.projector), self.rig.R, self.rig.t)
 
     def residuals_over_noise(self, axis: Axis) -> float:
         """Return the ratio of the residuals of an axis to their predicted noise; 1 where noise explains them."""
@@ -180,7 +180,7 @@ class SplinedModel:
             },
             "sigma_volume_mm": self.sigma_volume,
             "left_out": dict(bundle.excluded),
-            "turned": list(bundle.turned),
+            "turned": list(bundle.half_turned_poses),
         }
 
     def text(self) -> str:
@@ -188,9 +188,10 @@ class SplinedModel:
         bundle, s = self.bundle, self.summary()
         noise, local, illuminated = s["noise_px"], s["local_distortion_rms_px"], s["cells_lit"]
         low, high = s["board_height_mm"]
-        sure = s["sigma_volume_mm"]
-        near, far = sure["depths_mm"]
-        u, v, z = sure["worst_at"]
+        sigma = s["sigma_volume_mm"]
+        half_turned = bundle.half_turned_poses
+        near, far = sigma["depths_mm"]
+        u, v, z = sigma["worst_at"]
         return "\n".join(
             [
                 f"splined: residuals camera {noise['camera']:.4f} px, projector x {noise['x']:.4f}, "
@@ -201,14 +202,15 @@ class SplinedModel:
                 f"  board: height {low:+.4f} ... {high:+.4f} mm, features misplaced by "
                 f"{s['board_offsets_rms_mm']:.4f} mm RMS",
                 *(
-                    [f"  board turned by 180 degrees in {', '.join(bundle.turned)}: numbered as in the others"]
-                    * bool(bundle.turned)
+                    [f"  board turned by 180 degrees in {', '.join(half_turned)}: numbered as in the others"]
+                    * bool(half_turned)
                 ),
                 f"  illuminated by target poses: {100 * illuminated['camera']:.0f} % of the camera's cells, "
                 f"{100 * illuminated['projector']:.0f} % of the projector's",
                 f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma): median "
-                f"{sure['median']:.4f} mm and 95 % below {sure['p95']:.4f} mm over the {100 * sure['supported']:.0f} % "
-                f"that the poses support; worst {sure['worst']:.3f} mm, at pixel ({u:.0f}, {v:.0f}) and {z:.0f} mm",
+                f"{sigma['median']:.4f} mm and 95 % below {sigma['p95']:.4f} mm "
+                f"over the {100 * sigma['supported']:.0f} % that the poses support; "
+                f"worst {sigma['worst']:.3f} mm, at pixel ({u:.0f}, {v:.0f}) and {z:.0f} mm",
             ]
         )
 

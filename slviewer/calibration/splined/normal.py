@@ -12,15 +12,16 @@ from slviewer.calibration.splined.unknowns import RIG, State
 from slviewer.geometry.jit import kernel
 
 MAX_LANES = 4
-"""Matrices that threads fill side by side: each takes the memory of the whole."""
+"""Largest number of matrices that threads fill in parallel; each has the size of the whole."""
 
 
 class PoseData(NamedTuple):
     """What was observed, all poses one after another.
 
-    Of pose i, features ``feature_from[i] : feature_from[i + 1]``: ``feature`` (n,) which of the board's, seen at
-    ``feature_px`` (n, 2); and samples ``sample_from[i] : ...``: camera pixels ``sample_px`` (m, 2), ``projector_px``
-    (m, 2) their coordinates, NaN for an axis not captured. ``points`` (f, 3) mm and ``frame`` (4,) are the board's.
+    Of pose i, features ``feature_from[i] : feature_from[i + 1]``: ``feature`` (n,) their indices on the board, and
+    ``feature_px`` (n, 2), their pixels; and samples ``sample_from[i] : ...``: camera pixels ``sample_px`` (m, 2), and
+    ``projector_px`` (m, 2), their projector coordinates, NaN for an axis not captured. ``points`` (f, 3) mm
+    and ``frame`` (4,) are the board's.
     """
 
     feature_from: np.ndarray
@@ -59,7 +60,7 @@ def allocate_workspace():
 
 
 def predict_observations(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
-    """Where features (n, 2) and samples' projector coordinates (m, 2) should be, px; NaN where nothing is seen."""
+    """Predict the features (n, 2) px and the samples' projector coordinates (m, 2) px; NaN where not visible."""
     features, samples = np.empty_like(data.feature_px), np.empty_like(data.sample_px)
     model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
     shares = _split_poses(state.layout.poses)
@@ -71,7 +72,7 @@ def predict_observations(state: State, data: PoseData) -> tuple[np.ndarray, np.n
 def normal_equations(
     state: State, data: PoseData, residuals: tuple[np.ndarray, np.ndarray], weights: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, N) of which the upper triangle is filled, and (N,): J'WJ and J'W r.
+    """Return J'WJ (N, N), of which the upper triangle is filled, and J'W r (N,).
 
     ``residuals`` and ``weights``: of features (n, 2), and of samples (m, 2); what weighs 0 may be NaN.
     """
@@ -167,7 +168,7 @@ def _add_dense(A, b, row, columns, length, w0, w1, r):
 
 @kernel()
 def _add_field(A, b, row, columns, length, w0, w1, r, device, i, j, basis, start):
-    """The field of the device in which the residual is seen: u's coefficients are in row u alone, v's in row v."""
+    """Add the field of the device that observes the residual: u's coefficients are in row u alone, v's in row v."""
     stride = device.coefficients.shape[2]
     knots = stride * device.coefficients.shape[1]
     for k in range(2):
@@ -224,16 +225,16 @@ def _add_through(A, b, row, columns, w0, w1, r, rig, ci, cj, pi, pj, by_field, w
                 target = A[one]
                 for other_k in range(k, 2):
                     coupling = (p * by_field[0, other_k] + q * by_field[1, other_k]) * value
-                    begin = at[3] + other_k * knots + cj * stride + ci
+                    start = at[3] + other_k * knots + cj * stride + ci
                     for c in range(m if other_k == k else 0, 4):
                         scaled = coupling * basis[2, c]
                         for d in range(n if (other_k == k and c == m) else 0, 4):
-                            target[begin + c * stride + d] += scaled * basis[0, d]
+                            target[start + c * stride + d] += scaled * basis[0, d]
                 for other_k in range(2):
                     coupling = (p if other_k == 0 else q) * value
                     if coupling != 0.0:
-                        begin = at[4] + other_k * others + pj * across + pi
+                        start = at[4] + other_k * others + pj * across + pi
                         for c in range(4):
                             scaled = coupling * other[2, c]
                             for d in range(4):
-                                target[begin + c * across + d] += scaled * other[0, d]
+                                target[start + c * across + d] += scaled * other[0, d]

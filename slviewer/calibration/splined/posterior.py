@@ -14,8 +14,8 @@ MAX_ENTRIES = RIG + 48
 the projector's."""
 
 
-def point_rows(state: State, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> sp.csr_matrix:
-    """As ``Bundle.point_jacobian`` says."""
+def compute_point_jacobian(state: State, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> sp.csr_matrix:
+    """Compute the Jacobian (3 n, unknowns) described in ``Bundle.point_jacobian``."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     if pixels.ndim != 2 or pixels.shape[1] != 2 or z.shape != pixels.shape[:1]:
         raise InputError(f"pixels {pixels.shape} and depths {z.shape} were given: (n, 2) and (n,) are needed")

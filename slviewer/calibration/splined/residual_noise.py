@@ -12,7 +12,7 @@ TUKEY_SIGMAS = 4.685
 """Sigmas beyond which an observation has no weight: 95 % efficient on normal residuals."""
 MIN_SIGMA_PX = 1e-4
 MAX_RATIO = 100.0
-"""Of residuals over their predicted noise, that the difference of both can tell."""
+"""Largest ratio of residuals to their predicted noise for which their difference is estimated."""
 MAX_POSE_NOISE_RATIO = 2.5
 """How many times the features' common noise one pose may have of its own: a tilted or blurred board is read less well.
 What exceeds that contradicts the other poses."""
@@ -118,7 +118,7 @@ def update_strength(
     """Update a prior's strength by MacKay's fixed point, which maximises the evidence.
 
     The prior is exp(-strength/2 c'Fc) for each component c of ``field`` (2, n), F = ``form`` (n, n); the coefficients
-    stand at ``first`` in the vector of ``size`` unknowns, and ``solve`` applies the inverse of its normal matrix.
+    start at ``first`` in the vector of ``size`` unknowns, and ``solve`` applies the inverse of its normal matrix.
     """
     components, n = field.shape
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (components, n, PROBES))

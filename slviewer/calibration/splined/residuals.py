@@ -13,7 +13,7 @@ from slviewer.geometry.brown import distort_point, undistort_point
 from slviewer.geometry.jit import kernel
 
 POSE, HEIGHT, OFFSET, CAMERA, PROJECTOR, TURN, SHIFT, DENSE = 0, 6, 18, 20, 29, 38, 41, 44
-"""Where each group begins in a dense row, and the row's length."""
+"""Index of each group's first entry in a dense row, and the row's length."""
 
 
 @kernel()

@@ -1,10 +1,10 @@
 """Calibration uncertainty at every point: systematic, so that neither longer exposure nor repeated scans reduce it.
 
-All of them are of what a rigid motion leaves: where the whole space lies in the camera's frame is thirty times less
-certain than its shape, and nothing that is measured with it depends on that.
+All uncertainties exclude a common rigid motion: the pose of the whole space in the camera's frame is thirty times less
+certain than its shape, and measurements of a shape do not depend on it.
 
-Outside the calibrated region, the fields are extrapolated by their priors. A prior takes second differences for
-independent of each other; where a lens's are not, it errs by more than the prior says, and by how much more is seen in
+Outside the calibrated region, the fields are extrapolated by their priors. A prior assumes independent second
+differences; where those of a lens are correlated, the errors exceed the prior's prediction by a factor estimated from
 the fields' supported part: ``persistence_ratio``.
 """
 
@@ -22,7 +22,7 @@ from slviewer.calibration.splined.volume import (
     Volume,
     depth_axis,
     is_supported,
-    motion_free,
+    remove_rigid_motion,
     sigma_3d,
     view_pixels,
     working_volume,
@@ -31,26 +31,26 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 
 NODES = (21, 16, 11)
-"""Of the map across, down, and in depth: then what lies between is right within a tenth or two, and a map takes about a
+"""Nodes of the map across, down, and in depth: interpolation errors stay below 10 to 20 %, and a map takes about a
 second."""
 MIN_FITTED_POINTS = 3
 EXTRAPOLATED_CELLS = 3
-"""Cells: about how far beyond the supported ones the working volume goes."""
+"""Approximate distance, in cells, of the working volume's border from the supported cells."""
 
 
 @dataclass(frozen=True, eq=False)
 class SigmaMap:
-    """One axis: ``nodes`` (nv, nu, nz) float32 mm, the standard deviation of z, evenly over the image and from ``near``
-    to ``far`` mm."""
+    """Standard deviation of z for one axis: ``nodes`` (nv, nu, nz) float32 mm, evenly spaced over the image and from
+    ``near`` to ``far`` mm."""
 
     nodes: np.ndarray
     near: float
     far: float
 
     def interpolate(self, points: np.ndarray) -> np.ndarray:
-        """(h, w) float32 mm at the organised points (h, w, 3) of the whole image; NaN where they are.
+        """Interpolate at the organised points (h, w, 3) mm of the whole image; returns (h, w) float32 mm, NaN at NaN.
 
-        Between nodes its logarithm is linear: it grows hundredfold where support ends.
+        The logarithm is interpolated linearly, since the value grows hundredfold where support ends.
         """
         out = np.empty(points.shape[:2], np.float32)
         _interpolate(np.ascontiguousarray(points[..., 2], np.float32), np.log(self.nodes), self.near, self.far, out)
@@ -58,9 +58,9 @@ class SigmaMap:
 
 
 def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> SigmaMap:
-    """What the calibration leaves uncertain of the depths measured through one axis: a second of work.
+    """Compute the calibration's uncertainty of depths measured through one axis, in about a second.
 
-    The rigid motion is that of the working volume's supported places.
+    The rigid motion removed is that of the working volume's supported points.
     """
     rig = bundle.state.rig
     reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
@@ -80,22 +80,27 @@ def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> Si
     sigma = np.sqrt(np.einsum("mn,mn->n", depths, depths)) * extrapolation_factor(bundle, places)
     unknown = np.isnan(sigma) | (abs(jacobian).sum(axis=1).A1 == 0)
     sigma, unknown = sigma.reshape(u.shape), unknown.reshape(u.shape)
-    # a pixel that is measured may have a node beyond the projector's view beside it
+    # a measured pixel may be next to a node outside the projector's view
     nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
     return SigmaMap(np.ascontiguousarray(sigma[tuple(nearest)], np.float32), near, far)
 
 
 def volume_sigmas(bundle: Bundle, axis: Axis, volume: Volume) -> np.ndarray:
-    """(n,) mm: standard deviation in all directions together of a volume's places, measured through one axis, without
-    the rigid motion of those that are supported."""
+    """Return the 3D standard deviation (n,) mm of a volume's points, measured through one axis.
+
+    The rigid motion of the supported points is removed.
+    """
     whitened = bundle.whiten(bundle.point_jacobian(axis, volume.pixels, volume.z))
-    sigma = sigma_3d(motion_free(whitened, volume.points, _select_fitted(bundle, volume)))
+    sigma = sigma_3d(remove_rigid_motion(whitened, volume.points, _select_fitted(bundle, volume)))
     return np.asarray(sigma * extrapolation_factor(bundle, volume))
 
 
 def extrapolation_factor(bundle: Bundle, places: Volume) -> np.ndarray:
-    """(n,): by how much the priors' standard deviations are too small: 1 inside the calibrated region; elsewhere the
-    persistence of the field, or fields, that none of them illuminated there."""
+    """Return the factors (n,) by which the priors underestimate the standard deviations at ``places``.
+
+    1 inside the calibrated region; elsewhere the ``persistence_ratio`` of the field that no pose illuminated there, the
+    larger one of two.
+    """
     factor = np.ones(len(places.z))
     rig = bundle.state.rig
     for device, pixels, poses in (
@@ -108,8 +113,10 @@ def extrapolation_factor(bundle: Bundle, places: Volume) -> np.ndarray:
 
 
 def persistence_ratio(device: Device, illuminated: np.ndarray) -> float:
-    """How much farther a field's second differences carry over some cells than if they were independent: the ratio of
-    their sums' standard deviations, over the cells (rows, columns) bool that poses illuminated; 1 or more."""
+    """Return the standard deviation of sums of a field's second differences, over that of independent ones; at least 1.
+
+    The sums are over neighbouring cells that are all ``illuminated`` (rows, columns) bool.
+    """
     c = device.coefficients
     corners = np.pad(illuminated, 1, mode="edge")
     known = corners[:-1, :-1] & corners[1:, :-1] & corners[:-1, 1:] & corners[1:, 1:]
@@ -126,10 +133,11 @@ def persistence_ratio(device: Device, illuminated: np.ndarray) -> float:
 
 
 def summarise_volume_sigma(bundle: Bundle) -> dict[str, Any]:
-    """Uncertainty of the working volume's points, in all directions together, before anything is scanned.
+    """Summarise the 3D uncertainty of the working volume's points.
 
-    ``median``, ``p95`` mm over the places that target poses support; ``worst`` mm of all, and ``worst_at`` (u, v, z);
-    ``supported``: their share of what camera and projector both see; ``depths_mm``; the ``axis`` measured through.
+    ``median``, ``p95`` mm over the points that target poses support; ``worst`` mm of all, and ``worst_at`` (u, v, z);
+    ``supported``: share of supported points in the common view of camera and projector; ``depths_mm``; ``axis``: the
+    projector axis of the measurement.
     """
     rig = bundle.state.rig
     volume = working_volume(rig, bundle.depth_range_mm)
@@ -149,7 +157,7 @@ def summarise_volume_sigma(bundle: Bundle) -> dict[str, Any]:
 
 
 def _select_fitted(bundle: Bundle, volume: Volume) -> np.ndarray:
-    """(n,) bool: the supported places; all, where these are too few to say how the space lies."""
+    """Select the points (n,) bool for the fit of the rigid motion: the supported ones, or all if these are too few."""
     supported = volume.supported(bundle.state.rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
     return supported if np.count_nonzero(supported) >= MIN_FITTED_POINTS else np.ones(len(supported), bool)
 

@@ -1,4 +1,4 @@
-"""What the adjustment estimates, and where each unknown stands in its vector."""
+"""The unknowns of the adjustment, and their order in its vector."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -19,7 +19,7 @@ RIG = 2 * LENS + 6
 
 
 class Arrangement(NamedTuple):
-    """Camera, projector, and X_p = R X_c + t, for the compiled kernels."""
+    """Camera and projector, with X_p = R X_c + t, for the compiled kernels."""
 
     camera: Device
     projector: Device
@@ -32,8 +32,8 @@ class UnknownLayout:
     """Order of the unknowns: poses (6 each), height, offsets (2 each), then the rig: both lenses (9 each), rotation and
     translation, the camera's field and the projector's (u's coefficients, then v's).
 
-    What is the rig's stands last, so that the last block of a Cholesky factor is the rig's own information with all
-    else marginalised out.
+    The rig's unknowns are last, so that the last block of a Cholesky factor is their information with all others
+    marginalised out.
     """
 
     poses: int
@@ -85,7 +85,7 @@ class State:
 
     @classmethod
     def from_stereo(cls, stereo: StereoModel, poses: list[str], features: int) -> "State":
-        """Where a stereo calibration leaves off: no displacement, a flat board."""
+        """Return the initial state from a stereo calibration: no displacement, a flat board."""
         rig = stereo.rig
         devices = [
             Device(lens.parameters, no_displacement(lens.size), np.array(lens.size, float))
@@ -107,7 +107,7 @@ class State:
         return UnknownLayout(len(self.t_board), len(self.offsets), knots[0], knots[1])
 
     def step(self, step: np.ndarray) -> "State":
-        """The state after a step in the vector's order; rotations turn from the left by small rotation vectors."""
+        """Return the state after a step (N,) in the order of ``layout``; rotation vectors apply from the left."""
         at = self.layout
         pose = step[: at.height].reshape(-1, 6)
         rig, s = self.rig, step[at.rig :]
@@ -127,15 +127,15 @@ class State:
         )
 
 
-def lens_of(device: Device) -> Lens:
-    """The pinhole and Brown part of a device."""
+def pinhole_lens(device: Device) -> Lens:
+    """Return the pinhole and Brown lens of a device, without its displacement field."""
     fx, fy, cx, cy, *D = device.numbers[:LENS]
     size = int(device.size[0]), int(device.size[1])
     return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
 
 
 def rotate_left(R: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """(3, 3): R turned from the left, and a rotation to rounding still."""
+    """Rotate R (3, 3) from the left by a rotation vector (3,); the result is orthonormalised."""
     u, _, v = np.linalg.svd(cv2.Rodrigues(np.ascontiguousarray(vector))[0] @ R)
     return np.asarray(u @ v)
 

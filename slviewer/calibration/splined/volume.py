@@ -70,8 +70,8 @@ def select_visible(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volum
     """Select the camera ``pixels`` (n, 2) at depths ``z`` (n,) mm whose points project into the projector's image."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     points, projector = view_pixels(rig, pixels, z)
-    seen = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)  # False for NaN
-    return Volume(pixels[seen], z[seen], points[seen], projector[seen])
+    in_view = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)  # False for NaN
+    return Volume(pixels[in_view], z[in_view], points[in_view], projector[in_view])
 
 
 def view_pixels(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -134,12 +134,12 @@ class BestMotion:
         return _motion_basis(points, self.centre, self.arm)
 
 
-def motion_free(whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | None = None) -> np.ndarray:
-    """(m, 3 n): ``whitened`` (m, 3 n; x, y, z of the first of ``points`` (n, 3), then of the next) without the rigid
-    motion of the points, to which measurements of a shape are invariant.
+def remove_rigid_motion(whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | None = None) -> np.ndarray:
+    """Remove the common rigid motion, to which measurements of a shape are invariant, from ``whitened`` (m, 3 n).
 
-    The motion is that which fits the points best, or those of them that are ``fitted`` (n,) bool; it is taken from all.
-    A Jacobian by the unknowns is given transposed. Raises InputError where fewer than three points are fitted.
+    The columns are x, y, z of the first of ``points`` (n, 3) mm, then of the next; pass a Jacobian by the unknowns
+    transposed. The motion is the best fit to all points, or to those that are ``fitted`` (n,) bool, and is removed from
+    all. Raises InputError where fewer than three points are fitted.
     """
     motion = BestMotion.fit(points, fitted)
     weights, moved = motion.weights.astype(whitened.dtype), motion.displace(points).astype(whitened.dtype)
