@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slviewer.devices.protocols import Camera, CameraSettings, Rig, one_channel
+from slviewer.devices.protocols import Camera, CameraSettings, Rig, extract_channel
 
 
 class ColouredCamera:
@@ -27,7 +27,7 @@ class ColouredCamera:
         return self._camera.apply(settings)
 
     def grab(self, out: np.ndarray) -> None:
-        one_channel(self.grab_colour(), "green", out)
+        extract_channel(self.grab_colour(), "green", out)
 
     def grab_colour(self) -> np.ndarray:
         width, height = self.size

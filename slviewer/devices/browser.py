@@ -1,8 +1,8 @@
 """A projector that any computer has: a page, full screen on the projector's output, that shows patterns pixel by pixel.
 
 A pattern varies along one axis, so that its profile alone is sent; the page keeps the profiles of one sequence, and
-repeats one over its canvas when it is shown. "Shown" is said two animation frames later: the picture is composited by
-then, not yet emitted, and what the display adds is measured and waited for as the rig's `settle_ms`.
+repeats one over its canvas when it is shown. "Shown" is reported two animation frames later: the picture is composited
+by then, not yet emitted, and what the display adds is measured and waited for as the rig's `settle_ms`.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import PatternSequence
 
-_LARGEST_PX = 16384
+_MAX_SIZE_PX = 16384
 
 
 class BrowserProjector(Openable):
@@ -35,7 +35,7 @@ class BrowserProjector(Openable):
         self._changes = 0
 
     def open(self) -> None:
-        """Dark. Raises DeviceError with what to change where the page cannot show each pixel as it is."""
+        """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by pixel."""
         super().open()
         try:
             self._forget()
@@ -47,14 +47,14 @@ class BrowserProjector(Openable):
             raise
 
     def close(self) -> None:
-        """Leave the page to its marker."""
+        """Release the page, which then shows its marker."""
         if self._open:
             self._channel.set_light(None)
         self._forget()
         super().close()
 
     def load(self, sequence: PatternSequence) -> None:
-        """Send all its patterns; nothing is sent where the page has them. Raises InputError, or DeviceError."""
+        """Send all patterns of the sequence, unless the page has them already. Raises InputError or DeviceError."""
         self.check_open()
         check_sequence(self, sequence)
         page = self._channel.page()
@@ -67,7 +67,7 @@ class BrowserProjector(Openable):
         self._sequence, self._sent, self._page, self._changes = sequence, sent, page, page.changes
 
     def show(self, index: int) -> None:
-        """Show one of them. Raises DeviceError where the page is not the one, or not as, it was when they were sent."""
+        """Show frame `index`. Raises DeviceError where the page or its size changed since the patterns were sent."""
         self.check_open()
         check_index(self, self._sequence, index)
         page = self._page
@@ -81,7 +81,7 @@ class BrowserProjector(Openable):
             raise
 
     def show_level(self, grey: int | None) -> None:
-        """Even light, which a page that is reloaded shows again."""
+        """Show even light; a reloaded page shows it again."""
         self.check_open()
         level = check_level(grey)
         page = self._channel.page()
@@ -93,21 +93,21 @@ class BrowserProjector(Openable):
 
 
 def browser_projector(size: Sequence[int] | None = None, channel: Channel | None = None) -> BrowserProjector:
-    """The projector page's projector, of `size` (width, height) px; None: as the connected page's screen has.
+    """Create a projector of `size` (width, height) px, by default the size of the connected page's screen.
 
-    Raises DeviceError without a channel, and where the size is to be the page's and no page is connected.
+    Raises DeviceError without a channel, and where `size` is None and no page is connected.
     """
     if channel is None:
         raise DeviceError(
             "the browser projector's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
         )
     if size is None:
-        found = channel.page_state().size
-        if found is None:
-            raise DeviceError("open the projector page first, or say the projector's size")
-        return BrowserProjector(channel, found)
-    if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= _LARGEST_PX for side in size):
-        raise InputError(f"{size!r} is no size of a projector: give its width and height in px, such as [1920, 1080]")
+        page_size = channel.page_state().size
+        if page_size is None:
+            raise DeviceError("the projector's size is unknown: open the projector page first, or give the size")
+        return BrowserProjector(channel, page_size)
+    if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= _MAX_SIZE_PX for side in size):
+        raise InputError(f"{size!r} is not a projector size: give its width and height in px, such as [1920, 1080]")
     return BrowserProjector(channel, (size[0], size[1]))
 
 

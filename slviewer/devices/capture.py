@@ -11,8 +11,8 @@ from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.sequence import PatternSequence
 
-MOST_EXPOSURES = 8
-"""More would take longer than anything stands still for."""
+MAX_EXPOSURES = 8
+"""With more, the scene would have to be still for too long."""
 
 
 def capture(
@@ -29,7 +29,7 @@ def capture(
     """
     rig.projector.load(sequence)
     out = _allocate(rig, len(sequence.frames), out)
-    _shoot(rig, len(sequence.frames), out, progress)
+    _capture_loaded(rig, len(sequence.frames), out, progress)
     return out
 
 
@@ -46,8 +46,8 @@ def _allocate(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
     return out
 
 
-def _shoot(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, int], None] | None) -> None:
-    """Show and grab the `n` frames that are loaded."""
+def _capture_loaded(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, int], None] | None) -> None:
+    """Show and grab the `n` loaded frames into `out` (n, h, w)."""
     if progress is not None:
         progress(0, n)
     for k in range(n):
@@ -56,17 +56,19 @@ def _shoot(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, int], Non
             settle(rig)
             rig.camera.grab(out[k])
             if k == n - 1:
-                rig.projector.show(k)  # one that changed during this exposure says so only when it is asked again
+                rig.projector.show(k)  # a change during this exposure is reported by the next request only
         except DeviceError as error:
-            raise DeviceError(f"the capture ended at frame {k + 1} of {n}, nothing is kept of it: {error}") from error
+            raise DeviceError(
+                f"the capture ended at frame {k + 1} of {n}, and its frames were discarded: {error}"
+            ) from error
         if progress is not None:
             progress(k + 1, n)
 
 
 @dataclass(frozen=True, eq=False)
 class CapturedFrames:
-    """What `take` brings home: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the whole sequence in one after
-    the other; what else the camera was set to; and a colour texture (h, w, 3), None of a camera that sees none.
+    """Result of `capture_with_texture`: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the whole sequence in
+    one after the other; the camera's settings; and a colour texture (h, w, 3), None with a monochrome camera.
     """
 
     frames: np.ndarray
@@ -75,75 +77,75 @@ class CapturedFrames:
     texture: np.ndarray | None = None
 
 
-def take(
+def capture_with_texture(
     rig: Rig,
     sequence: PatternSequence,
     exposures_ms: Sequence[float] = (),
     out: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> CapturedFrames:
-    """Capture `sequence`, in each of two or more `exposures_ms` if they are given, and the colours after it.
+    """Capture `sequence`, in each of two or more `exposures_ms` if they are given, and then a colour texture.
 
     `out` is (k n, h, w) where it is given, and `progress(done, k n)` as in `capture`. The camera's settings are as
-    before when this returns or raises. Raises InputError for exposures that are none, DeviceError for a camera that
+    before when this returns or raises. Raises InputError for invalid exposures, DeviceError for a camera that
     cannot be set to them, and whatever `capture` raises.
     """
     if not exposures_ms:
         frames = capture(rig, sequence, out, progress)
-        return CapturedFrames(frames, rig.camera.settings(), (), _colours(rig))
+        return CapturedFrames(frames, rig.camera.settings(), (), _try_capture_texture(rig))
     wanted = check_exposures(exposures_ms)
     n = len(sequence.frames)
     out = _allocate(rig, n * len(wanted), out)
-    rig.projector.load(sequence)  # once: a projector that is lost between two exposures must not be taken for the same
-    before, taken = rig.camera.settings(), []
+    rig.projector.load(sequence)  # once: a projector reconnected between two exposures must not go unnoticed
+    before, applied_ms = rig.camera.settings(), []
     try:
         for e, exposure in enumerate(wanted):
-            taken.append(_exposed(rig, exposure))
-            if e and taken[e] <= taken[e - 1]:
+            applied_ms.append(_set_exposure(rig, exposure))
+            if e and applied_ms[e] <= applied_ms[e - 1]:
                 raise DeviceError(
-                    f"{rig.camera.name} took {taken[e]:g} ms when it was asked for {exposure:g} ms: "
+                    f"{rig.camera.name} set {applied_ms[e]:g} ms instead of the requested {exposure:g} ms: "
                     "choose exposures that it can tell apart, or a single one"
                 )
-            _shoot(rig, n, out[e * n : (e + 1) * n], _counting(progress, e * n, len(out)))
+            _capture_loaded(rig, n, out[e * n : (e + 1) * n], _offset_progress(progress, e * n, len(out)))
     finally:
-        with contextlib.suppress(DeviceError):  # one that is lost tells so itself
+        with contextlib.suppress(DeviceError):  # a lost device raises its own error
             rig.camera.apply(before)
-    return CapturedFrames(out, rig.camera.settings(), tuple(taken), _colours(rig))
+    return CapturedFrames(out, rig.camera.settings(), tuple(applied_ms), _try_capture_texture(rig))
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
-    """Two or more exposures in ms, the shortest first. Raises InputError where they are not."""
+    """Return two or more exposures, ms, ascending. Raises InputError for too few, too many or repeated ones."""
     wanted = sorted(CameraSettings(exposure).exposure_ms or 0.0 for exposure in exposures_ms)
-    if len(set(wanted)) < max(2, len(exposures_ms)) or len(wanted) > MOST_EXPOSURES:
+    if len(set(wanted)) < max(2, len(exposures_ms)) or len(wanted) > MAX_EXPOSURES:
         raise InputError(
-            f"exposures of {', '.join(f'{e:g}' for e in exposures_ms)} ms: give 2 to {MOST_EXPOSURES}, each once"
+            f"exposures of {', '.join(f'{e:g}' for e in exposures_ms)} ms: give 2 to {MAX_EXPOSURES}, each once"
         )
     return wanted
 
 
-def _colours(rig: Rig) -> np.ndarray | None:
-    """The colour texture; None also where it fails: the frames are whole, and a lost device tells so itself."""
+def _try_capture_texture(rig: Rig) -> np.ndarray | None:
+    """Capture the colour texture; None also on a DeviceError: the frames are complete without it."""
     with contextlib.suppress(DeviceError):
-        return colour_texture(rig)
+        return capture_texture(rig)
     return None
 
 
-def _exposed(rig: Rig, exposure_ms: float) -> float:
-    """Set an exposure; what the camera took."""
-    taken = rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
-    if taken is None:
-        raise DeviceError(f"{rig.camera.name} does not say which exposure it took: capture in a single one")
-    return taken
+def _set_exposure(rig: Rig, exposure_ms: float) -> float:
+    """Set the exposure; returns the value, ms, that the camera applied. Raises DeviceError where it is unknown."""
+    applied_ms = rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
+    if applied_ms is None:
+        raise DeviceError(f"{rig.camera.name} does not report its exposure: capture in a single one")
+    return applied_ms
 
 
-def _counting(
+def _offset_progress(
     progress: Callable[[int, int], None] | None, before: int, frames: int
 ) -> Callable[[int, int], None] | None:
-    """The progress of one exposure's frames among all."""
+    """Progress over all `frames`, for one exposure whose frames come after `before` others."""
     return None if progress is None else lambda done, _: progress(before + done, frames)
 
 
-def colour_texture(rig: Rig) -> np.ndarray | None:
+def capture_texture(rig: Rig) -> np.ndarray | None:
     """(h, w, 3) RGB of the scene under white light, where the camera of the open rig sees colour; else None."""
     if not isinstance(rig.camera, ColourCamera):
         return None
@@ -153,6 +155,6 @@ def colour_texture(rig: Rig) -> np.ndarray | None:
 
 
 def settle(rig: Rig) -> None:
-    """Wait until what the projector says it shows has reached the scene."""
+    """Wait for the delay between the projector's report and the light on the scene (`settle_ms`)."""
     if rig.settle_ms > 0:
         time.sleep(rig.settle_ms / 1000)

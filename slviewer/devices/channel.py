@@ -1,9 +1,9 @@
-"""The wire between a projector, on the thread that owns it, and its page, which a server reaches on its event loop.
+"""The message channel between a projector, on the thread that owns it, and its page, on a server's event loop.
 
-The projector's side asks and waits; the server's side connects a page, hands on what it says, and tells when it is
-gone. One window at a time is the projector: it stays so when it is reloaded, and another one takes over only when
-somebody asks for that in it. What the page says of its screen is judged here whether or not a projector is open, and
-the page is told the same words as the operator.
+The projector's side sends requests and waits; the server's side connects and disconnects pages and passes messages on.
+One window at a time is the projector: it stays so when it is reloaded, and another one takes over only when the user
+requests that in it. The page's report of its screen is judged here whether or not a projector is open, and the page
+shows the same message as the operator's panel.
 """
 
 import struct
@@ -28,7 +28,7 @@ _NO_PAGE = "no projector page is connected: open the projector's link on the pro
 
 
 class Hello(msgspec.Struct, tag_field="op", tag="hello"):
-    """A page's first message; `window` is the same after a reload, `take`: somebody asked for it to take over."""
+    """A page's first message; `window` is the same after a reload, `take`: it requests to be the projector."""
 
     window: str
     take: bool
@@ -50,7 +50,7 @@ class Done(msgspec.Struct, tag_field="op", tag="done"):
 
 @dataclass(frozen=True)
 class PageState:
-    """Where the projector page stands: "waiting" for one to be opened, "refused" or "ready", and the same in words.
+    """State of the projector page: "waiting" for one to be opened, "refused" or "ready", and a message in `words`.
 
     `size` is the (width, height) px of the page's screen, None while there is none.
     """
@@ -61,7 +61,7 @@ class PageState:
 
 
 class PageConnection:
-    """One connection of a projector page. Asked from the projector's thread, fed from the server's."""
+    """One connection of a projector page. The projector's thread sends requests, the server's stores the answers."""
 
     def __init__(self, condition: threading.Condition, hello: Hello, send: Send) -> None:
         self.window, self.screen = hello.window, hello.screen
@@ -74,7 +74,7 @@ class PageConnection:
         self._answer: Done | None = None
 
     def request(self, op: str, payload: bytes = b"", **fields: Any) -> None:
-        """Have the page do it, and wait until it says that it has. Raises DeviceError within two seconds."""
+        """Send a request, and wait until the page reports it done. Raises DeviceError within two seconds."""
         with self._condition:
             self._number += 1
             self.check()
@@ -82,28 +82,28 @@ class PageConnection:
             end = time.monotonic() + ANSWER_S
             while self._answer is None or self._answer.number != self._number:
                 self.check()
-                left = end - time.monotonic()
-                if left <= 0:
+                remaining_s = end - time.monotonic()
+                if remaining_s <= 0:
                     raise DeviceError(
                         f"the projector page did not answer within {ANSWER_S:g} s: look whether its window is covered, "
                         "its computer asleep, or the network down"
                     )
-                self._condition.wait(left)
+                self._condition.wait(remaining_s)
             if self._answer.why:
                 raise DeviceError(f"the projector page failed, {self._answer.why}: reload it")
 
     def check(self) -> None:
-        """Raise DeviceError if it is gone, or its screen cannot show the patterns."""
+        """Raise DeviceError if the page is disconnected, or its screen cannot show the patterns."""
         if self.gone or self.refused:
             raise DeviceError(self.gone or self.refused)
 
     def store_answer(self, done: Done) -> None:
-        """Keep an answer for whoever waits for it."""
+        """Store an answer for the waiting `request`."""
         self._answer = done
 
 
 class Channel:
-    """Where a projector finds its page. Every method may be called from any thread; only `wait_ready` waits."""
+    """Connects a projector to its page. Every method may be called from any thread; only `wait_ready` waits."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
@@ -111,10 +111,10 @@ class Channel:
         self._size: tuple[int, int] | None = None
         self._light: int | None = None
 
-    # for whoever shows where it stands
+    # for panels that show the state
 
     def page_state(self) -> PageState:
-        """Where the page stands now."""
+        """The current state of the page."""
         with self._condition:
             page = self._page
             if page is None:
@@ -125,7 +125,7 @@ class Channel:
             return PageState("ready", f"ready {size[0]} x {size[1]}", size)
 
     def wait_ready(self, timeout_s: float) -> PageState:
-        """Where it stands as soon as it is ready, or when the time is up."""
+        """Wait until the page is ready, at most `timeout_s`; returns its state."""
         with self._condition:
             self._condition.wait_for(lambda: self.page_state().state == "ready", timeout_s)
             return self.page_state()
@@ -145,7 +145,7 @@ class Channel:
             self._publish_state()
 
     def page(self) -> PageConnection:
-        """The page, connected and able to show the patterns. Raises DeviceError with what to change."""
+        """The connected page, able to show the patterns. Raises DeviceError with a remedy."""
         with self._condition:
             if self._page is None:
                 raise DeviceError(_NO_PAGE)
@@ -155,38 +155,40 @@ class Channel:
     # the server's side
 
     def connect(self, hello: str | bytes, send: Send) -> PageConnection | None:
-        """The page that says hello; None where another window is the projector. Raises InputError for nonsense."""
-        message_in: Hello = _decode(hello, Hello)
+        """Connect the page that sent `hello`; None where another window is the projector. Raises InputError for an
+        invalid message.
+        """
+        incoming: Hello = _decode(hello, Hello)
         with self._condition:
             before = self._page
             if before is not None:
-                if message_in.window != before.window and not message_in.take:
+                if incoming.window != before.window and not incoming.take:
                     return None
                 self._end(
                     before,
                     "the projector page was reloaded, or connected anew"
-                    if message_in.window == before.window
+                    if incoming.window == before.window
                     else "another window was made the projector",
                 )
                 before.send(None)
-            page = self._page = PageConnection(self._condition, message_in, send)
+            page = self._page = PageConnection(self._condition, incoming, send)
             self._publish_state()
             return page
 
     def handle_message(self, page: PageConnection, message: str | bytes) -> None:
-        """What a connected page says. Raises InputError for nonsense."""
-        message_in = _decode(message, Report | Done)
+        """Handle a message of a connected page. Raises InputError for an invalid one."""
+        incoming = _decode(message, Report | Done)
         with self._condition:
-            if isinstance(message_in, Done):
-                page.store_answer(message_in)
-            elif message_in.screen != page.screen:
-                page.screen = message_in.screen
+            if isinstance(incoming, Done):
+                page.store_answer(incoming)
+            elif incoming.screen != page.screen:
+                page.screen = incoming.screen
                 page.changes += 1
                 self._publish_state()
             self._condition.notify_all()
 
     def disconnect(self, page: PageConnection) -> None:
-        """The page is gone."""
+        """Handle the loss of a page's connection."""
         with self._condition:
             if self._page is page:
                 self._page = None
@@ -197,7 +199,7 @@ class Channel:
         self._condition.notify_all()
 
     def _publish_state(self) -> None:
-        """Judge the page, and let it say where it stands if that is news to it."""
+        """Judge the page's screen, and send the page its state if that has changed."""
         page = self._page
         if page is None:
             return
@@ -221,4 +223,4 @@ def _decode(message: str | bytes, kind: Any) -> Any:
     try:
         return msgspec.json.decode(message, type=kind)
     except (msgspec.MsgspecError, UnicodeError) as error:
-        raise InputError(f"what the projector page says is not understood ({error}): reload it") from error
+        raise InputError(f"the projector page sent an invalid message ({error}): reload it") from error

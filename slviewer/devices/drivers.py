@@ -46,12 +46,12 @@ class Driver:
 def drivers() -> dict[str, Driver]:
     """All drivers by name, usable here or not."""
     modules = (module.name for module in pkgutil.iter_modules(slviewer.devices.__path__))
-    found = (getattr(importlib.import_module(f"slviewer.devices.{name}"), "DRIVER", None) for name in modules)
-    return {driver.name: driver for driver in found if isinstance(driver, Driver)}
+    candidates = (getattr(importlib.import_module(f"slviewer.devices.{name}"), "DRIVER", None) for name in modules)
+    return {driver.name: driver for driver in candidates if isinstance(driver, Driver)}
 
 
 def available() -> list[Driver]:
-    """All drivers, those that can be used here first; `needs` and `missing` say what the others want."""
+    """All drivers, those that can be used here first; `needs` and `missing` name what the others require."""
     return sorted(drivers().values(), key=lambda driver: (bool(driver.missing), driver.name))
 
 
@@ -59,7 +59,7 @@ def driver(name: str) -> Driver:
     """The driver called `name`. Raises InputError if there is none, DeviceError if it lacks a package."""
     if name not in drivers():
         raise InputError(f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}")
-    found = drivers()[name]
-    if found.missing:
-        raise DeviceError(f"the driver {name} cannot be used here, {found.missing}")
-    return found
+    selected = drivers()[name]
+    if selected.missing:
+        raise DeviceError(f"the driver {name} cannot be used here, {selected.missing}")
+    return selected

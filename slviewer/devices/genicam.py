@@ -8,31 +8,32 @@ import numpy as np
 
 from slviewer.devices.drivers import Driver
 from slviewer.devices.genicam_features import Features, Trigger
-from slviewer.devices.gentl import Found, connected
-from slviewer.devices.gentl_link import Image, Link, asked
+from slviewer.devices.gentl import ListedCamera, list_cameras
+from slviewer.devices.gentl_link import Image, Link, open_node_map
 from slviewer.devices.opening import Openable
 from slviewer.devices.pixel_formats import PixelFormat
-from slviewer.devices.protocols import Camera, CameraSettings, Channel, check_frame, one_channel
+from slviewer.devices.protocols import Camera, CameraSettings, Channel, check_frame, extract_channel
 from slviewer.errors import DeviceError, InputError
 
 IN_FLIGHT = 2
 """Frames of a camera that runs by its own clock, or a line's, that may have begun before a call and arrive after it:
 one that is being exposed, and the one before, which is being read out and sent."""
 
-_ANSWER_S = 2.0
+_ANSWER_TIMEOUT_S = 2.0
 
 
 class GenicamCamera(Openable):
-    """Grey levels as they come from the camera: uint8, or uint16 with its 10 or 12 bits at the bottom.
+    """A camera that delivers grey levels unprocessed: uint8, or uint16 with its 10 or 12 bits at the bottom.
 
     With a software trigger each grab starts its own exposure. Of a camera that runs free, or by a line whose pulses
     repeat (a projector's frame clock), buffers are thrown away until one comes whose exposure began after the call. A
-    frame that is late or incomplete is a DeviceError, and never mistaken for the next: the stream begins anew after it.
+    frame that is late or incomplete is a DeviceError, and never mistaken for the next: the stream is restarted after
+    it.
     """
 
     def __init__(
         self,
-        camera: Found,
+        camera: ListedCamera,
         size: tuple[int, int],
         pixels: PixelFormat,
         trigger: Trigger,
@@ -43,10 +44,10 @@ class GenicamCamera(Openable):
         self.size, self.dtype, self.pixels = size, pixels.dtype, pixels
         self._camera, self._trigger, self._line, self._first = camera, trigger, line, first
         self._link: Link | None = None
-        self._timeout_s = _ANSWER_S
+        self._timeout_s = _ANSWER_TIMEOUT_S
 
     def open(self) -> None:
-        """Claim the camera and let it run. Raises DeviceError where it is gone, in use, or not as it was."""
+        """Claim the camera and start it. Raises DeviceError where it is gone, in use or was reconfigured."""
         super().open()
         try:
             self._link = Link(self._camera)
@@ -64,7 +65,7 @@ class GenicamCamera(Openable):
             raise
 
     def close(self) -> None:
-        """Give it back, running free."""
+        """Release the camera, in free-running mode."""
         super().close()
         link, self._link = self._link, None
         if link is not None:
@@ -77,25 +78,25 @@ class GenicamCamera(Openable):
         """A frame whose exposure began after the call."""
         self.check_open()
         check_frame(self, out)
-        with self._fresh() as image:
+        with self._grab_fresh() as image:
             self.pixels.unpack(image.data, out, image.padding)
 
     def settings(self) -> CameraSettings:
-        """What is set; None for what it lacks, and for a gain in steps of its own."""
+        """The current settings; None for those that the camera lacks, and for a gain in device-specific steps."""
         self.check_open()
         return self._features().settings()
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set the nearest that it can do. What it lacks stays None."""
+        """Set the nearest supported values, and return them; None for settings that the camera lacks."""
         self.check_open()
         features = self._features()
         features.apply(settings)
-        taken = features.settings()
-        self._timeout_s = _ANSWER_S + (taken.exposure_ms or 0.0) / 1000
-        return taken
+        applied = features.settings()
+        self._timeout_s = _ANSWER_TIMEOUT_S + (applied.exposure_ms or 0.0) / 1000
+        return applied
 
     @contextlib.contextmanager
-    def _fresh(self) -> Iterator[Image]:
+    def _grab_fresh(self) -> Iterator[Image]:
         link = self._link
         assert link is not None
         try:
@@ -121,7 +122,7 @@ class GenicamCamera(Openable):
 
 
 class GenicamColourCamera(GenicamCamera):
-    """One channel of its colours, and all three as a texture."""
+    """A colour camera: `grab` returns one channel, `grab_colour` all three."""
 
     def __init__(self, *what: Any, channel: Channel) -> None:
         super().__init__(*what)
@@ -131,17 +132,17 @@ class GenicamColourCamera(GenicamCamera):
         """The channel of a frame whose exposure began after the call."""
         self.check_open()
         check_frame(self, out)
-        with self._fresh() as image:
-            one_channel(self._rgb(image), self.channel, out)
+        with self._grab_fresh() as image:
+            extract_channel(self._rgb(image), self.channel, out)
 
     def grab_colour(self) -> np.ndarray:
         """The whole of such a frame, (h, w, 3) RGB."""
         self.check_open()
-        with self._fresh() as image:
+        with self._grab_fresh() as image:
             return np.array(self._rgb(image))
 
     def _rgb(self, image: Image) -> np.ndarray:
-        return self.pixels.rgb(self.pixels.samples_of(image.data, image.size, image.padding))
+        return self.pixels.rgb(self.pixels.view_samples(image.data, image.size, image.padding))
 
 
 def genicam_camera(
@@ -158,34 +159,34 @@ def genicam_camera(
     """The connected camera of that serial number or model, or the only one there is; not opened yet.
 
     `producer` is the .cti file of its maker's software, None: all that are installed. `exposure_ms` and `gain` are set
-    when it is opened, None: left as they are. `pixel_format` None: the deepest mono of up to 12 bits that comes
+    when it is opened, None: unchanged. `pixel_format` None: the deepest mono of up to 12 bits that comes
     unpacked; of a colour camera its colours, of which `channel` is decoded. `trigger` "software" (where it has one),
     "hardware" with the name of its `line`, or "free". Raises InputError for what the camera has not, or where several
     fit; DeviceError where none is connected.
     """
     if channel not in get_args(Channel):
         raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
-    camera = _choose(connected(producer), None if serial is None else str(serial), model)
+    camera = _choose_camera(list_cameras(producer), None if serial is None else str(serial), model)
     name, first = f"the camera {camera}", CameraSettings(exposure_ms, gain)
-    with asked(camera) as node_map:
+    with open_node_map(camera) as node_map:
         features = Features(node_map, name)
-        pixels, begun = features.format(pixel_format), features.trigger(trigger, line)
+        pixels, begun = features.choose_format(pixel_format), features.choose_trigger(trigger, line)
         features.check_settings(first)
         what = (camera, features.size(), pixels, begun, line, first)
     return GenicamColourCamera(*what, channel=channel) if pixels.colour else GenicamCamera(*what)
 
 
-def _choose(cameras: list[Found], serial: str | None, model: str | None) -> Found:
+def _choose_camera(cameras: list[ListedCamera], serial: str | None, model: str | None) -> ListedCamera:
     listed = "; ".join(map(str, cameras))
-    fitting = [
+    matching = [
         camera
         for camera in cameras
         if serial in (None, camera.serial) and (model is None or model.casefold() == camera.model.casefold())
     ]
-    if len(fitting) == 1:
-        return fitting[0]
-    if fitting:
-        raise InputError(f"{len(fitting)} cameras fit ({listed}): say which one by its `serial` number")
+    if len(matching) == 1:
+        return matching[0]
+    if matching:
+        raise InputError(f"{len(matching)} cameras match ({listed}): choose one by its `serial` number")
     if cameras:
         raise DeviceError(f"no such camera is connected, only {listed}: choose one of them, or plug yours in")
     raise DeviceError("no camera is connected: plug one in, wait until it has started, and close other programs")
@@ -193,7 +194,7 @@ def _choose(cameras: list[Found], serial: str | None, model: str | None) -> Foun
 
 def list_connected() -> list[str]:
     """One line for each camera that is connected: maker, model, serial number. Raises DeviceError without producers."""
-    return [str(camera) for camera in connected()]
+    return [str(camera) for camera in list_cameras()]
 
 
 _INSTALL = "pip install 'slviewer[genicam]'"

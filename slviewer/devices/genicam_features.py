@@ -1,4 +1,4 @@
-"""GenICam's features as a structured-light rig wants them: exposure in ms, gain as a factor, a trigger, no automatics.
+"""GenICam features for a structured-light rig: exposure in ms, gain as a factor, a trigger, no automatics.
 
 A node map is any object with a camera's nodes as attributes; its nodes are those of `genicam.genapi`.
 """
@@ -6,14 +6,14 @@ A node map is any object with a camera's nodes as attributes; its nodes are thos
 import math
 from typing import Any, Literal, get_args
 
-from slviewer.devices.gentl import answering
+from slviewer.devices.gentl import as_device_error
 from slviewer.devices.pixel_formats import PixelFormat, best_format, pixel_format
 from slviewer.devices.protocols import CameraSettings
 from slviewer.errors import DeviceError, InputError
 
 Trigger = Literal["software", "hardware", "free"]
 
-_THERE, _READABLE, _WRITABLE = (1, 2, 3, 4), (3, 4), (2, 4)  # EAccessMode: 1 not now, 2 write, 3 read, 4 both
+_IMPLEMENTED, _READABLE, _WRITABLE = (1, 2, 3, 4), (3, 4), (2, 4)  # EAccessMode: 1 not now, 2 write, 3 read, 4 both
 _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")  # the second is older GigE cameras'
 _MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "s": 1e3}
 _AUTOMATIC = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto", "BlackLevelAuto")
@@ -28,7 +28,7 @@ _FRAME_TRIGGERS = ("FrameStart", "ExposureStart")
 
 
 class Features:
-    """The features of one camera, `name` in messages. Every method raises DeviceError when it does not answer."""
+    """The features of one camera, called `name` in messages. Every method raises DeviceError if it does not answer."""
 
     def __init__(self, node_map: Any, name: str) -> None:
         self._nodes, self._name = node_map, name
@@ -37,26 +37,28 @@ class Features:
         """(width, height) px of its images: the whole sensor, or the region that is set in it."""
         width, height = self._readable("Width"), self._readable("Height")
         if width is None or height is None:
-            raise DeviceError(f"{self._name} does not say how large its images are: it cannot be used")
-        with answering(self._name):
+            raise DeviceError(f"{self._name} does not report its image size: use another camera")
+        with as_device_error(self._name):
             return int(width.value), int(height.value)
 
-    def format(self, wanted: str | None = None) -> PixelFormat:
-        """The pixel format to use, `wanted` or the best. Raises InputError for one that it has not, or is not read."""
+    def choose_format(self, wanted: str | None = None) -> PixelFormat:
+        """Choose the pixel format, `wanted` or the best. Raises InputError for one that is not offered or not
+        supported.
+        """
         offered = self._choices("PixelFormat")
         usable = [name for name in offered if pixel_format(name) is not None]
-        found = best_format(usable) if wanted is None else pixel_format(wanted) if wanted in offered else None
-        if found is None:
-            asked = "none that can be read" if wanted is None else f"no {wanted} that can be read"
+        chosen = best_format(usable) if wanted is None else pixel_format(wanted) if wanted in offered else None
+        if chosen is None:
+            missing = "none that can be read" if wanted is None else f"no {wanted} that can be read"
             raise InputError(
-                f"{self._name} offers {asked}: use one of {', '.join(usable) or 'another camera'} as pixel_format"
+                f"{self._name} offers {missing}: use one of {', '.join(usable) or 'another camera'} as pixel_format"
             )
-        return found
+        return chosen
 
-    def trigger(self, wanted: Trigger | None, line: str | None) -> Trigger:
-        """What starts an exposure: `wanted`, or software where it has that, or else nothing but its own clock.
+    def choose_trigger(self, wanted: Trigger | None, line: str | None) -> Trigger:
+        """Choose what starts an exposure: `wanted`, else software where supported, else free running.
 
-        Raises InputError for a trigger or a line that it has not.
+        Raises InputError for a trigger or a line that the camera lacks.
         """
         if wanted is not None and wanted not in get_args(Trigger):
             raise InputError(f"no trigger is called {wanted!r}: use one of {', '.join(get_args(Trigger))}")
@@ -78,17 +80,17 @@ class Features:
         return wanted
 
     def check_settings(self, wanted: CameraSettings) -> None:
-        """Raise InputError for what it has no feature for."""
+        """Raise InputError for settings that the camera has no feature for."""
         if wanted.exposure_ms is not None and self._exposure() is None:
             raise InputError(f"{self._name} has no exposure time that can be set: leave exposure_ms out")
         if wanted.gain is not None and self._gain() is None:
             gain = self._readable("Gain")
-            why = "no gain" if gain is None else "a gain in steps of its own, whose factor it does not tell"
+            why = "no gain" if gain is None else "a gain in device-specific steps of unknown factor"
             raise InputError(f"{self._name} has {why}: leave `gain` out, and set it with its maker's software")
 
     def prepare(self, chosen: PixelFormat, trigger: Trigger, line: str | None) -> None:
-        """Set all that makes frames comparable: nothing automatic, levels proportional to light, this trigger."""
-        with answering(self._name):
+        """Configure comparable frames: no automatics, grey levels proportional to light, this format and trigger."""
+        with as_device_error(self._name):
             self._choose("PixelFormat", chosen.name)
             self._choose("AcquisitionMode", "Continuous")
             self._choose("ExposureMode", "Timed")
@@ -100,40 +102,40 @@ class Features:
                     node.value = False
             gamma = self._writable("Gamma")
             if gamma is not None:
-                _set(gamma, 1.0)
+                _set_nearest(gamma, 1.0)
             self._choose("GainSelector", "All")
             self._set_trigger(trigger, line)
-            taken = self._readable("PixelFormat")
-            if taken is None or taken.value != chosen.name:
-                raise DeviceError(f"{self._name} did not take the pixel format {chosen.name}: choose another one")
+            current = self._readable("PixelFormat")
+            if current is None or current.value != chosen.name:
+                raise DeviceError(f"{self._name} did not accept the pixel format {chosen.name}: choose another one")
 
     def release(self) -> None:
-        """Let it run free, as other programs expect it."""
-        with answering(self._name):
+        """Restore free running, which other programs expect."""
+        with as_device_error(self._name):
             self._set_trigger("free", None)
 
     def fire(self) -> None:
         """Start an exposure by software."""
-        with answering(self._name):
+        with as_device_error(self._name):
             self._nodes.TriggerSoftware.execute()
 
     def settings(self) -> CameraSettings:
-        """What is set now; None for what it has not, and for a gain whose factor it does not tell."""
-        with answering(self._name):
+        """The current settings; None for those that the camera lacks, and for a gain of unknown factor."""
+        with as_device_error(self._name):
             exposure, gain = self._exposure(), self._gain()
             return CameraSettings(
-                None if exposure is None else float(exposure.value) * _ms(exposure),
+                None if exposure is None else float(exposure.value) * _ms_per_unit(exposure),
                 None if gain is None else 10 ** (float(gain.value) / 20),
             )
 
     def apply(self, settings: CameraSettings) -> None:
-        """Set the nearest that it can do, of what it has."""
-        with answering(self._name):
+        """Set the nearest supported values of the settings that the camera has."""
+        with as_device_error(self._name):
             exposure, gain = self._exposure(), self._gain()
-            if settings.exposure_ms is not None and _settable(exposure):
-                _set(exposure, settings.exposure_ms / _ms(exposure))
-            if settings.gain is not None and _settable(gain):
-                _set(gain, 20 * math.log10(settings.gain))
+            if settings.exposure_ms is not None and _is_settable(exposure):
+                _set_nearest(exposure, settings.exposure_ms / _ms_per_unit(exposure))
+            if settings.gain is not None and _is_settable(gain):
+                _set_nearest(gain, 20 * math.log10(settings.gain))
 
     def _exposure(self) -> Any:
         return next((node for name in _EXPOSURES if (node := self._readable(name)) is not None), None)
@@ -143,7 +145,7 @@ class Features:
         return gain if gain is not None and str(getattr(gain, "unit", "")).strip().lower() == "db" else None
 
     def _set_trigger(self, trigger: Trigger, line: str | None) -> None:
-        """Of all triggers that it has, leave one on at most: the one that starts each frame."""
+        """Switch every trigger off but the one that starts each frame."""
         selectors = self._choices("TriggerSelector")
         for selector in selectors or [""]:
             self._choose("TriggerSelector", selector)
@@ -155,18 +157,18 @@ class Features:
             break
         source = "Software" if trigger == "software" else line
         if not (self._choose("TriggerSource", source or "") and self._choose("TriggerMode", "On")):
-            raise DeviceError(f"{self._name} did not take the trigger {source}: choose another one")
+            raise DeviceError(f"{self._name} did not accept the trigger {source}: choose another one")
 
     def _choices(self, name: str) -> list[str]:
-        """What an enumeration offers now."""
+        """The currently readable entries of the enumeration `name`."""
         node = self._readable(name)
         if node is None:
             return []
-        with answering(self._name):
+        with as_device_error(self._name):
             return [entry.symbolic for entry in node.entries if entry.get_access_mode() in _READABLE]
 
     def _choose(self, name: str, choice: str) -> bool:
-        """Whether it has that choice; it is then made."""
+        """Set the enumeration `name` to `choice`; False where the camera does not offer it."""
         if choice not in self._choices(name):
             return False
         node = getattr(self._nodes, name)
@@ -181,27 +183,27 @@ class Features:
         return self._node(name, _WRITABLE)
 
     def _node(self, name: str, access: tuple[int, ...]) -> Any:
-        """A node that can be used so now; None where it has none."""
-        with answering(self._name):
+        """The node `name`, if it has one of these access modes now; else None."""
+        with as_device_error(self._name):
             node = getattr(self._nodes, name, None)
             return node if node is not None and node.get_access_mode() in access else None
 
     def _has(self, name: str) -> bool:
-        """Whether it has a node, be it one that cannot be used before another is set."""
-        return self._node(name, _THERE) is not None
+        """Whether the camera implements a node, even if it is not accessible now."""
+        return self._node(name, _IMPLEMENTED) is not None
 
 
-def _settable(node: Any) -> bool:
+def _is_settable(node: Any) -> bool:
     return node is not None and node.get_access_mode() in _WRITABLE
 
 
-def _ms(exposure: Any) -> float:
-    """What one of its units is in ms: the standard has microseconds."""
+def _ms_per_unit(exposure: Any) -> float:
+    """Length of the exposure node's unit in ms; microseconds, as in the standard, where it names none."""
     return _MS.get(str(getattr(exposure, "unit", "")).strip(), 1e-3)
 
 
-def _set(node: Any, wanted: float) -> None:
-    """Set a number to the nearest that its node takes."""
+def _set_nearest(node: Any, wanted: float) -> None:
+    """Set a numeric node to the nearest valid value."""
     low, high = node.min, node.max
     whole = isinstance(low, int)
     step = node.inc if whole or node.has_inc() else 0

@@ -1,7 +1,7 @@
-"""Which cameras are behind the GenTL producers that are installed.
+"""Lists the cameras of the installed GenTL producers.
 
 A producer (`.cti`) comes with the camera maker's software and can be loaded once in a process, so that everything that
-asks for the same file here shares it.
+requests the same file here shares it.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ _LOG.addHandler(logging.NullHandler())  # harvesters prints every failure with i
 
 
 @dataclass(frozen=True)
-class Found:
+class ListedCamera:
     """A camera that a producer lists; `id` is the producer's own for it."""
 
     vendor: str
@@ -42,14 +42,14 @@ class Found:
 
 
 @contextlib.contextmanager
-def answering(name: str) -> Iterator[None]:
-    """Turn what the GenICam libraries raise into a DeviceError about `name`."""
+def as_device_error(name: str) -> Iterator[None]:
+    """Convert exceptions of the GenICam libraries into a DeviceError about `name`."""
     try:
         yield
     except _library_errors() as error:
-        said = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise DeviceError(
-            f"{name} does not answer: check its cable, and close other programs that use it ({said})"
+            f"{name} does not answer: check its cable, and close other programs that use it ({reason})"
         ) from error
 
 
@@ -73,7 +73,7 @@ def producer_files(producer: str | None = None) -> list[str]:
     return list(dict.fromkeys(files))
 
 
-def connected(producer: str | None = None) -> list[Found]:
+def list_cameras(producer: str | None = None) -> list[ListedCamera]:
     """All cameras that the producers list; one that cannot be loaded fails only where it is the only one.
 
     While a camera of a producer is claimed in this process, its list is that of when it was claimed: to look again
@@ -82,8 +82,8 @@ def connected(producer: str | None = None) -> list[Found]:
     files, cameras, problems = producer_files(producer), [], []
     for file in files:
         try:
-            with loaded(file) as harvester:
-                cameras += [listed_as(info, file) for info in harvester.device_info_list]
+            with open_producer(file) as harvester:
+                cameras += [read_listed_camera(info, file) for info in harvester.device_info_list]
         except DeviceError as problem:
             problems.append(problem)
     if problems and len(problems) == len(files):
@@ -98,8 +98,8 @@ class _Producer:
 
 
 @contextlib.contextmanager
-def loaded(file: str) -> Iterator[Any]:
-    """The harvester of one producer: listed afresh by its first user, closed after its last."""
+def open_producer(file: str) -> Iterator[Any]:
+    """The harvester of one producer, shared: it updates its list for the first user, and is closed after the last."""
     with LOCK:
         if file not in _PRODUCERS:
             _PRODUCERS[file] = _Producer(_load(file))
@@ -112,7 +112,7 @@ def loaded(file: str) -> Iterator[Any]:
             producer.users -= 1
             if producer.users == 0:
                 del _PRODUCERS[file]
-                quietly(producer.harvester.reset)
+                ignore_errors(producer.harvester.reset)
 
 
 def _load(file: str) -> Any:
@@ -125,24 +125,24 @@ def _load(file: str) -> Any:
         if not harvester.has_revised_device_info_list:  # harvesters logs why, and goes on without cameras
             raise DeviceError(f"the GenTL producer {file} cannot list cameras: close other programs that use them")
     except BaseException as error:
-        quietly(harvester.reset)
+        ignore_errors(harvester.reset)
         if isinstance(error, (OSError, *_library_errors())):
             raise DeviceError(f"the GenTL producer {file} cannot be loaded: install it again ({error})") from error
         raise
     return harvester
 
 
-def listed_as(info: Any, file: str) -> Found:
-    """What a producer tells of a camera in its list."""
+def read_listed_camera(info: Any, file: str) -> ListedCamera:
+    """Convert a producer's device info of one camera."""
 
     def word(what: str) -> str:
         return str(read_info(info, what) or "").strip() or "?"
 
-    return Found(word("vendor"), word("model"), word("serial_number"), file, word("id_"))
+    return ListedCamera(word("vendor"), word("model"), word("serial_number"), file, word("id_"))
 
 
 def read_info(module: Any, what: str) -> Any:
-    """A fact about a GenTL module, None where its producer does not tell."""
+    """The property `what` of a GenTL module, None where its producer does not report it."""
     try:
         return getattr(module, what)
     except _library_errors():
@@ -155,8 +155,8 @@ def _library_errors() -> tuple[type[Exception], ...]:
     return (genapi.GenericException, gentl.GenericException)
 
 
-def quietly(step: Callable[[], object]) -> None:
-    """Do what belongs to closing, and go on whatever it raises."""
+def ignore_errors(step: Callable[[], object]) -> None:
+    """Run one step of closing; log what it raises."""
     try:
         step()
     except Exception as error:

@@ -1,6 +1,6 @@
 """One claimed camera behind a GenTL producer, and its filled buffers one by one.
 
-`harvesters` claims and streams; what is worked around of it is said where it is done.
+`harvesters` claims and streams; each workaround of its behaviour has a comment.
 """
 
 import contextlib
@@ -13,11 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.devices.gentl import LOCK, Found, answering, listed_as, loaded, quietly, read_info
+from slviewer.devices.gentl import (
+    LOCK,
+    ListedCamera,
+    as_device_error,
+    ignore_errors,
+    open_producer,
+    read_info,
+    read_listed_camera,
+)
 from slviewer.errors import DeviceError
 
 _POLL_S = 0.0005
-_LINKS: dict[Found, "Link"] = {}
+_LINKS: dict[ListedCamera, "Link"] = {}
 
 
 @dataclass(frozen=True)
@@ -30,8 +38,8 @@ class Image:
 
 
 @contextlib.contextmanager
-def asked(camera: Found) -> Iterator[Any]:
-    """The node map of `camera`, to be read only; claimed for that long where this process has not claimed it yet."""
+def open_node_map(camera: ListedCamera) -> Iterator[Any]:
+    """The node map of `camera`, for reading; claims the camera meanwhile unless this process has claimed it already."""
     with LOCK:
         link = _LINKS.get(camera)
     if link is not None:
@@ -47,22 +55,24 @@ def asked(camera: Found) -> Iterator[Any]:
 class Link:
     """One claimed camera. Belongs to one thread; `close` never raises, and the camera can be claimed again after it."""
 
-    def __init__(self, camera: Found) -> None:
-        """Claim it. Raises DeviceError where it is not connected or another program has it."""
+    def __init__(self, camera: ListedCamera) -> None:
+        """Claim the camera. Raises DeviceError where it is not connected or in use by another program."""
         self.name = f"the camera {camera}"
         self._camera = camera
         self._acquirer: Any = None
-        self._incomplete = _counter()
+        self._incomplete = _make_event_counter()
         self._format = 0
         self._producer = contextlib.ExitStack()
         self.streaming = False
         with LOCK:
             try:
-                self._harvester = self._producer.enter_context(loaded(camera.file))
-                listed = [info for info in self._harvester.device_info_list if listed_as(info, camera.file) == camera]
+                self._harvester = self._producer.enter_context(open_producer(camera.file))
+                listed = [
+                    info for info in self._harvester.device_info_list if read_listed_camera(info, camera.file) == camera
+                ]
                 if not listed:
                     raise DeviceError(f"{self.name} is not connected: plug it in, and wait until it has started")
-                with answering(self.name), _interrupts_kept():
+                with as_device_error(self.name), _preserve_sigint_handler():
                     self._acquirer = self._harvester.create(listed[0], config=_acquirer_options())
                 if len(self._acquirer.data_streams) != 1:
                     raise DeviceError(f"{self.name} sends {len(self._acquirer.data_streams)} streams: use one with one")
@@ -75,35 +85,35 @@ class Link:
             _LINKS[camera] = self
 
     def close(self) -> None:
-        """Give everything back, also of a camera that is gone."""
+        """Release the camera and its producer, even if the camera is disconnected."""
         with LOCK:
             if _LINKS.get(self._camera) is self:
                 del _LINKS[self._camera]
             acquirer, self._acquirer, self.streaming = self._acquirer, None, False
             if acquirer is not None:
-                quietly(lambda: acquirer.__exit__(None, None, None))  # unlike destroy(), lets go of its memory
+                ignore_errors(lambda: acquirer.__exit__(None, None, None))  # unlike destroy(), lets go of its memory
                 if acquirer.is_valid():  # it failed halfway: the second time skips what failed
-                    quietly(acquirer.destroy)
-                quietly(lambda: self._harvester.image_acquirers.remove(acquirer))
+                    ignore_errors(acquirer.destroy)
+                ignore_errors(lambda: self._harvester.image_acquirers.remove(acquirer))
             self._producer.close()
 
     def start(self) -> None:
-        """Let images flow into buffers that are all empty."""
-        with answering(self.name):
+        """Start streaming into empty buffers."""
+        with as_device_error(self.name):
             self._format = self.node_map.PixelFormat.get_int_value()
             self._acquirer.start()
         self.streaming = True
 
     def stop(self) -> None:
-        """Let none flow, and forget those that did; never raises."""
+        """Stop streaming and discard filled buffers; never raises."""
         self.streaming = False
         if self._acquirer is not None:
-            quietly(self._acquirer.stop)
+            ignore_errors(self._acquirer.stop)
 
     def drop_filled(self) -> None:
-        """Hand back unread the buffers that were filled before this call."""
+        """Return the buffers that were filled before this call, unread."""
         for _ in range(self._acquirer.num_buffers):
-            with answering(self.name):
+            with as_device_error(self.name):
                 before = self._incomplete.count
                 buffer = self._acquirer.try_fetch(timeout=_POLL_S / 5, is_raw=True)
                 if buffer is not None:
@@ -112,35 +122,35 @@ class Link:
                     return
 
     def drop_next(self, timeout_s: float) -> None:
-        """Hand back unread the next buffer, complete or not."""
+        """Return the next buffer, complete or not, unread."""
         buffer = self._wait(timeout_s)
         if buffer is not None:
-            with answering(self.name):
+            with as_device_error(self.name):
                 _hand_back(buffer)
 
     @contextlib.contextmanager
     def next(self, timeout_s: float, nbytes: Callable[[tuple[int, int], int], int]) -> Iterator[Image]:
-        """The next image; `nbytes(size, padding)` says how large one must be. Raises DeviceError for one not whole."""
+        """The next image; `nbytes(size, padding)`: the bytes required. Raises DeviceError for an incomplete one."""
         buffer = self._wait(timeout_s)
         if buffer is None:
-            raise DeviceError(_lossy(self.name))
+            raise DeviceError(_describe_incomplete_frame(self.name))
         try:
-            with answering(self.name):
+            with as_device_error(self.name):
                 image = self._image(buffer, nbytes)
             yield image
         finally:
-            quietly(lambda: _hand_back(buffer))
+            ignore_errors(lambda: _hand_back(buffer))
 
     def _wait(self, timeout_s: float) -> Any:
         """The next buffer, None for one that is incomplete.
 
-        Asked again and again with pauses of our own: the binding keeps all Python threads waiting while it waits, and
-        `fetch` begins its time anew after each incomplete buffer, and returns none of them.
+        Polled, with pauses of our own: the binding keeps all Python threads waiting while it waits, and
+        `fetch` restarts its timeout after each incomplete buffer, and returns none of them.
         """
         until = time.monotonic() + timeout_s
         before = self._incomplete.count
         while True:
-            with answering(self.name):
+            with as_device_error(self.name):
                 buffer = self._acquirer.try_fetch(timeout=_POLL_S / 5, is_raw=True)
             if buffer is not None or self._incomplete.count != before:
                 return buffer
@@ -161,11 +171,11 @@ class Link:
         needed = nbytes(size, padding)
         filled = read_info(buffer, "size_filled")
         if min(len(data), len(data) if filled is None else filled - offset) < needed:
-            raise DeviceError(_lossy(self.name))
+            raise DeviceError(_describe_incomplete_frame(self.name))
         return Image(data, size, padding)
 
 
-def _counter() -> Any:
+def _make_event_counter() -> Any:
     """A callback that counts."""
     from harvesters.core import Callback
 
@@ -181,13 +191,13 @@ def _counter() -> Any:
 def _acquirer_options() -> Any:
     from harvesters.core import ParameterKey, ParameterSet
 
-    # What nobody reads is not parsed: the chunks of a damaged buffer cannot be, which costs the buffer.
+    # Unused chunks are not parsed: the chunks of a damaged buffer cannot be, which costs the buffer.
     return ParameterSet({ParameterKey.ENABLE_AUTO_CHUNK_DATA_UPDATE: False})
 
 
 @contextlib.contextmanager
-def _interrupts_kept() -> Iterator[None]:
-    """Keep Ctrl+C what it was: harvesters makes it close the camera instead of ending the program."""
+def _preserve_sigint_handler() -> Iterator[None]:
+    """Restore the handler of Ctrl+C: harvesters' own closes the camera instead of ending the program."""
     before = signal.getsignal(signal.SIGINT)
     try:
         yield
@@ -200,7 +210,7 @@ def _hand_back(buffer: Any) -> None:
     buffer.parent.queue_buffer(buffer)
 
 
-def _lossy(name: str) -> str:
+def _describe_incomplete_frame(name: str) -> str:
     return (
         f"{name} sent an incomplete frame: use a faster port or a shorter cable, and for GigE cameras jumbo packets or "
         "a longer packet delay"

@@ -16,22 +16,22 @@ from slviewer.devices.drivers import Driver
 from slviewer.devices.opencv_controls import (
     Dialect,
     dialect_of,
+    disable_automatics,
     exposure_ms,
     set_exposure,
     set_value,
-    switch_automatics_off,
 )
 from slviewer.devices.opencv_reader import OPENING_S, Reader
-from slviewer.devices.opencv_source import connect, described, list_connected
+from slviewer.devices.opencv_source import connect, describe_source, list_connected
 from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings, Channel, check_frame, one_channel
+from slviewer.devices.protocols import CameraSettings, Channel, check_frame, extract_channel
 from slviewer.errors import DeviceError, InputError
 
 SETTLING = 3
 """Pictures that a webcam takes until an exposure that was set is the one that they have."""
 
 _IN_USE: dict[int | str, "OpenCVCamera"] = {}
-"""Who has which source open in this process: most cannot be opened a second time to ask for their size."""
+"""Who has which source open in this process: most cannot be opened a second time to query their size."""
 
 
 class OpenCVCamera(Openable):
@@ -72,7 +72,7 @@ class OpenCVCamera(Openable):
             raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
         if not all(value is None or math.isfinite(value) for value in (gain, focus, white_balance)):
             raise InputError("a gain, a focus or a white balance that is no number cannot be set: give one")
-        super().__init__(described(source))
+        super().__init__(describe_source(source))
         known = _IN_USE.get(source)
         wanted = (size[0], size[1]) if size is not None else known.size if known is not None else None
         self._source, self._connect = source, partial(connect, source, wanted)
@@ -84,21 +84,21 @@ class OpenCVCamera(Openable):
         self._next: np.ndarray | None = None  # the video's picture that was read to learn its size
         self._read, self._unsettled = 0, 0
         self._notices: dict[str, str] = {}
-        self.size: tuple[int, int] = wanted or self._probed()
+        self.size: tuple[int, int] = wanted or self._probe_size()
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What an operator should know of its settings, a sentence each."""
+        """Warnings about the settings, a sentence each."""
         return tuple(f"{self.name}: {sentence}" for sentence in self._notices.values() if sentence)
 
     def open(self) -> None:
-        """Start reading. Raises DeviceError where it does not answer, or its frames have not the size they should."""
+        """Start reading. Raises DeviceError where the source does not answer, or its frames have another size."""
         super().open()
         try:
             if self._reader is not None:
                 self._reader.join(OPENING_S)  # it may hang in a call, the device still in its hands
             self._reader = Reader(self.name, self._connect)
-            self._next, self._read = self._checked(self._reader.first()), 0
+            self._next, self._read = self._check_size(self._reader.first()), 0
             self._notices = {}
             self._reader.do(self._prepare)
             _IN_USE[self._source] = self
@@ -107,7 +107,7 @@ class OpenCVCamera(Openable):
             raise
 
     def close(self) -> None:
-        """Give it back, if need be when it returns from a call in which it hangs."""
+        """Release the source, if necessary once it returns from a blocking call."""
         if self._reader is not None:
             self._reader.close()
         if _IN_USE.get(self._source) is self:
@@ -115,29 +115,29 @@ class OpenCVCamera(Openable):
         super().close()
 
     def grab(self, out: np.ndarray) -> None:
-        """A picture whose exposure began after this call; of a video file, its next one."""
+        """Grab a picture whose exposure started after this call; of a video file, the next picture."""
         check_frame(self, out)
-        image = self._picture()
+        image = self._read_picture()
         if image.ndim == 2:
             np.copyto(out, image)
         else:
-            one_channel(image[..., ::-1], self._channel, out)
+            extract_channel(image[..., ::-1], self._channel, out)
 
     def grab_colour(self) -> np.ndarray:
-        """The same in colour; of a source that has none, three equal channels."""
-        image = self._picture()
+        """As `grab`, (h, w, 3) RGB; three equal channels for a monochrome source."""
+        image = self._read_picture()
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
 
     def settings(self) -> CameraSettings:
-        """The exposure, where the camera tells it."""
+        """The exposure, None where the camera does not report it."""
         dialect = self._dialect
-        reader = self._opened()
+        reader = self._require_reader()
         return CameraSettings(None if dialect is None else reader.do(lambda capture: exposure_ms(capture, dialect)))
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Set the exposure; what could not be set is in `notes`."""
         dialect, ms = self._dialect, settings.exposure_ms
-        reader = self._opened()
+        reader = self._require_reader()
         if dialect is not None and ms is not None:
             self._notices["exposure"] = reader.do(lambda capture: set_exposure(capture, dialect, ms))
             self._unsettled = SETTLING
@@ -145,23 +145,23 @@ class OpenCVCamera(Openable):
             self._notices["gain"] = "its gain has units of its own: set it in the rig's file, as the camera's gain"
         return self.settings()
 
-    def _opened(self) -> Reader:
+    def _require_reader(self) -> Reader:
         self.check_open()
         assert self._reader is not None
         return self._reader
 
     def _prepare(self, capture: cv2.VideoCapture) -> None:
-        """Set what is to be set at the start; on the reader's thread."""
+        """Apply the constructor's settings; called on the reader's thread."""
         dialect = self._dialect = dialect_of(capture)
         controls = (self._gain, self._focus, self._white_balance)
         if dialect is None:
-            if self._opened().live or (self._exposure_ms, *controls) != (None,) * 4:
+            if self._require_reader().live or (self._exposure_ms, *controls) != (None,) * 4:
                 self._notices["controls"] = (
                     "its exposure, gain, focus and white balance cannot be set from here: set them at the camera "
                     "itself, and switch off everything automatic"
                 )
             return
-        self._notices |= switch_automatics_off(capture, dialect)
+        self._notices |= disable_automatics(capture, dialect)
         if self._exposure_ms is not None:
             self._notices["exposure"] = set_exposure(capture, dialect, self._exposure_ms)
         properties = (cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FOCUS, dialect.white_balance)
@@ -170,13 +170,13 @@ class OpenCVCamera(Openable):
                 self._notices[what] = set_value(capture, control, value, what)
         self._unsettled = SETTLING
 
-    def _picture(self) -> np.ndarray:
-        """(h, w, 3) BGR or (h, w)."""
-        reader = self._opened()
+    def _read_picture(self) -> np.ndarray:
+        """The next valid picture, (h, w, 3) BGR or (h, w)."""
+        reader = self._require_reader()
         if reader.live:
             image = reader.picture(later=self._unsettled)
             self._unsettled = 0
-            return self._checked(image)
+            return self._check_size(image)
         following, self._next = self._next, None
         if following is None:
             read, following = reader.do(lambda capture: capture.read())
@@ -185,9 +185,9 @@ class OpenCVCamera(Openable):
                     f"{self.name} has ended after {self._read} pictures: close it and open it again to start over"
                 )
         self._read += 1
-        return self._checked(following)
+        return self._check_size(following)
 
-    def _checked(self, image: np.ndarray) -> np.ndarray:
+    def _check_size(self, image: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise DeviceError(
@@ -198,8 +198,8 @@ class OpenCVCamera(Openable):
             raise DeviceError(f"{self.name} gives {image.dtype} and not 8 bits: switch it to an 8-bit format")
         return image
 
-    def _probed(self) -> tuple[int, int]:
-        """Its size when nobody asks for one."""
+    def _probe_size(self) -> tuple[int, int]:
+        """The source's default size (width, height) px."""
         reader = Reader(self.name, self._connect)
         try:
             height, width = reader.first().shape[:2]

@@ -15,8 +15,8 @@ UNKNOWN = -1.0
 
 @dataclass(frozen=True)
 class Dialect:
-    """One backend's words. `automatics`: each automatic control, and the value that switches it off; empty where a
-    value that is set switches its own automatic off.
+    """The control conventions of one backend. `automatics`: each automatic control, and the value that switches it off;
+    empty where a value that is set switches its own automatic off.
     """
 
     to_ms: Callable[[float], float]
@@ -54,28 +54,29 @@ _DIALECTS = {
 
 
 def dialect_of(capture: cv2.VideoCapture) -> Dialect | None:
-    """How the open `capture` is spoken to; None where its controls are out of reach: those of a stream, and on macOS
-    those of any camera (cap_avfoundation_mac.mm sets a size and a frame rate only).
+    """The control conventions of the open `capture`'s backend; None where controls are not accessible: those of a
+    stream, and on macOS those of any camera (cap_avfoundation_mac.mm sets a size and a frame rate only).
     """
-    found = _DIALECTS.get(capture.getBackendName())
-    if found is _V4L2:
+    dialect = _DIALECTS.get(capture.getBackendName())
+    if dialect is _V4L2:
         capture.set(cv2.CAP_PROP_MODE, 0)
-    return found
+    return dialect
 
 
-def switch_automatics_off(capture: cv2.VideoCapture, words: Dialect) -> dict[str, str]:
-    """Leave exposure, white balance and focus at what they are now; what is to be said of those that stay automatic.
+def disable_automatics(capture: cv2.VideoCapture, words: Dialect) -> dict[str, str]:
+    """Fix exposure, white balance and focus at their current values; returns {control: warning} for those that stay
+    automatic.
 
     A pattern sequence means nothing when its frames are exposed differently.
     """
-    said = {}
+    refusals = {}
     if words.automatics:
         for what, control, off in words.automatics:
             if capture.get(control) != UNKNOWN and not (capture.set(control, off) and capture.get(control) == off):
-                said[f"automatic {what}"] = (
+                refusals[f"automatic {what}"] = (
                     f"its automatic {what} cannot be switched off: look for a switch at the camera itself"
                 )
-        return said
+        return refusals
     for what, control in (
         ("exposure", cv2.CAP_PROP_EXPOSURE),
         ("white balance", words.white_balance),
@@ -83,35 +84,35 @@ def switch_automatics_off(capture: cv2.VideoCapture, words: Dialect) -> dict[str
     ):
         now = capture.get(control)
         if now != UNKNOWN and not capture.set(control, now):
-            said[f"automatic {what}"] = (
+            refusals[f"automatic {what}"] = (
                 f"its automatic {what} cannot be switched off: do it in the system's camera settings"
             )
-    return said
+    return refusals
 
 
 def exposure_ms(capture: cv2.VideoCapture, words: Dialect) -> float | None:
-    """What is set now; None where the camera does not tell."""
+    """The current exposure, ms; None where the camera does not report it."""
     value = capture.get(cv2.CAP_PROP_EXPOSURE)
     ms = 0.0 if value == UNKNOWN else words.to_ms(value)
     return ms if 0 < ms < 1e5 else None
 
 
 def set_exposure(capture: cv2.VideoCapture, words: Dialect, ms: float) -> str:
-    """Set it to the nearest that the camera has; what is to be said if that is another, or none."""
+    """Set the exposure to the nearest supported value; returns a warning if that differs or failed, else ""."""
     value = words.from_ms(ms)
     capture.set(cv2.CAP_PROP_EXPOSURE, value)
-    taken = exposure_ms(capture, words)
-    if taken is None:
+    applied = exposure_ms(capture, words)
+    if applied is None:
         return "its exposure cannot be set: set it at the camera itself"
-    if abs(taken - ms) > 0.01 * ms:
-        return f"its exposure is {taken:g} ms, {ms:g} ms were asked for"
+    if abs(applied - ms) > 0.01 * ms:
+        return f"its exposure is {applied:g} ms, {ms:g} ms were requested"
     return ""
 
 
 def set_value(capture: cv2.VideoCapture, control: int, value: float, what: str) -> str:
-    """Set a control in the camera's own units; what is to be said if it then has another value, or none."""
+    """Set a control, in the camera's units; returns a warning if the value differs or was not set, else ""."""
     capture.set(control, value)
-    taken = capture.get(control)
-    if taken == UNKNOWN != value:
+    applied = capture.get(control)
+    if applied == UNKNOWN != value:
         return f"its {what} cannot be set: set it at the camera itself"
-    return "" if abs(taken - value) < 0.5 else f"its {what} is {taken:g}, {value:g} was asked for"
+    return "" if abs(applied - value) < 0.5 else f"its {what} is {applied:g}, {value:g} was requested"

@@ -1,7 +1,7 @@
 """One video capture on a thread of its own, which alone knows which of its pictures are new.
 
 Calls into a capture may block for as long as a driver or a network likes, so that whoever needs a picture waits here,
-and not longer than `PATIENCE_S`. A live source is read without a break, wanted or not: what nobody reads piles up in
+and not longer than `PATIENCE_S`. A live source is read without a break, wanted or not: unread pictures pile up in
 the buffers of the driver, of the network and of the sender, and comes out later as if it were new.
 """
 
@@ -24,8 +24,9 @@ OPENING_S = 6.0
 """A webcam's driver may take seconds to start it."""
 
 FRAMES = 3
-"""The first picture that arrives after a question was being exposed before it. So may the second have been, by a sensor
-that exposes its next picture while it reads out the one before; the third began after it."""
+"""The exposure of the first picture that arrives after a request started before it. So may the second have been, by a
+sensor that exposes its next picture while it reads out the previous one; that of the third started after it.
+"""
 
 _WARM_UP_S = 0.5
 _ENDED_S = 0.5
@@ -47,16 +48,16 @@ class Connected:
 
 
 class Pace:
-    """Tells by the rhythm of their arrival which pictures are new and which have waited in a buffer."""
+    """Distinguishes new pictures from buffered ones by the rhythm of their arrival."""
 
     def __init__(self) -> None:
         self._arrivals: deque[tuple[float, float]] = deque()
 
     def add(self, now: float, busy: float) -> float | None:
-        """A picture arrives at `now` s, when the reader has computed for `busy` s in all.
+        """Add a picture that arrived at `now` s, when the reader had computed for `busy` s in all.
 
-        The time since the one before, in mean frame periods; None before three have arrived. The mean is taken over
-        seconds, so that pictures which come in clumps, or in a flood after a pause, do not shorten it.
+        Returns the time since the previous one in mean frame periods; None before three have arrived. The mean is taken
+        over seconds, so that pictures which come in clumps, or in a flood after a pause, do not shorten it.
         """
         arrivals = self._arrivals
         periods = None
@@ -98,16 +99,16 @@ class _Job:
 
 
 class _Wanted:
-    """A picture that somebody waits for, after so many that count."""
+    """A requested picture: the last of the next `frames` new ones."""
 
     def __init__(self, frames: int) -> None:
-        self.left = frames
+        self.remaining = frames
         self.paused = False
         self.image: np.ndarray | None = None
 
 
 class Reader:
-    """Reads what `connect` opens, from when it is made until `close`. Its methods belong to one other thread.
+    """Reads the capture that `connect` opens, until `close`. Its methods are called from one other thread.
 
     `connect` may raise DeviceError. So does every method once the source is lost: make another reader then.
     """
@@ -139,7 +140,7 @@ class Reader:
             return self._first
 
     def do(self, work: Callable[[cv2.VideoCapture], T]) -> T:
-        """What `work(capture)` returns, done on the reader's thread between two pictures."""
+        """Run `work(capture)` on the reader's thread between two pictures; returns its result."""
         job = _Job(work)
         with self._condition:
             self._jobs.append(job)
@@ -148,7 +149,7 @@ class Reader:
         return job.result()
 
     def picture(self, later: int = 0) -> np.ndarray:
-        """A live source's picture, its exposure begun after this call, or `later` pictures after that one.
+        """A live source's first picture exposed after this call, or the one `later` pictures after that.
 
         The delay within an encoder and a network cannot be seen from here: it is the rig's to measure and to wait for.
         """
@@ -157,37 +158,37 @@ class Reader:
             self._wanted = wanted
             try:
                 # some sources may be slow and others may come in clumps: the end is when nothing counts for too long
-                self._wait(lambda: wanted.image is not None, PATIENCE_S, PATIENCE_S * wanted.left)
+                self._wait(lambda: wanted.image is not None, PATIENCE_S, PATIENCE_S * wanted.remaining)
             finally:
                 self._wanted = None
         assert wanted.image is not None
         return wanted.image
 
     def close(self) -> None:
-        """Give the capture back, at once or when it returns from the call in which it hangs."""
+        """Release the capture, at once or when it returns from a blocking call."""
         with self._condition:
             self._closing = True
             self._condition.notify_all()
         self.join(0.5)
 
     def join(self, timeout_s: float) -> None:
-        """Wait until the capture has been given back."""
+        """Wait until the capture is released."""
         self._thread.join(timeout_s)
 
     def _wait(self, ready: Callable[[], bool], patience_s: float, longest_s: float = 0.0) -> None:
-        """Until `ready()`, on the condition. Raises DeviceError once no picture has come for `patience_s`."""
-        asked = time.monotonic()
+        """Wait for `ready()` on the condition. Raises DeviceError once no picture has come for `patience_s`."""
+        requested_s = time.monotonic()
         while not ready():
             if self._lost:
                 raise DeviceError(self._lost)
             now = time.monotonic()
-            silent = now - max(self._arrived, asked) if longest_s else now - asked
+            silent = now - max(self._arrived, requested_s) if longest_s else now - requested_s
             if silent > patience_s:
                 raise DeviceError(
                     f"{self._name} gave no picture within {patience_s:g} s: check its cable and whether another "
                     "program uses it"
                 )
-            if longest_s and now - asked > longest_s:
+            if longest_s and now - requested_s > longest_s:
                 raise DeviceError(
                     f"the pictures of {self._name} come too unevenly to tell new ones from old ones: "
                     "use a cable instead of a radio link, or a lower frame rate"
@@ -201,7 +202,7 @@ class Reader:
         try:
             connected = self._connect()
             capture = connected.capture
-            self._begin(connected)
+            self._read_first(connected)
             while not self._closing:
                 with self._condition:
                     if not connected.live:
@@ -216,20 +217,20 @@ class Reader:
                 if connected.live and not self._closing:
                     self._read(connected)
         except DeviceError as error:
-            self._give_up(str(error))
+            self._report_loss(str(error))
         except Exception as error:
-            self._give_up(f"{self._name} failed ({error}): close it and open it again")
+            self._report_loss(f"{self._name} failed ({error}): close it and open it again")
         finally:
             if capture is not None:
                 capture.release()
 
-    def _begin(self, connected: Connected) -> None:
-        """The first good picture. What comes at first may be dark, and out of the buffers that opening has filled."""
-        begun = time.monotonic()
+    def _read_first(self, connected: Connected) -> None:
+        """Read the first valid picture; the earliest may be dark, or from buffers filled while opening."""
+        start_s = time.monotonic()
         read, image = connected.capture.read()
         frames = 1
         while connected.live and not self._closing:
-            late = time.monotonic() - begun
+            late = time.monotonic() - start_s
             if (read and frames > 2 and late > _WARM_UP_S) or (not read and late > PATIENCE_S):
                 break
             if not read:
@@ -238,14 +239,15 @@ class Reader:
             frames += read
         if not read:
             raise DeviceError(
-                f"{self._name} was found and gives no picture: check whether another program uses it, or another size"
+                f"{self._name} was detected and gives no picture: check whether another program uses it, or choose "
+                "another size"
             )
         with self._condition:
             self._first, self._live, self._arrived = image, connected.live, time.monotonic()
             self._condition.notify_all()
 
     def _read(self, connected: Connected) -> None:
-        """The next picture of a live source, unpacked only if it is the one that is wanted."""
+        """Read the next picture of a live source, decoded only if it is the requested one."""
         image = None
         if connected.grab_waits:
             read = connected.capture.grab()
@@ -265,8 +267,8 @@ class Reader:
         if periods > 2 and not wanted.paused:  # after a pause of the reader's own, the first of those that waited
             wanted.paused = True
             return
-        wanted.left -= 1
-        if wanted.left > 0:
+        wanted.remaining -= 1
+        if wanted.remaining > 0:
             return
         if self._pace.saturated:
             raise DeviceError(
@@ -280,7 +282,7 @@ class Reader:
                 wanted.image = image
                 self._condition.notify_all()
 
-    def _give_up(self, why: str) -> None:
+    def _report_loss(self, why: str) -> None:
         with self._condition:
             self._lost = why
             self._condition.notify_all()

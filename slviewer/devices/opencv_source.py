@@ -15,12 +15,12 @@ from slviewer.errors import DeviceError
 _WEBCAMS = {"win32": (cv2.CAP_DSHOW, cv2.CAP_MSMF), "darwin": (cv2.CAP_AVFOUNDATION,)}.get(
     sys.platform, (cv2.CAP_V4L2,)
 )
-_TRIED = 4  # webcams, where the system lists none
+_MAX_WEBCAMS = 4  # webcams, where the system lists none
 _SYSFS = Path("/sys/class/video4linux")
 
 
-def described(source: int | str) -> str:
-    """What an operator calls it; an address without the password in it."""
+def describe_source(source: int | str) -> str:
+    """The source's name for messages; an address without its password."""
     if isinstance(source, int):
         return f"the camera {source}"
     if _is_address(source):
@@ -30,15 +30,15 @@ def described(source: int | str) -> str:
 
 
 def connect(source: int | str, size: tuple[int, int] | None) -> Connected:
-    """Open it, a webcam at `size` (width, height) px if it has it. Raises DeviceError."""
-    _quieten()
+    """Open a source, a webcam at `size` (width, height) px where supported. Raises DeviceError."""
+    _silence_libraries()
     if isinstance(source, int) or _is_device(source):
-        return _webcam(source, size)
-    name = described(source)
+        return _open_webcam(source, size)
+    name = describe_source(source)
     if _is_address(source):
         limit = int(1000 * PATIENCE_S)
         # one thread: a decoder that works on several pictures at once keeps as many of them back. A stream that changes
-        # its size is scaled to the one that it had, and nothing tells
+        # its size is scaled to the previous one, without notice
         options = {
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: limit,
             cv2.CAP_PROP_READ_TIMEOUT_MSEC: limit,
@@ -59,21 +59,21 @@ def connect(source: int | str, size: tuple[int, int] | None) -> Connected:
 
 
 def list_connected() -> list[str]:
-    """Webcams that are connected, a line each. Where the system lists them, none is opened for it."""
+    """The connected webcams, a line each; opened only where the system does not list them."""
     if sys.platform == "linux":
-        return listed(_SYSFS)
-    _quieten()
+        return list_sysfs_webcams(_SYSFS)
+    _silence_libraries()
     lines = []
-    for index in range(_TRIED):
+    for index in range(_MAX_WEBCAMS):
         with contextlib.suppress(DeviceError):
-            connected = _webcam(index, None)
+            connected = _open_webcam(index, None)
             lines.append(f"source {index}")
             connected.capture.release()
     return lines
 
 
-def listed(sysfs: Path) -> list[str]:
-    """The same from Linux's list: its names, and who may not be opened. A camera's further nodes carry no pictures."""
+def list_sysfs_webcams(sysfs: Path) -> list[str]:
+    """As `list_connected`, from Linux's sysfs, with missing permissions. A camera's further nodes carry no pictures."""
     lines = []
     for node in sorted(sysfs.glob("video*"), key=lambda node: (len(node.name), node.name)):
         with contextlib.suppress(OSError):
@@ -84,26 +84,26 @@ def listed(sysfs: Path) -> list[str]:
     return lines
 
 
-def _webcam(source: int | str, size: tuple[int, int] | None) -> Connected:
+def _open_webcam(source: int | str, size: tuple[int, int] | None) -> Connected:
     for backend in _WEBCAMS:
         capture = cv2.VideoCapture(source, backend)
         if capture.isOpened():
             break
     else:
         raise DeviceError(
-            f"{described(source)} does not answer: check its cable, whether another program uses it, and what "
+            f"{describe_source(source)} does not answer: check its cable, whether another program uses it, and what "
             "`slviewer devices` finds"
         )
-    if size is not None and not _sized(capture, size):
+    if size is not None and not _set_size(capture, size):
         # many webcams have their larger sizes compressed only, and OpenCV tries that last
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
-        _sized(capture, size)
-    # DirectShow's grab only asks whether the camera is there (cap_dshow.cpp: grabFrame)
+        _set_size(capture, size)
+    # DirectShow's grab only checks whether the camera is there (cap_dshow.cpp: grabFrame)
     return Connected(capture, live=True, grab_waits=backend != cv2.CAP_DSHOW)
 
 
-def _sized(capture: cv2.VideoCapture, size: tuple[int, int]) -> bool:
-    """Switch to `size`; whether the camera has it."""
+def _set_size(capture: cv2.VideoCapture, size: tuple[int, int]) -> bool:
+    """Switch to `size`; returns whether the camera supports it."""
     sides = dict(zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), size, strict=True))
     for side, pixels in sides.items():
         capture.set(side, pixels)
@@ -118,8 +118,8 @@ def _is_device(source: str) -> bool:
     return source.startswith("/dev/")
 
 
-def _quieten() -> None:
-    """Keep the libraries' own words out of the terminal: what matters is raised. What somebody set to debug, stays."""
+def _silence_libraries() -> None:
+    """Silence the libraries' terminal output, unless a log level is set: errors are raised."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s until a webcam without pictures is given up
     if "OPENCV_LOG_LEVEL" not in os.environ:

@@ -1,4 +1,4 @@
-"""Open or closed: what devices without hardware have in common."""
+"""Base class of devices without hardware: they are open or closed."""
 
 from slviewer.errors import DeviceError
 
@@ -11,13 +11,13 @@ class Openable:
         self._open = False
 
     def open(self) -> None:
-        """Ready for work. Raises DeviceError if it is open already."""
+        """Open the device. Raises DeviceError if it is open already."""
         if self._open:
             raise DeviceError(f"{self.name} is open already: close it first")
         self._open = True
 
     def close(self) -> None:
-        """No longer ready; nothing happens when it is not open."""
+        """Close the device; nothing happens when it is not open."""
         self._open = False
 
     def check_open(self) -> None:

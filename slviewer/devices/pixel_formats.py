@@ -57,12 +57,12 @@ class PixelFormat:
 
     @property
     def colour(self) -> bool:
-        """Whether it tells colours."""
+        """Whether it carries colour."""
         return self.kind != "Mono"
 
     @property
     def samples(self) -> int:
-        """Numbers for a pixel."""
+        """Samples per pixel."""
         return len(self.kind) if self.kind in _ORDERS else 1
 
     def nbytes(self, size: tuple[int, int], padding: int = 0) -> int:
@@ -89,8 +89,8 @@ class PixelFormat:
         else:
             np.copyto(out.reshape(rows, used // 2), np.ascontiguousarray(lines).view("<u2"))
 
-    def samples_of(self, data: np.ndarray, size: tuple[int, int], padding: int = 0) -> np.ndarray:
-        """(h, w), or (h, w, samples), of `dtype`: the buffer's own bytes where they are such an array already."""
+    def view_samples(self, data: np.ndarray, size: tuple[int, int], padding: int = 0) -> np.ndarray:
+        """A buffer's samples (h, w), or (h, w, samples), of `dtype`: a view where they need no unpacking."""
         width, height = size
         shape = (height, width) if self.samples == 1 else (height, width, self.samples)
         if self.bits == 8 and padding == 0:
@@ -100,7 +100,7 @@ class PixelFormat:
         return out
 
     def rgb(self, samples: np.ndarray) -> np.ndarray:
-        """(h, w, 3) RGB of what `samples_of` gives; only a Bayer mosaic is copied, its gaps are filled linearly."""
+        """Convert the result of `view_samples` to (h, w, 3) RGB; a Bayer mosaic is interpolated linearly."""
         if self.kind in _ORDERS:
             reverse = _ORDERS[self.kind] == (2, 1, 0)
             return samples[..., 2::-1] if reverse else samples[..., :3]
@@ -110,7 +110,7 @@ class PixelFormat:
 
 
 def pixel_format(name: str) -> PixelFormat | None:
-    """The format called so; None for one that is not read here."""
+    """The format called `name`; None for an unsupported one."""
     match = _NAME.fullmatch(name)
     if match is None:
         return None
@@ -124,13 +124,13 @@ def pixel_format(name: str) -> PixelFormat | None:
 
 
 def best_format(names: Sequence[str]) -> PixelFormat | None:
-    """The one to use among those that a camera offers, None if none can be read.
+    """The best of the formats `names` that a camera offers, None if none is supported.
 
     Unpacked and up to 12 bits deep where there is such a one; a camera that offers colours is a colour camera, and
     its mosaic comes before colours that it would fill in itself and send as three.
     """
-    formats = [found for name in names if (found := pixel_format(name)) is not None and found.bits <= 12]
-    colours = [found for found in formats if found.colour]
+    formats = [candidate for name in names if (candidate := pixel_format(name)) is not None and candidate.bits <= 12]
+    colours = [candidate for candidate in formats if candidate.colour]
     return max(colours or formats, key=lambda f: (not f.packing, f.samples == 1, f.bits, -f.samples), default=None)
 
 
@@ -144,11 +144,11 @@ def _unpack(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[
     if groups * count != out.shape[1]:
         whole = np.empty((len(out), groups * count), np.uint16)
     for k, parts in enumerate(pixels):
-        first, second = (_moved(lines[:, byte::group] & np.uint8(bits), left) for byte, bits, left in parts)
+        first, second = (_shift_bits(lines[:, byte::group] & np.uint8(bits), shift) for byte, bits, shift in parts)
         np.bitwise_or(first, second, out=whole[:, k::count])
     if whole is not out:
         out[:] = whole[:, : out.shape[1]]
 
 
-def _moved(bits: np.ndarray, left: int) -> np.ndarray:
-    return np.left_shift(bits, left, dtype=np.uint16) if left > 0 else np.right_shift(bits, -left, dtype=np.uint16)
+def _shift_bits(bits: np.ndarray, shift: int) -> np.ndarray:
+    return np.left_shift(bits, shift, dtype=np.uint16) if shift > 0 else np.right_shift(bits, -shift, dtype=np.uint16)

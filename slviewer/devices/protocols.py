@@ -1,4 +1,4 @@
-"""What a camera and a projector can be asked: as little as a structured-light rig needs.
+"""Protocols of cameras and projectors: as little as a structured-light rig needs.
 
 A device belongs to the thread that opened it. Every method raises `DeviceError` when the device does not answer, is not
 open or was unplugged; after that, `close` and `open` are the way back, and `close` never raises.
@@ -37,7 +37,7 @@ class Camera(Protocol):
 
     @property
     def name(self) -> str:
-        """What an operator calls it, fit to begin a sentence with, such as "the simulated camera"."""
+        """The operator's name for it, to start a sentence with, such as "the simulated camera"."""
         ...
 
     @property
@@ -59,24 +59,24 @@ class Camera(Protocol):
         ...
 
     def grab(self, out: np.ndarray) -> None:
-        """Fill `out` (h, w) of `dtype` with a frame whose exposure began after the projector last said "shown"."""
+        """Fill `out` (h, w) of `dtype` with a frame exposed after the projector last reported "shown"."""
         ...
 
     def settings(self) -> CameraSettings:
-        """What is set now, read from the device."""
+        """The current settings, read from the device."""
         ...
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set it, and return what the device really took: the nearest it can do."""
+        """Apply the settings, and return those in effect: the nearest that the device supports."""
         ...
 
 
 @runtime_checkable
 class ColourCamera(Camera, Protocol):
-    """A camera that also sees colour: `grab` fills one channel, and a texture may be taken in all three."""
+    """A camera that also sees colour: `grab` fills one channel, and a texture has all three."""
 
     def grab_colour(self) -> np.ndarray:
-        """A fresh (h, w, 3) RGB frame of `dtype`, under the same promise as `grab`."""
+        """Grab a new (h, w, 3) RGB frame of `dtype`, exposed as `grab` requires."""
         ...
 
 
@@ -84,7 +84,7 @@ Channel = Literal["red", "green", "blue", "grey"]
 """What a colour camera decodes; green has the most pixels under a Bayer mosaic, and the most light of most lamps."""
 
 
-def one_channel(rgb: np.ndarray, channel: Channel, out: np.ndarray) -> None:
+def extract_channel(rgb: np.ndarray, channel: Channel, out: np.ndarray) -> None:
     """Fill `out` (h, w) with one channel of (h, w, 3) RGB, or with their mean."""
     if channel == "grey":
         np.copyto(out, rgb.mean(axis=2) + 0.5, casting="unsafe")
@@ -93,11 +93,11 @@ def one_channel(rgb: np.ndarray, channel: Channel, out: np.ndarray) -> None:
 
 
 class Projector(Protocol):
-    """Shows one image until it is told to show another; `name` and `size` can be read before it is open."""
+    """Shows one image until another is requested; `name` and `size` can be read before it is open."""
 
     @property
     def name(self) -> str:
-        """What an operator calls it, fit to begin a sentence with."""
+        """The operator's name for it, to start a sentence with."""
         ...
 
     @property
@@ -114,7 +114,7 @@ class Projector(Protocol):
         ...
 
     def load(self, sequence: PatternSequence) -> None:
-        """Make ready to show any frame of `sequence` at once; replaces what was loaded, and shows nothing yet.
+        """Load `sequence`, so that `show` is immediate; replaces the previous sequence, and shows nothing yet.
 
         Raises InputError for patterns that are not of the projector's size.
         """

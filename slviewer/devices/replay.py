@@ -14,13 +14,13 @@ class Recording:
     """Frames (n, h, w), uint8 or uint16, and the sequence that was projected; `play` puts another in its place."""
 
     def __init__(self, frames: np.ndarray, sequence: PatternSequence) -> None:
-        _check(frames, sequence)
+        _check_recording(frames, sequence)
         self.played = (frames, sequence)
-        self.seen: np.ndarray | None = None  # (h, w) that belongs to what the projector shows; None: was not recorded
+        self.visible_frame: np.ndarray | None = None  # (h, w) of the pattern shown; None: not recorded
 
     def play(self, frames: np.ndarray, sequence: PatternSequence) -> None:
         """Play another capture of the same rig, from any thread; a capture that is running ends with the old one."""
-        _check(frames, sequence)
+        _check_recording(frames, sequence)
         before, projector = self.played[0], self.played[1].projector
         if frames.shape[1:] != before.shape[1:] or frames.dtype != before.dtype or sequence.projector != projector:
             raise InputError(
@@ -31,7 +31,7 @@ class Recording:
 
 
 class ReplayCamera(Openable):
-    """Sees the recorded frames. Its settings are unknown and stay as they were: what was recorded was recorded."""
+    """Returns the recorded frames. Its settings are unknown and cannot be changed."""
 
     def __init__(self, recording: Recording) -> None:
         super().__init__("the replay camera")
@@ -43,22 +43,22 @@ class ReplayCamera(Openable):
         """The recorded frame of the pattern shown; under even light of any level, the recorded texture."""
         self.check_open()
         check_frame(self, out)
-        if self._recording.seen is None:
+        if self._recording.visible_frame is None:
             raise DeviceError("the recording holds no dark frame: show a pattern or light")
-        out[:] = self._recording.seen
+        out[:] = self._recording.visible_frame
 
     def settings(self) -> CameraSettings:
-        """Nothing known."""
+        """Unknown settings: all None."""
         self.check_open()
         return CameraSettings()
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Nothing set."""
+        """Set nothing; returns unknown settings."""
         return self.settings()
 
 
 class ReplayProjector(Openable):
-    """Shows what was shown then, and refuses anything else."""
+    """Accepts the recorded sequence, and refuses any other."""
 
     def __init__(self, recording: Recording) -> None:
         super().__init__("the replay projector")
@@ -67,7 +67,7 @@ class ReplayProjector(Openable):
         self.size = recording.played[1].projector
 
     def open(self) -> None:
-        """Ready, dark, nothing loaded."""
+        """Open the projector: dark, nothing loaded."""
         super().open()
         self._loaded = None
         self.show_level(None)
@@ -78,44 +78,44 @@ class ReplayProjector(Openable):
         played = self._recording.played
         if sequence != played[1]:
             raise DeviceError(
-                f"the recording answers only to the patterns it was made with, {_described(played[1])}, "
-                f"and was asked for {_described(sequence)}: capture with its own sequence"
+                f"the recording answers only to the patterns it was made with, {_describe_sequence(played[1])}, "
+                f"and was asked for {_describe_sequence(sequence)}: capture with its own sequence"
             )
         self._loaded = played
 
     def show(self, index: int) -> None:
-        """Let the camera see that frame."""
+        """Make frame `index` the camera's next one."""
         self.check_open()
         frames, sequence = self._loaded or (None, None)
         check_index(self, sequence, index)
         assert frames is not None
-        self._recording.seen = frames[index]
+        self._recording.visible_frame = frames[index]
 
     def show_level(self, grey: int | None) -> None:
-        """Even light as far as the recording has it: its texture, or its dark frame."""
+        """Show even light as the recording has it: its texture, or its dark frame."""
         self.check_open()
         frames, sequence = self._recording.played
         if check_level(grey):
-            self._recording.seen = texture(sequence, frames)
+            self._recording.visible_frame = texture(sequence, frames)
         else:
             dark = [i for i, frame in enumerate(sequence.frames) if frame.kind == "black"]
-            self._recording.seen = frames[dark[0]] if dark else None
+            self._recording.visible_frame = frames[dark[0]] if dark else None
 
 
 def replay(frames: np.ndarray, sequence: PatternSequence) -> Rig:
-    """The rig that took `frames` (n, h, w) of `sequence`; they are not copied. Raises InputError if they don't fit."""
-    return replayed(Recording(frames, sequence))
+    """A rig that replays `frames` (n, h, w) of `sequence`, not copied. Raises InputError if they do not fit."""
+    return recording_rig(Recording(frames, sequence))
 
 
-def replayed(recording: Recording) -> Rig:
-    """The rig of a recording whose owner will `play` more captures on it."""
+def recording_rig(recording: Recording) -> Rig:
+    """A rig that replays `recording`, on which more captures can be played later."""
     return Rig("replay", ReplayCamera(recording), ReplayProjector(recording))
 
 
 DRIVER = Driver("replay", "a recorded capture, played back", needs="frames and their pattern sequence", rig=replay)
 
 
-def _check(frames: np.ndarray, sequence: PatternSequence) -> None:
+def _check_recording(frames: np.ndarray, sequence: PatternSequence) -> None:
     if frames.ndim != 3 or frames.dtype not in (np.uint8, np.uint16) or len(frames) != len(sequence.frames):
         raise InputError(
             f"{len(sequence.frames)} frames (n, h, w) of uint8 or uint16 are needed for this sequence, "
@@ -123,7 +123,7 @@ def _check(frames: np.ndarray, sequence: PatternSequence) -> None:
         )
 
 
-def _described(sequence: PatternSequence) -> str:
+def _describe_sequence(sequence: PatternSequence) -> str:
     width, height = sequence.projector
     kinds = sorted({frame.kind for frame in sequence.frames})
     periods = sorted({frame.period_px for frame in sequence.frames if frame.kind == "phase"})

@@ -14,7 +14,7 @@ class Screen(msgspec.Struct, frozen=True):
     """What the page reports of its window.
 
     `dpr`: device pixels per page pixel. `inner`, `whole`: (width, height) of the window's inside and of its screen in
-    page pixels. `box`: the inside in device pixels as the browser laid it out, None where a browser does not tell.
+    page pixels. `box`: the inside in device pixels as the browser laid it out, None where a browser does not report it.
     `full`: shown full screen on request. `settled`: the browser no longer shows over the page that Esc leaves full
     screen. `pinched`: magnification by touch.
     """
@@ -30,7 +30,7 @@ class Screen(msgspec.Struct, frozen=True):
 
     @property
     def full_screen(self) -> bool:
-        """Whether it is shown so, on request or because it was opened so (kiosk, F11)."""
+        """Whether the window is full screen, on request or because it was opened so (kiosk, F11)."""
         return self.full or self.inner == self.whole
 
     @property
@@ -40,7 +40,7 @@ class Screen(msgspec.Struct, frozen=True):
         return round(width * self.dpr), round(height * self.dpr)
 
     @property
-    def exact(self) -> bool:
+    def is_pixel_exact(self) -> bool:
         """Whether the window is a whole number of device pixels wide and high."""
         sides = [self.dpr * side for side in self.inner]
         whole = tuple(round(side) for side in sides)
@@ -63,14 +63,14 @@ def refusal(screen: Screen, size: tuple[int, int] | None) -> str:
         )
     if abs(screen.pinched - 1) > 1e-3:
         return "the projector page is magnified by touch: pinch it back to its normal size, or reload it"
-    if not screen.exact:
+    if not screen.is_pixel_exact:
         width, height = (screen.dpr * side for side in screen.inner)
         return (
             f"the projector page would resample the patterns, its window is {width:g} x {height:g} px at "
             f"{screen.dpr:g} px per page pixel: set the scaling of the projector's display to 100 % in the system's "
             "display settings, and the page's zoom to 100 % (Ctrl+0)"
         )
-    if screen.inner != screen.whole:  # zoomed, beside a bar, or full screen inside a tab that is recorded
+    if screen.inner != screen.whole:  # zoomed, next to a bar, or full screen inside a tab that is recorded
         (width, height), (columns, rows) = screen.inner, screen.whole
         return (
             f"the projector page is full screen and {width} x {height} page pixels large where its screen has "

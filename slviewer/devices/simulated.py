@@ -1,4 +1,4 @@
-"""The simulated rig as one more pair of drivers: it sees what stands in its `SimulatedWorld`."""
+"""Simulated camera and projector: drivers that capture the content of a `SimulatedWorld`."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,9 @@ from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 
 AUTO = CameraSettings(exposure_ms=1.0, gain=1.0)
-"""At 1 ms the brightest half percent of the lit scene reach the sensor's `peak_level` in white light, near or far."""
+"""At 1 ms the brightest half percent of the illuminated scene reach the sensor's `peak_level` in white light, near or
+far.
+"""
 
 _EXPOSURES_MS = (0.01, 100.0)
 _GAINS = (1.0, 16.0)
@@ -32,15 +34,15 @@ class SimulatedCamera(Openable):
         self.size = world.rig.camera.size
         self.world = world
         self._settings = AUTO
-        self._seen: tuple[Shown | None, int] = (None, 0)
+        self._last_grab: tuple[Shown | None, int] = (None, 0)
 
     def grab(self, out: np.ndarray) -> None:
-        """What the projector shows on what stands there now; every frame has noise of its own."""
+        """Render the current scene under the projected pattern; every frame has its own noise."""
         self.check_open()
         check_frame(self, out)
         shown = self.world.shown
-        grabs = self._seen[1] + 1 if self._seen[0] is shown else 0
-        self._seen = (shown, grabs)
+        grabs = self._last_grab[1] + 1 if self._last_grab[0] is shown else 0
+        self._last_grab = (shown, grabs)
         keys = np.random.default_rng([*shown.seed, grabs]).integers(0, 2**32, 2, dtype=np.uint32)
         renderer = self.world.renderer(shown.preview)
         width, height = renderer.rig.camera.size
@@ -71,7 +73,7 @@ class SimulatedCamera(Openable):
 
 
 class SimulatedProjector(Openable):
-    """Throws patterns into the world. The same captures in the same order have the same noise, previews or not."""
+    """Projects patterns into the world. The same captures in the same order have the same noise, previews or not."""
 
     def __init__(self, world: SimulatedWorld) -> None:
         super().__init__("the simulated projector")
@@ -88,7 +90,7 @@ class SimulatedProjector(Openable):
         self.show_level(None)
 
     def close(self) -> None:
-        """Dark, and no longer ready."""
+        """Show dark, and close."""
         if self._open:
             self.show_level(None)
         super().close()
@@ -102,7 +104,7 @@ class SimulatedProjector(Openable):
         self._loads, self._shows = self._loads + 1, 0
 
     def show(self, index: int) -> None:
-        """Show one of them."""
+        """Show frame `index`."""
         self.check_open()
         check_index(self, self._sequence, index)
         self._show(self._profiles[index], preview=False)
@@ -126,7 +128,7 @@ def simulated_rig(world: SimulatedWorld) -> Rig:
 
 
 def preset_rig(preset: str = "letter", scale: float = 1.0, seed: int = 0, board: str = "circles:21x16:9") -> Rig:
-    """A preset's rig before a board, such as "circles:21x16:9"; the camera's size is the preset's times `scale`."""
+    """A preset's rig and a board, such as "circles:21x16:9"; the camera's size is the preset's times `scale`."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     return simulated_rig(SimulatedWorld(letter(scale, seed), Board.parse(board)))

@@ -1,4 +1,4 @@
-"""What stands before the simulated rig, and the light that its projector throws on it."""
+"""The scene of the simulated rig, and the light that its projector throws on it."""
 
 import threading
 import time
@@ -19,7 +19,7 @@ from slviewer.target.board import Board
 Thing = Literal["board", "plane", "sphere", "object"]
 """The printed target, the blank plate, the Letter's sphere, the demo object."""
 
-_FIRST_PLACES_MM: dict[Thing, float] = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0}
+_INITIAL_DEPTHS_MM: dict[Thing, float] = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0}
 _SETTLED_S = 0.3  # a thing that has not been moved for so long is rendered in full by a preview too
 _DRAFT_SCALE = 0.25  # of a preview while things move: the geometry of 400x300 rays instead of 1600x1200
 
@@ -40,7 +40,7 @@ class Shown:
 class SimulatedWorld:
     """One rig's surroundings, shared by its camera and its projector. Things may be moved from any thread.
 
-    One thing stands there at a time, and each keeps its place while another does. A pose is T_camera_thing: the board's
+    One thing is in view at a time; the others keep their poses for later. A pose is T_camera_thing: the board's
     origin is its first feature, the plane's its middle, the sphere's its centre, the object's its own.
     """
 
@@ -50,8 +50,8 @@ class SimulatedWorld:
         self._draft_rig = replace(rig, camera=replace(rig.camera, scale=min(rig.camera.scale, _DRAFT_SCALE)))
         self._lock = threading.RLock()
         self._things: dict[Thing, Scene] = {
-            "plane": blank_board(_facing("plane")),
-            "sphere": sphere((0.0, 0.0, _FIRST_PLACES_MM["sphere"])),
+            "plane": blank_board(_initial_pose("plane")),
+            "sphere": sphere((0.0, 0.0, _INITIAL_DEPTHS_MM["sphere"])),
         }
         self._standing: Thing = "board"
         self._moved = time.monotonic()
@@ -60,63 +60,63 @@ class SimulatedWorld:
 
     @property
     def standing(self) -> Thing:
-        """What stands before the rig."""
+        """The kind of thing in view."""
         return self._standing
 
     @property
     def scene(self) -> Scene:
-        """The same for a `Renderer`, whose truth is this world's truth."""
+        """The thing in view as a scene for a `Renderer`, whose truth is this world's truth."""
         with self._lock:
             return self._things[self._standing]
 
     @property
     def board(self) -> Board:
-        """What is printed on the board."""
+        """The printed board geometry."""
         board = self._board().board
         assert board is not None
         return board
 
     @property
     def shape(self) -> BoardShape:
-        """How far the board is from flat, and its features from their places."""
+        """The board's deviation from flat, and of its features from their nominal positions."""
         return self._board().shape
 
     @property
     def pose(self) -> Pose:
-        """Where the thing that stands there is; a sphere's is not turned."""
-        return _pose(self.scene)
+        """T_camera_thing of the thing in view; identity rotation for a sphere."""
+        return _pose_of(self.scene)
 
     @property
     def turn_deg(self) -> float:
-        """By how much it is turned about the vertical."""
+        """Rotation of the thing in view about the vertical, degrees."""
         R = self.pose.R
         return float(np.degrees(np.arctan2(R[0, 2], R[2, 2])))
 
     def print_board(self, board: Board, shape: BoardShape = FLAT) -> None:
-        """Take another board, its middle on the camera's axis; it does not replace what stands before the rig.
+        """Replace the board by another, centred on the camera's axis; the thing in view stays the same.
 
         Raises InputError for ChArUco boards, which the simulation does not print.
         """
         middle = (board.points.min(0) + board.points.max(0)) / 2
-        pose = Pose(np.eye(3), np.array([0, 0, _FIRST_PLACES_MM["board"]]) - middle)
+        pose = Pose(np.eye(3), np.array([0, 0, _INITIAL_DEPTHS_MM["board"]]) - middle)
         self._put("board", printed_board(board, pose, shape, self.rig.seed))
 
     def place(self, thing: Thing, pose: Pose | None = None) -> None:
-        """Let `thing` stand at T_camera_thing, in place of whatever stood there; None: where it stood before."""
+        """Put `thing` in view at T_camera_thing, in place of the current one; None: at its last pose."""
         if thing not in get_args(Thing):
             raise InputError(f"the simulated world has no {thing!r}: use one of {', '.join(get_args(Thing))}")
         if pose is not None and not (np.isfinite(pose.R).all() and np.isfinite(pose.t).all()):
             raise InputError("a pose with numbers that are not finite places nothing: give a turn and mm")
         with self._lock:
-            scene = self._things[thing] if thing in self._things else demo_object(_facing(thing))
+            scene = self._things[thing] if thing in self._things else demo_object(_initial_pose(thing))
             if pose is not None:
-                scene = _placed(scene, pose)
+                scene = _with_pose(scene, pose)
             self._standing = thing
             self._put(thing, scene)
 
-    def bring(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
-        """Move what stands there along its ray from the camera to a distance in z, turn it so far about the vertical;
-        None leaves one as it is.
+    def move(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
+        """Move the thing in view along its camera ray to depth `distance_mm`, and turn it to `turn_deg` about the
+        vertical; None: unchanged.
         """
         with self._lock:
             pose = self.pose
@@ -126,7 +126,7 @@ class SimulatedWorld:
             self.place(self._standing, Pose(R @ pose.R, t))
 
     def renderer(self, preview: bool) -> Renderer:
-        """Of what stands there now: in full, or a draft for a preview while things move, (h, w) at a smaller scale."""
+        """A renderer of the current scene; for previews of a moving scene a draft, (h, w) at a smaller scale."""
         with self._lock:
             draft = preview and time.monotonic() - self._moved < _SETTLED_S
             draft = draft and self._draft_rig.camera.scale < self.rig.camera.scale
@@ -148,19 +148,19 @@ class SimulatedWorld:
         return scene
 
 
-def _pose(scene: Scene) -> Pose:
+def _pose_of(scene: Scene) -> Pose:
     if isinstance(scene, Spheres):
         return Pose(np.eye(3), scene.centres[0])
     assert isinstance(scene, BoardScene | MeshScene)
     return scene.pose
 
 
-def _placed(scene: Scene, pose: Pose) -> Scene:
+def _with_pose(scene: Scene, pose: Pose) -> Scene:
     if isinstance(scene, Spheres):
         return replace(scene, centres=pose.t[None].astype(float))
     assert isinstance(scene, BoardScene | MeshScene)
     return replace(scene, pose=pose)
 
 
-def _facing(thing: Thing) -> Pose:
-    return Pose(np.eye(3), np.array([0.0, 0.0, _FIRST_PLACES_MM[thing]]))
+def _initial_pose(thing: Thing) -> Pose:
+    return Pose(np.eye(3), np.array([0.0, 0.0, _INITIAL_DEPTHS_MM[thing]]))

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from slviewer.devices.capture import CapturedFrames, check_exposures, take
+from slviewer.devices.capture import CapturedFrames, capture_with_texture, check_exposures
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
@@ -76,7 +76,7 @@ def capture(
         _check_disk_space(store, bench, len(sequence.frames) * max(1, len(exposures)))
         with bench.rig.opened() as devices:
             set_camera(devices, choice, exposure_ms, gain, warn)
-            captured = take(
+            captured = capture_with_texture(
                 devices,
                 sequence,
                 exposures,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.devices.protocols import Rig
-from slviewer.devices.replay import Recording, replayed
+from slviewer.devices.replay import Recording, recording_rig
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import ignore_warnings
@@ -26,7 +26,7 @@ class Reel:
         self.names = list(shots)
         self._shots, self._at = shots, 0
         self._recording = Recording(*shots[self.names[0]]())
-        self.rig: Rig = replayed(self._recording)
+        self.rig: Rig = recording_rig(self._recording)
 
     @property
     def sequence(self) -> PatternSequence:

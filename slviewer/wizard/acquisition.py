@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from slviewer.devices.capture import CapturedFrames, take
+from slviewer.devices.capture import CapturedFrames, capture_with_texture
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import Cancelled, DeviceError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
@@ -340,7 +340,7 @@ class Acquisition:
             self._shown = None  # the request shows and sets its own from here on
             if isinstance(request, CaptureRequest):
                 out = self._buffer_of(rig, request.frames)
-                request.save(take(rig, request.sequence, request.exposures_ms, out, self._report_frame))
+                request.save(capture_with_texture(rig, request.sequence, request.exposures_ms, out, self._report_frame))
                 request.saved()
             else:
                 self._applied = None

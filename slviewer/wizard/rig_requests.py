@@ -138,7 +138,7 @@ class RigRequests(RequestHandler):
     @request("Placing")
     def move_object(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
         """Move the simulated object to a distance on its ray; turn it about the vertical."""
-        self._engine.world.bring(distance_mm, turn_deg)
+        self._engine.world.move(distance_mm, turn_deg)
 
     def place_at_suggestion(self) -> bool:
         """Put the simulated board where the next pose is suggested."""

@@ -18,7 +18,7 @@ genicam = pytest.importorskip("genicam", reason="the optional package genicam is
 pytest.importorskip("harvesters", reason="the optional package harvesters is not installed")
 
 from slviewer.devices import genicam as driver_module  # noqa: E402
-from slviewer.devices.capture import capture, colour_texture  # noqa: E402
+from slviewer.devices.capture import capture, capture_texture  # noqa: E402
 from slviewer.devices.drivers import driver  # noqa: E402
 from slviewer.devices.genicam import IN_FLIGHT, GenicamCamera, genicam_camera, list_connected  # noqa: E402
 from slviewer.devices.genicam_features import Features  # noqa: E402
@@ -155,7 +155,7 @@ def test_a_capture_of_a_sequence(camera):
     projector.open()
     frames = capture(rig, sequence)
     assert len(np.unique([column(frame) for frame in frames])) > len(frames) - 3
-    assert colour_texture(rig).shape == (400, 400, 3)
+    assert capture_texture(rig).shape == (400, 400, 3)
 
 
 def test_what_the_camera_lacks_is_said(camera):

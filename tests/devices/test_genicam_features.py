@@ -105,7 +105,7 @@ def test_a_camera_is_made_comparable():
     nodes.ExposureTime.access = BOTH
     camera = features(nodes)
     assert camera.size() == (2448, 2048)
-    chosen, trigger = camera.format(), camera.trigger(None, None)
+    chosen, trigger = camera.choose_format(), camera.choose_trigger(None, None)
     assert chosen.name == "Mono12" and trigger == "software"
     camera.prepare(chosen, trigger, None)
     assert nodes.PixelFormat.value == "Mono12"
@@ -122,25 +122,25 @@ def test_a_camera_is_made_comparable():
 def test_a_line_triggers_where_it_is_named():
     nodes = machine_vision_camera()
     camera = features(nodes)
-    camera.prepare(camera.format("Mono8"), camera.trigger("hardware", "Line3"), "Line3")
+    camera.prepare(camera.choose_format("Mono8"), camera.choose_trigger("hardware", "Line3"), "Line3")
     assert nodes.TriggerSource.value == "Line3" and nodes.TriggerMode.modes["FrameStart"] == "On"
     for line in (None, "Line7", "Software"):
         with pytest.raises(InputError, match="Line0, Line3"):
-            camera.trigger("hardware", line)
+            camera.choose_trigger("hardware", line)
     with pytest.raises(InputError, match="software, hardware, free"):
-        camera.trigger("often", None)
-    assert camera.trigger("free", None) == "free"
+        camera.choose_trigger("often", None)
+    assert camera.choose_trigger("free", None) == "free"
 
 
 def test_a_camera_without_triggers_runs_free_and_says_so():
     nodes = machine_vision_camera()
     del nodes.TriggerSoftware
-    assert features(nodes).trigger(None, None) == "free"
+    assert features(nodes).choose_trigger(None, None) == "free"
     with pytest.raises(InputError, match="software"):
-        features(nodes).trigger("software", None)
+        features(nodes).choose_trigger("software", None)
     del nodes.TriggerMode
     with pytest.raises(InputError, match="lines"):
-        features(nodes).trigger("hardware", "Line0")
+        features(nodes).choose_trigger("hardware", "Line0")
 
 
 def test_a_trigger_without_selector_is_turned_off():
@@ -210,11 +210,11 @@ def test_formats_that_it_has_not_are_refused():
     camera = features(nodes := machine_vision_camera())
     for name in ("Mono10", "BayerRG8", "rubbish"):
         with pytest.raises(InputError, match=r"Mono8, Mono12, Mono12p.*pixel_format"):
-            camera.format(name)
-    assert camera.format("Mono12p").packing == "p"
+            camera.choose_format(name)
+    assert camera.choose_format("Mono12p").packing == "p"
     nodes.PixelFormat.offered = ("YUV422_8",)
     with pytest.raises(InputError):
-        camera.format()
+        camera.choose_format()
     with pytest.raises(DeviceError, match="pixel format"):
         camera.prepare(pixel_format("Mono12"), "free", None)
 

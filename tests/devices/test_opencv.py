@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from mjpeg import NetworkCamera, network_camera
 
-from slviewer.devices.capture import take
+from slviewer.devices.capture import capture_with_texture
 from slviewer.devices.drivers import driver
 from slviewer.devices.opencv import OpenCVCamera
-from slviewer.devices.opencv_source import listed
+from slviewer.devices.opencv_source import list_sysfs_webcams
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig, check_index, check_level
 from slviewer.errors import DeviceError, InputError
@@ -145,7 +145,7 @@ def test_every_frame_of_a_capture_is_of_its_pattern():
     with network_camera(coded(255), FPS) as seen:
         rig = Rig("painted", OpenCVCamera(seen.url, SIZE), Painter(seen))
         with rig.opened():
-            taken = take(rig, sequence)
+            taken = capture_with_texture(rig, sequence)
             assert [number(frame) for frame in taken.frames] == list(range(len(sequence.frames)))
             assert number(taken.texture[..., 0]) == 255 and taken.settings == CameraSettings()
 
@@ -261,9 +261,9 @@ def test_webcams_are_listed_by_their_names(tmp_path):
         (tmp_path / node).mkdir()
         (tmp_path / node / "index").write_text(f"{index}\n")
         (tmp_path / node / "name").write_text(f"{name}\n")
-    lines = listed(tmp_path)
+    lines = list_sysfs_webcams(tmp_path)
     assert [line.split(",")[0] for line in lines] == ["source 0: HD Webcam", "source 10: Arducam"]
-    assert listed(tmp_path / "none") == [] and isinstance(driver("opencv").list_connected(), list)
+    assert list_sysfs_webcams(tmp_path / "none") == [] and isinstance(driver("opencv").list_connected(), list)
 
 
 class _OneAtATime(NetworkCamera):

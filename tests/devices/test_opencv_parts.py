@@ -10,7 +10,7 @@ from mjpeg import network_camera
 
 from slviewer.devices import opencv as opencv_module
 from slviewer.devices.opencv import OpenCVCamera
-from slviewer.devices.opencv_controls import dialect_of, exposure_ms, set_exposure, switch_automatics_off
+from slviewer.devices.opencv_controls import dialect_of, disable_automatics, exposure_ms, set_exposure
 from slviewer.devices.opencv_reader import Connected, Pace
 from slviewer.devices.opencv_source import connect
 from slviewer.devices.protocols import CameraSettings
@@ -67,7 +67,7 @@ def test_exposures_are_told_in_milliseconds_whatever_the_camera_counts_in():
     bare = Webcam(None, "V4L2", {})
     assert exposure_ms(bare, dialect_of(bare)) is None
     assert "cannot be set" in set_exposure(bare, dialect_of(bare), 5.0)
-    assert switch_automatics_off(bare, dialect_of(bare)) == {}
+    assert disable_automatics(bare, dialect_of(bare)) == {}
 
 
 def test_windows_is_told_the_values_it_has_so_that_they_stay():
@@ -79,7 +79,7 @@ def test_windows_is_told_the_values_it_has_so_that_they_stay():
             return control != cv2.CAP_PROP_FOCUS
 
     webcam = Windows(None, "DSHOW", {cv2.CAP_PROP_EXPOSURE: -6.0, cv2.CAP_PROP_FOCUS: 20.0})
-    said = switch_automatics_off(webcam, dialect_of(webcam))
+    said = disable_automatics(webcam, dialect_of(webcam))
     assert written == [(cv2.CAP_PROP_EXPOSURE, -6.0), (cv2.CAP_PROP_FOCUS, 20.0)]
     assert list(said) == ["automatic focus"]
 
@@ -115,7 +115,7 @@ def test_a_webcam_is_set_and_read_back_and_its_automatics_are_switched_off(plugg
         }
         assert camera.apply(CameraSettings(12.5)) == CameraSettings(12.5) and camera.notes == ()
         assert camera.apply(CameraSettings(80.0)) == CameraSettings(50.0)
-        assert camera.notes == ("the camera 0: its exposure is 50 ms, 80 ms were asked for",)
+        assert camera.notes == ("the camera 0: its exposure is 50 ms, 80 ms were requested",)
         camera.apply(CameraSettings(30.0, gain=2.0))
         (note,) = camera.notes
         assert "units of its own" in note

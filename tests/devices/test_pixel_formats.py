@@ -63,7 +63,7 @@ def test_colours_in_any_order_are_rgb(name):
         stored = np.concatenate([stored, np.full((4, 6, 1), 9, np.uint8)], axis=2)
     for padding in (0, 5):
         data = np.frombuffer(b"".join(row.tobytes() + b"x" * padding for row in stored), np.uint8)
-        rgb = found.rgb(found.samples_of(data, (6, 4), padding))
+        rgb = found.rgb(found.view_samples(data, (6, 4), padding))
         np.testing.assert_array_equal(rgb, seen)
         assert np.shares_memory(rgb, data) == (padding == 0)
 

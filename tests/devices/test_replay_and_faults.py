@@ -8,7 +8,7 @@ from slviewer.devices import drivers as drivers_module
 from slviewer.devices.capture import capture
 from slviewer.devices.drivers import Driver, available, driver, drivers
 from slviewer.devices.protocols import CameraSettings, Rig
-from slviewer.devices.replay import Recording, replay, replayed
+from slviewer.devices.replay import Recording, recording_rig, replay
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.presets import gray, p18
 from slviewer.fringe.sequence import Frame, PatternSequence
@@ -67,7 +67,7 @@ def test_replay_plays_one_capture_after_another_but_never_a_mixture():
         if done == 5:
             recording.play(second, SEQUENCE)
 
-    with replayed(recording).opened() as rig:
+    with recording_rig(recording).opened() as rig:
         assert np.array_equal(capture(rig, SEQUENCE, progress=change), first)
         assert np.array_equal(capture(rig, SEQUENCE), second)
     with pytest.raises(InputError):

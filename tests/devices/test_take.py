@@ -7,7 +7,7 @@ from colour_camera import ColouredCamera, coloured
 from faulty_rig import breakable
 
 from slviewer.devices.browser import BrowserProjector
-from slviewer.devices.capture import capture, colour_texture, take
+from slviewer.devices.capture import capture, capture_texture, capture_with_texture
 from slviewer.devices.channel import Channel
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.devices.replay import replay
@@ -32,7 +32,7 @@ def test_a_sequence_is_taken_in_every_exposure_the_shortest_first():
     seen = []
     with rig().opened() as one:
         one.camera.apply(CameraSettings(1.5, 2.0))
-        taken = take(one, SEQUENCE, (4.0, 0.5), progress=lambda done, of: seen.append((done, of)))
+        taken = capture_with_texture(one, SEQUENCE, (4.0, 0.5), progress=lambda done, of: seen.append((done, of)))
         assert one.camera.settings() == CameraSettings(1.5, 2.0) == taken.settings
     assert taken.exposures_ms == (0.5, 4.0) and taken.texture is None
     assert taken.frames.shape == (2 * N, 120, 160)
@@ -46,7 +46,7 @@ def test_a_sequence_is_taken_in_every_exposure_the_shortest_first():
 
 def test_one_exposure_is_what_capture_gives():
     with rig().opened() as one:
-        taken = take(one, SEQUENCE)
+        taken = capture_with_texture(one, SEQUENCE)
     with rig().opened() as other:
         np.testing.assert_array_equal(taken.frames, capture(other, SEQUENCE))
     assert taken.exposures_ms == () and taken.settings == CameraSettings(1.0, 1.0)
@@ -59,37 +59,37 @@ def test_the_exposure_is_restored_whatever_happens():
 
     with rig().opened() as one:
         with pytest.raises(Cancelled):
-            take(one, SEQUENCE, (0.5, 4.0), progress=stop)
+            capture_with_texture(one, SEQUENCE, (0.5, 4.0), progress=stop)
         assert one.camera.settings().exposure_ms == 1.0
     broken, faults = breakable(rig())
     with broken.opened():
         faults.plan("timeout", 4)
         with pytest.raises(DeviceError, match=f"5 of {N}"):
-            take(broken, SEQUENCE, (0.5, 4.0))
+            capture_with_texture(broken, SEQUENCE, (0.5, 4.0))
         assert broken.camera.settings().exposure_ms == 1.0
         faults.plan("unplugged", 4)
         with pytest.raises(DeviceError):
-            take(broken, SEQUENCE, (0.5, 4.0))
+            capture_with_texture(broken, SEQUENCE, (0.5, 4.0))
 
 
 def test_exposures_that_cannot_be_are_refused():
     with rig().opened() as one:
         for exposures in ((2.0,), (2.0, 2.0), (-1.0, 2.0), tuple(range(1, 12)), (float("nan"), 1.0)):
             with pytest.raises(InputError):
-                take(one, SEQUENCE, exposures)
+                capture_with_texture(one, SEQUENCE, exposures)
         with pytest.raises(DeviceError, match=r"100 ms.*500 ms"):
-            take(one, SEQUENCE, (200.0, 500.0))
+            capture_with_texture(one, SEQUENCE, (200.0, 500.0))
         frames = capture(one, SEQUENCE)
     with replay(frames, SEQUENCE).opened() as recorded:
         with pytest.raises(DeviceError):
-            take(recorded, SEQUENCE, (1.0, 2.0))
-        np.testing.assert_array_equal(take(recorded, SEQUENCE).frames, frames)
+            capture_with_texture(recorded, SEQUENCE, (1.0, 2.0))
+        np.testing.assert_array_equal(capture_with_texture(recorded, SEQUENCE).frames, frames)
 
 
 def test_a_colour_camera_brings_its_colours_home():
     with coloured(rig()).opened() as one:
         assert isinstance(one.camera, ColourCamera)
-        taken = take(one, SEQUENCE)
+        taken = capture_with_texture(one, SEQUENCE)
         assert taken.texture is not None and taken.texture.shape == (120, 160, 3)
         illuminated = taken.texture[..., 1] > 60
         ratio = taken.texture[illuminated].astype(float) / taken.texture[illuminated][:, 1:2]
@@ -100,10 +100,10 @@ def test_a_colour_camera_brings_its_colours_home():
             raise DeviceError("the video has ended")
 
         one.camera.grab_colour, one.camera.grab = gone, one.camera._camera.grab
-        taken = take(one, SEQUENCE)
+        taken = capture_with_texture(one, SEQUENCE)
         assert taken.texture is None and taken.frames.any()  # the frames are whole
     with rig().opened() as grey:
-        assert colour_texture(grey) is None
+        assert capture_texture(grey) is None
 
 
 class _Page:
@@ -128,7 +128,7 @@ def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():
     channel, camera = Channel(), rig().camera
     first = _Page(channel, SEQUENCE.projector)
     with Rig("r", camera, BrowserProjector(channel, SEQUENCE.projector)).opened() as one:
-        assert len(take(one, SEQUENCE, (0.5, 4.0)).frames) == 2 * N
+        assert len(capture_with_texture(one, SEQUENCE, (0.5, 4.0)).frames) == 2 * N
         assert first.asked.count("load") == 1 and first.asked.count("show") == 2 * (N + 1)
 
         def reload(done: int, _: int) -> None:
@@ -136,6 +136,6 @@ def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():
                 _Page(channel, SEQUENCE.projector)
 
         with pytest.raises(DeviceError):
-            take(one, SEQUENCE, (0.5, 4.0), progress=reload)
+            capture_with_texture(one, SEQUENCE, (0.5, 4.0), progress=reload)
         with pytest.raises(InputError):
-            take(one, SEQUENCE, (0.5, 4.0), out=np.empty((N, 120, 160), np.uint8))
+            capture_with_texture(one, SEQUENCE, (0.5, 4.0), out=np.empty((N, 120, 160), np.uint8))

@@ -76,7 +76,7 @@ def test_a_network_camera_and_a_browser_capture_what_is_projected(browser: Brows
             watch(operator, projector, camera, "frame", lambda s: s.rig.capture is not None and s.rig.capture.frame > 3)
             projector.reload()
             lost = watch(operator, projector, camera, "fault", lambda s: s.notices[-1].level == "error")
-            assert "nothing is kept of it" in lost.notices[-1].text
+            assert "and its frames were discarded" in lost.notices[-1].text
             watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
             session = operator.snapshot().session
             assert session is not None and [pose.name for pose in session.poses] == ["pose_01"]

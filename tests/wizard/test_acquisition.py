@@ -112,7 +112,7 @@ def test_a_fault_ends_one_capture_and_nothing_else(bench: Bench, fault, frame: i
     bench.acquisition.capture(bench.request("broken"))
     bench.acquisition.capture(bench.request("waiting"))
     bench.until(lambda: len(bench.texts) >= 2)
-    assert f"frame {frame + 1} of {FRAMES}, nothing is kept of it" in bench.texts[0]
+    assert f"frame {frame + 1} of {FRAMES}, and its frames were discarded" in bench.texts[0]
     assert "1 waiting capture dropped" in bench.texts[0] and bench.texts[1] == "the rig answers again"
     assert bench.saved == [] and bench.acquisition.idle
     bench.previews_go_on()
