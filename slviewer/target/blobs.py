@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 MIN_AREA_PX = 12
 """Smallest area of a blob whose shape can be judged."""
@@ -19,13 +20,13 @@ class Blobs:
     """``centres`` (n, 2) px, ``areas`` (n,) px² and ``covariances`` (n, 2, 2) px² of elliptical blobs, all darker than
     their surroundings, or all brighter if ``inverted``."""
 
-    centres: np.ndarray
-    areas: np.ndarray
-    covariances: np.ndarray
+    centres: NDArray[np.float64]
+    areas: NDArray[np.float64]
+    covariances: NDArray[np.float64]
     inverted: bool
 
     @property
-    def roundness(self) -> np.ndarray:
+    def roundness(self) -> NDArray[np.float64]:
         """(n,) area over that of the ellipse with the same second moments: 1 for ellipses, 0.955 for rectangles."""
         return np.asarray(self.areas / (4 * np.pi * np.sqrt(np.linalg.det(self.covariances))))
 
@@ -33,13 +34,13 @@ class Blobs:
         """Return a subset of the blobs, by index or mask."""
         return Blobs(self.centres[which], self.areas[which], self.covariances[which], self.inverted)
 
-    def rescale(self, scale: np.ndarray) -> "Blobs":
+    def rescale(self, scale: NDArray[np.float64]) -> "Blobs":
         """Return the blobs in the pixels of an image that is ``scale`` (2,) times as wide and as high."""
         centres = (self.centres + 0.5) * scale - 0.5
         return Blobs(centres, self.areas * scale.prod(), self.covariances * np.outer(scale, scale), self.inverted)
 
 
-def detect_blobs(grey: np.ndarray, pitch: float, inverted: bool) -> Iterator[Blobs]:
+def detect_blobs(grey: NDArray[np.uint8], pitch: float, inverted: bool) -> Iterator[Blobs]:
     """Yield the dark blobs of an image (h, w) uint8, or the bright ones if ``inverted``, once per threshold.
 
     ``pitch`` px is the largest distance that neighbouring circles can have. Each attempt compares pixels with the

@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Literal, cast, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 
@@ -133,7 +134,7 @@ class Board:
         return (self.columns - 1, self.rows - 1) if self.kind == "charuco" else (self.columns, self.rows)
 
     @cached_property
-    def points(self) -> np.ndarray:
+    def points(self) -> NDArray[np.float64]:
         """(n, 3) float64 mm, z = 0, row by row; read-only."""
         columns, rows = self.features
         i, j = np.divmod(np.arange(columns * rows), columns)
@@ -142,7 +143,7 @@ class Board:
         points.flags.writeable = False
         return points
 
-    def outline(self, margin_mm: float | None = None) -> np.ndarray:
+    def outline(self, margin_mm: float | None = None) -> NDArray[np.float64]:
         """Return a rectangle (4, 3) float64 mm around the features, from top left over top right to bottom left.
 
         ``margin_mm`` beyond the outermost features; by default what is part of the board for certain: half a pitch

@@ -1,6 +1,7 @@
 """Sub-pixel centres of circles: centroids of their ink, relative to the brightness of the paper around them."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.target.blobs import Blobs
 
@@ -19,7 +20,7 @@ MIN_RING_PIXELS = 8
 """Smallest number of pixels for a plane fit."""
 
 
-def refine_centres(image: np.ndarray, blobs: Blobs) -> np.ndarray:
+def refine_centres(image: NDArray[np.float32], blobs: Blobs) -> NDArray[np.float64]:
     """Return the centroids (n, 2) float64 px of the circles' ink, relative to the brightness around each circle.
 
     ``image`` (h, w) float32; ``blobs`` describe the circles' ellipses to some tenths of a pixel. Ink is ``1 - I / W``

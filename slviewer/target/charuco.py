@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
@@ -21,7 +22,7 @@ def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
     return cv2.aruco.CharucoBoard((board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary)
 
 
-def detect_charuco(board: Board, image: BoardImage) -> tuple[np.ndarray, np.ndarray]:
+def detect_charuco(board: Board, image: BoardImage) -> tuple[NDArray[np.float64], np.ndarray]:
     """Detect corners; returns pixels (n, 2) float64 and ids (n,) int. Raises DetectionError for too few corners."""
     detector = cv2.aruco.CharucoDetector(opencv_board(board))
     first = min(1.0, SEARCH_PX / max(image.grey.shape))

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
@@ -10,7 +11,7 @@ from slviewer.target.numbering import check_grid, select_upright
 from slviewer.target.saddle import refine_corners
 
 
-def detect_chessboard(board: Board, image: BoardImage) -> np.ndarray:
+def detect_chessboard(board: Board, image: BoardImage) -> NDArray[np.float64]:
     """Detect every inner corner: (n, 2) float64 px in the order of ``board.points``.
 
     Raises DetectionError, whose message gives the number of corners detected.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
 from slviewer.target.blobs import Blobs, detect_blobs
@@ -54,7 +55,7 @@ class _Grid:
         return float(cv2.contourArea(hull))
 
 
-def detect_circles(board: Board, image: BoardImage) -> tuple[np.ndarray, float, bool]:
+def detect_circles(board: Board, image: BoardImage) -> tuple[NDArray[np.float64], float, bool]:
     """Detect every circle of a board.
 
     Returns the centres (n, 2) float64 px in the order of ``board.points``, the circles' radius in mm, and whether the

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.target.board import Board
@@ -24,7 +25,7 @@ class Detection:
     ``marked``: the mark beside the first circle was detected, so that the numbering is the board's own at any turn.
     """
 
-    pixels: np.ndarray
+    pixels: NDArray[np.float64]
     ids: np.ndarray
     radius_mm: float = 0.0
     marked: bool = False
@@ -49,7 +50,7 @@ def detect(board: Board, image: np.ndarray) -> Detection:
     return Detection(pixels, ids, radius, marked)
 
 
-def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> np.ndarray:
+def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Return the mask (h, w) bool of the pixels inside ``board.outline()``, by the homography of the detected features.
 
     ``shape`` is the image's, (h, w) or (h, w, 3).

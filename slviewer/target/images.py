@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 
@@ -19,8 +20,8 @@ class BoardImage:
     sub-pixel refinement, in the image's own grey levels.
     """
 
-    grey: np.ndarray
-    deep: np.ndarray
+    grey: NDArray[np.uint8]
+    deep: NDArray[np.float32]
 
     @classmethod
     def from_image(cls, image: np.ndarray) -> "BoardImage":
@@ -41,7 +42,7 @@ class BoardImage:
         return cls(np.ascontiguousarray(grey), image.astype(np.float32))
 
 
-def light_advice(grey: np.ndarray) -> str:
+def light_advice(grey: NDArray[np.uint8]) -> str:
     """Return advice on exposure and board position for an error message, by the share of saturated pixels."""
     saturated = float(np.mean(grey[::4, ::4] == 255))
     exposure = f"lower the exposure ({saturated:.0%} of the image is saturated), or " if saturated > 0.02 else ""
@@ -57,7 +58,7 @@ def resize_image(image: np.ndarray, factor: float) -> np.ndarray:
     )
 
 
-def flatten_light(grey: np.ndarray) -> np.ndarray:
+def flatten_light(grey: NDArray[np.uint8]) -> np.ndarray:
     """Divide an image (h, w) uint8 by the local maximum brightness, so that paper becomes evenly white."""
     factor = 64 / max(grey.shape)
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)

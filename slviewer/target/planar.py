@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
 from slviewer.geometry.polynomial import monomials
@@ -12,7 +13,9 @@ HUBER_SIGMAS = 3.0
 """Residuals beyond so many robust standard deviations are down-weighted in the fit of a grid's map."""
 
 
-def fit_homography(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -> np.ndarray:
+def fit_homography(
+    points: NDArray[np.float64], pixels: NDArray[np.float64], robust: bool = False
+) -> NDArray[np.float64]:
     """Fit the homography (3, 3) float64 from points (n, 2) mm to pixels (n, 2), with positive depth on the board.
 
     By least squares; ``robust``: by least median of squares, with up to half outliers. Raises DetectionError where the
@@ -24,12 +27,12 @@ def fit_homography(points: np.ndarray, pixels: np.ndarray, robust: bool = False)
     return np.asarray(H * np.sign(points.mean(0) @ H[2, :2] + H[2, 2]))
 
 
-def to_image(H: np.ndarray, points: np.ndarray) -> np.ndarray:
+def to_image(H: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Project points (n, 2) mm to pixels (n, 2) by a homography (3, 3)."""
     return np.asarray((points @ H[:2, :2].T + H[:2, 2]) / (points @ H[2, :2] + H[2, 2])[:, None])
 
 
-def jacobians(H: np.ndarray, points: np.ndarray) -> np.ndarray:
+def jacobians(H: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the Jacobians (n, 2, 2) px per mm of a homography (3, 3) at points (n, 2) mm."""
     w = points @ H[2, :2] + H[2, 2]
     return np.asarray((H[None, :2, :2] - to_image(H, points)[:, :, None] * H[2, :2]) / w[:, None, None])
@@ -44,25 +47,25 @@ class GridMap:
     lengths.
     """
 
-    H: np.ndarray
-    low: np.ndarray
-    span: np.ndarray
+    H: NDArray[np.float64]
+    low: NDArray[np.float64]
+    span: NDArray[np.float64]
     degree: int
     coefficients: np.ndarray
-    residuals: np.ndarray
+    residuals: NDArray[np.float64]
     sigma_px: float
 
-    def to_image(self, points: np.ndarray) -> np.ndarray:
+    def to_image(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map points (n, 2) in pitches to pixels (n, 2); extrapolates beyond the fitted features."""
         scaled = 2 * (points - self.low) / self.span - 1
         return to_image(self.H, points) + monomials(scaled, self.degree) @ self.coefficients
 
-    def pitch_px(self, points: np.ndarray) -> np.ndarray:
+    def pitch_px(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pitch (n,) px in the image at points (n, 2) in pitches; 0 behind the camera."""
         return np.sqrt(np.maximum(np.linalg.det(jacobians(self.H, points)), 0.0))
 
 
-def fit_grid_map(points: np.ndarray, pixels: np.ndarray, robust: bool = False) -> GridMap:
+def fit_grid_map(points: NDArray[np.float64], pixels: NDArray[np.float64], robust: bool = False) -> GridMap:
     """Fit the map from points (n, 2) in pitches to pixels (n, 2): a homography and a cubic polynomial.
 
     ``robust``: with Huber's weights, for up to a third of outliers. Raises DetectionError where the features do not

@@ -6,6 +6,7 @@ refinement (OpenCV's ``cornerSubPix``) is off by 0.03 to 0.07 px on the same ima
 """
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import erf
 
 from slviewer.target.planar import fit_homography, jacobians
@@ -22,8 +23,12 @@ CONVERGENCE_PX = 1e-3
 
 
 def refine_corners(
-    image: np.ndarray, pixels: np.ndarray, points: np.ndarray, pitch: float, marker: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:
+    image: NDArray[np.float32],
+    pixels: NDArray[np.float64],
+    points: NDArray[np.float64],
+    pitch: float,
+    marker: float = 0.0,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Refine corners; returns sub-pixel positions (n, 2) float64 px and whether each fits the model, (n,) bool.
 
     ``image`` (h, w) float32; ``pixels`` (n, 2) px: initial positions, good to a px or two; ``points`` (n, 2) mm: the
