@@ -1,6 +1,7 @@
 """The projector coordinate at a board feature, and its slopes there, read from the phase around it."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel
 
@@ -10,8 +11,8 @@ extrapolate. At a chessboard's corner two opposite squares are bright, and their
 
 
 def fit_local_values(
-    field: np.ndarray, weight: np.ndarray, pixels: np.ndarray, radius: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    field: np.ndarray, weight: np.ndarray, pixels: NDArray[np.float64], radius: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic around each.
 
     ``radius`` (n,) px: half the width of each window; ``weight`` (h, w): 0 where the field is not used, so that the

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.calibration.board_plane import BoardPlane
 from slviewer.calibration.edges import bright_pixels
@@ -47,9 +48,9 @@ class Samples:
     (n, 2) px: their standard deviations predicted from the capture's noise. An axis that was not captured is NaN.
     """
 
-    camera: np.ndarray
-    projector: np.ndarray
-    sigma: np.ndarray
+    camera: NDArray[np.float64]
+    projector: NDArray[np.float64]
+    sigma: NDArray[np.float64]
 
     def __post_init__(self) -> None:
         shapes = {a.shape for a in (self.camera, self.projector, self.sigma)}
@@ -119,8 +120,8 @@ class Observation:
     """
 
     name: str
-    points: np.ndarray
-    camera: np.ndarray
+    points: NDArray[np.float64]
+    camera: NDArray[np.float64]
     projector: np.ndarray
     surfaces: Mapping[Axis, SplineSurface | Polynomial2D]
     periods_px: Mapping[Axis, float]
@@ -133,13 +134,13 @@ class Observation:
     samples: Samples | None = field(default=None, repr=False)
 
     @property
-    def region(self) -> np.ndarray:
+    def region(self) -> NDArray[np.bool_]:
         """(v1 - v0, u1 - u0) bool over ``box`` = (u0, v0, u1, v1)."""
         u0, v0, u1, v1 = self.box
         shape = (v1 - v0, u1 - u0)
         return np.unpackbits(self.packed_region, count=shape[0] * shape[1]).view(bool).reshape(shape)
 
-    def smoothed_phase(self, axis: Axis) -> np.ndarray:
+    def smoothed_phase(self, axis: Axis) -> NDArray[np.float64]:
         """(v1 - v0, u1 - u0) float64 rad over ``box``: the smoothed absolute phase, NaN outside the region."""
         u0, v0, u1, v1 = self.box
         return np.where(self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan)
@@ -258,7 +259,7 @@ def observe(
     )
 
 
-def pitch_px(board: Board, detection: Detection) -> np.ndarray:
+def pitch_px(board: Board, detection: Detection) -> NDArray[np.float64]:
     """Return the board's pitch (n,) in camera px at each feature."""
     points = board.points[detection.ids][:, :2]
     H, _ = cv2.findHomography(points, np.asarray(detection.pixels, float))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from slviewer.calibration.moments import fit_rational
 from slviewer.calibration.observe import Observation
@@ -39,12 +40,12 @@ class PixelFit:
     and ``phase_max`` (h, w) rad: their phase range; ``condition`` (h, w): condition number of the fit of eq. 9.
     """
 
-    coefficients: np.ndarray
-    rms_mm: np.ndarray
-    poses: np.ndarray
-    phase_min: np.ndarray
-    phase_max: np.ndarray
-    condition: np.ndarray
+    coefficients: NDArray[np.float64]
+    rms_mm: NDArray[np.float32]
+    poses: NDArray[np.uint16]
+    phase_min: NDArray[np.float32]
+    phase_max: NDArray[np.float32]
+    condition: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class PixelwiseModel:
         """The captured axes."""
         return tuple(self.fits)
 
-    def points(self, phase: PhaseMap) -> np.ndarray:
+    def points(self, phase: PhaseMap) -> NDArray[np.float32]:
         """Return points (h, w, 3) float32 mm; NaN where phase or fit are invalid, or too far from the fitted range."""
         fit = self.fits[phase.axis]
         out = np.empty((*phase.phase.shape, 3), np.float32)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
@@ -41,14 +42,14 @@ class PoseChange:
     """
 
     name: str
-    change: np.ndarray
-    spreads: Mapping[str, np.ndarray]
-    by_growth: np.ndarray
+    change: NDArray[np.float64]
+    spreads: Mapping[str, NDArray[np.float64]]
+    by_growth: NDArray[np.float64]
     scale: float
     across_px: float
     misfit_px: float
 
-    def covariance(self, sigmas: Mapping[str, float]) -> np.ndarray:
+    def covariance(self, sigmas: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of the change from the sigma in px of each kind of observation."""
         return sum((sigmas[kind] ** 2 * spread for kind, spread in self.spreads.items()), np.zeros((6, 6)))
 
@@ -63,8 +64,8 @@ class DriftReference:
     """
 
     rig: StereoRig
-    shared: np.ndarray
-    covariance: np.ndarray
+    shared: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     sigmas: Mapping[str, float]
     pose_changes: tuple[PoseChange, ...]
 
@@ -131,7 +132,9 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
     return DriftReference(rig, shared, covariance, sigmas, pose_changes)
 
 
-def solve_change(e: LinearView, shared: np.ndarray, sigmas: Mapping[str, float], supported: np.ndarray) -> PoseChange:
+def solve_change(
+    e: LinearView, shared: NDArray[np.float64], sigmas: Mapping[str, float], supported: NDArray[np.bool_]
+) -> PoseChange:
     """Estimate the projector's apparent change in one view by robust least squares, given the ``shared`` lens errors.
 
     ``sigmas``: px by kind; ``supported`` (k,) bool: rows with certain lens errors.

@@ -11,6 +11,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
@@ -34,10 +35,10 @@ class DriftView:
     ``projector`` coordinates (m, 2) px there, a column of NaN for an axis that was not captured."""
 
     name: str
-    points: np.ndarray
-    camera: np.ndarray
-    pixels: np.ndarray
-    projector: np.ndarray
+    points: NDArray[np.float64]
+    camera: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+    projector: NDArray[np.float64]
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "DriftView":
@@ -79,7 +80,7 @@ class DisplacementField:
         """Number of coefficients of one of the two components."""
         return (self.cells[0] + 3) * (self.cells[1] + 3)
 
-    def basis(self, pixels: np.ndarray) -> sp.csr_array:
+    def basis(self, pixels: NDArray[np.float64]) -> sp.csr_array:
         """Return the spline basis (n, unknowns) at pixels (n, 2): displacement by coefficients."""
         (i, wu), (j, wv) = (
             _splines_at((pixels[:, k] + 0.5) * self.cells[k] / self.size[k], self.cells[k]) for k in (0, 1)
@@ -114,15 +115,15 @@ class LinearView:
 
     name: str
     kinds: np.ndarray
-    residuals: np.ndarray
-    pose: np.ndarray
-    change: np.ndarray
-    scale: np.ndarray
+    residuals: NDArray[np.float64]
+    pose: NDArray[np.float64]
+    change: NDArray[np.float64]
+    scale: NDArray[np.float64]
     shared: sp.csr_array
-    across: np.ndarray
+    across: NDArray[np.float64]
 
     @property
-    def usable(self) -> np.ndarray:
+    def usable(self) -> NDArray[np.bool_]:
         """(k,) bool: the rows that were measured."""
         return np.asarray(np.isfinite(self.residuals) & np.isfinite(self.change).all(1))
 

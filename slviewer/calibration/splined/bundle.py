@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from slviewer.calibration.splined.fields import Device
@@ -42,7 +43,7 @@ class Bundle:
 
     state: State
     poses: tuple[str, ...]
-    points: np.ndarray
+    points: NDArray[np.float64]
     noise: Noise
     strengths: tuple[float, float]
     fits: Mapping[str, PoseFit]
@@ -50,12 +51,12 @@ class Bundle:
     depth_range_mm: tuple[float, float]
     camera_poses: np.ndarray
     projector_poses: np.ndarray
-    packed_factor: np.ndarray
+    packed_factor: NDArray[np.float32]
     steps: int
     half_turned_poses: tuple[str, ...] = ()
 
     @cached_property
-    def factor(self) -> np.ndarray:
+    def factor(self) -> NDArray[np.float32]:
         """(n, n) float32, lower triangular: factor @ factor.T is the information (inverse covariance) of the rig's n
         unknowns in the order of ``UnknownLayout`` from ``rig`` on, with poses and board marginalised out."""
         layout = self.state.layout

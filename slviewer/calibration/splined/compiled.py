@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from os import cpu_count
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from slviewer.calibration.splined.correction_grid import evaluate
@@ -40,10 +41,10 @@ class CompiledAxis:
     where the projector does not see the ray, or where the coordinate hardly changes with depth.
     """
 
-    coefficients: np.ndarray
+    coefficients: NDArray[np.float32]
     centre: float
-    grid: np.ndarray
-    supported_grid: np.ndarray
+    grid: NDArray[np.float32]
+    supported_grid: NDArray[np.float32]
     step: int
     near: float
     far: float
@@ -68,7 +69,7 @@ class CompiledAxis:
         return np.asarray(np.abs(c1 - c0 * c2) / (1 + c2 * s) ** 2)
 
 
-def pixel_rays(rig: Arrangement) -> np.ndarray:
+def pixel_rays(rig: Arrangement) -> NDArray[np.float64]:
     """Return the undistorted normalised coordinates (2, h, w) float64 of the camera pixels."""
     width, height = (int(n) for n in rig.camera.size)
     rays = np.empty((2, height, width))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, distance_transform_edt, uniform_filter
 
 from slviewer.calibration.splined.bundle import Bundle
@@ -43,11 +44,11 @@ class SigmaMap:
     """Standard deviation of z for one axis: ``nodes`` (nv, nu, nz) float32 mm, evenly spaced over the image and from
     ``near`` to ``far`` mm."""
 
-    nodes: np.ndarray
+    nodes: NDArray[np.float32]
     near: float
     far: float
 
-    def interpolate(self, points: np.ndarray) -> np.ndarray:
+    def interpolate(self, points: np.ndarray) -> NDArray[np.float32]:
         """Interpolate at the organised points (h, w, 3) mm of the whole image; returns (h, w) float32 mm, NaN at NaN.
 
         The logarithm is interpolated linearly, since the value grows hundredfold where support ends.
@@ -85,7 +86,7 @@ def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> Si
     return SigmaMap(np.ascontiguousarray(sigma[tuple(nearest)], np.float32), near, far)
 
 
-def volume_sigmas(bundle: Bundle, axis: Axis, volume: Volume) -> np.ndarray:
+def volume_sigmas(bundle: Bundle, axis: Axis, volume: Volume) -> NDArray[np.float64]:
     """Return the 3D standard deviation (n,) mm of a volume's points, measured through one axis.
 
     The rigid motion of the supported points is removed.
@@ -95,7 +96,7 @@ def volume_sigmas(bundle: Bundle, axis: Axis, volume: Volume) -> np.ndarray:
     return np.asarray(sigma * extrapolation_factor(bundle, volume))
 
 
-def extrapolation_factor(bundle: Bundle, places: Volume) -> np.ndarray:
+def extrapolation_factor(bundle: Bundle, places: Volume) -> NDArray[np.float64]:
     """Return the factors (n,) by which the priors underestimate the standard deviations at ``places``.
 
     1 inside the calibrated region; elsewhere the ``persistence_ratio`` of the field that no pose illuminated there, the

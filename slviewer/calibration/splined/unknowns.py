@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
 from slviewer.calibration.splined.fields import Device, no_displacement
@@ -23,8 +24,8 @@ class Arrangement(NamedTuple):
 
     camera: Device
     projector: Device
-    R: np.ndarray
-    t: np.ndarray
+    R: NDArray[np.float64]
+    t: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -78,10 +79,10 @@ class State:
     ``offsets`` (f, 2) mm: the board's shape."""
 
     rig: Arrangement
-    R_board: np.ndarray
-    t_board: np.ndarray
-    heights: np.ndarray
-    offsets: np.ndarray
+    R_board: NDArray[np.float64]
+    t_board: NDArray[np.float64]
+    heights: NDArray[np.float64]
+    offsets: NDArray[np.float64]
 
     @classmethod
     def from_stereo(cls, stereo: StereoModel, poses: list[str], features: int) -> "State":
@@ -106,7 +107,7 @@ class State:
         knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
         return UnknownLayout(len(self.t_board), len(self.offsets), knots[0], knots[1])
 
-    def step(self, step: np.ndarray) -> "State":
+    def step(self, step: NDArray[np.float64]) -> "State":
         """Return the state after a step (N,) in the order of ``layout``; rotation vectors apply from the left."""
         at = self.layout
         pose = step[: at.height].reshape(-1, 6)
@@ -134,7 +135,7 @@ def pinhole_lens(device: Device) -> Lens:
     return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
 
 
-def rotate_left(R: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def rotate_left(R: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate R (3, 3) from the left by a rotation vector (3,); the result is orthonormalised."""
     u, _, v = np.linalg.svd(cv2.Rodrigues(np.ascontiguousarray(vector))[0] @ R)
     return np.asarray(u @ v)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slviewer.calibration.splined.fields import Device, distort_to_pixel, undistort_pixel
 from slviewer.calibration.splined.unknowns import Arrangement
@@ -23,10 +24,10 @@ class Volume:
     (n, 2).
     """
 
-    pixels: np.ndarray
-    z: np.ndarray
-    points: np.ndarray
-    projector: np.ndarray
+    pixels: NDArray[np.float64]
+    z: NDArray[np.float64]
+    points: NDArray[np.float64]
+    projector: NDArray[np.float64]
 
     def supported(
         self, rig: Arrangement, camera_illuminated: np.ndarray, projector_illuminated: np.ndarray
