@@ -144,7 +144,8 @@ def calibrate_stereo(
             excluded[observation.name] = f"holds the {only} axis alone: a calibration pose needs both x and y"
         elif measured.sum() < MIN_FEATURES:
             excluded[observation.name] = (
-                f"{measured.sum()} of {len(measured)} features carry both projector coordinates: light the whole board"
+                f"{measured.sum()} of {len(measured)} features carry both projector coordinates: "
+                "illuminate the whole board"
             )
         else:
             inliers[observation.name] = measured
