@@ -152,17 +152,17 @@ def _definitions(module: str) -> dict[str, ast.stmt]:
     """{name: where it is defined or imported from} of a module's functions, types, constants and imports."""
     spec = find_spec(module)
     assert spec is not None and spec.origin is not None
-    found: dict[str, ast.stmt] = {}
+    definitions: dict[str, ast.stmt] = {}
     for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef):
-            found[node.name] = node
+            definitions[node.name] = node
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             target = node.targets[0] if isinstance(node, ast.Assign) else node.target
             if isinstance(target, ast.Name):
-                found[target.id] = node
+                definitions[target.id] = node
         elif isinstance(node, ast.ImportFrom):
-            found |= {alias.asname or alias.name: node for alias in node.names}
-    return found
+            definitions |= {alias.asname or alias.name: node for alias in node.names}
+    return definitions
 
 
 class _Names(dict[str, Any]):

@@ -55,9 +55,9 @@ class Comparison:
     def warnings(self) -> list[str]:
         """Where more than 2 % was set aside, where a plane is a minor part of the scene, and where the RMS is far above
         the noise floor by every model."""
-        found = [f"{model}: {result.warning}" for model, result in self.results.items() if result.warning]
+        messages = [f"{model}: {result.warning}" for model, result in self.results.items() if result.warning]
         if self.is_searched and self.shape == "plane" and self.share < LEAST_SHARE:
-            found.append(
+            messages.append(
                 f"the largest plane holds {100 * self.share:.0f} % of the measured pixels ({self.region_text()}), and "
                 "the figures are of it alone: is this a capture of a plane?"
             )
@@ -65,11 +65,11 @@ class Comparison:
         known = {model: ratio for model, ratio in ratios.items() if np.isfinite(ratio)}
         best = min(known, key=lambda model: known[model], default="")
         if best and known[best] > MOST_OVER_FLOOR:
-            found.append(
+            messages.append(
                 f"the RMS is {known[best]:.1f} times the noise floor at best ({best}): this is no {self.shape}, the "
                 "frames are disturbed, or the calibration is off by that much"
             )
-        return found
+        return messages
 
     def region_text(self) -> str:
         """Where the measured region lies in the image, in words; empty where its map is not at hand."""

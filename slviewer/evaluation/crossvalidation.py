@@ -125,13 +125,13 @@ def smoothed_phases(observation: Observation) -> dict[Axis, PhaseMap]:
     """Phase maps over the board alone, from the smoothed phase of a pose that was kept."""
     width, height = observation.size
     u0, v0, u1, v1 = observation.box
-    found: dict[Axis, PhaseMap] = {}
+    phases: dict[Axis, PhaseMap] = {}
     for axis in (a for a in AXES if a in observation.surfaces):
         phase = np.full((height, width), np.nan, np.float32)
         phase[v0:v1, u0:u1] = observation.smoothed_phase(axis)
         illuminated = np.isfinite(phase).astype(np.float32)
         reason = np.where(illuminated > 0, Reason.VALID, Reason.DARK).astype(np.uint8)
-        found[axis] = PhaseMap(
+        phases[axis] = PhaseMap(
             axis,
             observation.periods_px[axis],
             phase,
@@ -142,7 +142,7 @@ def smoothed_phases(observation: Observation) -> dict[Axis, PhaseMap]:
             (1.0, 0.0),
             18,
         )
-    return found
+    return phases
 
 
 def measure_held_out(
@@ -162,20 +162,20 @@ def measure_held_out(
     if np.count_nonzero(read) < LEAST_FEATURES:
         return {}
     board = observation.points[read]
-    found = {}
+    results = {}
     for name, points in clouds.items():
-        seen, X = points[common].astype(float), features[name][read]
+        measured, X = points[common].astype(float), features[name][read]
         placed, scale = _align_board(board, X)
-        found[name] = HeldOutPose(
-            plane_mm=float(np.sqrt(np.mean(fit_plane(seen).distance(seen) ** 2))),
+        results[name] = HeldOutPose(
+            plane_mm=float(np.sqrt(np.mean(fit_plane(measured).distance(measured) ** 2))),
             board_mm=_rms(X - placed),
             scale_ppm=1e6 * (scale - 1),
             camera_px=_rms(rig.camera.project(X) - rig.camera.project(placed)),
             projector_px=_rms(rig.project(X) - rig.project(placed)),
-            pixels=len(seen),
+            pixels=len(measured),
             depth_mm=float(X[:, 2].mean()),
         )
-    return found
+    return results
 
 
 def gather_results(
@@ -190,7 +190,7 @@ def gather_results(
     """
     poses: dict[str, dict[str, HeldOutPose]] = {}
     for model in (name for name in names if name not in failed):
-        by_pose = {pose: found[model] for fold in measured for pose, found in fold.items() if model in found}
+        by_pose = {pose: by_model[model] for fold in measured for pose, by_model in fold.items() if model in by_model}
         if by_pose:
             poses[model] = by_pose
     if not poses:

@@ -1,4 +1,4 @@
-"""One least-squares shape in one cloud: what it leaves over, and what noise alone would leave over."""
+"""One least-squares shape in one cloud: its residuals, and those that noise alone would cause."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ LEAST_POINTS = 100
 
 @dataclass(frozen=True, eq=False)
 class ShapeResult:
-    """What a cloud's distance from its own best plane or sphere says.
+    """Distances of a cloud from its own best plane or sphere.
 
     ``points`` pixels were looked at; of these ``set_aside`` lie beyond 5 robust sigma and count neither in the fit nor
     in ``rms_mm``, the root mean square of the perpendicular (radial) distances. ``noise_floor_mm`` is what that would
@@ -41,7 +41,7 @@ class ShapeResult:
 
     @property
     def warning(self) -> str | None:
-        """A sentence if so much was set aside that the RMS does not speak for the shape."""
+        """A sentence if so much was set aside that the RMS is not representative of the shape."""
         if self.set_aside_share <= SET_ASIDE_WARNING:
             return None
         return (
@@ -68,13 +68,13 @@ def fit_settled(
     ``fit(points, shape)`` is a least-squares fit that may start from a shape. Returns the shape and which points were
     used, (n,) bool.
     """
-    shape, kept = start, np.zeros(len(points), dtype=bool)
+    shape, inliers = start, np.zeros(len(points), dtype=bool)
     for _ in range(30):
-        before, kept = kept, within_sigmas(shape.distance(points), points)
-        if np.count_nonzero(kept ^ before) <= 1e-5 * len(points):
+        before, inliers = inliers, within_sigmas(shape.distance(points), points)
+        if np.count_nonzero(inliers ^ before) <= 1e-5 * len(points):
             break
-        shape = fit(points[kept], shape)
-    return shape, kept
+        shape = fit(points[inliers], shape)
+    return shape, inliers
 
 
 def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -94,21 +94,21 @@ def measure(
     start: Fitted,
     fit: Callable[[np.ndarray], Fitted],
 ) -> tuple[Fitted, ShapeResult]:
-    """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and judge what is left over."""
+    """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and evaluate the residuals."""
     looked_at = mask & np.isfinite(points).all(axis=2)
     chosen = points[looked_at].astype(np.float64)
     if len(chosen) < LEAST_POINTS:
         raise InputError(f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed.")
-    shape, kept = fit_settled(lambda some, _: fit(some), chosen, start)
+    shape, is_inlier = fit_settled(lambda some, _: fit(some), chosen, start)
     residuals = shape.distance(chosen)
 
     error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)
     error_map[looked_at] = residuals
     inliers = np.zeros(points.shape[:2], dtype=bool)
-    inliers[looked_at] = kept
-    floor = float("nan") if sigma_z is None else noise_floor(shape, chosen[kept], sigma_z[inliers])
-    rms = float(np.sqrt(np.mean(residuals[kept] ** 2)))
-    return shape, ShapeResult(rms, floor, len(chosen), int(np.count_nonzero(~kept)), error_map, inliers)
+    inliers[looked_at] = is_inlier
+    floor = float("nan") if sigma_z is None else noise_floor(shape, chosen[is_inlier], sigma_z[inliers])
+    rms = float(np.sqrt(np.mean(residuals[is_inlier] ** 2)))
+    return shape, ShapeResult(rms, floor, len(chosen), int(np.count_nonzero(~is_inlier)), error_map, inliers)
 
 
 def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) -> float:

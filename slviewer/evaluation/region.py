@@ -67,12 +67,12 @@ def find_spheres(
 ) -> list[tuple[Sphere, np.ndarray]]:
     """``count`` spheres of one cloud and their regions, from left to right in the image."""
     free = measured_pixels(points, None)
-    found = []
+    spheres = []
     for _ in range(count):
         sphere, region = find_sphere(points, free, sigma_z, radius)
-        found.append((sphere, region))
+        spheres.append((sphere, region))
         free &= ~cv2.dilate(region.astype(np.uint8), np.ones((4 * RIM_PX + 1,) * 2, np.uint8)).astype(bool)
-    return sorted(found, key=lambda each: float(np.nonzero(each[1])[1].mean()))
+    return sorted(spheres, key=lambda each: float(np.nonzero(each[1])[1].mean()))
 
 
 def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None) -> Plane:

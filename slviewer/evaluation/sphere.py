@@ -45,5 +45,5 @@ def evaluate_spheres(
     points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
 ) -> list[SphereResult]:
     """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise as above."""
-    found = find_spheres(points, count, sigma_z, radius)
-    return [evaluate_sphere(points, region, sigma_z, radius, start) for start, region in found]
+    spheres = find_spheres(points, count, sigma_z, radius)
+    return [evaluate_sphere(points, region, sigma_z, radius, start) for start, region in spheres]

@@ -12,7 +12,7 @@ from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import Painter
 from slviewer.gui.steps.scan import sort_scans
 from slviewer.gui.widgets import Html, Text, paint
-from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
+from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.session.measurements import Measurement, measurement_arrays
 from slviewer.wizard.snapshot import SessionView
@@ -154,5 +154,5 @@ def _deviating(arrays: dict[str, np.ndarray], measured: Measurement) -> tuple[np
     limit = colour_limit(arrays["signed"], None if verdict is None else float(verdict["tolerance_mm"]))
     uncovered = arrays["uncovered"].reshape(-1, 3)
     points = np.concatenate([arrays["points"], uncovered]).astype(np.float32)
-    grey = np.broadcast_to(np.array(LEFT_OUT, np.uint8), uncovered.shape)
+    grey = np.broadcast_to(np.array(EXCLUDED_COLOUR, np.uint8), uncovered.shape)
     return points, np.concatenate([deviation_colours(arrays["signed"], limit), grey]), deviation_bar(limit)

@@ -4,7 +4,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 
-LEFT_OUT = (150, 154, 160)
+EXCLUDED_COLOUR = (150, 154, 160)
 _AT = np.array([-1.0, -0.6, -0.25, 0.0, 0.25, 0.6, 1.0])
 _RGB = np.array(
     [(26, 54, 140), (48, 126, 208), (150, 205, 232), (236, 238, 226), (250, 205, 120), (232, 112, 52), (150, 18, 38)],
@@ -19,7 +19,7 @@ def deviation_colours(signed: np.ndarray, limit: float) -> np.ndarray:
         raise InputError(f"A range of {limit:g} mm was given for the colours: give a positive one.")
     share = np.clip(np.nan_to_num(np.asarray(signed, np.float64) / limit), -1, 1)
     colours = np.stack([np.interp(share, _AT, _RGB[:, k]) for k in range(3)], axis=-1)
-    colours[~np.isfinite(signed)] = LEFT_OUT
+    colours[~np.isfinite(signed)] = EXCLUDED_COLOUR
     return np.asarray(np.round(colours), np.uint8)
 
 

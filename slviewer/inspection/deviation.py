@@ -19,12 +19,12 @@ REACH = 0.02
 """Of the nominal's diagonal: scan points farther from it belong to something else, a table or a clamp."""
 NOISE_REACH = 10.0
 COVERAGE_SAMPLES = 20_000
-MOST_ALIGNED = 60_000
-MOST_FEET = 400_000
+MAX_ALIGNED_POINTS = 60_000
+MAX_FEET = 400_000
 SPACINGS = 3.0
 """A place on the nominal was measured if a scan point's foot is no farther than so many of their spacings."""
-ROUNDS = 40
-SLANT = 0.5
+MAX_ITERATIONS = 40
+MIN_NORMAL_COSINE = 0.5
 """Cosine: a scan point whose normal is turned away further from the nominal's lies on something else there."""
 
 
@@ -73,7 +73,7 @@ class Deviation:
         }
 
     def histogram(self, bins: int = 81) -> tuple[np.ndarray, np.ndarray]:
-        """Edges (bins + 1,) mm, symmetric about 0, and counts (bins,); what lies beyond 99.8 % is left out."""
+        """Edges (bins + 1,) mm, symmetric about 0, and counts (bins,); values beyond 99.8 % are excluded."""
         values = self.signed[self.counted]
         limit = max(float(np.percentile(np.abs(values), 99.8)), 1e-6)
         edges = np.linspace(-limit, limit, bins + 1)
@@ -107,7 +107,7 @@ def deviation(
     belong to something else; by default 2 % of its diagonal, never below ten times the noise. ``initial`` (4, 4) scan
     to nominal: replaces the search. Raises SlviewerError where the two cannot be aligned with trust.
     """
-    say = progress or (lambda share: None)
+    report = progress or (lambda share: None)
     points = np.asarray(points, np.float64)
     if not len(points) or not np.isfinite(points).all():
         raise InputError("The scan has no points, or some that are not finite: give its measured points alone.")
@@ -116,24 +116,24 @@ def deviation(
         reach_mm = max(REACH * surface.diagonal, NOISE_REACH * (sigma_mm or 0.0))
     if not reach_mm > 0:
         raise InputError(f"A reach of {reach_mm:g} mm was given: give a positive one.")
-    say(0.0)
+    report(0.0)
     start = None
     if initial is None:
-        start = search_start(points, normals, surface, sigma_mm, lambda share: say(0.6 * share))
+        start = search_start(points, normals, surface, sigma_mm, lambda share: report(0.6 * share))
         initial = start.T_reference_scan
-    T, alignment = _best_fit(points, normals, surface, initial, reach_mm, lambda share: say(0.6 + 0.2 * share))
-    say(0.8)
+    T, alignment = _best_fit(points, normals, surface, initial, reach_mm, lambda share: report(0.6 + 0.2 * share))
+    report(0.8)
     signed, towards = _signed(points, normals, surface, T, reach_mm)
-    kept = np.isfinite(signed)
-    if not kept.any():
+    counted = np.isfinite(signed)
+    if not counted.any():
         raise InputError(
             f"No point of the scan lies within {reach_mm:.3g} mm of the nominal model: does it show that part?"
         )
-    say(0.95)
-    feet = move_points(T, points[kept]) - signed[kept, None] * towards[kept]
+    report(0.95)
+    feet = move_points(T, points[counted]) - signed[counted, None] * towards[counted]
     measured, uncovered = _coverage(feet, surface)
     back = np.linalg.inv(T)
-    say(1.0)
+    report(1.0)
     return Deviation(
         signed.astype(np.float32),
         (towards @ T[:3, :3]).astype(np.float32),
@@ -154,7 +154,7 @@ def _signed(
     belongs = np.abs(away) <= reach
     if normals is not None:
         cosine = np.sum((normals @ T[:3, :3].T) * towards, axis=1)
-        belongs &= ~(cosine < SLANT)  # an unknown normal says nothing
+        belongs &= ~(cosine < MIN_NORMAL_COSINE)  # an unknown normal excludes nothing
     away[~belongs] = np.nan
     towards[~belongs] = np.nan
     return away, towards
@@ -166,32 +166,32 @@ def _best_fit(
     surface: NominalSurface,
     T: np.ndarray,
     reach: float,
-    say: Callable[[float], None],
+    report: Callable[[float], None],
 ) -> tuple[np.ndarray, float]:
     """The pose of least squared distances of the points that belong to the nominal, by Gauss-Newton, and the standard
     uncertainty, mm, that its own gives the points."""
-    step = -(-len(points) // MOST_ALIGNED)
+    step = -(-len(points) // MAX_ALIGNED_POINTS)
     points = points[::step]
     normals = None if normals is None else normals[::step]
     T = np.array(T, np.float64)
-    for turn in range(ROUNDS):
-        say(turn / ROUNDS)
+    for turn in range(MAX_ITERATIONS):
+        report(turn / MAX_ITERATIONS)
         away, towards = _signed(points, normals, surface, T, reach)
-        kept = np.isfinite(away)
-        if np.count_nonzero(kept) < 100:
+        counted = np.isfinite(away)
+        if np.count_nonzero(counted) < 100:
             raise InputError(
-                f"Only {np.count_nonzero(kept)} points of the scan lie within {reach:.3g} mm of the nominal model: "
+                f"Only {np.count_nonzero(counted)} points of the scan lie within {reach:.3g} mm of the nominal model: "
                 "does it show that part?"
             )
-        moved = move_points(T, points[kept])
+        moved = move_points(T, points[counted])
         middle = moved.mean(axis=0)
-        J = np.hstack([np.cross(moved - middle, towards[kept]), towards[kept]])
+        J = np.hstack([np.cross(moved - middle, towards[counted]), towards[counted]])
         information = J.T @ J
-        change = -np.linalg.lstsq(information, J.T @ away[kept], rcond=1e-10)[0]
+        change = -np.linalg.lstsq(information, J.T @ away[counted], rcond=1e-10)[0]
         T = turn_about(change[:3], middle, change[3:]) @ T
         if np.abs(J @ change).max() < 1e-5:
             break
-    covariance = scatter_covariance(moved, J, away[kept])
+    covariance = scatter_covariance(moved, J, away[counted])
     return T, float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean()))
 
 
@@ -199,7 +199,7 @@ def _coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndar
     """Share of the nominal's area that was measured, and places (k, 3) in its frame of the rest. ``feet`` (n, 3): where
     on the nominal the scan's points were measured."""
     places, _ = surface.sample(COVERAGE_SAMPLES, seed=1)
-    thin = feet[:: -(-len(feet) // MOST_FEET)]
+    thin = feet[:: -(-len(feet) // MAX_FEET)]
     tree = cKDTree(thin)
     spacing, _ = tree.query(thin[:: -(-len(thin) // 2000)], k=2)
     away, _ = tree.query(places, workers=-1)

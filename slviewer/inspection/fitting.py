@@ -17,25 +17,25 @@ from slviewer.inspection.uncertainty import Shared, Spread, propagate_covariance
 from slviewer.records import to_plain
 
 LEAST_POINTS = 50
-MOST_FITTED = 20_000
+MAX_FITTED_POINTS = 20_000
 """Points that a fit looks at: more of them change it by less than what it cannot know anyway."""
-MOST_SHARED = 400
-MOST_COMPARED = 2_000
-MOST_LEFT_OUT = 0.4
+MAX_SHARED_POINTS = 400
+MAX_COMPARED_POINTS = 2_000
+MAX_EXCLUDED_SHARE = 0.4
 """Share of a region that may lie off the shape; beyond it the region holds something else."""
-MOST_RISE = 0.005
+MAX_RMS_RISE = 0.005
 """Distance from a plane (1 sigma), as a share of the region's size, from which on a region that bends is no plane."""
-RIVAL = 2.0
+RIVAL_RATIO = 2.0
 """Another shape must leave this many times less before a region is said to hold that one instead."""
-MOST_RADIUS = 100.0
+MAX_RADIUS_RATIO = 100.0
 """Times the region's size: a cylinder of a larger radius is a plane."""
-MOST_RADIUS_SIGMA = 0.1
+MAX_RADIUS_SIGMA = 0.1
 """Largest standard deviation of a radius, as a share of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureFit:
-    """A feature with what its fit left over, mm.
+    """A fitted feature and its residuals, mm.
 
     ``rms`` and ``maximum`` (signed, the one farthest off) over the points used; ``form``: width of the narrowest range
     that holds 95 % of their deviations; ``used`` and ``left_out`` count points; ``warnings``: sentences.
@@ -51,18 +51,18 @@ class FeatureFit:
     warnings: tuple[str, ...] = ()
 
     def quantities(self) -> list[Quantity]:
-        """What is read off it, each with its uncertainty where that is known."""
+        """The quantities of the feature, each with its uncertainty where that is known."""
         f, covariance = self.feature, self.spread.covariance
         known = self.spread.shared is not None
-        found: list[Quantity] = []
+        listed: list[Quantity] = []
         if f.radius is not None:
             sigma = propagate_covariance(lambda step: float(f.moved(step).radius or 0.0), covariance)
-            found.append(Quantity("radius", f.radius, "mm", sigma, known))
-            found.append(Quantity("diameter", 2 * f.radius, "mm", 2 * sigma, known))
-        found.append(Quantity("form (95 %)", self.form, "mm"))
-        found.append(Quantity("RMS", self.rms, "mm"))
-        found.append(Quantity("farthest off", self.maximum, "mm"))
-        return found
+            listed.append(Quantity("radius", f.radius, "mm", sigma, known))
+            listed.append(Quantity("diameter", 2 * f.radius, "mm", 2 * sigma, known))
+        listed.append(Quantity("form (95 %)", self.form, "mm"))
+        listed.append(Quantity("RMS", self.rms, "mm"))
+        listed.append(Quantity("farthest off", self.maximum, "mm"))
+        return listed
 
     def to_json(self) -> dict[str, Any]:
         """The record of a measurement, without the part of the uncertainty that fits of one calibration share."""
@@ -81,7 +81,7 @@ class FeatureFit:
 
 
 def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, calibration: str = "") -> FeatureFit:
-    """The shape of a region's points (n, 3) mm, by least squares of the distances, stray points set aside.
+    """The shape of a region's points (n, 3) mm, by least squares of the distances, outliers excluded.
 
     ``shared``: what the calibration leaves uncertain at places, of the ``calibration`` of that name or hash. Raises
     InputError where the region does not hold the shape.
@@ -94,62 +94,63 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
         )
     if kind == "point":
         raise InputError("A point is picked, not fitted: fit a plane, a sphere or a cylinder.")
-    looked_at = points[:: -(-len(points) // MOST_FITTED)]
+    looked_at = points[:: -(-len(points) // MAX_FITTED_POINTS)]
     try:
-        feature, kept = _fit_robustly(kind, looked_at)
+        feature, inliers = _fit_robustly(kind, looked_at)
     except InputError as error:
         raise _describe_alternative(kind, looked_at, error) from error
     residuals = feature.distance(points)
     counted = within_sigmas(residuals, points)
     used = int(np.count_nonzero(counted))
-    aside = 1 - used / len(points)
+    excluded_share = 1 - used / len(points)
     rms = float(np.sqrt(np.mean(residuals[counted] ** 2)))
-    if aside > MOST_LEFT_OUT:
+    if excluded_share > MAX_EXCLUDED_SHARE:
         raise InputError(
-            f"{100 * aside:.0f} % of the region lies off the best {kind}: select a region that shows nothing else."
+            f"{100 * excluded_share:.0f} % of the region lies off the best {kind}: "
+            "select a region that shows nothing else."
         )
-    basis = looked_at[kept]
+    basis = looked_at[inliers]
     _refuse_other(kind, feature, basis)
     spread = _estimate_spread(feature, basis, shared, calibration)
     _refuse_uncertain_radius(kind, feature, spread)
     warnings = []
-    if aside > SET_ASIDE_WARNING:
+    if excluded_share > SET_ASIDE_WARNING:
         warnings.append(
-            f"{100 * aside:.1f} % of the region lie beyond {SET_ASIDE_SIGMA:g} robust sigma of the {kind} and were set "
-            "aside: see that it shows nothing else"
+            f"{100 * excluded_share:.1f} % of the region lie beyond {SET_ASIDE_SIGMA:g} robust sigma "
+            f"of the {kind} and were excluded: see that it shows nothing else"
         )
     farthest = float(residuals[counted][np.argmax(np.abs(residuals[counted]))])
     form = narrowest_range(residuals[counted], 0.95)
     return FeatureFit(feature, spread, rms, farthest, form, used, len(points) - used, tuple(warnings))
 
 
-def least_squares(kind: Kind, points: np.ndarray, begin: Feature | None) -> Feature:
-    """The shape of least squared distances from points (n, 3); a cylinder needs somewhere to ``begin``."""
+def least_squares(kind: Kind, points: np.ndarray, start: Feature | None) -> Feature:
+    """The shape of least squared distances from points (n, 3); a cylinder needs a ``start``."""
     if kind == "plane":
         return fit_plane_feature(points)
     if kind == "sphere":
         return fit_sphere_feature(points)
-    assert begin is not None
-    return _fit_cylinder(begin, points)
+    assert start is not None
+    return _fit_cylinder(start, points)
 
 
 def _fit_robustly(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
     """The feature, and which of the points it was fitted to: repeated until the set is stable."""
 
-    def fit(some: np.ndarray, begin: Feature | None) -> Feature:
-        return least_squares(kind, some, begin)
+    def fit(some: np.ndarray, start: Feature | None) -> Feature:
+        return least_squares(kind, some, start)
 
     return fit_settled(fit, points, estimate_start(kind, points, fit))
 
 
 def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
-    """The least-squares cylinder near a start; its place ends beside the middle of the points. Raises InputError where
+    """The least-squares cylinder near a start; its place is next to the middle of the points. Raises InputError where
     the radius diverges: the points are flat."""
     solution = scipy.optimize.least_squares(
         lambda step: start.moved(step).distance(points), np.zeros(start.parameters), method="lm", max_nfev=600
     )
     feature = start.moved(solution.x)
-    if not 0 < (feature.radius or 0.0) < MOST_RADIUS * float(np.linalg.norm(np.ptp(points, axis=0))):
+    if not 0 < (feature.radius or 0.0) < MAX_RADIUS_RATIO * float(np.linalg.norm(np.ptp(points, axis=0))):
         raise InputError("No cylinder fits: its radius diverges; select a region that shows more of its curve.")
     assert feature.direction is not None
     along = feature.direction * np.sign(feature.direction[np.argmax(np.abs(feature.direction))])
@@ -162,7 +163,7 @@ def _estimate_spread(feature: Feature, points: np.ndarray, shared: Shared | None
     own = scatter_covariance(points, J, feature.distance(points))
     if shared is None:
         return Spread(own)
-    some = points[:: -(-len(points) // MOST_SHARED)]
+    some = points[:: -(-len(points) // MAX_SHARED_POINTS)]
     J = feature.jacobian(some)
     # a displacement of the points changes each distance by its part along the normal, and the fit makes up for it
     answers = -np.linalg.pinv(J)[:, :, None] * feature.normals(some)[None]
@@ -170,12 +171,12 @@ def _estimate_spread(feature: Feature, points: np.ndarray, shared: Shared | None
 
 
 def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
-    """Raise InputError where the region plainly holds something else than the shape asked for."""
-    some = points[:: -(-len(points) // MOST_COMPARED)]
+    """Raise InputError where the region plainly holds something else than the requested shape."""
+    some = points[:: -(-len(points) // MAX_COMPARED_POINTS)]
     mine = robust_sigma(feature.distance(some))
     if kind == "plane":
         size = float(np.linalg.norm(np.ptp(some, axis=0)))
-        if mine > MOST_RISE * size and mine > RIVAL * _residual_from_quadric(feature, some):
+        if mine > MAX_RMS_RISE * size and mine > RIVAL_RATIO * _residual_from_quadric(feature, some):
             raise InputError(
                 f"The region bends: it rises {mine:.3g} mm off its best plane over {size:.3g} mm; fit a sphere or a "
                 "cylinder, or select a flatter region."
@@ -183,12 +184,12 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
         return
     other: Kind = "cylinder" if kind == "sphere" else "sphere"
     rival, flat = _residual_of(other, some), _residual_of("plane", some)
-    if rival * RIVAL < mine and rival * RIVAL < flat:
+    if rival * RIVAL_RATIO < mine and rival * RIVAL_RATIO < flat:
         raise InputError(
             f"The region is no {kind}: points lie {mine:.3g} mm off it, and {rival:.3g} mm off a {other} (1 sigma); "
             f"fit a {other}, or select another region."
         )
-    if not flat > RIVAL * mine:
+    if not flat > RIVAL_RATIO * mine:
         raise InputError(
             f"The region is nearly flat: points lie {flat:.3g} mm off a plane, and {mine:.3g} mm off the {kind} (1 "
             f"sigma); fit a plane, or select more of the {kind}'s curve."
@@ -197,14 +198,15 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
 
 def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
     """What the region holds instead of a shape that could not be fitted at all."""
-    some = points[:: -(-len(points) // MOST_COMPARED)]
+    some = points[:: -(-len(points) // MAX_COMPARED_POINTS)]
     other: Kind = "cylinder" if kind == "sphere" else "sphere"
     flat, rival = _residual_of("plane", some), _residual_of(other, some)
-    best, left = (other, rival) if rival * RIVAL < flat else ("plane", flat)
-    if not np.isfinite(left):
+    best, residual = (other, rival) if rival * RIVAL_RATIO < flat else ("plane", flat)
+    if not np.isfinite(residual):
         return error
     return InputError(
-        f"The region holds no {kind}, rather a {best}: points lie {left:.3g} mm off that (1 sigma); fit a {best}, or "
+        f"The region holds no {kind}, rather a {best}: points lie {residual:.3g} mm off that (1 sigma); "
+        f"fit a {best}, or "
         f"select more of the {kind}'s curve."
     )
 
@@ -218,7 +220,7 @@ def _residual_of(kind: Kind, points: np.ndarray) -> float:
 
 
 def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
-    """Robust sigma in mm about the quadratic surface over a plane: curvature taken away, noise is left."""
+    """Robust sigma in mm about the quadratic surface over a plane: curvature removed, noise remains."""
     assert plane.direction is not None
     offsets = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets - (offsets @ plane.direction)[:, None] * plane.direction, full_matrices=False)
@@ -238,7 +240,7 @@ def _refuse_uncertain_radius(kind: Kind, feature: Feature, spread: Spread) -> No
     if feature.radius is None:
         return
     sigma = float(spread.sigmas[-1])
-    if not sigma <= MOST_RADIUS_SIGMA * feature.radius:
+    if not sigma <= MAX_RADIUS_SIGMA * feature.radius:
         raise InputError(
             f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the region shows too "
             "little of its curve; select more of it."

@@ -35,7 +35,7 @@ class NominalSurface:
         # normals of the vertices weighted by the triangles' angles tell the side of a place (Bærentzen and Aanæs 2005)
         self._smooth = np.asarray(self._mesh.vertex_normals)
         self._faces = mesh.faces
-        self._at_rim = _at_rim(mesh.faces, len(vertices))
+        self._at_rim = _rim_vertices(mesh.faces, len(vertices))
         core = open3d().core
         self._scene: Any = open3d().t.geometry.RaycastingScene()
         self._scene.add_triangles(
@@ -46,10 +46,10 @@ class NominalSurface:
         """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open mesh; and the
         surface's normals (n, 3) where each is nearest."""
         centred = points - self.middle
-        found = self._scene.compute_closest_points(open3d().core.Tensor(centred.astype(np.float32)))
-        face = found["primitive_ids"].numpy().astype(np.int64)
-        s, t = found["primitive_uvs"].numpy().astype(np.float64).T
-        offsets = centred - found["points"].numpy().astype(np.float64)
+        nearest = self._scene.compute_closest_points(open3d().core.Tensor(centred.astype(np.float32)))
+        face = nearest["primitive_ids"].numpy().astype(np.int64)
+        s, t = nearest["primitive_uvs"].numpy().astype(np.float64).T
+        offsets = centred - nearest["points"].numpy().astype(np.float64)
         normals = self._flat[face]
         # inside a triangle its own plane says how far; at a side or corner the direction does, and the side of the
         # surface follows from the normals of the vertices there
@@ -77,12 +77,12 @@ class NominalSurface:
     def seen_from(self, places: np.ndarray, facing: np.ndarray, view: np.ndarray, least: float) -> np.ndarray:
         """(n,) bool: which places (n, 3) on the surface, facing (n, 3), are seen from far away, in the direction
         ``view`` (3,); ``least``: cosine between the two."""
-        seen: np.ndarray = facing @ view > least
+        is_visible: np.ndarray = facing @ view > least
         lift = 1e-4 * self.diagonal
-        begin = (places[seen] - self.middle + lift * facing[seen]).astype(np.float32)
-        rays = np.concatenate([begin, np.broadcast_to(view, begin.shape)], axis=1).astype(np.float32)
-        seen[seen] = ~self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy()
-        return seen
+        origins = (places[is_visible] - self.middle + lift * facing[is_visible]).astype(np.float32)
+        rays = np.concatenate([origins, np.broadcast_to(view, origins.shape)], axis=1).astype(np.float32)
+        is_visible[is_visible] = ~self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy()
+        return is_visible
 
     def sample(self, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Places (count, 3) mm evenly over the area, and the unit normals (count, 3) there."""
@@ -92,10 +92,10 @@ class NominalSurface:
         return np.asarray(places) + self.middle, self._flat[face]
 
 
-def _at_rim(faces: np.ndarray, count: int) -> np.ndarray:
+def _rim_vertices(faces: np.ndarray, count: int) -> np.ndarray:
     """(count,) bool: the vertices at sides that one triangle alone has."""
     sides = np.sort(half_edges(faces), axis=1)
     edges, triangles = np.unique(sides, axis=0, return_counts=True)
-    found = np.zeros(count, bool)
-    found[edges[triangles == 1]] = True
-    return found
+    is_rim = np.zeros(count, bool)
+    is_rim[edges[triangles == 1]] = True
+    return is_rim

@@ -14,8 +14,8 @@ from slviewer.registration.refusal import Refused
 
 SAMPLES = 60_000
 """Points of the nominal that a scan is aligned with, all around it."""
-MOST_POINTS = 40_000
-LEAST_SEEN = 2_000
+MAX_POINTS = 40_000
+MIN_VISIBLE = 2_000
 GOOD_RMS = 0.002
 """Of the nominal's diagonal: no better place is looked for than one that leaves less, or thrice the noise, of most of
 the scan."""
@@ -25,7 +25,7 @@ VIEWS = [
     for view in sorted(product((-1, 0, 1), repeat=3), key=lambda v: (np.count_nonzero(v), -abs(v[2])))[1:]
 ]
 """From where a model is looked at: its sides, from below and above first, then its edges, then its corners."""
-FACING = 0.1
+MIN_FACING_COSINE = 0.1
 AWAY = 3.0
 """Diagonals: from so far."""
 
@@ -35,7 +35,7 @@ def search_start(
     normals: np.ndarray | None,
     surface: NominalSurface,
     sigma_mm: float | None,
-    say: Callable[[float], None],
+    report: Callable[[float], None],
 ) -> Registration:
     """The scan (n, 3) registered to the nominal.
 
@@ -43,40 +43,40 @@ def search_start(
     else the best that is accepted. Raises the first refusal where none is.
     """
     places, facing = surface.sample(SAMPLES)
-    step = -(-len(points) // MOST_POINTS)
+    step = -(-len(points) // MAX_POINTS)
     scan = prepare_scan("scan", points[::step], None if normals is None else normals[::step], sigma_mm)
     good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
     refusal: SlviewerError | None = None
     best: Registration | None = None
     for turn, view in enumerate(VIEWS):
-        say(turn / len(VIEWS))
-        seen = surface.seen_from(places, facing, view, FACING)
-        if np.count_nonzero(seen) < LEAST_SEEN:
+        report(turn / len(VIEWS))
+        visible = surface.seen_from(places, facing, view, MIN_FACING_COSINE)
+        if np.count_nonzero(visible) < MIN_VISIBLE:
             continue
         camera = surface.middle + AWAY * surface.diagonal * view
         try:
-            found = _registered(scan, prepare_scan("nominal model", places[seen] - camera, facing[seen]))
+            result = _register(scan, prepare_scan("nominal model", places[visible] - camera, facing[visible]))
         except SlviewerError as error:
             refusal = refusal or error
             continue
-        T = found.T_reference_scan.copy()
+        T = result.T_reference_scan.copy()
         T[:3, 3] += camera
-        found = replace(found, T_reference_scan=T)
-        if best is None or found.rms_mm / found.overlap < best.rms_mm / best.overlap:
-            best = found
+        result = replace(result, T_reference_scan=T)
+        if best is None or result.rms_mm / result.overlap < best.rms_mm / best.overlap:
+            best = result
         if best.rms_mm <= good and best.overlap >= GOOD_OVERLAP:
             break
     if best is None and isinstance(refusal, Refused):
         raise refusal.with_context(
-            "The scan was not found on the nominal model: see that it shows this part, at this size, and that little "
-            "else is in view. One of the tries ended so:"
+            "The scan could not be aligned to the nominal model: see that it shows this part, at this size, and that "
+            "little else is in view. One of the tries ended so:"
         )
     if best is None:
         raise refusal or SlviewerError("The nominal model shows no side that a scan could lie on: check the file.")
     return best
 
 
-def _registered(scan: PreparedScan, reference: PreparedScan) -> Registration:
+def _register(scan: PreparedScan, reference: PreparedScan) -> Registration:
     """As ``register_prepared``; of a part that looks alike from several sides the pose that leaves least: which of them
     it is makes no difference to how far the scan lies off."""
     size = min(scan.size, reference.size)
@@ -95,4 +95,4 @@ def _registered(scan: PreparedScan, reference: PreparedScan) -> Registration:
             continue
     if not alike:
         raise refusal
-    return min(alike, key=lambda found: found.rms_mm / found.overlap)
+    return min(alike, key=lambda result: result.rms_mm / result.overlap)

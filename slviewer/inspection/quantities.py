@@ -1,4 +1,4 @@
-"""One number that was measured, with its unit and how sure it is."""
+"""A measured number with its unit and uncertainty."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -26,7 +26,7 @@ class Meaning:
     of: Callable[[Feature, Feature], float]
 
 
-def _apart(a: Feature, b: Feature) -> float:
+def _distance(a: Feature, b: Feature) -> float:
     return float(np.linalg.norm(b.place - a.place))
 
 
@@ -36,21 +36,21 @@ def _angle(a: Feature, b: Feature) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), abs(u @ v))))
 
 
-def _off_axis(a: Feature, axis: Feature) -> float:
+def _offset(a: Feature, axis: Feature) -> float:
     return float(np.linalg.norm(np.cross(a.place - axis.place, _directed(axis))))
 
 
-def _over(a: Feature, plane: Feature) -> float:
+def _height(a: Feature, plane: Feature) -> float:
     return float((a.place - plane.place) @ _directed(plane))
 
 
-def _planes(a: Feature, b: Feature) -> float:
-    return 0.5 * (abs(_over(a, b)) + abs(_over(b, a)))
+def _plane_gap(a: Feature, b: Feature) -> float:
+    return 0.5 * (abs(_height(a, b)) + abs(_height(b, a)))
 
 
-def _axes(a: Feature, b: Feature) -> float:
+def _axis_gap(a: Feature, b: Feature) -> float:
     if _angle(a, b) < PARALLEL_DEG:
-        return 0.5 * (_off_axis(a, b) + _off_axis(b, a))
+        return 0.5 * (_offset(a, b) + _offset(b, a))
     across = np.cross(_directed(a), _directed(b))
     return float(abs((b.place - a.place) @ across) / np.linalg.norm(across))
 
@@ -66,55 +66,55 @@ def _directed(feature: Feature) -> np.ndarray:
 
 
 MEANINGS: dict[tuple[str, str], tuple[Meaning, ...]] = {
-    ("point", "point"): (Meaning("distance", "mm", "between the two points", _apart),),
+    ("point", "point"): (Meaning("distance", "mm", "between the two points", _distance),),
     ("point", "plane"): (
-        Meaning("height", "mm", "of the point over the plane, positive on the camera's side", _over),
+        Meaning("height", "mm", "of the point over the plane, positive on the camera's side", _height),
     ),
     ("point", "sphere"): (
-        Meaning("distance from the centre", "mm", "of the point", _apart),
+        Meaning("distance from the centre", "mm", "of the point", _distance),
         Meaning(
-            "distance from the surface", "mm", "of the point, negative inside", lambda p, s: _apart(p, s) - _size(s)
+            "distance from the surface", "mm", "of the point, negative inside", lambda p, s: _distance(p, s) - _size(s)
         ),
     ),
     ("point", "cylinder"): (
-        Meaning("distance from the axis", "mm", "of the point", _off_axis),
+        Meaning("distance from the axis", "mm", "of the point", _offset),
         Meaning(
-            "distance from the surface", "mm", "of the point, negative inside", lambda p, c: _off_axis(p, c) - _size(c)
+            "distance from the surface", "mm", "of the point, negative inside", lambda p, c: _offset(p, c) - _size(c)
         ),
     ),
     ("plane", "plane"): (
         Meaning("angle", "deg", "between the planes, 0 to 90", _angle),
-        Meaning("distance", "mm", "of the middle of each region from the other's plane, the mean of both", _planes),
+        Meaning("distance", "mm", "of the middle of each region from the other's plane, the mean of both", _plane_gap),
     ),
     ("plane", "sphere"): (
-        Meaning("height of the centre", "mm", "over the plane", lambda p, s: _over(s, p)),
-        Meaning("gap", "mm", "to the sphere, negative where they cut", lambda p, s: abs(_over(s, p)) - _size(s)),
+        Meaning("height of the centre", "mm", "over the plane", lambda p, s: _height(s, p)),
+        Meaning("gap", "mm", "to the sphere, negative where they cut", lambda p, s: abs(_height(s, p)) - _size(s)),
     ),
     ("plane", "cylinder"): (
         Meaning("angle", "deg", "between the axis and the plane", lambda p, c: 90.0 - _angle(p, c)),
         Meaning("height of the axis", "mm", "over the plane, in the middle of the cylinder's region",
-                lambda p, c: _over(c, p)),
+                lambda p, c: _height(c, p)),
     ),
     ("sphere", "sphere"): (
-        Meaning("distance of the centres", "mm", "of the two spheres", _apart),
-        Meaning("gap", "mm", "between the spheres", lambda a, b: _apart(a, b) - _size(a) - _size(b)),
+        Meaning("distance of the centres", "mm", "of the two spheres", _distance),
+        Meaning("gap", "mm", "between the spheres", lambda a, b: _distance(a, b) - _size(a) - _size(b)),
     ),
     ("sphere", "cylinder"): (
-        Meaning("distance from the axis", "mm", "of the sphere's centre", _off_axis),
+        Meaning("distance from the axis", "mm", "of the sphere's centre", _offset),
     ),
     ("cylinder", "cylinder"): (
         Meaning("angle", "deg", "between the axes, 0 to 90", _angle),
         Meaning("distance of the axes", "mm", f"the shortest; within {PARALLEL_DEG:g} degrees of parallel, that in the "
-                "middle of the regions", _axes),
+                "middle of the regions", _axis_gap),
     ),
 }  # fmt: skip
-"""What can be asked of two features."""
+"""The quantities of each pair of feature kinds."""
 
 
 def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list[Quantity]:
     """All quantities between two features, in either order, with what is known of their uncertainty.
 
-    What the same calibration leaves uncertain of both is not taken twice.
+    The uncertainty that both share through one calibration counts once.
     """
     if KINDS.index(a.kind) > KINDS.index(b.kind):
         a, a_spread, b, b_spread = b, b_spread, a, a_spread

@@ -61,35 +61,35 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
     share = (low / (low - high))[:, None]
     places = vertices[edges[:, 0]] * (1 - share) + vertices[edges[:, 1]] * share
     drawn = plane.drawn(places)
-    lines = [_ordered(drawn[chain]) for chain in _chains(segments, len(edges))]
+    lines = [_order_line(drawn[chain]) for chain in _join_segments(segments, len(edges))]
     return sorted(lines, key=lambda line: -float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))
 
 
-def _ordered(line: np.ndarray) -> np.ndarray:
+def _order_line(line: np.ndarray) -> np.ndarray:
     closed = np.array_equal(line[0], line[-1])
     return line if closed or line[0, 0] <= line[-1, 0] else line[::-1]
 
 
-def _chains(segments: np.ndarray, count: int) -> list[list[int]]:
+def _join_segments(segments: np.ndarray, count: int) -> list[list[int]]:
     """Segments (m, 2) of numbered places as lines of places that follow one another; open ones first."""
     touching: list[list[int]] = [[] for _ in range(count)]
     for number, (a, b) in enumerate(segments.tolist()):
         touching[a].append(number)
         touching[b].append(number)
-    ends, left = segments.tolist(), [True] * len(segments)
+    ends, is_unused = segments.tolist(), [True] * len(segments)
     # where more than two triangles share a side, lines end
     starts = [place for place in range(count) if len(touching[place]) != 2]
     chains = []
     for place in [*starts, *range(count)]:
         for first in touching[place]:
-            if not left[first]:
+            if not is_unused[first]:
                 continue
             chain, number = [place], first
             while True:
-                left[number] = False
+                is_unused[number] = False
                 a, b = ends[number]
                 chain.append(b if a == chain[-1] else a)
-                onwards = [n for n in touching[chain[-1]] if left[n]]
+                onwards = [n for n in touching[chain[-1]] if is_unused[n]]
                 if len(touching[chain[-1]]) != 2 or not onwards:
                     break
                 number = onwards[0]

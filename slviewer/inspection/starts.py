@@ -29,25 +29,25 @@ def estimate_start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Fe
     rated: list[tuple[float, int, Feature]] = []
     for n in range(HYPOTHESES if kind != "plane" else HYPOTHESES // 4):
         try:
-            found = _fit_sample(kind, sample, normals, rng)
+            candidate = _fit_sample(kind, sample, normals, rng)
         except (InputError, np.linalg.LinAlgError):
             continue
-        if found is not None:
-            rated.append((_median_distance(found, sample), n, found))
+        if candidate is not None:
+            rated.append((_median_distance(candidate, sample), n, candidate))
     refused: InputError | None = None
     best: tuple[float, Feature] | None = None
-    for rating, _, found in sorted(rated, key=lambda each: each[:2])[:POLISHED]:
+    for rating, _, candidate in sorted(rated, key=lambda each: each[:2])[:POLISHED]:
         for _ in range(3):
-            chosen = np.abs(found.distance(sample)) <= NEAR * 1.4826 * rating + 1e-9
+            chosen = np.abs(candidate.distance(sample)) <= NEAR * 1.4826 * rating + 1e-9
             try:
-                found = fit(sample[chosen], found)
+                candidate = fit(sample[chosen], candidate)
             except InputError as error:
                 refused = error
                 break
-            rating = _median_distance(found, sample)
+            rating = _median_distance(candidate, sample)
         else:
             if best is None or rating < best[0]:
-                best = rating, found
+                best = rating, candidate
     if best is None:
         raise refused or InputError(f"No {kind} passes through the {len(points)} points: select another region.")
     return best[1]
@@ -106,12 +106,12 @@ def _median_distance(feature: Feature, points: np.ndarray) -> float:
 
 def fit_sphere_feature(points: np.ndarray) -> Feature:
     """The least-squares sphere of points (n, 3). Raises InputError where they are too flat for one."""
-    found = fit_sphere(points)
-    return Feature("sphere", found.centre, None, found.radius)
+    sphere = fit_sphere(points)
+    return Feature("sphere", sphere.centre, None, sphere.radius)
 
 
 def fit_plane_feature(points: np.ndarray) -> Feature:
     """The least-squares plane of points (n, 3); its place is their middle."""
-    found = fit_plane(points)
+    plane = fit_plane(points)
     middle = points.mean(axis=0)
-    return Feature("plane", middle - found.distance(middle) * found.normal, found.normal)
+    return Feature("plane", middle - plane.distance(middle) * plane.normal, plane.normal)

@@ -37,17 +37,17 @@ class ToleranceVerdict:
     close: float
 
 
-def judge_deviation(found: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> ToleranceVerdict:
+def judge_deviation(deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> ToleranceVerdict:
     """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the surface's normal."""
     if not tolerance_mm > 0:
         raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
-    kept = found.counted
-    signed = found.signed[kept].astype(np.float64)
-    U = 2 * np.hypot(np.nan_to_num(sigma_mm[kept].astype(np.float64)), found.alignment_mm)
+    counted = deviation.counted
+    signed = deviation.signed[counted].astype(np.float64)
+    U = 2 * np.hypot(np.nan_to_num(sigma_mm[counted].astype(np.float64)), deviation.alignment_mm)
     typical = float(np.median(U))
     off = np.abs(signed)
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
-    numbers = found.statistics()
+    numbers = deviation.statistics()
     ends = [AcceptanceFigure.of_length(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")]
     decisions = [judge(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends]
     return ToleranceVerdict(

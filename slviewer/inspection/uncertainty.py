@@ -122,7 +122,7 @@ def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
     linear = np.linalg.lstsq(rays[known], grid[known], rcond=None)[0]
     pixels = points / points[:, 2:] @ linear
     for _ in range(6):
-        seen = view_pixels(rig, pixels, points[:, 2])[0]
-        wrong = np.nan_to_num(points - seen) / points[:, 2:]
+        viewed = view_pixels(rig, pixels, points[:, 2])[0]
+        wrong = np.nan_to_num(points - viewed) / points[:, 2:]
         pixels = pixels + wrong[:, :2] @ linear[:2]
     return pixels

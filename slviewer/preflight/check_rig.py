@@ -56,24 +56,24 @@ def check_rig(
 
 
 def check_capture(session: SessionLike, capture: str, *, progress: Progress = ignore_progress) -> Preflight:
-    """What the frames of a recorded capture say about the rig that took them: order, light, exposure, response, noise,
+    """Check the rig of a recorded capture from its frames: order, light, exposure, response, noise,
     description, decoded share. Raises SessionError for a capture that cannot be read, and whatever `progress` raises.
     """
     with opened(session) as store:
         return preflight_capture(store.load_capture(capture), progress)
 
 
-_LOOKS = 52
+_EXPECTED_IMAGES = 52
 """How often about the bench shows something: what progress is measured by."""
-_MEAN = 8  # images
+_AVERAGED_IMAGES = 8  # images
 _LONG_MS = 300.0  # of patience where the delay is unknown
-_ALL = ("latency", "exposure", "flicker", "gamma", "pixels", "order", "repeats", "ambient", "motion")
+_CHECK_ORDER = ("latency", "exposure", "flicker", "gamma", "pixels", "order", "repeats", "ambient", "motion")
 
 
 def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: Progress | None = None) -> Preflight:
     """Look at an open rig, on the thread that owns its devices; about 10 s.
 
-    `say` hears of each check as it is done, in a sentence. `progress` may raise Cancelled. Raises DeviceError where a
+    `say` receives one sentence for each check. `progress` may raise Cancelled. Raises DeviceError where a
     device does not answer. Patterns are loaded and light is shown; what was loaded and shown before is for the caller
     to restore.
     """
@@ -83,11 +83,11 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
 
     def tick(doing: str) -> None:
         nonlocal shown
-        heard(min(0.99, shown / _LOOKS), doing)
+        heard(min(0.99, shown / _EXPECTED_IMAGES), doing)
         shown += 1
 
-    def add(*found: Check) -> None:
-        for check in found:
+    def add(*results: Check) -> None:
+        for check in results:
             checks.append(check)
             if say is not None:
                 say(check.sentence if not check.remedy else f"{check.sentence} {check.remedy}")
@@ -97,24 +97,24 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
     delay, settle_ms = measure_latency(bench)
     if settle_ms is None:
         bench.settle_ms = _LONG_MS
-    seen = check_screen(bench)
-    if seen.verdict == "bad" or settle_ms is None:
+    screen = check_screen(bench)
+    if screen.verdict == "bad" or settle_ms is None:
         # What else was measured would be another screen's.
-        add(seen)
-        if seen.verdict != "bad":
+        add(screen)
+        if screen.verdict != "bad":
             add(delay)
         unseen = "It was not looked at, because the camera does not see what the projector is given to show."
-        rest = [name for name in _ALL if name not in {check.name for check in checks}]
+        rest = [name for name in _CHECK_ORDER if name not in {check.name for check in checks}]
         checks += [Check(name, "unknown", unseen, "", {}) for name in rest]
         return Preflight(tuple(checks), None, None, None, time.monotonic() - began)
-    add(seen, delay)
+    add(screen, delay)
     right, exposure_ms = check_exposure(bench)
     add(right)
     images = capture_burst(bench)
     add(check_flicker(bench, images))
     response, levels, middle = check_gamma(bench)
     add(response, check_pixels(bench, middle), *check_order(bench))
-    last_dark, last_white = (bench.grab_mean(grey, "what changed meanwhile", _MEAN) for grey in (None, 255))
+    last_dark, last_white = (bench.grab_mean(grey, "what changed meanwhile", _AVERAGED_IMAGES) for grey in (None, 255))
     add(check_ambient(bench, last_dark), check_motion(bench, images, last_white))
     heard(1.0, "checked")
     return Preflight(tuple(checks), settle_ms, levels, exposure_ms, time.monotonic() - began)

@@ -9,15 +9,15 @@ import numpy as np
 from slviewer.pipeline.check_results import Check
 from slviewer.preflight.rig_under_test import RigUnderTest
 
-_CHANGES = 8
+_CHANGE_COUNT = 8
 _NEAR, _NEAREST = (
     0.05,
     0.4,
 )  # share of a change that may be missing from one that has arrived, and that may under flicker
-_GIVE_UP_S = 1.2
-_PROOFS = 3
+_TIMEOUT_S = 1.2
+_STALE_TRIALS = 3
 _LONG_MS = 250.0
-_FEWEST_LIT = 0.01
+_MIN_ILLUMINATED = 0.01
 
 
 @dataclass(frozen=True)
@@ -35,25 +35,25 @@ class _Change:
 
 def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
     """The check, and the `settle_ms` that follows from it; fills in the bench's frame time, delay and stale images."""
-    if bench.illuminated.mean() < _FEWEST_LIT:
-        return Check("latency", "unknown", "The delay cannot be measured: no change of light is seen.", "", {}), None
+    if bench.illuminated.mean() < _MIN_ILLUMINATED:
+        return Check("latency", "unknown", "The delay cannot be measured: no change of light is visible.", "", {}), None
     begin_s = [bench.grab_timed()[0] for _ in range(6)]
     bench.frame_ms = 1000 * float(np.median(np.diff(begin_s)))
-    changes = [_time_change(bench, i) for i in range(_CHANGES)]
+    changes = [_time_change(bench, i) for i in range(_CHANGE_COUNT)]
     if not all(change.arrived for change in changes):
         lost = sum(not change.arrived for change in changes)
         return (
             Check(
                 "latency",
                 "bad",
-                f"After {lost} of {_CHANGES} changes the camera saw nothing new within {_GIVE_UP_S:g} s.",
+                f"After {lost} of {_CHANGE_COUNT} changes the camera saw nothing new within {_TIMEOUT_S:g} s.",
                 "Check that the projector really changes its picture, and that the camera sends fresh images.",
-                {"changes": _CHANGES, "unseen": lost},
+                {"changes": _CHANGE_COUNT, "unseen": lost},
             ),
             None,
         )
     settle = _settle_ms([change.arrival_ms(0) for change in changes], bench.frame_ms)
-    bench.stale = max(_count_stale(bench, settle, i) for i in range(_PROOFS))
+    bench.stale = max(_count_stale(bench, settle, i) for i in range(_STALE_TRIALS))
     fresh = [change.arrival_ms(bench.stale) for change in changes]
     settle = _settle_ms(fresh, bench.frame_ms)
     bench.settle_ms = settle
@@ -95,15 +95,15 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
 def _time_change(bench: RigUnderTest, i: int) -> _Change:
     """One change from dark to white or back; each begins at another moment of the camera's own clock."""
     target = 0.0 if i % 2 == 0 else 1.0  # the references leave it white
-    time.sleep(bench.frame_ms / 1000 * i / _CHANGES)
+    time.sleep(bench.frame_ms / 1000 * i / _CHANGE_COUNT)
     bench.show(255 if target else None, "delay of the light")
     shown, begin_s = time.monotonic(), []
     while True:
-        begin, image = bench.grab_timed()
-        begin_s.append(begin - shown)
+        start, image = bench.grab_timed()
+        begin_s.append(start - shown)
         if abs(bench.share(image, bench.illuminated) - target) < _change_tolerance(bench):
             return _Change(tuple(begin_s), True)
-        if begin - shown > _GIVE_UP_S:
+        if start - shown > _TIMEOUT_S:
             return _Change(tuple(begin_s), False)
 
 

@@ -36,8 +36,8 @@ def _grab_images(bench: RigUnderTest, grey: int | None, count: int) -> tuple[np.
     return np.array(begin_s), np.stack(images)
 
 
-_TARGET = 0.85  # of full scale, for the 99.5th percentile of what is illuminated
-_BACK_OFF = 0.5  # how much light is too much cannot be seen: half of it, then look again
+_TARGET_LEVEL = 0.85  # of full scale, for the 99.5th percentile of what is illuminated
+_SATURATED_FACTOR = 0.5  # the excess of a saturated image is unknown: half of it, then measure again
 
 
 def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
@@ -47,7 +47,7 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     clipped = float(np.mean(level >= 0.985 * full))
     black = float(np.median(bench.dark[bench.illuminated]))
     present = bench.rig.camera.settings().exposure_ms
-    factor = _BACK_OFF if bright >= 0.985 * full else (_TARGET * full - black) / max(bright - black, 1.0)
+    factor = _SATURATED_FACTOR if bright >= 0.985 * full else (_TARGET_LEVEL * full - black) / max(bright - black, 1.0)
     wanted = None if present is None else _round_ms(present * factor)
     figures = {
         "bright_share_of_full_scale": round(bright / full, 3),
@@ -77,10 +77,10 @@ def _round_ms(milliseconds: float) -> float:
 
 
 _LEVELS = np.arange(18) * 15
-CURVED = 0.03
+MAX_NONLINEARITY = 0.03
 """Deviation from a straight line, as a share of white, from which the response is named."""
 _MIN_PIXELS = 500  # pixels
-_MOST_FLICKER = 0.02
+_MAX_FLICKER = 0.02
 
 
 def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, float]:
@@ -89,7 +89,7 @@ def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, flo
     if np.count_nonzero(where) < _MIN_PIXELS:
         text = "The response cannot be measured: too few pixels are illuminated and not saturated."
         return Check("gamma", "unknown", text, "Correct the exposure first.", {}), None, 0.5
-    if bench.unsteady > _MOST_FLICKER:
+    if bench.unsteady > _MAX_FLICKER:
         text = f"The response cannot be measured: the light flickers by {100 * bench.unsteady:.0f} %."
         return Check("gamma", "unknown", text, "Correct the flicker first.", {}), None, 0.5
     images = [bench.grab_mean(int(level), "response to grey levels") for level in _LEVELS]
@@ -97,19 +97,19 @@ def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, flo
     if light[-1] <= light[0]:
         text = "The response cannot be measured: white is no brighter than black."
         return Check("gamma", "unknown", text, "Correct what the other checks name first.", {}), None, 0.5
-    seen = (light - light[0]) / (light[-1] - light[0])
-    exponent, curved = fit_gamma(_LEVELS, seen), measure_nonlinearity(_LEVELS, seen)
-    errors = {n: predict_phase_error(_LEVELS, seen, n) for n in (3, 4, 6, 8)}
+    response = (light - light[0]) / (light[-1] - light[0])
+    exponent, curved = fit_gamma(_LEVELS, response), measure_nonlinearity(_LEVELS, response)
+    errors = {n: predict_phase_error(_LEVELS, response, n) for n in (3, 4, 6, 8)}
     figures = {
         "gamma": round(exponent, 3),
         "nonlinearity_percent": round(100 * curved, 2),
         "phase_error_rad": {str(n): round(error, 5) for n, error in errors.items()},
         "shown": _LEVELS.tolist(),
-        "seen": [round(float(s), 5) for s in seen],
+        "seen": [round(float(s), 5) for s in response],
     }
-    levels = linearise_levels(_LEVELS, seen)
-    middle = float(np.interp(127.5, _LEVELS, seen))
-    if curved <= CURVED:
+    levels = linearise_levels(_LEVELS, response)
+    middle = float(np.interp(127.5, _LEVELS, response))
+    if curved <= MAX_NONLINEARITY:
         text = f"Light is proportional to grey levels within {100 * curved:.1f} %."
         return Check("gamma", "good", text, "", figures), levels, middle
     text = (
@@ -130,9 +130,9 @@ _DRIFTS = 0.8
 def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
     """Light in the dark frames, and whether it was the same at the end."""
     where = bench.illuminated
-    room = float(np.median(bench.dark[where])) / max(bench.contrast, 1e-6)
+    ambient = float(np.median(bench.dark[where])) / max(bench.contrast, 1e-6)
     step = float(np.median((last_dark - bench.dark)[where])) / max(bench.contrast, 1e-6)
-    figures = {"room_over_projector": round(room, 3), "change_over_projector": round(step, 4)}
+    figures = {"room_over_projector": round(ambient, 3), "change_over_projector": round(step, 4)}
     if abs(step) > max(_STEP, 3 * bench.unsteady):
         more = "brighter" if step > 0 else "darker"
         return Check(
@@ -142,15 +142,15 @@ def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
             "Keep lamps, doors and daylight as they are while capturing.",
             figures,
         )
-    if room > _BRIGHT:
+    if ambient > _BRIGHT:
         return Check(
             "ambient",
-            "bad" if room > _TOO_BRIGHT else "warning",
-            f"The room is {100 * room:.0f} % as bright as the projector's light.",
+            "bad" if ambient > _TOO_BRIGHT else "warning",
+            f"The room is {100 * ambient:.0f} % as bright as the projector's light.",
             "Darken the room, or move closer so that the projector is brighter.",
             figures,
         )
-    return Check("ambient", "good", f"The room adds {100 * room:.0f} % to the projector's light.", "", figures)
+    return Check("ambient", "good", f"The room adds {100 * ambient:.0f} % to the projector's light.", "", figures)
 
 
 def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
@@ -166,24 +166,24 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
         _remove_drift(v / span, t) for v, t in ((white, burst.white_s), (dark, burst.dark_s))
     )
     swing = float(np.sqrt(max(0.0, float(np.var(white_rest)) - noise**2)))
-    room = float(np.sqrt(max(0.0, float(np.var(dark_rest)) - noise**2)))
+    ambient = float(np.sqrt(max(0.0, float(np.var(dark_rest)) - noise**2)))
     present = bench.rig.camera.settings().exposure_ms
     hertz = _identify_mains(white_rest, burst.white_s)
     figures = {
         "rms_in_white": round(swing, 5),
-        "rms_in_dark": round(room, 5),
+        "rms_in_dark": round(ambient, 5),
         "drift": round(drift, 5),
         "mains_hz": hertz,
         "exposure_ms": present,
         "exposures_ms": _mains_multiples(present, hertz),
     }
-    worst = max(swing, room)
+    worst = max(swing, ambient)
     if worst <= _UNSTEADY:
         if abs(drift) > 2 * _UNSTEADY:
             text = f"The light drifts by {100 * abs(drift):.1f} % within a second."
             return Check("flicker", "warning", text, "Let the projector's lamp warm up for some minutes.", figures)
         return Check("flicker", "good", f"The light is steady to {100 * worst:.2f} %.", "", figures)
-    source = "room's" if room > 0.5 * swing else "projector's"
+    source = "room's" if ambient > 0.5 * swing else "projector's"
     named = {100: " (100 Hz)", 120: " (120 Hz)", None: ""}[hertz]
     return Check(
         "flicker",

@@ -1,4 +1,4 @@
-"""Is frame k of a capture pattern k? A burst of coded frames says so."""
+"""Is frame k of a capture pattern k? A burst of coded frames decides."""
 
 from dataclasses import replace
 
@@ -43,10 +43,10 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
     wrong = [i for i, on in levels.items() if abs(shares[i] - on) > 0.4]
     part = max(0.08, 5 * bench.unsteady)
     mixed = [i for i, on in levels.items() if part < abs(shares[i] - on) <= 0.4]
-    found = frame_residuals(sequence, stack, "x")
+    residuals = frame_residuals(sequence, stack, "x")
     # Where the light flickers, a frame that fits no step needs no other explanation.
     ignored = (*LIGHT_FAULTS, "strange") if bench.unsteady > 0.01 else LIGHT_FAULTS
-    misplaced = [s for s in found.suspects if s.fault not in ignored]
+    misplaced = [s for s in residuals.suspects if s.fault not in ignored]
     figures = {
         "frames": n,
         "light": [round(shares[i], 3) for i in sorted(shares)],
@@ -80,8 +80,8 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
             "Wait longer between showing and grabbing, or lock the camera to the projector.",
             figures,
         )
-    if found.said:
-        return Check("order", "unknown", f"The order could not be proved: {found.said}.", "", figures)
+    if residuals.said:
+        return Check("order", "unknown", f"The order could not be proved: {residuals.said}.", "", figures)
     return Check("order", "good", f"All {n} coded frames came in order.", "", figures)
 
 

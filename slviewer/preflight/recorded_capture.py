@@ -18,7 +18,7 @@ from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_fr
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.preflight.light import CURVED
+from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import check_repeats
 from slviewer.session.capture import Capture
 
@@ -32,7 +32,7 @@ _LEAST_ILLUMINATED = 0.005
 
 
 def preflight_capture(capture: Capture, progress: Progress = ignore_progress) -> Preflight:
-    """What the frames of a capture say about the rig that took them, in the words of `run.preflight`."""
+    """Check the rig of a capture from its frames, with the messages of `check_rig.preflight`."""
     began = time.monotonic()
     progress(0.0, "reading frames")
     frames, sequence = capture.stack(), capture.sequence
@@ -45,21 +45,21 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
     progress(0.5, "comparing the frames")
     fits = capture_residuals(sequence, frames)
     checks = (
-        _description(capture.name, sequence, frames, phases),
-        _order(sequence, fits),
+        _check_description(capture.name, sequence, frames, phases),
+        _check_order(sequence, fits),
         check_repeats(sequence, frames),
         check_capture_exposure(sequence, frames, phases),
-        _light(fits),
-        _room_light(fits),
-        _response(sequence, frames, fits),
-        _noise(sequence, frames, phases),
-        _decoded(phases),
+        _check_light(fits),
+        _check_ambient_light(fits),
+        _check_response(sequence, frames, fits),
+        _check_noise(sequence, frames, phases),
+        _check_decoded(phases),
     )
     progress(1.0, "checked")
     return Preflight(checks, None, None, None, time.monotonic() - began)
 
 
-def _description(
+def _check_description(
     name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
 ) -> Check:  # fmt: skip
     try:
@@ -70,74 +70,74 @@ def _description(
     return Check("description", "good", "The frames agree with the description of the patterns.", "", {})
 
 
-def _order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> Check:
+def _check_order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> Check:
     others = _LIGHT_FAULTS + _ROOM_FAULTS + _RESPONSE_FAULTS
     suspects = [s for fit in fits for s in fit.suspects if s.fault not in others]
     n = len(sequence.frames)
     figures = {"frames": n, "misplaced_frames": sorted({s.frame + 1 for s in suspects})}
     if suspects:
-        said = "; ".join(dict.fromkeys(s.sentence for s in suspects[:3]))
+        findings = "; ".join(dict.fromkeys(s.sentence for s in suspects[:3]))
         remedy = "Capture again with a longer delay between showing and grabbing, or put the files in order."
-        return Check("order", "bad", f"Of {n} frames, {said}.", remedy, figures)
+        return Check("order", "bad", f"Of {n} frames, {findings}.", remedy, figures)
     unknown = "; ".join(fit.said for fit in fits if fit.said)
     if unknown:
         return Check("order", "unknown", f"The order of some frames cannot be checked: {unknown}.", "", figures)
     return Check("order", "good", f"All {n} frames are in order.", "", figures)
 
 
-def _light(fits: Sequence[FrameResiduals]) -> Check:
+def _check_light(fits: Sequence[FrameResiduals]) -> Check:
     known = np.array([f.light for fit in fits for f in fit.frames if np.isfinite(f.light)])
     spread = float(np.sqrt(np.mean((known - 1) ** 2))) if known.size else None
     figures = {"rms_from_frame_to_frame": None if spread is None else round(spread, 5)}
     suspects = [s for fit in fits for s in fit.suspects if s.fault in _LIGHT_FAULTS]
     if suspects:
-        said = "; ".join(dict.fromkeys(s.sentence for s in suspects[:3]))
+        findings = "; ".join(dict.fromkeys(s.sentence for s in suspects[:3]))
         remedy = (
             "Lock the camera's exposure, gain and white balance; make the exposure a multiple of 10 ms (8.33 ms where "
             "the mains have 60 Hz)."
         )
-        return Check("flicker", "warning", f"{said[0].upper()}{said[1:]}.", remedy, figures)
+        return Check("flicker", "warning", f"{findings[0].upper()}{findings[1:]}.", remedy, figures)
     if spread is None:
         return Check("flicker", "good", "No frame is brighter or darker than the others.", "", figures)
     return Check("flicker", "good", f"The light is steady to {100 * spread:.2f} % from frame to frame.", "", figures)
 
 
-def _room_light(fits: Sequence[FrameResiduals]) -> Check:
+def _check_ambient_light(fits: Sequence[FrameResiduals]) -> Check:
     suspects = [s for fit in fits for s in fit.suspects if s.fault in _ROOM_FAULTS]
     if suspects:
-        said = "; ".join(dict.fromkeys(s.sentence for s in suspects))
+        findings = "; ".join(dict.fromkeys(s.sentence for s in suspects))
         remedy = "Keep lamps, doors and daylight as they are while capturing."
-        return Check("ambient", "warning", f"{said[0].upper()}{said[1:]}.", remedy, {})
+        return Check("ambient", "warning", f"{findings[0].upper()}{findings[1:]}.", remedy, {})
     return Check("ambient", "good", "The light of the room did not change between the frames.", "", {})
 
 
-def _response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]) -> Check:
+def _check_response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]) -> Check:
     remedy = "Straighten the projector's response, or use more steps."
     suspects = [s.sentence for fit in fits for s in fit.suspects if s.fault in _RESPONSE_FAULTS]
     harmonics = {axis: measure_second_harmonic(sequence, frames, axis) for axis in sequence.axes}
     known = {axis: value for axis, value in harmonics.items() if np.isfinite(value)}
     if suspects:
-        said = "; ".join(dict.fromkeys(suspects))
-        return Check("gamma", "warning", f"{said[0].upper()}{said[1:]}.", remedy, {})
+        findings = "; ".join(dict.fromkeys(suspects))
+        return Check("gamma", "warning", f"{findings[0].upper()}{findings[1:]}.", remedy, {})
     if not known:
         why = "fewer than five phase steps, or too few pixels that see fringes"
         return Check("gamma", "unknown", f"The response cannot be measured: {why}.", "", {})
     axis = max(known, key=lambda each: abs(known[each]))
     gamma, steps = gamma_from_harmonic(known[axis]), axis_layout(sequence, axis).steps
     shown = np.linspace(0, 255, 18)
-    seen = (shown / 255) ** gamma
-    curved, error = measure_nonlinearity(shown, seen), predict_phase_error(shown, seen, steps)
+    response = (shown / 255) ** gamma
+    curved, error = measure_nonlinearity(shown, response), predict_phase_error(shown, response, steps)
     figures = {"second_harmonic": {a: round(h, 4) for a, h in known.items()}, "gamma": round(gamma, 3)}
-    said = f"a second harmonic of {100 * known[axis]:.1f} % of the fringe, as of a gamma of {gamma:.2f}"
-    if curved <= CURVED:
-        return Check("gamma", "good", f"The response is straight: {said}.", "", figures)
-    sentence = f"The response is curved: {said}; an error of {error:.4f} rad with {steps} steps."
+    findings = f"a second harmonic of {100 * known[axis]:.1f} % of the fringe, as of a gamma of {gamma:.2f}"
+    if curved <= MAX_NONLINEARITY:
+        return Check("gamma", "good", f"The response is straight: {findings}.", "", figures)
+    sentence = f"The response is curved: {findings}; an error of {error:.4f} rad with {steps} steps."
     return Check("gamma", "warning", sentence, remedy, figures)
 
 
-def _noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
+def _check_noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
     figures: dict[str, Any] = {}
-    said, weak = [], False
+    lines, weak = [], False
     for axis, phase in phases.items():
         valid = phase.mask
         if not valid.any():
@@ -155,10 +155,10 @@ def _noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, 
             "median_modulation_levels": round(modulation, 2),
             "median_sigma_px": round(sigma, 5),
         }
-        said.append(f"axis {axis}: noise {noise:.2f} of {modulation:.1f} grey levels of modulation, {sigma:.3f} px")
-    if not said:
+        lines.append(f"axis {axis}: noise {noise:.2f} of {modulation:.1f} grey levels of modulation, {sigma:.3f} px")
+    if not lines:
         return Check("noise", "unknown", "The noise cannot be judged: no pixel is valid.", "", {})
-    sentence = f"{'; '.join(said)}."
+    sentence = f"{'; '.join(lines)}."
     sentence = sentence[0].upper() + sentence[1:]
     if weak:
         remedy = "Make the patterns brighter: longer exposure, wider aperture, darker room, or a nearer projector."
@@ -166,9 +166,9 @@ def _noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, 
     return Check("noise", "good", sentence, "", figures)
 
 
-def _decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
+def _check_decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
     figures: dict[str, Any] = {}
-    said, worst, least = [], 1.0, 1.0
+    lines, worst, least = [], 1.0, 1.0
     for axis, phase in phases.items():
         illuminated = float(phase.illuminated.mean())
         counts = {reason: float(np.mean(phase.reason == reason)) for reason in Reason}
@@ -177,10 +177,10 @@ def _decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
         figures[axis] = {"illuminated_share": round(illuminated, 4), "decoded_share": round(share, 4)} | {
             f"{reason.name.lower()}_share": round(value, 4) for reason, value in counts.items()
         }
-        said.append(
+        lines.append(
             f"axis {axis}: {100 * share:.1f} % of the illuminated {100 * illuminated:.1f} % of the image decode"
         )
-    sentence = "; ".join(said)
+    sentence = "; ".join(lines)
     sentence = f"{sentence[0].upper()}{sentence[1:]}."
     if least < _LEAST_ILLUMINATED or worst < _TOO_FEW:
         verdict: CheckVerdict = "bad"

@@ -11,8 +11,8 @@ from slviewer.fringe.layout import white_level
 
 _PIXELS = 150_000
 """So many pixels of an image are looked at."""
-_PATIENCE_S = 0.35
-_PATIENT_GRABS = 4
+_SETTLE_S = 0.35
+_DISCARDED_GRABS = 4
 """What a reference waits for: longer than any projector and camera take between them."""
 _MEAN = 8
 _SIGMAS = 6.0
@@ -46,8 +46,8 @@ class RigUnderTest:
 
     def grab_timed(self) -> tuple[float, np.ndarray]:
         """When grabbing began, in s of the monotonic clock, and the image."""
-        begin = time.monotonic()
-        return begin, self.grab()
+        start_s = time.monotonic()
+        return start_s, self.grab()
 
     def show(self, grey: int | None, doing: str) -> None:
         """Even light, without waiting for it. May raise Cancelled."""
@@ -68,34 +68,34 @@ class RigUnderTest:
 
     def measure_references(self) -> None:
         """Measure dark and white, with patience: nothing is known yet of the rig's delays."""
-        taken = []
+        bursts = []
         for grey, doing in ((None, "dark"), (255, "white light")):
             self.show(grey, doing)
-            end, passed = time.monotonic() + _PATIENCE_S, 0
-            while time.monotonic() < end or passed < _PATIENT_GRABS:
+            end, passed = time.monotonic() + _SETTLE_S, 0
+            while time.monotonic() < end or passed < _DISCARDED_GRABS:
                 self.grab()
                 passed += 1
                 time.sleep(max(0.0, min(0.02, end - time.monotonic())))
-            taken.append(np.stack([self.grab() for _ in range(_MEAN)]))
-        dark, white = taken
+            bursts.append(np.stack([self.grab() for _ in range(_MEAN)]))
+        dark, white = bursts
         self.dark, self.white = dark.mean(axis=0), white.mean(axis=0)
         difference = white[1] - white[0]
         self.noise = float(np.median(np.abs(difference - np.median(difference)))) / 0.6745 / math.sqrt(2)
         # Light that flickers lifts whole images, and must not pass for the projector's.
-        swing = max(float(np.std([np.median(image) for image in images])) for images in taken)
+        swing = max(float(np.std([np.median(image) for image in images])) for images in bursts)
         self.illuminated = self.white - self.dark > max(_SIGMAS * self.noise, 0.02 * self.full, 3 * swing)
         if self.illuminated.any():
-            self.unsteady = max(float(np.std([self.share(i, self.illuminated) for i in images])) for images in taken)
+            self.unsteady = max(float(np.std([self.share(i, self.illuminated) for i in images])) for images in bursts)
 
     @property
     def full(self) -> float:
         """The grey level at which the camera clips."""
-        seen = np.stack([self.white, self.dark]).astype(self._frame.dtype)
-        return white_level(seen, [0, 1])
+        references = np.stack([self.white, self.dark]).astype(self._frame.dtype)
+        return white_level(references, [0, 1])
 
     @property
     def contrast(self) -> float:
-        """Grey levels of the projector's white light where it is seen, in the middle."""
+        """Grey levels of the projector's white light: median over the illuminated pixels."""
         return float(np.median((self.white - self.dark)[self.illuminated])) if self.illuminated.any() else 0.0
 
     def usable(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from slviewer.pipeline.check_results import Check
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CODE = (1, 0, 1, 1, 0, 0, 1, 0)
-_FOLLOWS = 0.9  # correlation with the code
+_MIN_CORRELATION = 0.9  # correlation with the code
 _NOTHING, _LITTLE = 0.01, 0.1  # shares of the image
 
 
@@ -22,7 +22,7 @@ def check_screen(bench: RigUnderTest) -> Check:
     amplitude = np.tensordot(code, images, 1) / float(code @ code)  # grey levels, white less dark
     spread = np.sqrt((images**2).sum(axis=0) * float(code @ code))
     correlation = amplitude * float(code @ code) / np.maximum(spread, 1e-6)
-    follows = (correlation > _FOLLOWS) & (amplitude > max(4 * bench.noise, 0.01 * bench.full))
+    follows = (correlation > _MIN_CORRELATION) & (amplitude > max(4 * bench.noise, 0.01 * bench.full))
     share = float(follows.mean())
     if share >= _NOTHING:
         bench.illuminated = follows
@@ -55,8 +55,8 @@ def _median_where(values: np.ndarray, where: np.ndarray) -> float:
     return float(np.median(values[where])) if where.any() else 0.0
 
 
-_TELLS = 0.08  # grey must be so far from half as bright as white
-_OFF = 0.3  # of that distance
+_MIN_GREY_CONTRAST = 0.08  # grey must be so far from half as bright as white
+_MAX_DEVIATION = 0.3  # of that distance
 
 
 def check_pixels(bench: RigUnderTest, middle: float) -> Check:
@@ -67,7 +67,7 @@ def check_pixels(bench: RigUnderTest, middle: float) -> Check:
     or not. Where a display scales them they become grey, and grey of a gamma is not half as bright.
     """
     where = bench.usable()
-    if abs(middle - 0.5) < _TELLS or not where.any():
+    if abs(middle - 0.5) < _MIN_GREY_CONTRAST or not where.any():
         text = "Whether the display scales the patterns cannot be seen: its grey is as bright as its finest stripes."
         return Check("pixels", "unknown", text, "", {"middle_grey": round(middle, 3)})
     size = bench.rig.projector.size
@@ -76,7 +76,7 @@ def check_pixels(bench: RigUnderTest, middle: float) -> Check:
         sequence = PatternSequence(size, tuple(phase_steps(axis, 4, 2.0)))
         rig = Rig(bench.rig.name, bench.rig.camera, bench.rig.projector, bench.settle_ms)
         frames = capture(rig, sequence)[:, :: bench.stride, :: bench.stride]
-        both = (frames[0].astype(np.float32) + frames[2]) / 2  # stripes and their negative: no moire is left
+        both = (frames[0].astype(np.float32) + frames[2]) / 2  # stripes and their negative: without moire
         shares.append(bench.share(both, where))
     worst = max(shares, key=lambda share: abs(share - 0.5))
     figures = {
@@ -84,7 +84,7 @@ def check_pixels(bench: RigUnderTest, middle: float) -> Check:
         "fine_stripes_y": round(shares[1], 3),
         "middle_grey": round(middle, 3),
     }
-    if (worst - 0.5) / (middle - 0.5) > _OFF:
+    if (worst - 0.5) / (middle - 0.5) > _MAX_DEVIATION:
         return Check(
             "pixels",
             "bad",

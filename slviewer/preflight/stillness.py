@@ -9,26 +9,26 @@ from slviewer.preflight.rig_under_test import RigUnderTest
 _BLOCK = 6  # sampled pixels
 _SIGMAS = 8.0
 _CHANGE = 0.04  # of the projector's light
-_SOMETHING, _MUCH = 0.004, 0.05  # shares of what is illuminated
+_SOME_MOTION, _MUCH_MOTION = 0.004, 0.05  # shares of what is illuminated
 
 
 def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Check:
     """White images of the beginning, the middle and the end, block by block, whatever the light as a whole did."""
     blocks = np.stack([_block_means(image, bench.illuminated) for image in (bench.white, *burst.white, last_white)])
-    seen = np.isfinite(blocks[0])
-    if not seen.any():
+    measured = np.isfinite(blocks[0])
+    if not measured.any():
         return Check("motion", "unknown", "Motion cannot be seen: too little is illuminated.", "", {})
-    blocks = blocks[:, seen]
+    blocks = blocks[:, measured]
     blocks = np.stack([_match_light(image, blocks[0]) for image in blocks])
     noise = 1.4826 * float(np.median(np.abs(np.diff(blocks[1:-1], axis=0)))) / np.sqrt(2)
     limit = max(_SIGMAS * np.sqrt(2) * noise, _CHANGE * bench.contrast)
     moved = (np.abs(blocks[1:] - blocks[0]) > limit).mean(axis=1)
     share = float(moved.max())
     figures = {"share_that_moved": round(share, 4), "limit_levels": round(limit, 2)}
-    if share > _SOMETHING:
+    if share > _SOME_MOTION:
         return Check(
             "motion",
-            "bad" if share > _MUCH else "warning",
+            "bad" if share > _MUCH_MOTION else "warning",
             f"{100 * share:.1f} % of the illuminated image changed while nothing should have: something moved.",
             "Let nothing move in front of the rig, stand it firmly, then check again.",
             figures,

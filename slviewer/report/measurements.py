@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
+from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import DECIDED, RULE
 from slviewer.records import from_plain
@@ -224,7 +224,7 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
     width, height = PICTURE
     points = np.concatenate([arrays["points"], arrays["uncovered"]]).astype(np.float64)
     normals = np.concatenate([arrays["normals"], np.full(arrays["uncovered"].shape, np.nan)])
-    grey = np.broadcast_to(np.array(LEFT_OUT, np.uint8), arrays["uncovered"].shape)
+    grey = np.broadcast_to(np.array(EXCLUDED_COLOUR, np.uint8), arrays["uncovered"].shape)
     colours = np.concatenate([deviation_colours(arrays["signed"], limit), grey]) / 255.0
     style_image_axes(left, f"{view.source} against {view.data['nominal']['name']}")
     left.imshow(

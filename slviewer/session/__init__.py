@@ -9,10 +9,10 @@
                            `texture.png` where the texture has colour
 `results/<name>/`          `meta.json` and one `.npy` an array; the name may hold slashes
 `rigs/<name>.toml`         the operator's own rigs
-`decisions.json`           what the operator decided, such as captures left out and why
+`decisions.json`           what the operator decided, such as captures excluded and why
 `trash/`                   what was replaced or deleted
 `exports/`                 files for other programs
 =========================  ==================================================================================
 
-A capture or result is written beside its place, synced, and renamed in: it is complete or absent, whatever happens.
+A capture or result is written next to its place, synced, and renamed in: it is complete or absent, whatever happens.
 """

@@ -1,6 +1,6 @@
 """Folders and files that are complete or absent, also after `kill -9` or with a full disk.
 
-A folder is written as `.<name>.tmp-<pid>-<random>` beside its place, every file synced, then renamed in. Where it
+A folder is written as `.<name>.tmp-<pid>-<random>` next to its place, every file synced, then renamed in. Where it
 replaces another it is first renamed to `.<name>.new-<pid>-<random>`: from then on the replacement is decided, and
 `recover` finishes it if the program dies between moving the old folder away and moving the new one in.
 """
@@ -71,7 +71,7 @@ def replace_json(path: Path, data: Any) -> None:
 
 def replace_file(path: Path, data: bytes) -> None:
     """Replace a file by a new one in one step. Raises SessionError where the disk refuses; the old one then stays."""
-    temporary = _beside(path, "tmp")
+    temporary = _staging_path(path, "tmp")
     with _disk_errors(path.parent, len(data)):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -90,10 +90,10 @@ def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
     For what is too large to be one `bytes`. Raises SessionError if the disk has not `needs_bytes` to spare, or refuses;
     what stood there then stays.
     """
-    temporary = _beside(path, "tmp")
+    temporary = _staging_path(path, "tmp")
     with _disk_errors(path.parent, needs_bytes):
         path.parent.mkdir(parents=True, exist_ok=True)
-        _check_space(path.parent, needs_bytes)
+        _require_space(path.parent, needs_bytes)
         try:
             with open(temporary, "xb") as file:
                 yield file
@@ -108,15 +108,15 @@ def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
 
 @contextmanager
 def staged_folder(target: Path, needs_bytes: int) -> Iterator[Path]:
-    """A new empty folder beside `target` to write into; synced when the block ends, gone if it fails.
+    """A new empty folder next to `target` to write into; synced when the block ends, gone if it fails.
 
     The caller then hands it to `commit`. Raises SessionError if the disk has not `needs_bytes` to spare, or fills up
     or fails while the block writes.
     """
     with _disk_errors(target.parent, needs_bytes):
         target.parent.mkdir(parents=True, exist_ok=True)
-        _check_space(target.parent, needs_bytes)
-        folder = _beside(target, "tmp")
+        _require_space(target.parent, needs_bytes)
+        folder = _staging_path(target, "tmp")
         folder.mkdir()
         try:
             yield folder
@@ -131,10 +131,10 @@ def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
     """Rename a staged folder to `target`. What stood there goes to `old_to`, or is deleted where that is None."""
     with _disk_errors(target.parent):
         if target.exists():
-            decided = _beside(target, "new")
+            decided = _staging_path(target, "new")
             os.rename(folder, decided)
             sync_folder(target.parent)
-            _make_way(target, old_to)
+            _move_away(target, old_to)
             folder = decided
         os.rename(folder, target)
         sync_folder(target.parent)
@@ -157,68 +157,70 @@ def discard(folder: Path) -> None:
         folder.unlink(missing_ok=True)
 
 
-def leftovers(root: Path) -> list[Path]:
-    """What writers that died left under `root`, or writers at work there are writing."""
-    found = []
+def list_leftovers(root: Path) -> list[Path]:
+    """Unfinished files and folders under `root`, of writers that died or are still writing."""
+    unfinished = []
     for parent, folders, files in os.walk(root):
-        found += [Path(parent, name) for name in (*folders, *files) if _LEFTOVER.fullmatch(name)]
+        unfinished += [Path(parent, name) for name in (*folders, *files) if _LEFTOVER.fullmatch(name)]
         # neither into leftovers nor into stacks, which hold a folder a frame
         folders[:] = [name for name in folders if not _LEFTOVER.fullmatch(name) and not name.endswith(".zarr")]
-    return found
+    return unfinished
 
 
 def recover(root: Path, trash: Path) -> None:
     """Finish decided replacements and remove unfinished ones. Call with the session's lock held, nothing writing."""
-    for path in leftovers(root):
+    for path in list_leftovers(root):
         match = _LEFTOVER.fullmatch(path.name)
         if match and match["state"] == "new":
             target = path.with_name(match["name"])
             if target.exists():
-                _make_way(target, trash / f"{target.name}-{secrets.token_hex(4)}")
+                _move_away(target, trash / f"{target.name}-{secrets.token_hex(4)}")
             os.rename(path, target)
             sync_folder(target.parent)
         else:
             discard(path)
 
 
-def _make_way(target: Path, old_to: Path | None) -> None:
+def _move_away(target: Path, old_to: Path | None) -> None:
     if old_to is not None:
         move(target, old_to)
         return
-    doomed = _beside(target, "tmp")
+    doomed = _staging_path(target, "tmp")
     os.rename(target, doomed)
     discard(doomed)
 
 
-def _beside(target: Path, state: str) -> Path:
+def _staging_path(target: Path, state: str) -> Path:
     return target.with_name(f".{target.name}.{state}-{os.getpid()}-{secrets.token_hex(4)}")
 
 
-def _check_space(folder: Path, needs_bytes: int) -> None:
+def _require_space(folder: Path, needs_bytes: int) -> None:
     if shutil.disk_usage(folder).free < needs_bytes + _SPARE_BYTES:
-        raise _full(folder, needs_bytes)
+        raise _disk_full_error(folder, needs_bytes)
 
 
-def _full(folder: Path, needs_bytes: int) -> SessionError:
+def _disk_full_error(folder: Path, needs_bytes: int) -> SessionError:
     free = shutil.disk_usage(folder).free
-    needs = f"needs {megabytes(needs_bytes)} and {megabytes(_SPARE_BYTES)} to spare, " if needs_bytes else ""
+    needs = (
+        f"needs {format_megabytes(needs_bytes)} and {format_megabytes(_SPARE_BYTES)} to spare, " if needs_bytes else ""
+    )
     return SessionError(
-        f"the disk is full: the save {needs}{megabytes(free)} are free on {folder}: "
+        f"the disk is full: the save {needs}{format_megabytes(free)} are free on {folder}: "
         "free some space or choose another folder"
     )
 
 
-def megabytes(size: int) -> str:
+def format_megabytes(size: int) -> str:
     """A size for people: `96 MB`."""
     return f"{size / 1e6:.0f} MB" if size >= 1e7 else f"{size / 1e6:.1f} MB"
 
 
 @contextmanager
 def _disk_errors(folder: Path, needs_bytes: int = 0) -> Iterator[None]:
-    """Turn what the system says about the disk into a SessionError."""
+    """Raise errors of the disk as SessionError."""
     try:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise _full(folder, needs_bytes) from error
+            raise _disk_full_error(folder, needs_bytes) from error
         raise SessionError(f"{folder} cannot be written ({error}): check its permissions and the disk") from error

@@ -18,12 +18,12 @@ from slviewer.session.stack import check_frames, describe_stack, read_stack, wri
 
 Role = Literal["calibration", "scan"]
 
-_AT_ONCE = 8  # frames of an exposure that are in memory together while their peaks are taken
+_FRAMES_IN_MEMORY = 8  # frames of an exposure that are in memory together while their peaks are computed
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A saved capture; frames and texture stay on disk until they are asked for."""
+    """A saved capture; frames and texture stay on disk until they are read."""
 
     name: str
     role: Role
@@ -31,7 +31,7 @@ class Capture:
     size: tuple[int, int]  # (width, height) of the camera's frames, px
     hash: str  # of frames, exposures, texture, sequence: equal where every result computed from them is equal
     folder: Path
-    meta: dict[str, Any] = field(repr=False, compare=False)  # capture.json as it stands: source, settings, board, ...
+    meta: dict[str, Any] = field(repr=False, compare=False)  # content of capture.json: source, settings, board, ...
 
     @property
     def frames(self) -> np.ndarray:
@@ -41,7 +41,7 @@ class Capture:
     def stack(self, indices: Sequence[int] | None = None) -> np.ndarray:
         """Frames (n, h, w) at `indices` into the sequence, in that order (all where None); reads only these.
 
-        Those of a capture in several exposures are merged, pixel by pixel, as `exposure_choice` says. Raises
+        Those of a capture in several exposures are merged, pixel by pixel, by `exposure_choice`. Raises
         SessionError where a frame is missing or damaged, or the capture was replaced since it was loaded.
         """
         path = self.folder / "frames.zarr"
@@ -52,23 +52,23 @@ class Capture:
 
     @property
     def exposures_ms(self) -> tuple[float, ...]:
-        """The exposures in which the sequence was taken one after another; empty where there was but one."""
+        """The exposure times of a sequence that was captured repeatedly; empty for a single exposure."""
         return tuple(float(exposure) for exposure in self.meta.get("exposures_ms") or ())
 
     @property
     def exposure_choice(self) -> np.ndarray | None:
-        """(h, w) uint8: which of `exposures_ms` each pixel's frames are of; None where there was but one."""
+        """(h, w) uint8: which of `exposures_ms` each pixel's frames are of; None for a single exposure."""
         if not self.exposures_ms:
             return None
-        return _choice(self.folder / "frames.zarr", self.exposures_ms, len(self.sequence.frames), self.hash)
+        return _choose_exposures(self.folder / "frames.zarr", self.exposures_ms, len(self.sequence.frames), self.hash)
 
     def _merged(self, path: Path, indices: Sequence[int] | None) -> np.ndarray:
-        """Frame by frame, so that no more than one frame of each exposure is in memory beside the result."""
+        """The merged frames (n, h, w) at `indices`; with one frame of each exposure in memory at most."""
         n, choice = len(self.sequence.frames), self.exposure_choice
         assert choice is not None
         wanted = list(range(n)) if indices is None else [int(index) for index in indices]
         if any(not 0 <= index < n for index in wanted):
-            raise InputError(f"frames {wanted} were asked for, {self.name} has frames 0 to {n - 1}")
+            raise InputError(f"frames {wanted} were requested, {self.name} has frames 0 to {n - 1}")
         masks = chosen(choice, len(self.exposures_ms))
         stack = np.empty((len(wanted), *choice.shape), describe_stack(path)[1])
         for slot, index in enumerate(wanted):
@@ -77,7 +77,7 @@ class Capture:
 
     @property
     def texture(self) -> np.ndarray | None:
-        """The colour texture (h, w, 3) RGB kept beside the frames, or None where the frames are all there is."""
+        """The colour texture (h, w, 3) RGB stored with the frames, or None where there is none."""
         path = self.folder / "texture.png"
         if not self.meta.get("texture"):
             return None
@@ -142,7 +142,7 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
         whole.update(to_json(exposures_ms))
     if texture is not None:
         whole.update(np.ascontiguousarray(texture).data)
-        write_bytes(folder / "texture.png", _png(texture))
+        write_bytes(folder / "texture.png", _encode_png(texture))
     write_json(
         folder / "capture.json",
         {
@@ -175,12 +175,12 @@ def read_capture(folder: Path) -> Capture:
 
 
 @lru_cache(maxsize=4)
-def _choice(path: Path, exposures_ms: tuple[float, ...], n: int, content_hash: str) -> np.ndarray:
-    """The choice for the stack of that content; it takes a look at every frame, and is asked for again and again."""
+def _choose_exposures(path: Path, exposures_ms: tuple[float, ...], n: int, content_hash: str) -> np.ndarray:
+    """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its content."""
 
     def frames(exposure: int) -> Iterator[np.ndarray]:
-        for first in range(0, n, _AT_ONCE):
-            yield from read_stack(path, range(exposure * n + first, exposure * n + min(first + _AT_ONCE, n)))
+        for first in range(0, n, _FRAMES_IN_MEMORY):
+            yield from read_stack(path, range(exposure * n + first, exposure * n + min(first + _FRAMES_IN_MEMORY, n)))
 
     choice = choose_exposure(np.stack([peaks(frames(e)) for e in range(len(exposures_ms))]), exposures_ms)
     if read_json(path.parent / "capture.json").get("hash") != content_hash:
@@ -189,7 +189,7 @@ def _choice(path: Path, exposures_ms: tuple[float, ...], n: int, content_hash: s
     return choice
 
 
-def _png(texture: np.ndarray) -> Any:
+def _encode_png(texture: np.ndarray) -> Any:
     import cv2
 
     # the fastest setting: level 1 halves nothing that matters and PNG stays readable everywhere

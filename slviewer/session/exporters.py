@@ -15,10 +15,10 @@ from slviewer.session.toml import describe_sequence
 
 
 def write_calibration(path: Path, entries: Mapping[str, Any], meanings: Mapping[str, str] | None = None) -> None:
-    """Write named matrices, numbers, words, and lists of such mappings (poses by name); the suffix says how.
+    """Write named matrices, numbers, words, and lists of such mappings (poses by name); the suffix selects the format.
 
     .yml, .yaml and .xml are OpenCV FileStorage, .json is plain JSON with matrices as nested lists; `import
-    opencv-calibration` reads them all. ``meanings``: {name: what the entry says, in which unit}, as comments; JSON,
+    opencv-calibration` reads them all. ``meanings``: {name: meaning and unit of the entry}, as comments; JSON,
     which knows none, gets them under "meanings". Replaces a file of that name in one step.
     """
     path = Path(path)
@@ -27,7 +27,7 @@ def write_calibration(path: Path, entries: Mapping[str, Any], meanings: Mapping[
     if suffix == ".json":
         data = to_json({"meanings": dict(meanings), **entries} if meanings else dict(entries))
     elif suffix in (".yml", ".yaml", ".xml"):
-        data = _file_storage(suffix, entries, meanings).encode()
+        data = _format_file_storage(suffix, entries, meanings).encode()
     else:
         raise InputError(f"{path.name}: a calibration is written as .yml, .xml or .json: choose one of these")
     replace_file(path, data)
@@ -41,7 +41,7 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
     folder = Path(folder).expanduser().absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} is not empty: choose a new folder for the patterns")
-    names = [f"{index:02d}_{_words(frame)}.png" for index, frame in enumerate(sequence.frames)]
+    names = [f"{index:02d}_{_describe_frame(frame)}.png" for index, frame in enumerate(sequence.frames)]
     with staged_folder(folder, len(names) * 4096) as staged:
         for index, name in enumerate(names):
             done, data = cv2.imencode(".png", render(sequence, index))
@@ -52,7 +52,7 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
     commit(staged, folder)
 
 
-def _words(frame: Frame) -> str:
+def _describe_frame(frame: Frame) -> str:
     parts: list[Any] = [frame.kind, frame.axis]
     if frame.kind == "phase":
         parts += [f"{frame.period_px:g}px", f"{frame.step:02d}"]
@@ -61,27 +61,27 @@ def _words(frame: Frame) -> str:
     return "_".join(str(part) for part in parts if part)
 
 
-def _file_storage(suffix: str, entries: Mapping[str, Any], meanings: Mapping[str, str]) -> str:
+def _format_file_storage(suffix: str, entries: Mapping[str, Any], meanings: Mapping[str, str]) -> str:
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for key, value in entries.items():
         if key in meanings:
             storage.writeComment(f"{key}: {meanings[key]}", False)
-        _store(storage, key, value)
+        _write_entry(storage, key, value)
     return storage.releaseAndGetString()
 
 
-def _store(storage: Any, key: str, value: Any) -> None:
+def _write_entry(storage: Any, key: str, value: Any) -> None:
     if isinstance(value, str | int | float) and not isinstance(value, bool):
         storage.write(key, value)
     elif isinstance(value, Mapping):
         storage.startWriteStruct(key, cv2.FileNode_MAP)
         for inner, each in value.items():
-            _store(storage, inner, each)
+            _write_entry(storage, inner, each)
         storage.endWriteStruct()
     elif isinstance(value, list | tuple) and all(isinstance(each, Mapping | str) for each in value):
         storage.startWriteStruct(key, cv2.FileNode_SEQ)
         for each in value:
-            _store(storage, "", each)
+            _write_entry(storage, "", each)
         storage.endWriteStruct()
     else:
         matrix = np.asarray(value)

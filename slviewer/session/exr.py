@@ -21,14 +21,14 @@ def write_exr(path: Path, values: np.ndarray) -> None:
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
     header = struct.pack("<2i", _MAGIC, _VERSION) + b"".join(
         (
-            _attribute("channels", "chlist", b"Y\0" + struct.pack("<i4B2i", _FLOAT, 0, 0, 0, 0, 1, 1) + b"\0"),
-            _attribute("compression", "compression", b"\0"),
-            _attribute("dataWindow", "box2i", window),
-            _attribute("displayWindow", "box2i", window),
-            _attribute("lineOrder", "lineOrder", b"\0"),
-            _attribute("pixelAspectRatio", "float", struct.pack("<f", 1.0)),
-            _attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0.0, 0.0)),
-            _attribute("screenWindowWidth", "float", struct.pack("<f", 1.0)),
+            _encode_attribute("channels", "chlist", b"Y\0" + struct.pack("<i4B2i", _FLOAT, 0, 0, 0, 0, 1, 1) + b"\0"),
+            _encode_attribute("compression", "compression", b"\0"),
+            _encode_attribute("dataWindow", "box2i", window),
+            _encode_attribute("displayWindow", "box2i", window),
+            _encode_attribute("lineOrder", "lineOrder", b"\0"),
+            _encode_attribute("pixelAspectRatio", "float", struct.pack("<f", 1.0)),
+            _encode_attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0.0, 0.0)),
+            _encode_attribute("screenWindowWidth", "float", struct.pack("<f", 1.0)),
             b"\0",
         )
     )
@@ -39,5 +39,5 @@ def write_exr(path: Path, values: np.ndarray) -> None:
     path.write_bytes(header + offsets.tobytes() + lines.tobytes())
 
 
-def _attribute(name: str, kind: str, value: bytes) -> bytes:
+def _encode_attribute(name: str, kind: str, value: bytes) -> bytes:
     return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value

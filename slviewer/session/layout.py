@@ -12,12 +12,12 @@ SCHEMA = 1
 
 def is_session(path: str | Path) -> bool:
     """Whether a session, readable or not, is in this folder."""
-    return (_absolute(path) / "session.json").is_file()
+    return (_absolute_path(path) / "session.json").is_file()
 
 
 def session_folder(path: str | Path) -> Path:
-    """The absolute folder of an existing session; SessionError where there is none, or a damaged or newer one."""
-    folder = _absolute(path)
+    """The absolute folder of an existing session; SessionError where it is missing, damaged or newer."""
+    folder = _absolute_path(path)
     if not is_session(folder):
         raise SessionError(
             f"{folder} is not a session folder (it holds no session.json): "
@@ -35,12 +35,12 @@ def session_folder(path: str | Path) -> Path:
 
 def new_folder(path: str | Path) -> Path:
     """A folder that a session may be made in, new or empty; SessionError otherwise."""
-    folder = _absolute(path)
+    folder = _absolute_path(path)
     if is_session(folder):
         raise SessionError(f"{folder} is a session already: open it, or choose another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        strangers = [entry.name for entry in folder.iterdir() if not _is_ours(entry)]
+        strangers = [entry.name for entry in folder.iterdir() if not _is_leftover(entry)]
     except OSError as error:
         raise SessionError(f"{folder} cannot be made ({error}): choose a folder that you may write to") from error
     if strangers:
@@ -65,12 +65,12 @@ def inner_folders(folder: Path) -> list[str]:
     return [entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
 
 
-def _is_ours(entry: Path) -> bool:
-    """Whether this may be left from a session whose making was cut short, or is what macOS leaves everywhere."""
+def _is_leftover(entry: Path) -> bool:
+    """Whether this may be a leftover of an interrupted creation of a session, or a file of macOS."""
     if entry.name in ("captures", "results"):
         return entry.is_dir() and not any(entry.iterdir())
     return entry.name in (".lock", ".lock-holder", ".DS_Store") or entry.name.startswith(".session.json.tmp-")
 
 
-def _absolute(path: str | Path) -> Path:
+def _absolute_path(path: str | Path) -> Path:
     return Path(path).expanduser().absolute()

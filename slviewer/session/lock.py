@@ -21,7 +21,7 @@ class WriterLock:
         self._holder = folder / ".lock-holder"
 
     def acquire(self, patience_s: float = _PATIENCE_S) -> None:
-        """Take the lock or raise a SessionError that says which process holds it."""
+        """Take the lock or raise a SessionError that names the process that holds it."""
         try:
             self._lock.acquire(timeout=patience_s, poll_interval=0.02)
         except Timeout as error:

@@ -45,11 +45,11 @@ def save_measurement(
     of: tuple[str, ...] = (),
     name: str = "",
 ) -> Measurement:
-    """Save a new measurement. ``inputs``: {capture or result: hash} of all that it was made from, so that it is seen as
+    """Save a new measurement. ``inputs``: {capture or result: hash} of all that it was made from, so that it becomes
     stale when one changes; the measurements ``of`` are added to them."""
-    numbers = [int(each.removeprefix("m")) for each in _ids(store)] + _numbers_in_trash(store)
+    numbers = [int(each.removeprefix("m")) for each in _list_ids(store)] + _list_trashed_numbers(store)
     identity = f"m{1 + max(numbers, default=0)}"
-    used = dict(inputs) | store.input_hashes(*(_result(store, each) for each in of))
+    used = dict(inputs) | store.input_hashes(*(_result_name(store, each) for each in of))
     meta = {
         "kind": kind,
         "name": name.strip(),
@@ -66,12 +66,12 @@ def save_measurement(
 
 def list_measurements(store: Session) -> list[Measurement]:
     """All measurements, in the order in which they were made."""
-    return [load_measurement(store, each) for each in _ids(store)]
+    return [load_measurement(store, each) for each in _list_ids(store)]
 
 
 def load_measurement(store: Session, identity: str) -> Measurement:
     """One measurement. Raises InputError where there is none of that id."""
-    result = _result(store, identity)
+    result = _result_name(store, identity)
     meta = store.load_result(result, only=())[0]
     return measurement_from_meta(identity, meta, store.decision(NAMES) or {}, store.state_of(result) == "stale")
 
@@ -94,19 +94,19 @@ def measurement_from_meta(identity: str, meta: Mapping[str, Any], names: Mapping
 
 def measurement_arrays(store: Session, identity: str) -> dict[str, np.ndarray]:
     """What a measurement keeps besides numbers and words, by name."""
-    return store.load_result(_result(store, identity))[1]
+    return store.load_result(_result_name(store, identity))[1]
 
 
 def rename_measurement(store: Session, identity: str, name: str) -> Measurement:
     """Give a measurement another name; an empty one gives back the name that it was made with."""
-    _result(store, identity)
+    _result_name(store, identity)
     store.decide(NAMES, {**(store.decision(NAMES) or {}), identity: name.strip()})
     return load_measurement(store, identity)
 
 
 def trash_measurement(store: Session, identity: str) -> None:
     """Move a measurement to the trash; ``restore_measurement`` brings it back. What was made from it becomes stale."""
-    store.trash_result(_result(store, identity))
+    store.trash_result(_result_name(store, identity))
 
 
 def restore_measurement(store: Session, identity: str = "") -> Measurement:
@@ -114,25 +114,25 @@ def restore_measurement(store: Session, identity: str = "") -> Measurement:
     if not identity:
         deleted = [each for each in store.deleted_results() if each.startswith(f"{FOLDER}-")]
         if not deleted:
-            raise InputError("no measurement was deleted: there is none to bring back")
+            raise InputError("no measurement was deleted, so none can be restored: measure again")
         identity = deleted[0].removeprefix(f"{FOLDER}-")
     store.restore_result(f"{FOLDER}/{identity}")
     return load_measurement(store, identity)
 
 
-def _ids(store: Session) -> list[str]:
+def _list_ids(store: Session) -> list[str]:
     names = [name for name in store.result_names() if name.startswith(f"{FOLDER}/m")]
     return sorted((name.removeprefix(f"{FOLDER}/") for name in names), key=natural_key)
 
 
-def _numbers_in_trash(store: Session) -> list[int]:
-    """So that no id is given twice, and one that was deleted can come back."""
-    found = [each.removeprefix(f"{FOLDER}-m") for each in store.deleted_results() if each.startswith(f"{FOLDER}-m")]
-    return [int(number) for number in found if number.isdecimal()]
+def _list_trashed_numbers(store: Session) -> list[int]:
+    """Numbers of deleted measurements, which may be restored and are not used again."""
+    numbers = [each.removeprefix(f"{FOLDER}-m") for each in store.deleted_results() if each.startswith(f"{FOLDER}-m")]
+    return [int(number) for number in numbers if number.isdecimal()]
 
 
-def _result(store: Session, identity: str) -> str:
+def _result_name(store: Session, identity: str) -> str:
     result = f"{FOLDER}/{identity}"
     if not store.has_result(result):
-        raise InputError(f"there is no measurement {identity!r}: there are {', '.join(_ids(store)) or 'none'}")
+        raise InputError(f"there is no measurement {identity!r}: there are {', '.join(_list_ids(store)) or 'none'}")
     return result

@@ -1,4 +1,4 @@
-"""Points and meshes for other programs; the file's suffix says how. What is written can be read anywhere, in its size.
+"""Points and meshes for other programs; the suffix selects the format, and files keep the size of the object.
 
 =======  ===========================================================================================================
 `.ply`   binary, float32, mm: normals, colours, the expected errors (sigma) and other values of each point
@@ -49,13 +49,13 @@ def write_shape(
     scalars: Mapping[str, np.ndarray] | None = None,
     notes: Sequence[str] = (),
 ) -> int:
-    """Writes points or a mesh as the suffix says, and returns the file's size in bytes.
+    """Write points or a mesh in the format of the suffix, and return the file's size in bytes.
 
     ``scalars``: values (n,) of each point by name, such as ``sigma_noise`` mm or ``deviation`` mm, for the formats that
     hold them (PLY); the shape's own ``sigma_mm`` is called ``sigma``. ``notes``: sentences for the comments.
 
     Raises InputError for another suffix, for points where a format takes only triangles, for NaN points and for an
-    empty shape; SessionError where the disk refuses (a file of that name is left as it was).
+    empty shape; SessionError where the disk refuses (a file of that name stays unchanged).
     """
     path = Path(path)
     file_format = path.suffix.lower().removeprefix(".")
@@ -130,7 +130,7 @@ def _to_trimesh(shape: PointSet | Mesh, scale: float = 1.0) -> Any:
 def _encode_stl(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
     from trimesh.exchange.stl import export_stl
 
-    # a header that began with "solid" would be taken for a text file
+    # a header that began with "solid" would be read as a text file
     header = f"slviewer {__version__}, binary STL, units mm".encode("ascii").ljust(80)
     return header + export_stl(_to_trimesh(shape))[80:]
 
@@ -157,7 +157,7 @@ def _encode_glb(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
     def describe(tree: dict[str, Any]) -> None:
         words = ["vertices in metres, in the frame of the camera", "the node turns y up and z towards the viewer"]
         tree["asset"] |= {"generator": f"slviewer {__version__}", "extras": {"notes": [*words, *notes]}}
-        # scanned surfaces are open: they have no inside that could be left undrawn
+        # scanned surfaces are open: they have no inside that need not be drawn
         roughness = {"metallicFactor": 0, "roughnessFactor": 1}
         tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": roughness}]
         for mesh in tree["meshes"]:

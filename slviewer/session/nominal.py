@@ -16,23 +16,23 @@ from slviewer.surface.shapes import Mesh
 
 Units = Literal["mm", "cm", "m", "inch"]
 FORMATS = (".stl", ".ply", ".obj")
-MOST_BYTES = 1 << 28
+MAX_BYTES = 1 << 28
 """Of a file: five million triangles of a binary STL."""
-MOST_TRIANGLES = 5_000_000
+MAX_TRIANGLES = 5_000_000
 MM: dict[Units, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
-LIKELY = 5.0
-"""A scan's size over the nominal's, or its inverse, from which on other units are asked for."""
-NEAR = 2.0
+MAX_SIZE_RATIO = 5.0
+"""A scan's size over the nominal's, or its inverse, from which on the units must be given."""
+MATCHING_SIZE_RATIO = 2.0
 """Units that bring the two so near are proposed."""
-FARTHEST_MM = 1e5
-MOST_DEGENERATE = 0.5
+MAX_COORDINATE_MM = 1e5
+MAX_DEGENERATE_SHARE = 0.5
 """Share of triangles without area from which on a file is refused."""
 
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
     """A nominal model: its ``mesh`` in mm, the file's ``name`` and content ``hash``, the ``units`` that it was read in
-    (None: none were given, and mm taken), whether it is ``closed``, and ``notes``, sentences on what was repaired."""
+    (None: none were given, and mm assumed), whether it is ``closed``, and ``notes``, one for each repair."""
 
     mesh: Mesh
     name: str
@@ -65,10 +65,10 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     if not np.isfinite(vertices).all():
         raise SessionError(f"{path.name} holds points that are no numbers (NaN or infinite): export the model again")
     vertices = vertices * MM[units or "mm"]
-    if not np.abs(vertices).max() < FARTHEST_MM:
+    if not np.abs(vertices).max() < MAX_COORDINATE_MM:
         raise SessionError(
-            f"{path.name} reaches {np.abs(vertices).max():.3g} mm: models up to {FARTHEST_MM:g} mm are read; give its "
-            "units, or move it to its origin"
+            f"{path.name} reaches {np.abs(vertices).max():.3g} mm: models up to {MAX_COORDINATE_MM:g} mm are read; "
+            "give its units, or move it to its origin"
         )
     notes: list[str] = []
     vertices, faces = _drop_degenerate(path.name, vertices, faces, notes)
@@ -78,25 +78,27 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
 
 
 def check_size(nominal: Nominal, points: np.ndarray) -> None:
-    """Raise InputError where a model, whose units nobody gave, is so much smaller or larger than a scan's points (n, 3)
-    mm that they may be others: it says what was seen, and what to give. Nothing is ever enlarged unasked."""
+    """Raise InputError where a model, without stated units, is so much smaller or larger than a scan's points (n, 3)
+    mm that they may be others: the message states both sizes and the units that fit. Nothing is scaled."""
     if nominal.units is not None:
         return
     some = points[:: max(1, len(points) // 100_000)]
     scan = float(np.linalg.norm(np.ptp(np.percentile(some, [1, 99], axis=0), axis=0)))
     model = float(np.linalg.norm(nominal.size_mm))
     ratio = scan / model
-    if 1 / LIKELY < ratio < LIKELY:
+    if 1 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
         return
-    fitting = [name for name, mm in MM.items() if 1 / NEAR < ratio / mm < NEAR and name != "mm"]
+    fitting = [
+        name for name, mm in MM.items() if 1 / MATCHING_SIZE_RATIO < ratio / mm < MATCHING_SIZE_RATIO and name != "mm"
+    ]
     many = (
         f"about {_format_size(ratio)} times larger" if ratio > 1 else f"about {_format_size(1 / ratio)} times smaller"
     )
     sizes = f"{_format_size(model)} mm across if its numbers are mm, and the scan {_format_size(scan)} mm"
-    seen = f"{nominal.name} measures {sizes}, {many}"
+    comparison = f"{nominal.name} measures {sizes}, {many}"
     if fitting:
-        raise InputError(f"{seen}: give --units {' or --units '.join(fitting)} if it is so, else --units mm")
-    raise InputError(f"{seen}: see that it is the same part; give --units mm if its numbers are mm all the same")
+        raise InputError(f"{comparison}: give --units {' or --units '.join(fitting)} if it is so, else --units mm")
+    raise InputError(f"{comparison}: see that it is the same part; give --units mm if its numbers are mm all the same")
 
 
 def _format_size(size: float) -> str:
@@ -111,9 +113,9 @@ def _read_bytes(path: Path) -> bytes:
         size = path.stat().st_size
         if not path.is_file():
             raise SessionError(f"{path} is no file: give an STL, PLY or OBJ file")
-        if size > MOST_BYTES:
+        if size > MAX_BYTES:
             raise SessionError(
-                f"{path.name} has {size / 1e6:.0f} MB, and up to {MOST_BYTES / 1e6:.0f} MB are read: decimate it first"
+                f"{path.name} has {size / 1e6:.0f} MB, and up to {MAX_BYTES / 1e6:.0f} MB are read: decimate it first"
             )
         return path.read_bytes()
     except OSError as error:
@@ -128,7 +130,7 @@ def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # from memory, so that files beside it that it may name are not opened; unprocessed, or points that are no
+            # from memory, so that other files that it may name are not opened; unprocessed, or points that are no
             # numbers would be dropped
             mesh: Any = trimesh.load(io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False)
             if np.isfinite(mesh.vertices).all():
@@ -145,9 +147,9 @@ def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
         )
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
-    if len(faces) > MOST_TRIANGLES:
+    if len(faces) > MAX_TRIANGLES:
         raise SessionError(
-            f"{name} has {len(faces):,} triangles, and at most {MOST_TRIANGLES:,} are read: decimate it first"
+            f"{name} has {len(faces):,} triangles, and at most {MAX_TRIANGLES:,} are read: decimate it first"
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
@@ -162,7 +164,7 @@ def _drop_degenerate(
     sides = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
     sound = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9 * sides**2
     flat = len(faces) - int(np.count_nonzero(sound))
-    if flat > MOST_DEGENERATE * len(faces):
+    if flat > MAX_DEGENERATE_SHARE * len(faces):
         raise SessionError(f"{flat:,} of the {len(faces):,} triangles in {name} have no area: export the model again")
     if flat:
         notes.append(f"{flat:,} of {len(faces):,} triangles without area were removed")

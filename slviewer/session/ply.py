@@ -14,7 +14,7 @@ COLOURS = ("red", "green", "blue")
 TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
 UNKNOWN_SIGMA = -1.0
-"""What stands for a standard deviation that nobody knows: no NaN is written, and 0 would claim too much."""
+"""Value of an unknown standard deviation: no NaN is written, and 0 would claim too much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,12 @@ def write_ply(
 
     ``colours``: (n,) grey or (n, 3) RGB, uint8. ``normals``: (n, 3); one that is not known (NaN) is written as 0 0 0.
     ``scalars``: named (n,), as float32 properties of the vertices; a sigma that is not known is written as -1.
-    ``faces``: (m, 3) indices into the points. ``notes``: sentences for the file's comments, beside those that state
+    ``faces``: (m, 3) indices into the points. ``notes``: sentences for the file's comments, besides those that state
     the program and the units. Raises InputError for shapes that do not fit together and for NaN elsewhere;
-    SessionError where the file cannot be written (an older file of that name is left as it was).
+    SessionError where the file cannot be written (an older file of that name stays unchanged).
     """
     points = np.asarray(points)
-    fields = _fields(points, colours, normals, dict(scalars or {}))
+    fields = _vertex_fields(points, colours, normals, dict(scalars or {}))
     vertex = np.dtype([(name, code) for name, code, _ in fields])
     names = {np.dtype(code): name for name, code in TYPES.items()}
     header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm"]
@@ -101,12 +101,12 @@ def read_ply(path: str | Path) -> Ply:
     start = end + len(b"end_header\n")
     middle = start + counts.get("vertex", 0) * vertex.itemsize
     if len(data) != middle + counts.get("face", 0) * FACE.itemsize or not {"x", "y", "z"} <= set(vertex.names or ()):
-        raise InputError(f"{path} is {len(data)} bytes, not what its header says: it is truncated, or has polygons.")
+        raise InputError(f"{path} is {len(data)} bytes, not the size in its header: it is truncated, or has polygons.")
     vertices = np.frombuffer(data[start:middle], dtype=vertex)
     faces = np.frombuffer(data[middle:], dtype=FACE)
     if (faces["count"] != 3).any():
         raise InputError(f"{path} has faces that are no triangles: triangulate it first.")
-    return _content(vertices, faces["vertices"].copy() if "face" in counts else None)
+    return _parse_content(vertices, faces["vertices"].copy() if "face" in counts else None)
 
 
 def to_ascii(note: str) -> str:
@@ -129,7 +129,7 @@ def check_faces(faces: np.ndarray, count: int) -> None:
         )
 
 
-def _content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
+def _parse_content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
     names = vertices.dtype.names or ()
 
     def join(*fields: str) -> np.ndarray | None:
@@ -147,7 +147,7 @@ def _content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
     return Ply(points, join(*COLOURS), normals, scalars, faces)
 
 
-def _fields(
+def _vertex_fields(
     points: np.ndarray, colours: np.ndarray | None, normals: np.ndarray | None, scalars: dict[str, np.ndarray]
 ) -> list[tuple[str, str, np.ndarray]]:
     """(name, type, values (n,)) of each property of a vertex, in the order in which PLY lays them out."""
@@ -157,16 +157,16 @@ def _fields(
         raise InputError("Some points are NaN: select the valid ones first.")
     fields: list[tuple[str, str, np.ndarray]] = [(name, "<f4", points[:, i]) for i, name in enumerate("xyz")]
     if normals is not None:
-        _check(normals.shape == points.shape, "normals", normals, len(points))
+        _check_length(normals.shape == points.shape, "normals", normals, len(points))
         fields += [(name, "<f4", normals[:, i]) for i, name in enumerate(("nx", "ny", "nz"))]
     if colours is not None:
-        _check(colours.shape in (points.shape, points.shape[:1]), "colours", colours, len(points))
+        _check_length(colours.shape in (points.shape, points.shape[:1]), "colours", colours, len(points))
         if colours.dtype != np.uint8:
             raise InputError(f"Colours of {colours.dtype} were given: they must be uint8.")
         fields += [(name, "u1", colours if colours.ndim == 1 else colours[:, i]) for i, name in enumerate(COLOURS)]
     for name, given in scalars.items():
         values = np.asarray(given)
-        _check(values.shape == points.shape[:1], name, values, len(points))
+        _check_length(values.shape == points.shape[:1], name, values, len(points))
         if not (name.isascii() and name.isidentifier()) or name in {field[0] for field in fields}:
             raise InputError(
                 f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a new name."
@@ -177,6 +177,6 @@ def _fields(
     return fields
 
 
-def _check(fits: bool, what: str, values: np.ndarray, count: int) -> None:
+def _check_length(fits: bool, what: str, values: np.ndarray, count: int) -> None:
     if not fits:
         raise InputError(f"{what} of shape {values.shape} do not belong to {count} points: give one for each point.")

@@ -14,7 +14,7 @@ from slviewer.session.atomic import read_json, to_json, write_bytes, write_json
 from slviewer.session.layout import inner_folders
 from slviewer.session.names import safe_path
 
-_ARRAYS = "arrays"
+_ARRAY_FOLDER = "arrays"
 _RESERVED = {"hash", "arrays"}
 
 
@@ -38,8 +38,8 @@ def check_place(root: Path, name: str) -> None:
 
 def check_result(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays as plain NumPy arrays; InputError for names that cannot be files or values that are no arrays."""
-    if taken := _RESERVED & set(meta):
-        raise InputError(f"meta holds {sorted(taken)}, which the session writes itself: use other keys")
+    if reserved := _RESERVED & set(meta):
+        raise InputError(f"meta holds {sorted(reserved)}, which the session writes itself: use other keys")
     checked = {safe_path(name): np.asarray(array) for name, array in arrays.items()}
     for name, array in checked.items():
         if array.dtype.hasobject:
@@ -54,7 +54,7 @@ def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.
         array = np.asarray(arrays[name], order="C")
         header = io.BytesIO()
         np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))
-        path = folder / _ARRAYS / f"{name}.npy"
+        path = folder / _ARRAY_FOLDER / f"{name}.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
         body = array.reshape(-1).view(np.uint8).data if array.size else b""
         write_bytes(path, header.getvalue(), body)
@@ -85,7 +85,7 @@ def read_arrays(folder: Path, only: Collection[str] | None = None) -> dict[str, 
     for name in names:
         if only is not None and name not in only:
             continue
-        path = folder / _ARRAYS / f"{name}.npy"
+        path = folder / _ARRAY_FOLDER / f"{name}.npy"
         try:
             arrays[name] = np.load(path, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:

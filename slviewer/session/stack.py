@@ -33,13 +33,13 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
     _create_array(path, frames.shape, _DTYPES[frames.dtype])
 
     def write(index: int) -> bytes:
-        frame = _little_endian(np.ascontiguousarray(frames[index]))
-        write_bytes(_chunk(path, _SEPARATOR, index), frame.data)
+        frame = _to_little_endian(np.ascontiguousarray(frames[index]))
+        write_bytes(_chunk_path(path, _SEPARATOR, index), frame.data)
         return hashlib.blake2b(frame.data, digest_size=20).digest()
 
     with ThreadPoolExecutor(_THREADS) as pool:
         digests = list(pool.map(write, range(len(frames))))
-    return _combined(frames.shape, frames.dtype, digests)
+    return _combine_digests(frames.shape, frames.dtype, digests)
 
 
 def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
@@ -47,14 +47,14 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
 
     Raises SessionError where a frame is missing or cut short, InputError for an index outside the stack.
     """
-    shape, dtype, separator = _described(path)
+    shape, dtype, separator = _read_description(path)
     wanted = list(range(shape[0])) if indices is None else [int(index) for index in indices]
     if any(not 0 <= index < shape[0] for index in wanted):
-        raise InputError(f"frames {wanted} were asked for, {path.parent.name} has frames 0 to {shape[0] - 1}")
+        raise InputError(f"frames {wanted} were requested, {path.parent.name} has frames 0 to {shape[0] - 1}")
     stack = np.empty((len(wanted), *shape[1:]), dtype)
 
     def read(slot: int) -> None:
-        chunk = _chunk(path, separator, wanted[slot])
+        chunk = _chunk_path(path, separator, wanted[slot])
         try:
             with open(chunk, "rb", buffering=0) as file:
                 whole = os.fstat(file.fileno()).st_size == stack[slot].nbytes
@@ -73,10 +73,10 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
 
 def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
     """Shape (n, h, w) and type of a stack; SessionError where its layout is not the one written here."""
-    return _described(path)[:2]
+    return _read_description(path)[:2]
 
 
-def _described(path: Path) -> tuple[tuple[int, int, int], np.dtype, str]:
+def _read_description(path: Path) -> tuple[tuple[int, int, int], np.dtype, str]:
     description = read_json(path / "zarr.json")
     try:
         n, height, width = (int(extent) for extent in description["shape"])
@@ -119,7 +119,7 @@ def _create_array(path: Path, shape: tuple[int, ...], dtype: str) -> None:
         os.fsync(file.fileno())
 
 
-def _chunk(path: Path, separator: str, index: int) -> Path:
+def _chunk_path(path: Path, separator: str, index: int) -> Path:
     return path / separator.join(("c", str(index), "0", "0"))
 
 
@@ -134,11 +134,11 @@ def _read_into(file: RawIOBase, frame: np.ndarray) -> bool:
     return True
 
 
-def _little_endian(frame: np.ndarray) -> np.ndarray:
+def _to_little_endian(frame: np.ndarray) -> np.ndarray:
     return frame if sys.byteorder == "little" else frame.byteswap()
 
 
-def _combined(shape: tuple[int, ...], dtype: np.dtype, digests: list[bytes]) -> str:
+def _combine_digests(shape: tuple[int, ...], dtype: np.dtype, digests: list[bytes]) -> str:
     whole = hashlib.blake2b(f"{shape} {_DTYPES[dtype]}".encode(), digest_size=20)
     for digest in digests:
         whole.update(digest)

@@ -107,7 +107,7 @@ class Session:
         return [capture for capture in loaded if role in (None, capture.role)]
 
     def load_capture(self, name: str) -> Capture:
-        """A capture; its frames stay on disk until asked for. InputError where there is none of that name."""
+        """A capture; its frames stay on disk until they are read. InputError where it does not exist."""
         folder = self._capture_folder(name)
         if not folder.is_dir():
             there = ", ".join(self.capture_names()) or "none"
@@ -132,7 +132,7 @@ class Session:
 
         Of two or more `exposures_ms`, the frames are (k n, h, w): the whole sequence in the first, then in the second.
 
-        Complete on disk when this returns; absent if it raises: InputError for a name that is taken (unless `force`,
+        Complete on disk when this returns; absent if it raises: InputError for a name that is in use (unless `force`,
         which moves the old capture to the trash) or frames that do not fit, SessionError where the disk refuses.
         """
         capture = NewCapture(name, sequence, frames, texture, source, settings or {}, exposures_ms)
@@ -161,7 +161,7 @@ class Session:
         return [self.load_capture(name) for name in staged]
 
     def trash_capture(self, name: str) -> Path:
-        """Move a capture to the trash folder; returns where it lies now."""
+        """Move a capture to the trash folder; returns its place there."""
         self._require_writer()
         folder = self.load_capture(name).folder
         target = self._trash_place(name)
@@ -220,7 +220,7 @@ class Session:
         return read_meta(folder), read_arrays(folder, only)
 
     def trash_result(self, name: str) -> Path:
-        """Move a result to the trash folder; returns where it lies now."""
+        """Move a result to the trash folder; returns its place there."""
         self._require_writer()
         self.load_result(name, only=())
         target = self._trash_place(name.replace("/", "-"))
@@ -248,10 +248,10 @@ class Session:
         """{name: content hash} of captures and results as they are now, for `meta["inputs"]`; InputError if absent."""
         hashes = {}
         for name in names:
-            found = self._hashes(name)
-            if not found:
+            content_hashes = self._hashes(name)
+            if not content_hashes:
                 raise InputError(f"there is no capture or result {name!r} in {self.folder}")
-            hashes[name] = found[0]
+            hashes[name] = content_hashes[0]
         return hashes
 
     def state_of(self, name: str) -> State:
@@ -315,8 +315,8 @@ class Session:
     # inside
 
     def _recover(self) -> None:
-        """Clear what dead writers left; a reader does so only where nobody writes and the folder lets it."""
-        if not atomic.leftovers(self.folder):
+        """Remove the leftovers of dead writers; a reader does so only without a writer, in a writable folder."""
+        if not atomic.list_leftovers(self.folder):
             return
         if self._lock is not None:
             atomic.recover(self.folder, self.folder / "trash")
@@ -336,7 +336,7 @@ class Session:
             self._allow()
 
     def _stage(self, capture: NewCapture, role: Role, board: str | None, force: bool) -> Path:
-        """Write a capture beside its place, and return the folder, which `atomic.commit` renames."""
+        """Write a capture next to its place, and return the folder, which `atomic.commit` renames."""
         self._require_writer()
         target = self._capture_folder(capture.name)
         if target.exists() and not force:
@@ -358,23 +358,23 @@ class Session:
 
     def _restorable(self) -> dict[str, Path]:
         """{name: the place in the trash of its latest version} of captures whose names are free, the latest first."""
-        trash, found = self.folder / "trash", dict[str, Path]()
+        trash, latest = self.folder / "trash", dict[str, Path]()
         places = [place for place in trash.glob("*-*") if (place / "capture.json").is_file()] if trash.is_dir() else []
         for place in sorted(places, key=lambda place: place.name.rpartition("-")[2], reverse=True):
             name = place.name.rpartition("-")[0]
             if not self._capture_folder(name).exists():
-                found.setdefault(name, place)
-        return found
+                latest.setdefault(name, place)
+        return latest
 
     def _hashes(self, name: str) -> list[str]:
         """Content hashes of the capture and of the result of that name, where there are any."""
-        found = []
+        content_hashes = []
         if "/" not in name and self._capture_folder(name).is_dir():
-            found.append(self.load_capture(name).hash)
+            content_hashes.append(self.load_capture(name).hash)
         folder = self.folder / "results" / safe_path(name)
         if (folder / "meta.json").is_file():
-            found.append(str(read_meta(folder).get("hash")))
-        return found
+            content_hashes.append(str(read_meta(folder).get("hash")))
+        return content_hashes
 
     def _decide(self, what: str, change: Callable[[Any], Any]) -> None:
         self._require_writer()

@@ -297,15 +297,15 @@ def _made_up(compiled: CompiledAxis, rays: np.ndarray) -> SplinedModel:
 
 def _file(cloud: Cloud) -> Row:
     """A cloud with texture and noise as a PLY, beside writing as many bytes."""
-    keep = cloud.mask
+    mask = cloud.mask
     with tempfile.TemporaryDirectory() as folder:
         path, plain = Path(folder) / "cloud.ply", Path(folder) / "plain"
         seconds = median(
-            lambda: write_ply(path, cloud.points[keep], colours=cloud.colours(), scalars=cloud.sigmas(keep)), 3
+            lambda: write_ply(path, cloud.points[mask], colours=cloud.colours(), scalars=cloud.sigmas(mask)), 3
         )
         content = path.read_bytes()
         least = median(lambda: plain.write_bytes(content), 3)
-    return row(f"write {np.count_nonzero(keep) / 1e6:.2f} M points as PLY", seconds, len(content) / 1e6, least)
+    return row(f"write {np.count_nonzero(mask) / 1e6:.2f} M points as PLY", seconds, len(content) / 1e6, least)
 
 
 def _calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledAxis, np.ndarray]:

@@ -121,7 +121,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
             points = live.points
             memory.append((passed / seconds, _memory_mb()))
             progress(min(passed / seconds, 0.999), f"live: {live.shown_per_s:.1f} clouds/s")
-    taken = operator.live_captures
+    captures = operator.live_captures
     camera = operator.snapshot().rig.camera
     assert camera is not None
     quarter, last = ([mb for share, mb in memory if low < share <= low + 0.25] for low in (0.25, 0.75))
@@ -130,7 +130,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
         size=camera,
         seconds=seconds,
         captures_per_s=(then - first) / halfway,
-        captures_per_s_stalled=(taken - then) / (time.monotonic() - begun - halfway),
+        captures_per_s_stalled=(captures - then) / (time.monotonic() - begun - halfway),
         clouds_per_s=statistics.median(made),
         shown_per_s=statistics.median(shown),
         latency_ms=statistics.median(behind) if behind else float("nan"),

@@ -133,7 +133,7 @@ def _time_kernel(one: CudaPass, frames: np.ndarray, light: LightLevels) -> tuple
     card.load(frames)
     source, target = (cuda.device_array(card.bytes_moved // 2, np.uint8) for _ in range(2))
     marks = [cuda.event() for _ in range(3)]
-    taken: list[tuple[float, float]] = []
+    durations: list[tuple[float, float]] = []
     for _ in range(TIMES):
         for _ in range(AHEAD):
             target.copy_to_device(source, stream=card.stream)
@@ -143,8 +143,10 @@ def _time_kernel(one: CudaPass, frames: np.ndarray, light: LightLevels) -> tuple
         card.sweep(light)
         marks[2].record(card.stream)
         card.stream.synchronize()
-        taken.append((marks[0].elapsed_time(marks[1]), marks[1].elapsed_time(marks[2])))
-    copied, swept = (max(1e-3 * statistics.median(ms), 1e-9) for ms in zip(*taken, strict=True))  # simulators return 0
+        durations.append((marks[0].elapsed_time(marks[1]), marks[1].elapsed_time(marks[2])))
+    copied, swept = (
+        max(1e-3 * statistics.median(ms), 1e-9) for ms in zip(*durations, strict=True)
+    )  # simulators return 0
     return swept, copied, card.bytes_moved
 
 
@@ -202,12 +204,12 @@ def icp_rows(points: np.ndarray) -> list[dict[str, Any]]:
             num_threads=2,
         )
 
-    rows = [row(f"align {count}, slviewer", _taken(lambda: register(moved, points, initial=np.eye(4))))]
+    rows = [row(f"align {count}, slviewer", _measure_seconds(lambda: register(moved, points, initial=np.eye(4))))]
     note = "point to plane, voxels of 0.5 mm, two threads, without a judgement of the result"
     return [*rows, row(f"align {count}, small-gicp {version('small-gicp')}", median(theirs, 1), note=note)]
 
 
-def _taken(work: Callable[[], object]) -> float:
+def _measure_seconds(work: Callable[[], object]) -> float:
     """Median seconds; a cloud that may slide on itself is refused after the same work."""
 
     def tried() -> None:

@@ -146,12 +146,14 @@ def _describe_board(bench: FaultBench, columns: int, rows: int) -> DiagnosedCali
 def _renumber(bench: FaultBench, order: FrameChange) -> DiagnosedCalibration:
     """Features of one pose in another order; ``order`` turns (rows, columns) indices."""
     captures = bench.examine_clean()
-    seen = captures[2].observation
-    assert seen is not None
+    observation = captures[2].observation
+    assert observation is not None
     columns, rows = bench.board.features
     turned = order(np.arange(columns * rows).reshape(rows, columns)).ravel()
-    slopes = None if seen.slopes is None else seen.slopes[turned]
-    wrong = replace(seen, camera=seen.camera[turned], projector=seen.projector[turned], slopes=slopes)
+    slopes = None if observation.slopes is None else observation.slopes[turned]
+    wrong = replace(
+        observation, camera=observation.camera[turned], projector=observation.projector[turned], slopes=slopes
+    )
     captures[2] = replace(captures[2], observation=wrong)
     return bench.attempt(captures)
 

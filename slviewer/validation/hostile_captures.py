@@ -114,8 +114,8 @@ class HostileBench:
         renderer = clean
         if fault is not None and fault.is_optical:
             light, renderer = hostile_light(fault, severity, self.rig, scene, self.sequence, number)
-        room = renderer.room_light()
-        frames = expose_frames(renderer.rig, light, self.sequence, room, number, fault, severity, self.seed)
+        ambient = renderer.room_light()
+        frames = expose_frames(renderer.rig, light, self.sequence, ambient, number, fault, severity, self.seed)
         return frames, renderer, clean
 
     def store(self, session: Path, captures: dict[str, np.ndarray], report: CaseReport) -> None:

@@ -205,7 +205,7 @@ def _row(rig: RigFigures) -> Row:
 
 def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = ignore_progress) -> RigFigures:
     """Calibrate a rig from ``poses`` rendered captures of its board, and measure ten planes and six spheres with it."""
-    begin = perf_counter()
+    start = perf_counter()
     rig = case.rig(scale)
     plan = letter_plan(rig, Board.parse(TARGET), poses, case.shape)
     targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
@@ -251,7 +251,7 @@ def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = ig
             }
             for model, each in fits.items()
         },
-        perf_counter() - begin,
+        perf_counter() - start,
     )
 
 

@@ -52,7 +52,7 @@ def prove_causes(
     confusion: dict[str, dict[str, int]] = {}
     for name, cause, attempt in cases:
         progress(len(rows) / len(cases), name)
-        begin = perf_counter()
+        start = perf_counter()
         verdict = attempt().verdict
         first = next(iter(verdict.causes), "none")
         counts = confusion.setdefault(cause or "none", {})
@@ -62,7 +62,7 @@ def prove_causes(
             "named": ", ".join(verdict.causes) or "none",
             "verdict": verdict.level,
             "right": "yes" if first == (cause or "none") else "NO",
-            "s": round(perf_counter() - begin, 1),
+            "s": round(perf_counter() - start, 1),
         })  # fmt: skip
         record.append({
             "fault": name, "cause": cause, "causes": list(verdict.causes), "level": verdict.level,

@@ -69,7 +69,7 @@ def prove_guidance(
         for way in _WAYS:
             label = f"rig {k + 1} of {rigs}, {way}"
             report = part(progress, len(figures) / total, (len(figures) + 1) / total, label)
-            begin, predicted = perf_counter(), None
+            start, predicted = perf_counter(), None
             if way == "guided":
                 observations, predicted = _observe_guided(rig, poses, report)
             else:
@@ -78,7 +78,7 @@ def prove_guidance(
             model = calibrate_observed(rig, observations)[1]
             rms, floor, supported, unmeasured = zip(*(_measure_plane(model, t) for t in targets), strict=True)
             over_floor = float(np.mean(rms) / np.mean(floor))
-            seconds = perf_counter() - begin
+            seconds = perf_counter() - start
             figures.append(
                 WayFigures(way, rig.seed, len(observations), rms, floor, supported, sum(unmeasured), predicted,
                            over_floor, seconds)
@@ -157,9 +157,9 @@ def _observe(rig: SimulatedRig, pose: Pose, number: int, report: Progress) -> Ob
         return None
 
 
-def _pose_features(seen: Observation) -> PoseFeatures:
-    noise = np.nan if seen.samples is None else float(np.nanmedian(seen.samples.sigma))
-    return PoseFeatures(seen.points, seen.camera, seen.projector, noise)
+def _pose_features(observation: Observation) -> PoseFeatures:
+    noise = np.nan if observation.samples is None else float(np.nanmedian(observation.samples.sigma))
+    return PoseFeatures(observation.points, observation.camera, observation.projector, noise)
 
 
 def _suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarray:
@@ -181,9 +181,9 @@ def _hand_held(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Gen
         R = rotation(np.radians(steady * rng.normal(0, HAND_DEG, 3))) @ T_camera_board[:3, :3]
         pose = Pose(R, centre + steady * rng.normal(0, HAND_MM, 3) - R @ middle)
         points = pose.to_camera(BOARD.points)
-        seen, illuminated = rig.camera.project(points), rig.project(points)
+        camera_px, illuminated = rig.camera.project(points), rig.project(points)
         margin = BOARD.pitch_mm / 4 * rig.camera.focal_px[0] * rig.camera.scale / points[:, 2:] + 2
-        inside = ((seen > margin) & (seen < np.array(rig.camera.size) - 1 - margin)).all()
+        inside = ((camera_px > margin) & (camera_px < np.array(rig.camera.size) - 1 - margin)).all()
         if inside and ((illuminated > 0) & (illuminated < np.array(rig.projector.size) - 1)).all():
             break
     return pose

@@ -178,7 +178,7 @@ class _Trial:
 
     def run(self, name: str, severity: Severity, direction: Direction) -> HostileCase:
         """Run one case; an error, a crash too, is its result."""
-        begin, report = perf_counter(), CaseReport()
+        start, report = perf_counter(), CaseReport()
         measured: Sequence[MeasuredScan] = ()
         try:
             measured = (self._scan if direction == "scan" else self._calibrate)(FAULTS[name], severity, report)
@@ -188,7 +188,7 @@ class _Trial:
         figures = score(measured, gauge) if measured else None
         outcome, named = judge(FAULTS[name], severity, report, figures, self._floor)
         messages = [*report.warnings, *([f"{type(report.error).__name__}: {report.error}"] if report.error else [])]
-        seconds = perf_counter() - begin
+        seconds = perf_counter() - start
         return HostileCase(
             name, severity, direction, outcome, outcome in PASSED, figures, self._floor, named, tuple(messages), seconds
         )
@@ -250,14 +250,14 @@ def fit_gauge(measured: Sequence[MeasuredScan]) -> tuple[np.ndarray, np.ndarray]
     points = np.concatenate([m.points[m.on_target] for m in measured])
     truth = np.concatenate([m.truth[m.on_target] for m in measured])
     R, t = np.eye(3), np.zeros(3)
-    keep = np.ones(len(points), bool)
+    inliers = np.ones(len(points), bool)
     for _ in range(3):
-        if np.count_nonzero(keep) < 10:
+        if np.count_nonzero(inliers) < 10:
             break
-        T = fit_rigid(points[keep], truth[keep])
+        T = fit_rigid(points[inliers], truth[inliers])
         R, t = T[:3, :3], T[:3, 3]
         off = np.linalg.norm(points @ R.T + t - truth, axis=1)
-        keep = off <= np.quantile(off, 0.9)
+        inliers = off <= np.quantile(off, 0.9)
     return R, t
 
 

@@ -123,9 +123,9 @@ def prove_registration(
 
     def register(kind: str, reference: str, starts: Starts | None, done: Progress) -> RegisteredScans:
         chosen = {name: cloud for name, cloud in clouds.items() if name.startswith(kind)}
-        begin = perf_counter()
+        start = perf_counter()
         alignment = register_all(chosen, reference, starts, lambda share: done(share, "registering"))
-        return RegisteredScans(chosen, alignment, truth, perf_counter() - begin)
+        return RegisteredScans(chosen, alignment, truth, perf_counter() - start)
 
     depths = register("object_", "object_r3", None, part(progress, 0.75, 0.8))
     turn = register("turn_", "turn_01", Starts(step_deg=STEP_DEG), part(progress, 0.8, 0.88))

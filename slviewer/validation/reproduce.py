@@ -46,11 +46,11 @@ def reproduce(
     session = out / "session"
     scale = QUICK_SCALE if quick else 1.0
     _simulate(session, scale, seed, part(progress, 0.0, 0.4))
-    found = calibrate(session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn)
-    assert found.pixelwise is not None
+    calibration = calibrate(session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn)
+    assert calibration.pixelwise is not None
     with Session.open(session) as store:
         names = store.capture_names("scan")
-        observations = load_observations(store, list(found.stereo.poses))
+        observations = load_observations(store, list(calibration.stereo.poses))
     planes = verify(
         session,
         [n for n in names if n.startswith("plane_")],
@@ -75,8 +75,8 @@ def reproduce(
     )
     result = Reproduction(
         quick=quick,
-        stereo=found.stereo,
-        pixelwise=found.pixelwise,
+        stereo=calibration.stereo,
+        pixelwise=calibration.pixelwise,
         planes=planes,
         spheres=spheres.captures,
         spacings_mm=_spacings(session, spheres),
@@ -113,6 +113,6 @@ def _spacings(session: Path, spheres: Verification) -> dict[str, tuple[float, Ma
     """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the simulation's truth."""
     centres = {name: np.array(record["centres"][0]) for name, record in _truth(session)["spheres"].items()}
     return {
-        f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), found)
-        for (a, b), found in spheres.centre_distances_mm().items()
+        f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), measured)
+        for (a, b), measured in spheres.centre_distances_mm().items()
     }

@@ -57,7 +57,7 @@ class Reproduction:
     def spacing_rms_mm(self) -> dict[str, float]:
         """RMS error of the distances between all pairs of sphere centres, by model."""
         return {
-            m: float(np.sqrt(np.mean([(found[m] - known) ** 2 for known, found in self.spacings_mm.values()])))
+            m: float(np.sqrt(np.mean([(measured[m] - known) ** 2 for known, measured in self.spacings_mm.values()])))
             for m in MODELS
         }
 
@@ -155,7 +155,7 @@ def _data(
         spheres=[
             _sphere_row(name, c, row) for (name, c), row in zip(result.spheres.items(), letter.TABLE_2, strict=True)
         ],
-        spacings=[SpacingRow(name, known, found) for name, (known, found) in result.spacings_mm.items()],
+        spacings=[SpacingRow(name, known, measured) for name, (known, measured) in result.spacings_mm.items()],
         pairs=[
             MergePair(
                 name,

@@ -9,7 +9,7 @@ from typing import Literal
 
 from slviewer.calibration.soundness import MIN_POSES
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE
-from slviewer.session.atomic import megabytes
+from slviewer.session.atomic import format_megabytes
 from slviewer.wizard.snapshot import CalibrationView, RigView, SessionView, Space, StepState, StepView
 
 COVERED, MANY_POSES = 0.75, 15
@@ -89,7 +89,7 @@ def _device_problems(facts: Facts) -> Iterator[str]:
     elif facts.rig.state == "lost":
         yield f"The connection to the rig is lost: {facts.rig.fault}. Retrying every two seconds."
     if facts.space is not None and not facts.space.enough:
-        needs, free = megabytes(facts.space.capture_bytes or 0), megabytes(facts.space.free_bytes)
+        needs, free = format_megabytes(facts.space.capture_bytes or 0), format_megabytes(facts.space.free_bytes)
         yield f"{free} are free on the disk and a capture needs {needs}: free some space."
     if facts.brightness == "saturated":
         yield "Parts of the image are saturated: lower the exposure, or close the aperture."

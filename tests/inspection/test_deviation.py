@@ -6,7 +6,7 @@ import trimesh
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.inspection import placing
-from slviewer.inspection.colours import LEFT_OUT, colour_limit, deviation_colours
+from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.tolerance import ToleranceVerdict, judge_deviation
@@ -195,5 +195,5 @@ def test_another_part_is_refused(ammonite, monkeypatch) -> None:
 def test_colours_run_from_blue_through_pale_to_red() -> None:
     blue, pale, red, more, unknown = deviation_colours(np.array([-0.1, 0.0, 0.1, 0.5, np.nan]), 0.1).tolist()
     assert blue[2] > 2 * blue[0] and min(pale) > 200 and red[0] > 3 * red[2]
-    assert more == red and tuple(unknown) == LEFT_OUT
+    assert more == red and tuple(unknown) == EXCLUDED_COLOUR
     assert colour_limit(np.array([np.nan, 1.0]), 0.2) == 0.2 and colour_limit(np.full(9, -0.3)) == pytest.approx(0.3)

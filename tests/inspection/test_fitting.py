@@ -22,7 +22,7 @@ def test_a_sphere_with_strays_has_its_radius_within_its_uncertainty() -> None:
     assert np.linalg.norm(found.feature.place - MIDDLE) < 0.06
     assert 0.028 < found.rms < 0.032 and 0.11 < found.form < 0.125  # 95 % of a normal's width: 3.92 sigma
     assert found.rms < abs(found.maximum) < 0.2
-    assert 0.13 < found.left_out / 6000 < 0.15 and "set aside" in found.warnings[0]
+    assert 0.13 < found.left_out / 6000 < 0.15 and "excluded" in found.warnings[0]
     radius, diameter, *_ = found.quantities()
     assert diameter.value == 2 * radius.value and abs(diameter.U / sigma - 4) < 0.05
 

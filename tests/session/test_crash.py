@@ -50,9 +50,9 @@ def test_a_writer_killed_at_any_moment_leaves_whole_captures(tmp_path, sequence,
                 assert writer.stdout.readline() == b"ready\n"
                 time.sleep(rng.uniform(0.2, 0.5))  # the first save imports zarr
                 writer.send_signal(signal.SIGKILL)
-            caught_in_the_act += bool(atomic.leftovers(folder))
+            caught_in_the_act += bool(atomic.list_leftovers(folder))
             with Session.open(folder, write=True) as session:
-                assert not atomic.leftovers(folder)
+                assert not atomic.list_leftovers(folder)
                 np.testing.assert_array_equal(session.load_capture("before").frames, frames)
                 for capture in session.captures():
                     if capture.name != "before":
@@ -95,7 +95,7 @@ def test_a_replacement_cut_short_anywhere_leaves_the_old_or_the_new(session, seq
         with Session.open(session.folder, write=write) as reopened:
             capture = reopened.load_capture("a")
             np.testing.assert_array_equal(capture.frames, frames if capture.meta["source"] == "old" else new)
-            assert not atomic.leftovers(session.folder)
+            assert not atomic.list_leftovers(session.folder)
     if capture.meta["source"] == "new":
         assert len(list((session.folder / "trash").iterdir())) == 1
 
@@ -158,4 +158,4 @@ def _check_unharmed(session, frames):
     with_lock = Session.open(session.folder)
     assert with_lock.capture_names() == ["a"] and with_lock.result_names() == []
     np.testing.assert_array_equal(with_lock.load_capture("a").frames, frames)
-    assert not atomic.leftovers(session.folder)
+    assert not atomic.list_leftovers(session.folder)

@@ -119,10 +119,10 @@ def test_files_that_a_model_names_are_not_opened(tmp_path: Path) -> None:
 
 def test_size_and_triangles_are_limited_before_anything_is_loaded(tmp_path: Path, monkeypatch) -> None:
     with open(tmp_path / "large.stl", "wb") as file:
-        file.truncate(nominal.MOST_BYTES + 1)  # sparse
+        file.truncate(nominal.MAX_BYTES + 1)  # sparse
     with pytest.raises(SessionError, match="268 MB"):
         read_nominal(tmp_path / "large.stl")
-    monkeypatch.setattr(nominal, "MOST_TRIANGLES", 100)
+    monkeypatch.setattr(nominal, "MAX_TRIANGLES", 100)
     for name in ("many.stl", "many.ply", "many.obj"):
         BALL.export(tmp_path / name)
         with pytest.raises(SessionError, match=r"320.*100"):

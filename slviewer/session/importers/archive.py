@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from slviewer.errors import InputError
-from slviewer.session.atomic import megabytes
+from slviewer.session.atomic import format_megabytes
 from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import listed, visible
 from slviewer.session.importers.layouts import LAYOUTS
@@ -19,7 +19,7 @@ MOST_BYTES = 20 * 10**9
 """Unpacked; a hundred poses of 50 frames of 4 MB."""
 MOST_FILES = 20_000
 _DRIVE = re.compile("[A-Za-z]:")
-_TAKEN = IMAGE_SUFFIXES | {".toml"}
+_EXTRACTED_SUFFIXES = IMAGE_SUFFIXES | {".toml"}
 
 
 def unpacked_size(archive: IO[bytes]) -> int:
@@ -72,7 +72,7 @@ def _members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]
             )
         if info.is_dir() or any(part.startswith((".", "__MACOSX")) for part in path.parts):
             continue
-        if path.suffix.lower() not in _TAKEN:
+        if path.suffix.lower() not in _EXTRACTED_SUFFIXES:
             others.append(path.name)
             continue
         if info.flag_bits & 1:
@@ -81,8 +81,8 @@ def _members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]
     total = sum(info.file_size for info in members)
     if total > MOST_BYTES or len(members) > MOST_FILES:
         raise InputError(
-            f"the zip holds {len(members)} files of {megabytes(total)} together: {MOST_FILES} files and "
-            f"{megabytes(MOST_BYTES)} are allowed; import the folder by its path on the server instead"
+            f"the zip holds {len(members)} files of {format_megabytes(total)} together: {MOST_FILES} files and "
+            f"{format_megabytes(MOST_BYTES)} are allowed; import the folder by its path on the server instead"
         )
     if not members:
         raise InputError("the zip holds no images: put the folder of captures into a zip")

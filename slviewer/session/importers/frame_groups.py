@@ -104,17 +104,17 @@ class FrameGroup:
         assert self.files is not None
         if len(self.files) == 1 and has_wildcard(self.files[0]):
             return match_files(folder, self.files[0])
-        found: list[Path] = []
+        files: list[Path] = []
         for name in self.files:
             if not has_wildcard(name):
-                found += [folder / name] if (folder / name).is_file() else []
+                files += [folder / name] if (folder / name).is_file() else []
                 continue
             matches = match_files(folder, name)
             if len(matches) > 1:
                 names = listed([file.name for file in matches])
                 raise InputError(f'{self.where}: "{name}" matches {names}: name one file')
-            found += matches
-        return found
+            files += matches
+        return files
 
 
 def read_groups(name: str, data: Mapping[str, Any]) -> tuple[FrameGroup, ...]:
@@ -128,13 +128,13 @@ def read_groups(name: str, data: Mapping[str, Any]) -> tuple[FrameGroup, ...]:
     key, entries, read = ("frames", groups, _read_group) if single is None else ("frame", single, _read_frame)
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{name} names no frames: add a [[frame]] table for each image, or [[frames]] for several")
-    found = []
+    parsed = []
     for number, entry in enumerate(entries, 1):
         where = f"{name}, [[{key}]] {number}"
         if not isinstance(entry, Mapping):
             raise InputError(f"{where} is no table: write [[{key}]] above its entries")
-        found.append(read(where, entry, ordered is not None))
-    return tuple(found)
+        parsed.append(read(where, entry, ordered is not None))
+    return tuple(parsed)
 
 
 def has_wildcard(name: str) -> bool:

@@ -96,16 +96,16 @@ class Description:
     def select_files(self, folder: Path) -> tuple[Path, ...]:
         """The files of one capture in the order of its stack; InputError that says what is missing or too many."""
         if self.groups[0].files is None:
-            found, count = images_by_name(folder), len(self.files_order)
-            if len(found) != count:
-                raise InputError(f"it holds {len(found)} images, and {count} are described: add or remove images")
+            matched, count = images_by_name(folder), len(self.files_order)
+            if len(matched) != count:
+                raise InputError(f"it holds {len(matched)} images, and {count} are described: add or remove images")
         else:
             selected = [group.select(folder) for group in self.groups]
             self._check_selected(selected)
-            found = [file for files in selected for file in files]
-            if double := {file.name for file in found if found.count(file) > 1}:
+            matched = [file for files in selected for file in files]
+            if double := {file.name for file in matched if matched.count(file) > 1}:
                 raise InputError(f"{listed(sorted(double))} would show two patterns: correct the patterns of the names")
-        return tuple(found[index] for index in self.files_order)
+        return tuple(matched[index] for index in self.files_order)
 
     def _check_selected(self, selected: Sequence[Sequence[Path]]) -> None:
         missing: list[str] = []

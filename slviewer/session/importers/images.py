@@ -121,13 +121,13 @@ def _fault(data: bytes) -> str | None:
     if data.startswith(_JPEG):
         return None if _jpeg_ends(data) else "cut short (its end-of-image marker is missing)"
     if data.startswith(b"BM") and len(data) >= 54:
-        begin, width, height, bits, packed = (
+        data_start, width, height, bits, packed = (
             *struct.unpack_from("<I", data, 10),
             *struct.unpack_from("<ii", data, 18),
             *struct.unpack_from("<HI", data, 28),
         )
         row = (abs(width) * bits + 31) // 32 * 4
-        return "cut short" if packed in (0, 3) and len(data) < begin + row * abs(height) else None
+        return "cut short" if packed in (0, 3) and len(data) < data_start + row * abs(height) else None
     return None
 
 

@@ -30,18 +30,20 @@ def detect_layout(source: Path) -> str:
     if find_description(source) is not None:
         return "frames"
     folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
-    found = [name for name, layout in LAYOUTS.items() if any(layout.is_capture(folder) for folder in folders)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise InputError(f"{source} holds captures of {' and '.join(found)}: name the layout, or import one at a time")
+    candidates = [name for name, layout in LAYOUTS.items() if any(layout.is_capture(folder) for folder in folders)]
+    if len(candidates) == 1:
+        return candidates[0]
+    if candidates:
+        raise InputError(
+            f"{source} holds captures of {' and '.join(candidates)}: name the layout, or import one at a time"
+        )
     known = "; ".join(f"{layout.name}: {layout.holds}" for layout in LAYOUTS.values())
     raise InputError(f"{source} has none of the known layouts ({known}): describe the images in a TOML in the folder")
 
 
 def find_description(source: Path) -> Path | None:
     """The TOML in a folder; None where there is none. Raises InputError where there are several."""
-    found = sorted(entry for entry in visible(Path(source)) if entry.suffix.lower() == ".toml")
-    if len(found) > 1:
-        raise InputError(f"{source} holds {' and '.join(file.name for file in found)}: keep one description")
-    return found[0] if found else None
+    descriptions = sorted(entry for entry in visible(Path(source)) if entry.suffix.lower() == ".toml")
+    if len(descriptions) > 1:
+        raise InputError(f"{source} holds {' and '.join(file.name for file in descriptions)}: keep one description")
+    return descriptions[0] if descriptions else None

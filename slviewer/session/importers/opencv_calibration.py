@@ -57,9 +57,9 @@ def read(path: Path, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]
             raise InputError(
                 f"{Path(path).name} has no {', '.join(missing)}: its keys are {', '.join(there) or 'none'}"
             )
-        found = [_matrix(storage.getNode(key), f"{Path(path).name}: {key}") for key in keys]
+        matrices = [_matrix(storage.getNode(key), f"{Path(path).name}: {key}") for key in keys]
     where = {entry: f"{Path(path).name}: {key}" for entry, key in zip(ENTRIES, keys, strict=True)}
-    values = dict(zip(ENTRIES, found, strict=True))
+    values = dict(zip(ENTRIES, matrices, strict=True))
     return {
         "K_camera": _intrinsics(values["K_camera"], where["K_camera"]),
         "D_camera": _distortion(values["D_camera"], where["D_camera"]),
@@ -78,13 +78,13 @@ def identify_keys(path: Path) -> tuple[str, ...]:
     with _opened(Path(path)) as storage:
         there = list(storage.root().keys())
     rows = [(*row[:4], *transform) for row in _SPELLINGS for transform in dict.fromkeys((row[4:], *_TRANSFORMS))]
-    found = list(dict.fromkeys(row for row in rows if set(row) <= set(there)))
-    if len(found) == 1:
-        return found[0]
-    asked = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {', '.join(there) or 'none'}"
-    if found:
-        raise InputError(f"{Path(path).name} holds {' and '.join(', '.join(row) for row in found)}: {asked}")
-    raise InputError(f"the entries of {Path(path).name} have no names that are known here: {asked}")
+    matches = list(dict.fromkeys(row for row in rows if set(row) <= set(there)))
+    if len(matches) == 1:
+        return matches[0]
+    remedy = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {', '.join(there) or 'none'}"
+    if matches:
+        raise InputError(f"{Path(path).name} holds {' and '.join(', '.join(row) for row in matches)}: {remedy}")
+    raise InputError(f"the entries of {Path(path).name} have no names that are known here: {remedy}")
 
 
 def read_sizes(path: Path) -> dict[str, tuple[tuple[int, int], str]]:
@@ -171,8 +171,8 @@ def _distortion(matrix: np.ndarray, where: str) -> np.ndarray:
 def _rotation(matrix: np.ndarray, where: str) -> np.ndarray:
     if matrix.shape != (3, 3):
         raise InputError(f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3")
-    left, _, right = np.linalg.svd(matrix)
-    nearest = left @ right
+    U, _, Vt = np.linalg.svd(matrix)
+    nearest = U @ Vt
     error = np.abs(matrix - nearest).max()
     if error > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
         raise InputError(

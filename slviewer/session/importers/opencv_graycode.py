@@ -50,14 +50,14 @@ def read(
         return match_files(folder, files) if files else images_by_name(folder)
 
     def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
-        found = select(folder)
-        if len(kinds := {re.sub(r"\d+$", "", file.stem) for file in found}) > 1:
+        files = select(folder)
+        if len(kinds := {re.sub(r"\d+$", "", file.stem) for file in files}) > 1:
             shown = listed([f"{kind}N" for kind in sorted(kinds)])
             raise InputError(f'it holds images named {shown}: choose one with --files "{min(kinds)}*"')
-        shown_sequence = _shown(sequence, len(found))
-        _check_shadow_images(found, shown_sequence)
-        recording = ImportableRecording(name, shown_sequence, tuple(found), folder)
-        return recording, strangers_warning(folder, [file for file in images_by_name(folder) if file not in found])
+        shown_sequence = _shown(sequence, len(files))
+        _check_shadow_images(files, shown_sequence)
+        recording = ImportableRecording(name, shown_sequence, tuple(files), folder)
+        return recording, strangers_warning(folder, [file for file in images_by_name(folder) if file not in files])
 
     def looks_so(folder: Path) -> bool:
         return 2 * len(select(folder)) > len(sequence.frames)

@@ -76,7 +76,7 @@ def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
     there = [entry for entry in visible(pose) if entry.is_dir() and entry.name.lower() in _AXES]
     if len({entry.name.lower() for entry in there}) < len(there):
         raise InputError(f"it holds {listed(sorted(entry.name for entry in there))}: keep one folder an axis")
-    return sorted(((entry, _AXES[entry.name.lower()]) for entry in there), key=lambda found: found[1])
+    return sorted(((entry, _AXES[entry.name.lower()]) for entry in there), key=lambda folder_axis: folder_axis[1])
 
 
 def _is_capture(folder: Path) -> bool:

@@ -77,11 +77,11 @@ def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis
     if len(candidates) > 1:
         shown = listed([f"{each} along {' and '.join(axes)}" for each, axes in candidates])
         raise InputError(f"{images} frames may be {shown}: choose with --codec")
-    found, axes = candidates[0]
+    sequence, axes = candidates[0]
     cells: PerAxis[float | None] | None = (
-        PerAxis(*(_gray_cell(each, projector) for each in AXES)) if found == "gray" else None
+        PerAxis(*(_gray_cell(each, projector) for each in AXES)) if sequence == "gray" else None
     )
-    return PatternSequence(projector, _frames(found, projector, axes), phase_sign=-1, gray_cell_px=cells)
+    return PatternSequence(projector, _frames(sequence, projector, axes), phase_sign=-1, gray_cell_px=cells)
 
 
 def _frames(codec: Codec, projector: tuple[int, int], axes: tuple[Axis, ...]) -> tuple[Frame, ...]:
