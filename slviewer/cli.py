@@ -116,16 +116,16 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         run()
     except SlviewerError as error:
-        terminal.say(f"slviewer: {error}")
+        terminal.print_message(f"slviewer: {error}")
         return error.exit_status
     except KeyboardInterrupt:
-        terminal.say("slviewer: cancelled")
+        terminal.print_message("slviewer: cancelled")
         return Cancelled.exit_status
     except BrokenPipeError:
         return 1
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
-        terminal.say(f"slviewer: {error.strerror or error}{where}")
+        terminal.print_message(f"slviewer: {error.strerror or error}{where}")
         return 1
     return 0
 

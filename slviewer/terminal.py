@@ -1,22 +1,22 @@
-"""What a command says on standard error while it works."""
+"""Progress and messages of a command, on standard error."""
 
 import sys
 
 
 def progress(done: float, doing: str) -> None:
-    """One line, redrawn in place on a terminal; silent elsewhere."""
+    """Print the share `done`, 0 ... 1, as one line that is redrawn in place; silent unless on a terminal."""
     if sys.stderr.isatty():
         end = "\n" if done >= 1 else ""
         print(f"\r\033[K{100 * done:3.0f} % {doing}", end=end, file=sys.stderr, flush=True)
 
 
-def say(message: str) -> None:
-    """One sentence, in the place of an unfinished progress line."""
+def print_message(message: str) -> None:
+    """Print a message, in place of an unfinished progress line."""
     if sys.stderr.isatty():
         print("\r\033[K", end="", file=sys.stderr)
     print(message, file=sys.stderr)
 
 
 def warn(message: str) -> None:
-    """One sentence that the operator should know of."""
-    say(f"warning: {message}")
+    """Print a warning."""
+    print_message(f"warning: {message}")

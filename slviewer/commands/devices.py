@@ -83,12 +83,12 @@ def _connect(port: int, ended: ExitStack) -> "Channel":
     channel, server = Channel(), serve("127.0.0.1", port, label="slviewer")
     ended.callback(server.stop)
     serve_projector(server, channel)
-    terminal.say(f"Open this on the projector's screen, full screen: {server.link(PATH)}")
+    terminal.print_message(f"Open this on the projector's screen, full screen: {server.link(PATH)}")
     reported = ""
     for _ in range(int(PAGE_PATIENCE_S)):
         standing = channel.wait_ready(1.0)
         if standing.state == "ready":
             return channel
         if standing.words != reported:
-            terminal.say(f"projector page: {(reported := standing.words)}")
+            terminal.print_message(f"projector page: {(reported := standing.words)}")
     raise DeviceError(f"the projector page was not ready within {PAGE_PATIENCE_S:g} s: {channel.page_state().words}")

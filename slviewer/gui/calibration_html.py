@@ -31,12 +31,12 @@ def verdict_html(verdict: Verdict, of_calibration: bool, calibration: Calibratio
     ]
     lines += [_finding(finding) for finding in verdict.findings]
     if not of_calibration:
-        left = (
+        consequence = (
             "This attempt gave no calibration."
             if calibration is None
             else "This attempt gave no calibration: the previous one is shown below."
         )
-        lines.append(f'<div style="margin-top:0.5em">{to_html(left)}</div>')
+        lines.append(f'<div style="margin-top:0.5em">{to_html(consequence)}</div>')
     return alert(Html("".join(lines)), tone)
 
 

@@ -49,11 +49,11 @@ class SessionValue:
 
     def _set(self) -> None:
         self._timer = None
-        left = self._entered + TYPING_S - time.monotonic()
-        if left <= 0:
+        remaining = self._entered + TYPING_S - time.monotonic()
+        if remaining <= 0:
             change(self._handle, value=self._latest)
         else:
-            self._timer = threading.Timer(left, self._set)
+            self._timer = threading.Timer(remaining, self._set)
             self._timer.daemon = True
             self._timer.start()
 

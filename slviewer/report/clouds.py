@@ -1,4 +1,4 @@
-"""Shaded views of scans and of what they were merged to."""
+"""Shaded views of scans and of merged clouds."""
 
 from collections.abc import Sequence
 

@@ -59,7 +59,7 @@ class SpacingRow:
 
 @dataclass(frozen=True)
 class MergePair:
-    """How one scan lies on the reference after ICP; ``overlap`` is a share, 0 to 1."""
+    """The alignment of one scan to the reference after ICP; ``overlap`` is a share, 0 to 1."""
 
     name: str
     reference: str
@@ -147,7 +147,7 @@ class ReproductionData:
 
 @dataclass(frozen=True)
 class CaptureRow:
-    """One capture of a session. ``state``: used, unused, excluded, waiting or scan; ``why`` says why it is not used."""
+    """One capture. ``state``: used, unused, excluded, waiting or scan; ``why``: why it is not used."""
 
     name: str
     role: str

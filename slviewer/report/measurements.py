@@ -137,8 +137,8 @@ def _deviation_items(view: Measurement, arrays: Mapping[str, np.ndarray]) -> lis
 
 
 def _deviation_table(view: Measurement) -> Table:
-    found, verdict = view.data, view.data["verdict"]
-    numbers = found["statistics_mm"]
+    data, verdict = view.data, view.data["verdict"]
+    numbers = data["statistics_mm"]
     columns = [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns.append(Column("decision", align="left"))
 
@@ -148,7 +148,7 @@ def _deviation_table(view: Measurement) -> Table:
     rows: list[list[str | Cell]] = [
         ["mean", format_number(numbers["mean"], 4, signed=True), "mm", ""],
         ["RMS", format_number(numbers["rms"], 4), "mm", ""],
-        ["RMS of the scan's noise alone", format_number(found["noise_mm"], 4), "mm", ""],
+        ["RMS of the scan's noise alone", format_number(data["noise_mm"], 4), "mm", ""],
         ["95 % of the points deviate by less than", format_number(numbers["within_95"], 4), "mm", ""],
         [
             "range of 99.7 % of the points, lower end",
@@ -172,12 +172,12 @@ def _deviation_table(view: Measurement) -> Table:
             ["outside by more than U", format_number(verdict["outside"], 2), "%", ""],
             ["undecided", format_number(verdict["close"], 2), "%", ""],
         ]
-    rows.append(["area of the nominal that was measured", format_number(100 * found["coverage"], 1), "%", ""])
+    rows.append(["area of the nominal that was measured", format_number(100 * data["coverage"], 1), "%", ""])
     share = 100 * numbers["left_out"] / max(numbers["points"] + numbers["left_out"], 1)
     notes = [
         f"{numbers['points']:,} points. {numbers['left_out']:,} ({share:.1f} %) lie farther than "
-        f"{found['reach_mm']:.3g} mm from the nominal or face another direction, and are excluded. The best fit adds "
-        f"{found['alignment_mm']:.4f} mm (1 sigma)."
+        f"{data['reach_mm']:.3g} mm from the nominal or face another direction, and are excluded. The best fit adds "
+        f"{data['alignment_mm']:.4f} mm (1 sigma)."
     ]
     return Table(columns, rows, f"{view.source} against {view.data['nominal']['name']}", notes)
 

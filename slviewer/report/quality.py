@@ -121,21 +121,21 @@ def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:
 
 
 def _acceptance_items(view: AcceptanceView) -> list[Item]:
-    found = view.found
-    artefact = found["artefact"]
+    result = view.found
+    artefact = result["artefact"]
     named = (
-        f"{artefact['name']}, certificate {artefact['certificate']}, measured by {found['model']} on {view.time[:10]}"
+        f"{artefact['name']}, certificate {artefact['certificate']}, measured by {result['model']} on {view.time[:10]}"
     )
-    decided, _ = _DECISIONS[found["decision"]]
+    decided, _ = _DECISIONS[result["decision"]]
     items: list[Item] = [
-        PageNotice(f"{named}: {decided.upper() if found['decision'] else decided}.",
-               "good" if found["decision"] == "pass" else "plain" if found["decision"] is None else "warning")
+        PageNotice(f"{named}: {decided.upper() if result['decision'] else decided}.",
+               "good" if result["decision"] == "pass" else "plain" if result["decision"] is None else "warning")
     ]  # fmt: skip
     if view.stale:
         items.append(PageNotice("The calibration or the captures have changed since this test: test again."))
-    items += [PageNotice(f"Incomplete: {what}.") for what in found["lacks"]]
+    items += [PageNotice(f"Incomplete: {what}.") for what in result["lacks"]]
     rows: list[list[str | Cell]] = []
-    for each in found["judgements"]:
+    for each in result["judgements"]:
         worst, limit = each["worst"], each["limit_mm"]
         rows.append(
             [
@@ -151,27 +151,27 @@ def _acceptance_items(view: AcceptanceView) -> list[Item]:
     columns = [Column("property", align="left"), Column("worst", "mm"), Column("at", align="left")]
     columns += [Column("uncertainty U, k = 2", "mm"), Column("95 % lie within", "mm", align="centre")]
     columns += [Column("limit", "mm"), Column("decision", align="left")]
-    notes = [f"{len(found['positions'])} positions."]
-    if scale := found["scale"]:
+    notes = [f"{len(result['positions'])} positions."]
+    if scale := result["scale"]:
         U = 2 * scale["u_ppm"]
         notes.append(
             f"Scale: {scale['ppm']:+.0f} ppm ± {U:.0f} ppm (k = 2) over {scale['length_mm']:.3f} mm.".replace("-", "−")
         )
-    if found["scale_applied"] is not None:
-        ppm = f"{1e6 * (found['scale_applied'] - 1):+.0f}".replace("-", "−")
+    if result["scale_applied"] is not None:
+        ppm = f"{1e6 * (result['scale_applied'] - 1):+.0f}".replace("-", "−")
         notes.append(f"The scale was corrected by {ppm} ppm from this test on.")
-    elif found["scale_factor"] != 1:
-        ppm = f"{1e6 * (found['scale_factor'] - 1):+.0f}".replace("-", "−")
+    elif result["scale_factor"] != 1:
+        ppm = f"{1e6 * (result['scale_factor'] - 1):+.0f}".replace("-", "−")
         notes.append(f"A scale correction of {ppm} ppm was in force during the test.")
-    if steady := found["repeatability"]:
+    if steady := result["repeatability"]:
         notes.append(
             f"Repeatability over {steady['captures']} captures of a still object: {steady['sigma_mm']:.4f} mm (median "
             f"over the pixels), {steady['predicted_mm']:.4f} mm expected from noise; the mean depth drifted by "
             f"{steady['wandering_mm']:.4f} mm. This is not a measure of accuracy."
         )
     items.append(Table(columns, rows, artefact["name"], notes))
-    if found["budget"]:
-        items.append(_budget_table(found["budget"]))
+    if result["budget"]:
+        items.append(_budget_table(result["budget"]))
     return items
 
 
@@ -191,7 +191,7 @@ def _budget_table(budget: Mapping[str, Any]) -> Table:
 def drift_section(checks: Sequence[DriftRow]) -> Section:
     """The answer of the last drift check, and the history."""
     last = checks[-1].drift
-    kept = last.verdict == "still good"
+    is_still_good = last.verdict == "still good"
     because = f", because {'; '.join(last.reasons)}" if last.reasons else ""
     rows: list[list[str | Cell]] = []
     for row in reversed(checks):
@@ -212,7 +212,7 @@ def drift_section(checks: Sequence[DriftRow]) -> Section:
     columns += [Column("change of scale", "ppm"), Column("epipolar error", "px")]
     columns.append(Column("of", align="left"))
     items: list[Item] = [
-        PageNotice(f"{last.capture}: {last.verdict}{because}.", "good" if kept else "warning"),
+        PageNotice(f"{last.capture}: {last.verdict}{because}.", "good" if is_still_good else "warning"),
         Table(columns, rows, "Drift checks, the latest first"),
     ]
     return Section("Drift", "One board against the saved calibration: whether the rig is still as it was.", items)

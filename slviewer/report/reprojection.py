@@ -1,4 +1,4 @@
-"""How well the target poses agree with a calibration, and where in the image they lay."""
+"""Figures of reprojection errors of the target poses, and of their coverage of the image."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -96,24 +96,24 @@ def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> 
     """Where the features (n, 2) px of each pose lay in an image of ``size``: their hulls, and how much they cover."""
     import cv2
 
-    seen = np.zeros((size[1], size[0]), np.uint8)
+    coverage_count = np.zeros((size[1], size[0]), np.uint8)
     hulls = []
     for pixels in poses:
         known = pixels[np.isfinite(pixels).all(axis=1)].astype(np.float32)
         if len(known) < 3:
             continue
         hull = cv2.convexHull(known)[:, 0]
-        filled = np.zeros_like(seen)
+        filled = np.zeros_like(coverage_count)
         cv2.fillConvexPoly(filled, np.round(hull).astype(np.int32), 1)
-        seen += filled
+        coverage_count += filled
         hulls.append(np.vstack([hull, hull[:1]]))
-    share = 100 * float((seen > 0).mean())
+    share = 100 * float((coverage_count > 0).mean())
     drawing, axes = _image_axes(size, f"{title}: {share:.0f} % of the image covered")
     for hull in hulls:
         axes.plot(*hull.T, color=INK, linewidth=0.6, alpha=0.4)
     step = max(1, size[0] // 600)
     image = axes.imshow(
-        np.ma.masked_equal(seen, 0)[::step, ::step],
+        np.ma.masked_equal(coverage_count, 0)[::step, ::step],
         cmap="YlGn",
         vmin=0,
         vmax=max(len(poses), 1),

@@ -32,7 +32,7 @@ from slviewer.report.tables import (
 
 WORST = 2.0
 """A pose whose reprojection error exceeds the RMS over the poses this many times is marked."""
-SET_ASIDE_PERCENT = 2.0
+MAX_EXCLUDED_PERCENT = 2.0
 """More points set aside than this, and the RMS does not speak for the shape."""
 
 
@@ -166,7 +166,7 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
         ]
     if stereo.pose_rms_px:
         items.append(_pose_table(stereo.pose_rms_px))
-    aside = stereo.features_excluded
+    excluded = stereo.features_excluded
     text = [
         "How far the target's features lie from where the calibration predicts them, in px: "
         + ", ".join(f"{device} {value:.3f}" for device, value in rms.items())
@@ -174,8 +174,8 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
         if rms
         else "This calibration was made elsewhere, without a reprojection error."
     ]
-    if aside:
-        text.append(f"Excluded: {_format_count(aside, 'feature')} beyond 6 robust sigma.")
+    if excluded:
+        text.append(f"Excluded: {_format_count(excluded, 'feature')} beyond 6 robust sigma.")
     return Section("Reprojection", text, items)
 
 
@@ -275,9 +275,9 @@ def _verifications_section(data: SessionData) -> Section:
         ("plane", "Planes: RMS distance from the best plane"),
         ("sphere", "Spheres: RMS and radius"),
     ):
-        found = [v for v in data.verifications if v.shape == shape]
-        if found:
-            items.append(_verification_table(found, caption))
+        verifications = [v for v in data.verifications if v.shape == shape]
+        if verifications:
+            items.append(_verification_table(verifications, caption))
     if data.spacings:
         items.append(spacing_table(data.spacings, "Distances between the centres of spheres"))
     for v in data.verifications:
@@ -292,9 +292,9 @@ def _verifications_section(data: SessionData) -> Section:
     )
 
 
-def _verification_table(found: list[VerificationView], caption: str) -> Table:
-    models = models_of([v.rms_mm for v in found])
-    sphere = found[0].shape == "sphere"
+def _verification_table(verifications: list[VerificationView], caption: str) -> Table:
+    models = models_of([v.rms_mm for v in verifications])
+    sphere = verifications[0].shape == "sphere"
     columns = [
         Column("capture", align="left"),
         Column("model", align="left"),
@@ -309,10 +309,10 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
         Column("excluded", "%"),
         Column("coverage", "%"),
     ]
-    masked = any(v.masked for v in found)
+    masked = any(v.masked for v in verifications)
     columns += [Column("masked", "%")] if masked else []
     rows: list[list[str | Cell]] = []
-    for v in found:
+    for v in verifications:
         for i, model in enumerate(m for m in models if m in v.rms_mm):
             rms, rival = v.rms_mm[model], v.rms_mm.get(models[0], np.nan)
             mark = better_worse(rms, rival) if model != models[0] else ""
@@ -327,10 +327,10 @@ def _verification_table(found: list[VerificationView], caption: str) -> Table:
             if sphere:
                 radius = v.radius_mm.get(model, np.nan)
                 row += [format_number(radius), format_number(radius - v.true_radius_mm, signed=True)]
-            aside = 100 * v.set_aside.get(model, 0) / max(v.points, 1)
-            share = f"{aside:.1f}"
+            excluded = 100 * v.set_aside.get(model, 0) / max(v.points, 1)
+            share = f"{excluded:.1f}"
             row += [format_incidence(v.incidence) if not i else "", f"{v.points:,}" if not i else ""]
-            row.append(Cell(share, "worse") if aside > SET_ASIDE_PERCENT else share)
+            row.append(Cell(share, "worse") if excluded > MAX_EXCLUDED_PERCENT else share)
             row.append(format_number(100 * v.coverage[model], 1) if model in v.coverage else UNKNOWN)
             if masked:
                 row.append(format_number(100 * v.masked[model], 1) if model in v.masked else UNKNOWN)

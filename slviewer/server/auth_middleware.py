@@ -24,7 +24,7 @@ _REDIRECT = """<!doctype html><meta charset="utf-8"><title>slviewer</title><scri
 
 
 class Route(NamedTuple):
-    """A page beside viser's, for the operator alone, and what talks to the browsers that open a WebSocket there."""
+    """A page besides viser's, for the operator alone, and the handler of the WebSockets that it opens."""
 
     html: bytes
     handler: Callable[[ServerConnection], Awaitable[None]]
@@ -118,7 +118,7 @@ class AuthMiddleware:
     async def _download(self, connection: Connection, path: str) -> Response:
         opened = self._downloads.open(path)
         if opened is None:
-            raise Refusal(HTTPStatus.NOT_FOUND, "This file is no longer offered: ask for it again in slviewer.")
+            raise Refusal(HTTPStatus.NOT_FOUND, "This file is no longer offered: request it again in slviewer.")
         headers, file = opened
         harden(headers)
         headers["Connection"] = "close"

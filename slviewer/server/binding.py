@@ -14,7 +14,7 @@ RESOLVE_SECONDS = 1.5
 def listen(host: str, port: int) -> socket.socket:
     """A TCP socket listening at exactly this address; port 0 takes any free one.
 
-    Raises SlviewerError within two seconds where the port is taken or the address is not this machine's.
+    Raises SlviewerError within two seconds where the port is in use or the address is not this machine's.
     """
     if not host or not 0 <= port <= 65535:
         raise SlviewerError(f"{host or 'An empty host'}:{port} is no address to serve at: try 127.0.0.1 and port 8080.")
@@ -33,31 +33,31 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def _resolve(host: str, port: int) -> tuple[int, tuple]:
-    found: list[tuple[int, tuple]] = []
+    candidates: list[tuple[int, tuple]] = []
 
     def look_up() -> None:
         try:
             infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         except (OSError, UnicodeError):
             return
-        found.extend((info[0], info[4]) for info in infos)
+        candidates.extend((info[0], info[4]) for info in infos)
 
     thread = threading.Thread(target=look_up, daemon=True)
     thread.start()
     thread.join(RESOLVE_SECONDS)
-    if not found:
+    if not candidates:
         raise SlviewerError(
             f"No address was found for the host {host!r}: use 127.0.0.1 for this machine alone, "
             "or an address of this machine to let others in."
         )
-    return found[0]
+    return candidates[0]
 
 
 def _remedy(host: str, port: int, error: OSError | OverflowError) -> str:
     number = getattr(error, "errno", None)
     if number in (errno.EADDRINUSE, getattr(errno, "WSAEADDRINUSE", -1)):
         return (
-            f"Port {port} at {host} is taken, perhaps by another slviewer: close that one, or choose another port "
+            f"Port {port} at {host} is in use, perhaps by another slviewer: close that one, or choose another port "
             "with --port (--port 0 takes any free one)."
         )
     if number in (errno.EACCES, errno.EPERM):

@@ -56,7 +56,7 @@ class ViserGate:
         self._uploads.close()
 
     def _check_message(self, message: Any, raw: bytes) -> bytes:
-        """The bytes that viser gets to see for this message; Refused where it may not."""
+        """The bytes that are passed on to viser for this message; raises MessageRefused where it is not allowed."""
         server, client = self._server, self._client
         assert client is not None
         # besides where they look from, those who watch may say that they have drawn something, when they are asked
@@ -108,7 +108,7 @@ class ViserGate:
         assert self._client is not None
         handle = inside.gui_input(self._server, self._client, uuid)
         if handle is None:
-            raise MessageRefused("nothing to be seen there")
+            raise MessageRefused("nothing visible there")
         if getattr(handle, "disabled", False):
             raise MessageRefused("disabled", correct=True)
         return handle

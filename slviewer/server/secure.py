@@ -21,7 +21,7 @@ from slviewer.server.responses import script_hash
 from slviewer.server.uploads import UploadBudget
 
 MESSAGE_LIMIT = 32 * 2**20
-"""Bytes of one message from a browser; the largest is a picture that the server asked it for."""
+"""Bytes of one message from a browser; the largest is a picture that the server requested."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class SafeServer:
         return self.link("/", "viewer")
 
     def link(self, path: str, role: Role = "operator") -> str:
-        """The address of a page of this server with a token, to be opened once; keep it as a password is kept."""
+        """The address of a page of this server with a token, to be opened once; as secret as a password."""
         token = self.access.token if role == "operator" else self.access.view_token
         return f"http://{self._shown_host()}:{self.port}{path}?{urllib.parse.urlencode({'token': token})}"
 

@@ -27,7 +27,7 @@ class _Transfer:
     size: int
     parts: int
     received: int = 0
-    seen: set[int] = field(default_factory=set)
+    received_parts: set[int] = field(default_factory=set)
 
 
 class Uploads:
@@ -39,7 +39,7 @@ class Uploads:
         self._transfers: dict[str, _Transfer] = {}
 
     def start(self, message: Any) -> Any:
-        """The announcement (a FileTransferStartUpload) with a safe file name; Refused where it asks for too much."""
+        """The announcement (a FileTransferStartUpload) with a safe file name; Refused where it is too large."""
         size, parts = message.size_bytes, message.part_count
         if size < 0 or not (parts == 0 if size == 0 else 1 <= parts <= size // SMALLEST_PART + 1):
             raise MessageRefused("an upload whose parts cannot make up its size")
@@ -64,11 +64,11 @@ class Uploads:
         fits = (
             message.source_component_uuid == transfer.source
             and 0 <= message.part_index < transfer.parts
-            and message.part_index not in transfer.seen
+            and message.part_index not in transfer.received_parts
             and transfer.received <= transfer.size
         )
-        transfer.seen.add(message.part_index)
-        complete = len(transfer.seen) == transfer.parts
+        transfer.received_parts.add(message.part_index)
+        complete = len(transfer.received_parts) == transfer.parts
         if not fits or (complete and transfer.received != transfer.size):
             self._end(message.transfer_uuid)
             self._forget(message.transfer_uuid)
@@ -77,7 +77,7 @@ class Uploads:
             self._end(message.transfer_uuid)
 
     def close(self) -> None:
-        """The client is gone."""
+        """End all uploads of a disconnected client."""
         for transfer in list(self._transfers):
             self._end(transfer)
             self._forget(transfer)

@@ -28,7 +28,7 @@ class Viewers:
         self._durations: dict[int, float] = {}
 
     def ready(self) -> list[viser.ClientHandle]:
-        """Those that have drawn everything that was marked by `sent`."""
+        """The clients that have drawn everything marked by `sent`."""
         clients = self._server.get_clients()
         with self._lock:
             for known in (self._request_times, self._durations):
@@ -37,11 +37,11 @@ class Viewers:
             return [client for number, client in clients.items() if number not in self._request_times]
 
     def here(self) -> set[int]:
-        """The numbers of all that are connected."""
+        """The numbers of all connected clients."""
         return set(self._server.get_clients())
 
     def sent(self, client: viser.ClientHandle) -> None:
-        """Something was sent to this one: it is not ready until it has drawn it."""
+        """Mark that something was sent to this client: it is not ready until it has drawn it."""
         number = client.client_id
         with self._lock:
             self._request_times[number] = time.monotonic()
@@ -51,12 +51,12 @@ class Viewers:
         """How long the slowest of them took for what it was sent last, those apart that have stalled; 0: none did."""
         now = time.monotonic()
         with self._lock:
-            waiting = [now - asked for asked in self._request_times.values() if now - asked < STALLED_S]
+            waiting = [now - sent_s for sent_s in self._request_times.values() if now - sent_s < STALLED_S]
             return max([*self._durations.values(), *waiting], default=0.0)
 
     def _record_answer(self, number: int) -> None:
         with self._lock:
-            asked = self._request_times.pop(number, None)
-            if asked is not None:
-                self._durations[number] = min(time.monotonic() - asked, STALLED_S)
+            sent_s = self._request_times.pop(number, None)
+            if sent_s is not None:
+                self._durations[number] = min(time.monotonic() - sent_s, STALLED_S)
         self._answered()

@@ -164,14 +164,14 @@ def gui_apis(server: viser.ViserServer, client_id: int | None) -> list[viser.Gui
 
 def gui_input(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
     """The input with this id that the client can see, or None."""
-    found = (api._gui_input_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
-    return next((handle for handle in found if handle is not None and is_shown(handle)), None)
+    candidates = (api._gui_input_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
+    return next((handle for handle in candidates if handle is not None and is_shown(handle)), None)
 
 
 def command(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
     """The command with this id that is not disabled, or None."""
-    found = (api._command_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
-    return next((one for one in found if one is not None and not (one._impl.removed or one.disabled)), None)
+    candidates = (api._command_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
+    return next((one for one in candidates if one is not None and not (one._impl.removed or one.disabled)), None)
 
 
 def is_shown(handle: Any) -> bool:
@@ -274,7 +274,7 @@ def refuse_upload(server: viser.ViserServer, client_id: int, source: str, transf
 
 
 def notify(server: viser.ViserServer, client_id: int, title: str, body: str) -> None:
-    """Tell one client what went wrong."""
+    """Show an error to one client."""
     client = server._connected_clients.get(client_id)
     if client is not None:
         client.add_notification(title=title, body=body, color="red", auto_close_seconds=10.0)

@@ -111,7 +111,7 @@ def expose_frames(
     rig: SimulatedRig,
     light: np.ndarray,
     sequence: PatternSequence,
-    room: np.ndarray,
+    room_light: np.ndarray,
     number: int = 0,
     fault: Fault | None = None,
     severity: Severity = "mild",
@@ -119,11 +119,12 @@ def expose_frames(
 ) -> np.ndarray:
     """(n, h, w) uint8: what the camera records of the ``light`` (n, h, w), spoilt by the fault.
 
-    ``room`` as ``Renderer.room_light`` gives it. The same ``number`` and ``seed`` give the same noise, fault or not.
+    ``room_light`` as ``Renderer.room_light`` gives it. The same ``number`` and ``seed`` give the same noise, fault or
+    not.
     """
     level = fault.level(severity) if fault else 0.0
     name = zlib.crc32(repr(fault.words).encode()) if fault else 0
-    shot = Shot(number, sequence, np.random.default_rng([rig.seed, seed, number, name]), room)
+    shot = Shot(number, sequence, np.random.default_rng([rig.seed, seed, number, name]), room_light)
     if fault and fault.light:
         light = fault.light(light, level, shot)
     sensor = rig.sensor

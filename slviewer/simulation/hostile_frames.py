@@ -12,14 +12,14 @@ from slviewer.fringe.sequence import Kind, PatternSequence
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What a fault may ask of the capture that it spoils: its number among its kind, its sequence, and a generator of
-    its own. ``room``: (h, w) float32, even light as strong as the projector's white, in grey levels.
+    """The capture that a fault acts on: its number among its kind, its sequence, and a generator of
+    its own. ``room_light``: (h, w) float32, even light as strong as the projector's white, in grey levels.
     """
 
     number: int
     sequence: PatternSequence
     rng: np.random.Generator
-    room: np.ndarray
+    room_light: np.ndarray
 
 
 # Light before the sensor
@@ -74,14 +74,14 @@ def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
     n, height, _ = light.shape
     rows = 1.6 * np.arange(height) / height
     bands = 0.2 * (1 + depth * np.sin(2 * np.pi * (rows + 0.29 * np.arange(n)[:, None])))
-    return 0.8 * light + bands.astype(np.float32)[:, :, None] * shot.room
+    return 0.8 * light + bands.astype(np.float32)[:, :, None] * shot.room_light
 
 
 def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
     """A lamp switched on half way through the phase steps of x: even light, as a share of the projector's."""
     steps = _indices(shot, "phase", "x")
     illuminated = light.copy()
-    illuminated[steps[len(steps) // 2] :] += np.float32(share) * shot.room
+    illuminated[steps[len(steps) // 2] :] += np.float32(share) * shot.room_light
     return illuminated
 
 

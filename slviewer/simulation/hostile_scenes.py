@@ -69,8 +69,8 @@ class DirtyBoard:
         rng = np.random.default_rng([self.seed, 0xD1])
         dirty = rng.random(shape) < self.share
         for _ in range(round(40 * self.share * 10)):  # scratches: lines of cells
-            begin, way = rng.uniform(0, 1, 2) * shape, rng.normal(size=2)
-            line = begin + np.arange(rng.integers(10, 40))[:, None] * way / np.linalg.norm(way)
+            start, way = rng.uniform(0, 1, 2) * shape, rng.normal(size=2)
+            line = start + np.arange(rng.integers(10, 40))[:, None] * way / np.linalg.norm(way)
             line = np.clip(line.astype(int), 0, shape - 1)
             dirty[line[:, 0], line[:, 1]] = True
         cells = np.clip(cells, 0, shape - 1)
@@ -104,11 +104,11 @@ class MirrorTable:
         # The table lies between camera and mirror image, so that the image's points are behind the mirror.
         with np.errstate(invalid="ignore"):
             behind = image.points @ self.normal > self.offset_mm
-        seen = ~direct & behind & np.isfinite(image.points[..., 2])
+        visible = ~direct & behind & np.isfinite(image.points[..., 2])
         points, normals, albedo = surface.points.copy(), surface.normals.copy(), surface.albedo.copy()
         M, shift = _reflection(self.normal, self.offset_mm)
-        points[seen], normals[seen] = image.points[seen] @ M.T + shift, image.normals[seen] @ M.T
-        albedo[seen] = np.float32(self.reflectivity) * image.albedo[seen]
+        points[visible], normals[visible] = image.points[visible] @ M.T + shift, image.normals[visible] @ M.T
+        albedo[visible] = np.float32(self.reflectivity) * image.albedo[visible]
         return Surface(points, normals, albedo)
 
     def is_direct(self, rays: np.ndarray) -> np.ndarray:
@@ -142,12 +142,12 @@ def with_hand(scene: Scene, reach_mm: float, number: int = 0) -> Scene:
 
 def _is_behind_plate(board: BoardScene, points: np.ndarray, source: np.ndarray) -> np.ndarray:
     """(n,) bool: the way from `points` (n, 3) to `source` (3,) crosses the plate; points on it are not behind it."""
-    begin, end = (points - board.pose.t) @ board.pose.R, (source - board.pose.t) @ board.pose.R
+    start, end = (points - board.pose.t) @ board.pose.R, (source - board.pose.t) @ board.pose.R
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = begin[:, 2] / (begin[:, 2] - end[2])
-    crossing = (begin + share[:, None] * (end - begin))[:, :2] - np.array(board.corner)
+        share = start[:, 2] / (start[:, 2] - end[2])
+    crossing = (start + share[:, None] * (end - start))[:, :2] - np.array(board.corner)
     inside = ((crossing > 0) & (crossing < np.array(board.plate))).all(1)
-    return np.asarray(inside & (share > 0) & (share < 1) & (np.abs(begin[:, 2]) > _THICKNESS_MM))
+    return np.asarray(inside & (share > 0) & (share < 1) & (np.abs(start[:, 2]) > _THICKNESS_MM))
 
 
 def moved_scene(scene: Scene, by_mm: np.ndarray, turn_rad: np.ndarray) -> Scene:

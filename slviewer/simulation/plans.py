@@ -111,8 +111,8 @@ def _placed(
         while step > 0.02:
             trials = np.tile(place, (60, 1))
             trials[:, direction] = offset[direction] * (reach + step * np.arange(60))
-            seen = _in_view(rig, board, features + trials[:, None])
-            reach += step * (len(seen) - 1 if seen.all() else int(np.argmin(seen)) - 1)
+            visible = _in_view(rig, board, features + trials[:, None])
+            reach += step * (len(visible) - 1 if visible.all() else int(np.argmin(visible)) - 1)
             step /= 50
         place[direction] = offset[direction] * reach * share
     return Pose(R, place - R @ middle)

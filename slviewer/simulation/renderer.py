@@ -192,14 +192,14 @@ class Renderer:
         columns, rows = rig.projector.size
         u, v = projector[..., 0], projector[..., 1]
         lens_falloff = (1 + (rays**2).sum(-1)) ** -2  # cos^4 of the angle to the camera's axis
-        seen = surface.albedo * lens_falloff
+        reflected = surface.albedo * lens_falloff
         illuminated = window(u, columns, blur) * window(v, rows, blur * self._rows_per_column)
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
         sigmas, level = blur_levels(blur)
         return _Maps(
-            gain=(seen * shade * reached * illuminated).astype(np.float32),
-            even=(seen * hit).astype(np.float32),
+            gain=(reflected * shade * reached * illuminated).astype(np.float32),
+            even=(reflected * hit).astype(np.float32),
             level=level,
             sigmas=sigmas,
             coordinates={"x": _finite(u), "y": _finite(v)},

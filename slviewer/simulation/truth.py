@@ -29,7 +29,7 @@ def rig_record(rig: SimulatedRig) -> dict[str, Any]:
 
 
 def scene_record(scene: Scene) -> dict[str, Any]:
-    """JSON-able: the shape and where it stands; mm, camera frame; poses as T_camera_board or T_camera_object (4, 4)."""
+    """JSON-able: the shape and its pose; mm, camera frame; poses as T_camera_board or T_camera_object (4, 4)."""
     if isinstance(scene, BoardScene):
         return {
             "shape": "plane",
@@ -103,8 +103,8 @@ class PerfectModel:
             )
             nearer, before, inverse = inverse, off, inverse - step
         out = np.full((*phase.phase.shape, 3), np.nan, np.float32)
-        found = (np.abs(off) <= _SETTLED_PX) & (inverse > 0)
-        out[valid] = np.where(found, 1 / np.where(found, inverse, 1), np.nan)[:, None] * rays
+        solved = (np.abs(off) <= _SETTLED_PX) & (inverse > 0)
+        out[valid] = np.where(solved, 1 / np.where(solved, inverse, 1), np.nan)[:, None] * rays
         return out
 
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:

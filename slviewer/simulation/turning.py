@@ -17,7 +17,7 @@ LOOKING_DOWN_DEG = 30.0
 AXIS = np.array([0.02, -np.cos(np.radians(LOOKING_DOWN_DEG)), -np.sin(np.radians(LOOKING_DOWN_DEG))])
 AXIS /= np.linalg.norm(AXIS)
 """Up from the table, in the camera's frame; the table turns the right-handed way about it."""
-_BESIDE = np.array([6.0, -4.0, 0.0])  # the object does not stand in the table's middle
+_AXIS_OFFSET_MM = np.array([6.0, -4.0, 0.0])  # the object does not stand in the table's middle
 
 _RADIUS_MM, _FOOT_MM = 56.0, 27.0
 _SUBDIVISIONS = 7  # edges of about half a millimetre
@@ -32,7 +32,7 @@ def turning() -> dict[str, MeshScene]:
     scenes = {}
     for k in range(STEPS):
         R = rotation(np.radians(STEP_DEG * k) * AXIS) @ upright
-        scenes[f"turn_{k + 1:02d}"] = MeshScene(vertices, triangles, Pose(R, AXIS_POINT + R @ _BESIDE))
+        scenes[f"turn_{k + 1:02d}"] = MeshScene(vertices, triangles, Pose(R, AXIS_POINT + R @ _AXIS_OFFSET_MM))
     return scenes
 
 

@@ -1,4 +1,4 @@
-"""The one thread that owns camera and projector: it shows, grabs, saves, and computes nothing of its own.
+"""The thread that owns camera and projector: it shows, grabs and saves, and computes nothing.
 
 Between captures it grabs previews and offers the latest one. A capture is saved by the request's own `save` before
 anything else happens, or it never existed. A fault ends the capture in which it happens, with a notice; the devices are

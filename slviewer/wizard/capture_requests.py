@@ -63,9 +63,17 @@ class CaptureRequests(ResultRequests):
             raise InputError("choose the target first: a pose is judged by it")
         sequence, source = pose_sequence(engine), engine.acquisition.view().name
 
-        def save(taken: CapturedFrames) -> None:
+        def save(captured: CapturedFrames) -> None:
             save_frames(
-                store, name, "calibration", sequence, taken, source=source, purpose="pose", board=target, force=retake
+                store,
+                name,
+                "calibration",
+                sequence,
+                captured,
+                source=source,
+                purpose="pose",
+                board=target,
+                force=retake,
             )
             if retake and name in store.excluded():
                 store.include(name)
@@ -83,8 +91,8 @@ class CaptureRequests(ResultRequests):
             sequence = one_axis(sequence, depth_axis(calibration.stereo.rig))  # half of the frames
         name, source = self._next_name(purpose), engine.acquisition.view().name
 
-        def save(taken: CapturedFrames) -> None:
-            save_frames(store, name, "scan", sequence, taken, source=source, purpose=purpose)
+        def save(captured: CapturedFrames) -> None:
+            save_frames(store, name, "scan", sequence, captured, source=source, purpose=purpose)
             self._set_label(name, label)
 
         self._queue(name, sequence, save, lambda: follow(name))
@@ -127,8 +135,8 @@ class CaptureRequests(ResultRequests):
 
     def _next_name(self, kind: str) -> str:
         """A name that no capture has, saved or waiting."""
-        taken = [*self._engine.store.capture_names(), *self._engine.acquisition.names()]
-        numbers = [name.removeprefix(f"{kind}_") for name in taken if name.startswith(f"{kind}_")]
+        used_names = [*self._engine.store.capture_names(), *self._engine.acquisition.names()]
+        numbers = [name.removeprefix(f"{kind}_") for name in used_names if name.startswith(f"{kind}_")]
         number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
         return f"{kind}_{number:02d}"
 

@@ -33,9 +33,11 @@ def export_file(
     """Write one file, as `pipeline.export.export` does; returns a sentence that begins with its name."""
     with staged_export(session, default_file_name(what, name, file_format), report) as path:
         accepts, progress = accepts_rejected(session), report.within(0, 0.98)
-        found = export(session, what, name, out=path, plan=plan, accept_rejected=accepts, progress=progress, warn=warn)
+        exported = export(
+            session, what, name, out=path, plan=plan, accept_rejected=accepts, progress=progress, warn=warn
+        )
     report(1.0, "exported")
-    return f"{path.name} is ready to download: {found.words}"
+    return f"{path.name} is ready to download: {exported.words}"
 
 
 def list_exports(session: Session) -> tuple[ExportView, ...]:

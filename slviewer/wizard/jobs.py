@@ -59,9 +59,9 @@ class Reporter:
         with self._lock:
             self._cancelled = True
 
-    def within(self, begin: float, end: float) -> "Reporter":
+    def within(self, start: float, end: float) -> "Reporter":
         """The reporter of one part of the work, whose own share goes from 0 to 1."""
-        return _PartReporter(self, begin, min(end, 0.999))  # the last report is the whole work's own
+        return _PartReporter(self, start, min(end, 0.999))  # the last report is the whole work's own
 
     @property
     def cancelled(self) -> bool:
@@ -74,12 +74,12 @@ class Reporter:
 
 
 class _PartReporter(Reporter):
-    def __init__(self, whole: Reporter, begin: float, end: float) -> None:
+    def __init__(self, whole: Reporter, start: float, end: float) -> None:
         super().__init__(whole._changed)
-        self._whole, self._begin, self._end = whole, begin, end
+        self._whole, self._start, self._end = whole, start, end
 
     def __call__(self, share: float, stage: str) -> None:
-        self._whole(self._begin + (self._end - self._begin) * share, stage)
+        self._whole(self._start + (self._end - self._start) * share, stage)
 
     def check(self) -> None:
         self._whole.check()

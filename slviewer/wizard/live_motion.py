@@ -42,11 +42,11 @@ def mask_motion(
     indices = np.concatenate([np.array(shift.indices, np.int64) for shift in shifts])
     signs = np.where(np.arange(len(finest)) % 2, -1.0, 1.0).astype(np.float32) / np.float32(len(finest))
     some = (slice(None, None, _SPARSE),) * 2
-    left = np.tensordot(signs, frames[(slice(None), *some)][finest], 1)
+    alternation = np.tensordot(signs, frames[(slice(None), *some)][finest], 1)
     shape = modulation[some] * np.cos(2 * phase[some])
     valid = np.isfinite(shape)
     power = float((shape[valid] ** 2).sum())
-    harmonic = float((shape[valid] * left[valid]).sum()) / power if power > 0 and len(finest) == 4 else 0.0
+    harmonic = float((shape[valid] * alternation[valid]).sum()) / power if power > 0 and len(finest) == 4 else 0.0
     few, many = (extreme(len(shift.indices) for shift in shifts) for extreme in (min, max))
     _hide(
         frames, indices, begins, signs, modulation, phase, np.float32(harmonic),
@@ -62,7 +62,7 @@ def _hide(frames, indices, begins, signs, modulation, phase, harmonic, a, b, mea
     groups = len(begins) - 1
     for row in numba.prange(height):
         lowest, highest = np.empty(width, np.float32), np.empty(width, np.float32)
-        total, left = np.empty(width, np.float32), np.zeros(width, np.float32)
+        total, alternation = np.empty(width, np.float32), np.zeros(width, np.float32)
         for g in range(groups):
             total[:] = 0.0
             share = np.float32(1.0) / np.float32(begins[g + 1] - begins[g])
@@ -72,7 +72,7 @@ def _hide(frames, indices, begins, signs, modulation, phase, harmonic, a, b, mea
                 for x in range(width):
                     level = np.float32(frame[x])
                     total[x] += share * level
-                    left[x] += sign * level
+                    alternation[x] += sign * level
             for x in range(width):
                 lowest[x] = total[x] if g == 0 else min(lowest[x], total[x])
                 highest[x] = total[x] if g == 0 else max(highest[x], total[x])
@@ -81,7 +81,7 @@ def _hide(frames, indices, begins, signs, modulation, phase, harmonic, a, b, mea
             noise = np.sqrt(max(a + b * total[x], np.float32(0.0)))
             known = harmonic * B * np.cos(np.float32(2.0) * phase[row, x])
             moved = (highest[x] - lowest[x] > mean * noise + part * B) | (
-                abs(left[x] - known) > alternating * noise + part * B
+                abs(alternation[x] - known) > alternating * noise + part * B
             )
             if moved:
                 points[row, x, 0] = points[row, x, 1] = points[row, x, 2] = np.nan

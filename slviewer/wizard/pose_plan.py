@@ -81,8 +81,8 @@ class PlanInput:
         """The nominal lens, else one estimated from the features."""
         if self.focal_px is not None:
             return nominal_lens(self.camera, self.focal_px)
-        seen = self.features.values()
-        return estimated_lens([f.points for f in seen], [f.camera for f in seen], self.camera)
+        poses = self.features.values()
+        return estimated_lens([f.points for f in poses], [f.camera for f in poses], self.camera)
 
 
 USUAL_SIGMA = 4e-5
@@ -116,19 +116,19 @@ class PosePlan:
 
 def plan(given: PlanInput) -> PosePlan:
     """The plan after the poses of `given`. The rig is the calibrated one, else one estimated from the poses."""
-    seen = list(given.features.values())
+    poses = list(given.features.values())
     if given.calibrated is not None:
         rig, known = given.calibrated.rig, given.calibrated.poses
     else:
         rough = estimate_rig(
-            [f.points for f in seen], [f.camera for f in seen], [f.projector for f in seen],
+            [f.points for f in poses], [f.camera for f in poses], [f.projector for f in poses],
             (given.camera, given.projector),
         )  # fmt: skip
         if rough is None:
             return _spread_poses(given, given.initial_lens(), {})
         rig, known = rough[0], dict(zip(given.features, rough[1], strict=True))
     spread = _spread_poses(given, rig.camera, known)
-    expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in seen]) / given.projector[0])
+    expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in poses]) / given.projector[0])
     try:
         guidance = suggest_poses(GuidanceModel(rig, given.board, expected), list(spread.poses.values()))
     except (InputError, np.linalg.LinAlgError):  # devices that share no view: better coverage may repair it

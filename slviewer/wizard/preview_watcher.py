@@ -130,7 +130,7 @@ class Watcher:
             # centres of reduced pixels to those of the camera's
             detection = replace(detection, pixels=(detection.pixels + 0.5) / scale - 0.5)
             still = self._stillness.update(detection.pixels, STILL_PX * image.shape[1] / scale, time_s)
-            board = board_seen(watch.board, detection, still, watch.lens, time_s)
+            board = observe_board(watch.board, detection, still, watch.lens, time_s)
         else:
             self._stillness.reset()
         self._result = (watch, board, missing)
@@ -180,7 +180,7 @@ def detect_board(board: Board | None, image: np.ndarray) -> tuple[Detection | No
         return None, str(error)
 
 
-def board_seen(
+def observe_board(
     board: Board, detection: Detection, still_s: float, lens: Lens | None, time_s: float
 ) -> BoardSeen | None:
     """The detected board as a panel draws it."""

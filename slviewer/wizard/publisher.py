@@ -88,10 +88,10 @@ class Publisher:
         end = time.monotonic() + timeout_s
         with self._condition:
             while not condition(self.latest):
-                left = end - time.monotonic()
-                if left <= 0 or self._closing:
+                remaining_s = end - time.monotonic()
+                if remaining_s <= 0 or self._closing:
                     return None
-                self._condition.wait(left)
+                self._condition.wait(remaining_s)
             return self.latest
 
     def close(self) -> None:

@@ -31,7 +31,8 @@ RNG = np.random.default_rng(3)
 
 def shot(**change):
     return Shot(
-        **{"number": 0, "sequence": SEQUENCE, "rng": np.random.default_rng(5), "room": RENDERER.room_light()} | change
+        **{"number": 0, "sequence": SEQUENCE, "rng": np.random.default_rng(5), "room_light": RENDERER.room_light()}
+        | change
     )
 
 
