@@ -1,17 +1,17 @@
 """What can go wrong, by how the program ends.
 
-Every message is one sentence that says what was seen and what to do about it; it is shown to the operator as it is.
+Every message states in one sentence what happened and what to do; it is shown to the operator as it is.
 """
 
 
 class SlviewerError(Exception):
-    """Something was refused or failed, and the message says what was seen and what to do."""
+    """Base of all errors of slviewer; the message states what happened and what to do."""
 
     exit_status = 1
 
 
 class UsageError(SlviewerError):
-    """A command that was not told what it needs."""
+    """A command that lacks a required option or argument."""
 
     exit_status = 2
 
@@ -21,7 +21,7 @@ class InputError(SlviewerError):
 
 
 class DetectionError(InputError):
-    """A target that was not found in an image."""
+    """A target that was not detected in an image."""
 
 
 class SessionError(SlviewerError):

@@ -108,9 +108,9 @@ def select_valid_samples(
         raise InputError(
             f"A surface fit was given {[len(a) for a in arrays]} of u, v, values, weights: equal numbers needed."
         )
-    kept = np.isfinite(u) & np.isfinite(v) & np.isfinite(values) & np.isfinite(w) & (w > 0)
-    kept &= (u >= box[0]) & (u <= box[2]) & (v >= box[1]) & (v <= box[3])
-    return u[kept], v[kept], values[kept], w[kept]
+    selected = np.isfinite(u) & np.isfinite(v) & np.isfinite(values) & np.isfinite(w) & (w > 0)
+    selected &= (u >= box[0]) & (u <= box[2]) & (v >= box[1]) & (v <= box[3])
+    return u[selected], v[selected], values[selected], w[selected]
 
 
 def _normalise_pixels(u: np.ndarray, v: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:

@@ -42,8 +42,8 @@ def fit_plane(points: np.ndarray, weights: np.ndarray | None = None) -> Plane:
     ``weights``: (n,), one over each point's variance. Raises InputError for fewer than three points, and for points on
     one line or in a clump, which define no plane.
     """
-    points, kept = _select_finite(points, 3, "a plane")
-    w = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)[kept]
+    points, finite = _select_finite(points, 3, "a plane")
+    w = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)[finite]
     if not w.sum() > 0:
         raise InputError("All points of a plane fit have weight 0: give at least three of them a positive weight.")
     centroid = w @ points / w.sum()
@@ -87,12 +87,12 @@ def _select_finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarra
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"Points of shape {points.shape} were given for {what}: they must be (n, 3).")
-    kept = np.isfinite(points).all(axis=1)
-    if kept.sum() < least:
+    finite = np.isfinite(points).all(axis=1)
+    if finite.sum() < least:
         raise InputError(
-            f"{kept.sum()} points were measured, and {what} needs {least} at least: select a wider region."
+            f"{finite.sum()} points were measured, and {what} needs {least} at least: select a wider region."
         )
-    return (points if kept.all() else points[kept]), kept
+    return (points if finite.all() else points[finite]), finite
 
 
 def _norms(vectors: np.ndarray) -> np.ndarray:

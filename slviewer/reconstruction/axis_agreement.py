@@ -171,16 +171,16 @@ def check_phases(
             )
         return CaptureCheck(1.0, (*warnings, *_depth_warning(name, depths, depth_range)))
     pixels, measured, sigma = _samples(phases)
-    found = measure_agreement(calibration, pixels, measured, sigma)
-    if found is None:
+    agreement = measure_agreement(calibration, pixels, measured, sigma)
+    if agreement is None:
         return CaptureCheck()
-    if found.is_refused:
-        refuse(f"{name}: {_contradiction(found)}: {_likely_reason(found, rig, pixels, measured)}")
-    factor = found.ratio if found.ratio > RAISED_RATIO else 1.0
-    if factor > 1.0 and not found.is_refused:
+    if agreement.is_refused:
+        refuse(f"{name}: {_contradiction(agreement)}: {_likely_reason(agreement, rig, pixels, measured)}")
+    factor = agreement.ratio if agreement.ratio > RAISED_RATIO else 1.0
+    if factor > 1.0 and not agreement.is_refused:
         warnings.append(
-            f"{name}: the x and y patterns disagree by {found.misfit_px:.2f} px with this calibration, and noise "
-            f"explains {found.predicted_px:.2f} px: the uncertainty of the points was raised by a factor of "
+            f"{name}: the x and y patterns disagree by {agreement.misfit_px:.2f} px with this calibration, and noise "
+            f"explains {agreement.predicted_px:.2f} px: the uncertainty of the points was raised by a factor of "
             f"{factor:.1f}; the rig may have moved since it was calibrated (run `slviewer check`), or the frames are "
             "disturbed"
         )
@@ -188,11 +188,11 @@ def check_phases(
     if excess is not None:
         warnings.append(
             f"{name}: in {100 * np.mean(excess > 0):.0f} % of the image the x and y patterns disagree by up to "
-            f"{excess.max():.2f} px (elsewhere {found.misfit_px:.2f} px): the uncertainty of the points there was "
+            f"{excess.max():.2f} px (elsewhere {agreement.misfit_px:.2f} px): the uncertainty of the points there was "
             "raised; look for reflections of the projector's light (a glossy table or wall, a shiny part, a deep "
             "corner), or for something that moved"
         )
-    return CaptureCheck(factor, (*warnings, *_depth_warning(name, found.depths_mm, depth_range)), found, excess)
+    return CaptureCheck(factor, (*warnings, *_depth_warning(name, agreement.depths_mm, depth_range)), agreement, excess)
 
 
 def local_misfit(
@@ -225,8 +225,8 @@ def measure_agreement(
     """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px, of noise ``sigma``
     (n, 2) px, miss each other; None where fewer than 200 are calibrated."""
     rig = calibration.pinholes
-    found = _agreement(rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px)
-    return found if found.pixels >= LEAST_PIXELS else None
+    agreement = _agreement(rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px)
+    return agreement if agreement.pixels >= LEAST_PIXELS else None
 
 
 def epipolar_distance(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -315,30 +315,29 @@ def _depth_warning(name: str, depths: np.ndarray, depth_range: tuple[float, floa
     )
 
 
-def _contradiction(found: AxisAgreement) -> str:
-    if found.misfit_px > max(REFUSED_PX, REFUSED_RATIO * found.predicted_px):
+def _contradiction(agreement: AxisAgreement) -> str:
+    if agreement.misfit_px > max(REFUSED_PX, REFUSED_RATIO * agreement.predicted_px):
         return (
-            f"the x and y patterns disagree by {found.misfit_px:.1f} px with this calibration, and noise explains "
-            f"{found.predicted_px:.2f} px"
+            f"the x and y patterns disagree by {agreement.misfit_px:.1f} px with this calibration, and noise explains "
+            f"{agreement.predicted_px:.2f} px"
         )
-    return (
-        f"by this calibration {100 * (1 - found.in_front):.0f} % of the points lie behind the camera or the projector"
-    )
+    return f"by this calibration {100 * (1 - agreement.in_front):.0f} % of the points lie behind the camera "
+    "or the projector"
 
 
-def _likely_reason(found: AxisAgreement, rig: StereoRig, pixels: np.ndarray, measured: np.ndarray) -> str:
+def _likely_reason(agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray, measured: np.ndarray) -> str:
     """The hypothesis that explains the frames best, in words."""
     best, reason = np.inf, ""
     for words, other, at, coordinates in _hypotheses(rig, pixels, measured):
         tried = _agreement(
             other, other.camera.undistort(at), other.projector.undistort(coordinates), np.zeros_like(at), 0.0
         )
-        enough = tried.pixels > 0.5 * found.pixels and tried.in_front >= LEAST_IN_FRONT
+        enough = tried.pixels > 0.5 * agreement.pixels and tried.in_front >= LEAST_IN_FRONT
         if enough and tried.misfit_px < best:
             best, reason = tried.misfit_px, words
-    explained = max(REFUSED_PX, REFUSED_RATIO * found.predicted_px)
-    if found.misfit_px > explained:
-        explained = max(explained, EXPLAINED * found.misfit_px)
+    explained = max(REFUSED_PX, REFUSED_RATIO * agreement.predicted_px)
+    if agreement.misfit_px > explained:
+        explained = max(explained, EXPLAINED * agreement.misfit_px)
     if best < explained:
         return f"{reason} (then they disagree by {best:.1f} px)"
     return "the calibration is of another rig, or the rig was moved since: calibrate the rig as it stands"
@@ -353,19 +352,19 @@ def _hypotheses(
     yield exchanged, rig, pixels, measured[:, ::-1]
     for flip, of_projector, of_camera in _FLIPS:
         yield of_projector, rig, pixels, np.where(flip, size - 1 - measured, measured)
-        said = f"the camera's image is {of_camera}; record it as for the calibration"
-        yield said, rig, np.where(flip, image - 1 - pixels, pixels), measured
+        reason = f"the camera's image is {of_camera}; record it as for the calibration"
+        yield reason, rig, np.where(flip, image - 1 - pixels, pixels), measured
     inverse = StereoRig(rig.camera, rig.projector, rig.R.T, -rig.R.T @ rig.t)
     yield "R and T are inverted: they map the projector to the camera; import their inverse", inverse, pixels, measured
     camera, projector = (
         Lens(other.K, other.D, own.size) for own, other in ((rig.camera, rig.projector), (rig.projector, rig.camera))
     )
-    said = "the matrices of camera and projector are exchanged; import them the other way round"
-    yield said, StereoRig(camera, projector, rig.R, rig.t), pixels, measured
+    reason = "the matrices of camera and projector are exchanged; import them the other way round"
+    yield reason, StereoRig(camera, projector, rig.R, rig.t), pixels, measured
     for factor, times, cure in ((2.0, "twice", "halve"), (0.5, "half", "double")):
         repair = f"{cure} fx, fy, cx and cy"
-        said = f"the camera's matrix is at {times} the pixel scale of the images: {repair}"
-        yield said, rig, (pixels + 0.5) * factor - 0.5, measured
+        reason = f"the camera's matrix is at {times} the pixel scale of the images: {repair}"
+        yield reason, rig, (pixels + 0.5) * factor - 0.5, measured
         fewer = "half" if factor > 1 else "twice"
         for factors, which in (
             ((factor, factor), f"{fewer} as many columns and {fewer} as many rows"),
@@ -373,11 +372,11 @@ def _hypotheses(
             ((1, factor), f"{fewer} as many rows"),
         ):
             matrix = f", or correct its matrix: {repair}" if factors[0] == factors[1] else ""
-            said = (
+            reason = (
                 f"the patterns were described with {which} as the calibrated projector has; give the projector's size "
                 f"and the fringe period as in the calibration{matrix}"
             )
-            yield said, rig, pixels, (measured + 0.5) * factors - 0.5
+            yield reason, rig, pixels, (measured + 0.5) * factors - 0.5
 
 
 def _size(size: tuple[int, int]) -> str:

@@ -36,6 +36,6 @@ def triangulate_grid(points: np.ndarray, max_jump: float) -> np.ndarray:
         ):
             depths = z[corners[a]], z[corners[b]], z[corners[c]]
             spread = np.maximum(np.maximum(*depths[:2]), depths[2]) - np.minimum(np.minimum(*depths[:2]), depths[2])
-            kept = chosen & (spread <= max_jump)  # False where a corner is NaN
-            faces.append(np.stack([index[corners[k]][kept] for k in (a, b, c)], axis=1))
+            selected = chosen & (spread <= max_jump)  # False where a corner is NaN
+            faces.append(np.stack([index[corners[k]][selected] for k in (a, b, c)], axis=1))
     return np.concatenate(faces)
