@@ -46,10 +46,12 @@ def sum_shares(a: Agreement) -> float:
 
 
 def _shares(a: Agreement) -> list[float]:
+    """Shares (0 to 1) of the tests of an agreement; NaN where a test cannot be made."""
     return [a.opposed, a.rule, a.common, a.rising, *a.level_common]
 
 
 def is_certain(a: Agreement) -> bool:
+    """Whether every known share exceeds ``CERTAIN``."""
     return all(np.isnan(share) or share > CERTAIN for share in _shares(a))
 
 

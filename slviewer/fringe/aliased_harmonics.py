@@ -90,8 +90,10 @@ def estimate_aliased_harmonics(
     n = pieces.steps
     if d.is_significant and d.value * M.value > 0 and _slope(n, M.value, d.value).min() > 0.1:
         noise_gain = float(np.mean(_slope(n, M.value, d.value) ** -2.0)) - 1
-        left = float(np.sqrt((spread**2 + d.error**2 + second**2) / 2 + max(noise_gain, 0.0) * pieces.sigma**2))
-        return AliasedHarmonics(n, M.value, d.value, True, left)
+        remaining_error = float(
+            np.sqrt((spread**2 + d.error**2 + second**2) / 2 + max(noise_gain, 0.0) * pieces.sigma**2)
+        )
+        return AliasedHarmonics(n, M.value, d.value, True, remaining_error)
     if abs(d.value - M.value) > SIGMAS * d.error + abs(M.value) / 2:  # no phase follows: the modulation is texture's
         return none
     return AliasedHarmonics(n, M.value, d.value, False, abs(M.value) / np.sqrt(2))
@@ -144,16 +146,20 @@ class _Pieces:
 
 @dataclass(frozen=True)
 class _Amplitude:
+    """Estimated amplitude of a ripple, its standard error, and the amplitude of a control that should be zero."""
+
     value: float
     error: float
     control: float
 
     @property
     def is_significant(self) -> bool:
+        """Whether the amplitude exceeds both its error and the control."""
         return abs(self.value) > max(SIGMAS * self.error, CONTROL * abs(self.control))
 
 
 def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]) -> _Pieces | None:
+    """Cut rows or columns, whichever cross more fringes, into pieces; None where too few fringes are in view."""
     indices = list(layout.shifts[-1].indices)
     candidates = [_sample_lines(stack, indices, white, noise)]
     candidates.append(_sample_lines(stack.transpose(0, 2, 1), indices, white, noise))
@@ -213,8 +219,8 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
         transposed = design.transpose(0, 2, 1)
         inverse = np.linalg.inv(transposed @ design + 1e-6 * size * np.eye(design.shape[2]))
         weights = inverse @ (transposed @ target)
-        left = np.sqrt(np.mean((target - design @ weights) ** 2, axis=1))
-        good = (left < OUTLIER * np.median(left, axis=0)).all(axis=1)
+        residual_rms = np.sqrt(np.mean((target - design @ weights) ** 2, axis=1))
+        good = (residual_rms < OUTLIER * np.median(residual_rms, axis=0)).all(axis=1)
         information = 1 / np.diagonal(inverse, axis1=1, axis2=2)
         # rows: constant, x, x^2, cos, sin, cos 2, sin 2; columns: phase, modulation
         phase_cosine, phase_sine, second, modulation_cosine, modulation_sine = (
@@ -238,8 +244,8 @@ def _robust_mean(values: np.ndarray, weights: np.ndarray, block: np.ndarray) -> 
     if len(values) == 0:
         return np.nan, np.nan, np.nan
     middle = np.median(values)
-    kept = np.abs(values - middle) <= OUTLIER * 1.4826 * np.median(np.abs(values - middle))
-    values, weights, block = values[kept], weights[kept], block[kept]
+    is_inlier = np.abs(values - middle) <= OUTLIER * 1.4826 * np.median(np.abs(values - middle))
+    values, weights, block = values[is_inlier], weights[is_inlier], block[is_inlier]
     total = np.bincount(block, weights)
     used = total > 0
     if np.count_nonzero(used) < FEWEST_BLOCKS:

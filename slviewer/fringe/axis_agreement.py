@@ -73,9 +73,11 @@ def described_frames(
     """The frames of an axis as a sequence has them, frame i shown in image ``images[i]``."""
 
     def images_of(steps: Iterable[int]) -> tuple[int | None, ...]:
+        """Image of each frame; None for a missing one."""
         return tuple(i if images is None else images[i] for i in steps)
 
     def shown(kind: Kind) -> tuple[int | None, ...]:
+        """Images of the frames of one kind, by bit."""
         return images_of(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
 
     complementary = shown("complementary")
@@ -139,13 +141,13 @@ class AxisReader:
     def __init__(self, sample: LineSample, indices: list[int]) -> None:
         swing = sample.swing(indices)
         self.illuminated = swing > sample.least_swing
-        seen = np.flatnonzero(self.illuminated)
-        self.seen = seen
-        self.frames = sample.frames[:, seen]
-        self.swing = swing[seen]
-        chosen = self.frames[indices] if len(seen) else np.zeros((1, 0), np.float32)
+        indices_illuminated = np.flatnonzero(self.illuminated)
+        self.seen = indices_illuminated
+        self.frames = sample.frames[:, indices_illuminated]
+        self.swing = swing[indices_illuminated]
+        chosen = self.frames[indices] if len(indices_illuminated) else np.zeros((1, 0), np.float32)
         self.middle = (chosen.max(axis=0) + chosen.min(axis=0)) / 2
-        self.line, self.place = sample.line[seen], sample.place[seen]
+        self.line, self.place = sample.line[indices_illuminated], sample.place[indices_illuminated]
         self.across = self.line >= sample.rows
         self._noise, self._least_swing = sample.noise, sample.least_swing
         # Each is asked for again by every hypothesis.
@@ -159,6 +161,7 @@ class AxisReader:
         return self._in_view(frozenset(i for i in assumed if i is not None))
 
     def _vary_enough(self, images: frozenset[int]) -> bool:
+        """Whether at least ``FEWEST_PIXELS`` pixels vary between these images."""
         swing = np.ptp(self.frames[sorted(images)], axis=0) if images else np.zeros(0)
         return bool(np.count_nonzero(swing > self._least_swing) >= FEWEST_PIXELS)
 
@@ -181,9 +184,9 @@ class AxisReader:
         noise = self._noise * (0.71 if both else 1.0)
         decided = np.abs(height) > np.maximum(DECIDED * self.swing, DECIDED_SIGMAS * noise)
         value = height > 0
-        return value, decided, float(decided.mean()) if decided.size else 0.0, self._stripe(value)
+        return value, decided, float(decided.mean()) if decided.size else 0.0, self._mean_stripe_width(value)
 
-    def _stripe(self, value: np.ndarray) -> float:
+    def _mean_stripe_width(self, value: np.ndarray) -> float:
         """Mean width in px of stripes, along the rows or the columns, whichever is less."""
         near = (np.diff(self.place) == 1) & (np.diff(self.line) == 0)
         edges = (value[1:] != value[:-1]) & near
@@ -214,26 +217,31 @@ def measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
 
 
 def _measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
+    """`measure_agreement` of a hypothesis that is not cached."""
     result = Agreement()
     if len(reader.swing) < FEWEST_PIXELS:
         return result
     if not frames.bits:
-        return _of_levels(reader, frames, result)
+        return _measure_level_agreement(reader, frames, result)
     code = _read_code(reader, frames)
-    rule, edges = _rule(reader, code)
+    rule, edges = _check_code_rule(reader, code)
     result = replace(
-        result, opposed=_opposed(reader, frames), rule=rule, edges=len(edges.first), unreadable=code.unreadable
+        result,
+        opposed=_measure_opposition(reader, frames),
+        rule=rule,
+        edges=len(edges.first),
+        unreadable=code.unreadable,
     )
     if code.known != (1 << code.count) - 1:  # only the bits above the missing one number anything
         missing = code.count - 1 - ((1 << code.count) - 1 - code.known).bit_length() + 1
         bits = tuple(image if b < missing else None for b, image in enumerate(frames.bits))
         inverse = tuple(image if b < missing else None for b, image in enumerate(frames.inverse))
         code = _read_code(reader, replace(frames, bits=bits, inverse=inverse))
-        _, edges = _rule(reader, code)
+        _, edges = _check_code_rule(reader, code)
     phasor = None if frames.fringe is None else reader.phasor(frames.fringe[1], frames)
     if phasor is not None and len(edges.first) >= FEWEST_EDGES:
-        result = _with_phase(reader, frames, code, edges, phasor, result)
-    return _with_reach(reader, frames, code, result)
+        result = _add_phase_agreement(reader, frames, code, edges, phasor, result)
+    return _add_coordinate_range(reader, frames, code, result)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,6 +267,7 @@ class _Edges:
 
 
 def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
+    """Read the Gray bits, from the most significant one down to the finest that is readable."""
     bits: list[tuple[np.ndarray, np.ndarray, float, float] | None] = []
     for b, image in enumerate(frames.bits):
         inverse = frames.inverse[b] if b < len(frames.inverse) else None
@@ -273,17 +282,17 @@ def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
         if not chosen:
             return _Code(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0, np.int32), 0, 0, unreadable)
         decided = np.logical_and.reduce([bit[1] for _, bit in chosen])
-        kept = np.flatnonzero(decided)
-        if len(kept) >= MIN_KEPT * len(decided):
+        decided_pixels = np.flatnonzero(decided)
+        if len(decided_pixels) >= MIN_KEPT * len(decided):
             break
         worst = chosen[int(np.argmin([bit[2] for _, bit in chosen]))][0]
         if worst != chosen[-1][0] or len(chosen) == 1:
             unreadable = worst if unreadable is None else unreadable
             break
         count = chosen[-1][0]  # stripes that blur has almost closed
-    gray, known = np.zeros(len(kept), np.int32), 0
+    gray, known = np.zeros(len(decided_pixels), np.int32), 0
     for b, bit in chosen:
-        gray |= (bit[0][kept] ^ frames.inverted).astype(np.int32) << (count - 1 - b)
+        gray |= (bit[0][decided_pixels] ^ frames.inverted).astype(np.int32) << (count - 1 - b)
         known |= 1 << (count - 1 - b)
     binary = gray.copy()
     shift = 1
@@ -291,14 +300,15 @@ def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
         binary ^= binary >> shift
         shift *= 2
     reach = float(np.clip(chosen[-1][1][3] / 3, *REACH))
-    return _Code(kept, gray, binary, count, known, unreadable, reach)
+    return _Code(decided_pixels, gray, binary, count, known, unreadable, reach)
 
 
 def _is_readable(bit: tuple[np.ndarray, np.ndarray, float, float]) -> bool:
+    """Whether enough pixels of a bit are decided, and its stripes are wide enough."""
     return bit[2] > READABLE_SHARE and bit[3] >= READABLE_STRIPE
 
 
-def _opposed(reader: AxisReader, frames: AxisFrames) -> float:
+def _measure_opposition(reader: AxisReader, frames: AxisFrames) -> float:
     """Of bits no finer than one whose stripes are clearly wider than blur, which makes both images one grey."""
     pairs = list(zip(frames.bits, frames.inverse, strict=False))
     readable = [
@@ -325,10 +335,10 @@ def _first_unreadable(
     return count if wider or wide or not widths else None
 
 
-def _rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
+def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
     """Share of each bit's edges that obey the Gray code, the least of all bits; and the edges that obey."""
-    kept = code.kept
-    near = (np.diff(reader.place[kept]) <= code.reach) & (np.diff(reader.line[kept]) == 0)
+    pixels = code.kept
+    near = (np.diff(reader.place[pixels]) <= code.reach) & (np.diff(reader.line[pixels]) == 0)
     change = (code.gray[1:] ^ code.gray[:-1]) * near
     at = np.flatnonzero(change)
     change = change[at]
@@ -336,7 +346,7 @@ def _rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
     below = change - 1  # the bits below the one that changes: 1, 0, 0 ...
     wanted = (change >> 1) & code.known
     obeys = single & ((code.gray[at] & below & code.known) == wanted)
-    weight = np.minimum(reader.swing[kept[at]], reader.swing[kept[at + 1]])
+    weight = np.minimum(reader.swing[pixels[at]], reader.swing[pixels[at + 1]])
     shares = []
     if len(change) >= FEWEST_EDGES:
         shares.append(float(weight[obeys].sum() / weight.sum()))
@@ -349,11 +359,12 @@ def _rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
     return min(shares, default=np.nan), _Edges(np.where(up, at, at + 1), np.where(up, at + 1, at))
 
 
-def _with_phase(
+def _add_phase_agreement(
     reader: AxisReader, frames: AxisFrames, code: _Code, edges: _Edges, phasor: np.ndarray, result: Agreement
 ) -> Agreement:  # fmt: skip
+    """Complete ``result`` by how the fringes' phase agrees with the edges of the code."""
     assert frames.fringe is not None
-    turned, gaps = _unwrapped(reader, phasor)
+    turned, gaps = _unwrap_along_lines(reader, phasor)
     first, second = code.kept[edges.first], code.kept[edges.second]
     below, above = phasor[first], phasor[second]
     # Between an edge's pixels, several px apart, a fine fringe turns by more than half a period.
@@ -361,7 +372,7 @@ def _with_phase(
     step = turned[second] - turned[first]
     angle = np.angle(below) + step / 2
     border = code.binary[edges.second].astype(np.float64)
-    per_cell = _turns_per_cell(reader, code, edges, phasor)
+    per_cell = _estimate_turns_per_cell(reader, code, edges, phasor)
     cell = frames.cell_of(code.count)
     common, begin = common_phase(angle, border * cell / frames.fringe[0], weight)
     return replace(
@@ -389,7 +400,7 @@ def common_phase(angle: np.ndarray, border_turns: np.ndarray, weight: np.ndarray
     return abs(mean), float((centre / TWO_PI + 0.5) % 1 - 0.5)
 
 
-def _unwrapped(reader: AxisReader, phasor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _unwrap_along_lines(reader: AxisReader, phasor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(p,) phase in rad, unwrapped from pixel to pixel along each line; and how many gaps come before each pixel."""
     adjacent = (np.diff(reader.place) == 1) & (np.diff(reader.line) == 0)
     steps = np.angle(phasor[1:] * np.conj(phasor[:-1]))
@@ -397,28 +408,32 @@ def _unwrapped(reader: AxisReader, phasor: np.ndarray) -> tuple[np.ndarray, np.n
     return angle, np.concatenate([[0], np.cumsum(~adjacent)])
 
 
-def _turns_per_cell(reader: AxisReader, code: _Code, edges: _Edges, phasor: np.ndarray) -> float:
+def _estimate_turns_per_cell(reader: AxisReader, code: _Code, edges: _Edges, phasor: np.ndarray) -> float:
     """Fringes between two successive edges of the code along a line, the median."""
-    angle, gaps = _unwrapped(reader, phasor)
+    angle, gaps = _unwrap_along_lines(reader, phasor)
     here, there = code.kept[edges.first], code.kept[edges.second]
     order = np.argsort(np.minimum(here, there))
-    left, middle = np.minimum(here, there)[order], ((angle[here] + angle[there]) / 2)[order]
+    lower_cell, middle = np.minimum(here, there)[order], ((angle[here] + angle[there]) / 2)[order]
     rising, cell = (there > here)[order], code.binary[edges.second][order]
-    consecutive = (rising[1:] == rising[:-1]) & (np.abs(np.diff(cell)) == 1) & (gaps[left[1:]] == gaps[left[:-1]])
+    consecutive = (
+        (rising[1:] == rising[:-1]) & (np.abs(np.diff(cell)) == 1) & (gaps[lower_cell[1:]] == gaps[lower_cell[:-1]])
+    )
     if np.count_nonzero(consecutive) < FEWEST_EDGES // 2:
         return np.nan
     return float(np.median(np.abs(np.diff(middle))[consecutive])) / TWO_PI
 
 
-def _with_reach(reader: AxisReader, frames: AxisFrames, code: _Code, result: Agreement) -> Agreement:
+def _add_coordinate_range(reader: AxisReader, frames: AxisFrames, code: _Code, result: Agreement) -> Agreement:
     """Where the coordinates lie that the code tells, to within the cells that were read."""
     if code.known != (1 << code.count) - 1 or len(code.kept) < FEWEST_PIXELS:
         return result
     cell = frames.cell_of(code.count)
-    return _reach(code.binary * cell + frames.origin_px, reader.swing[code.kept], cell, frames.extent, result)
+    return _measure_coordinate_range(
+        code.binary * cell + frames.origin_px, reader.swing[code.kept], cell, frames.extent, result
+    )
 
 
-def _reach(
+def _measure_coordinate_range(
     coordinate: np.ndarray, weight: np.ndarray, cell: float, extent: int | None, result: Agreement
 ) -> Agreement:  # fmt: skip
     """``coordinate``: where cells of so many px begin."""
@@ -440,23 +455,23 @@ def estimate_coordinates(reader: AxisReader, frames: AxisFrames) -> np.ndarray:
         code = _read_code(reader, frames)
         out[reader.seen[code.kept]] = code.binary * frames.cell_of(code.count) + frames.origin_px
     else:
-        found = _levels(reader, frames)
-        if found is not None:
-            out[reader.seen] = found[2]
+        levels = _unwrap_levels_of_sample(reader, frames)
+        if levels is not None:
+            out[reader.seen] = levels[2]
     return out
 
 
-def _of_levels(reader: AxisReader, frames: AxisFrames, result: Agreement) -> Agreement:
+def _measure_level_agreement(reader: AxisReader, frames: AxisFrames, result: Agreement) -> Agreement:
     """Of several periods without a Gray code."""
-    found = _levels(reader, frames)
-    if found is None:
+    levels = _unwrap_levels_of_sample(reader, frames)
+    if levels is None:
         return result
-    common, turns, coordinate, weight = found
+    common, turns, coordinate, weight = levels
     result = replace(result, level_common=common, level_turns=turns)
-    return _reach(coordinate, weight, 0.0, frames.extent, result)
+    return _measure_coordinate_range(coordinate, weight, 0.0, frames.extent, result)
 
 
-def _levels(
+def _unwrap_levels_of_sample(
     reader: AxisReader, frames: AxisFrames
 ) -> tuple[tuple[float, ...], tuple[float, ...], np.ndarray, np.ndarray] | None:
     """Concentration and mean of the step to each finer level, coordinates (p,) in px, and the weight of each pixel."""

@@ -39,15 +39,15 @@ LINES = {"x": "columns", "y": "rows"}
 def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> list[Answer]:
     """The fewest changes of one axis' description with which its frames agree; several where they do so equally."""
     answers: list[Answer] = []
-    for variant, changes in _variants(described_frames(sequence, axis), axis):
-        explain = _with_values if variant.bits else _with_offset
+    for variant, changes in _list_variants(described_frames(sequence, axis), axis):
+        explain = _fit_code_values if variant.bits else _fit_level_offset
         answer = explain(reader, variant, axis, changes)
         if answer is not None:
             answers.append(answer)
     if not answers:
         return []
-    fewest = min(_count(answer) for answer in answers)
-    answers = sorted((a for a in answers if _count(a) == fewest), key=lambda a: -a.score)
+    fewest = min(_count_changes(answer) for answer in answers)
+    answers = sorted((a for a in answers if _count_changes(a) == fewest), key=lambda a: -a.score)
     # Several gammas fit more or less: the best of them stands for all.
     first = answers[0].contradictions[0].cause
     return [
@@ -56,11 +56,12 @@ def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> l
     ]
 
 
-def _count(answer: Answer) -> int:
+def _count_changes(answer: Answer) -> int:
+    """Number of changes that an answer makes to the description."""
     return len(answer.contradictions)
 
 
-def _variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list[Contradiction]]]:
+def _list_variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list[Contradiction]]]:
     """The description with bits, phase sign or both changed; and what each change means."""
     bits: list[tuple[AxisFrames, list[Contradiction]]] = [(frames, [])]
     if len(frames.bits) - frames.complementary > 1:
@@ -94,7 +95,7 @@ def _variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list
             yield replace(frames, gamma=gamma), [Contradiction("gamma", text, axis, gamma)]
 
 
-def _with_values(
+def _fit_code_values(
     reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
 ) -> Answer | None:  # fmt: skip
     """The changes, and the values besides them with which all tests are passed; None if there are none."""
@@ -133,7 +134,7 @@ def _with_values(
             out[-1] = Contradiction("step-order", text, axis, float(frames.sign))
             late = wrap(late + 1 / n)
         if abs(late) > MAX_BEGIN_TURNS:
-            out += _phase_shifted(frames, a, late, axis)
+            out += _describe_phase_shift(frames, a, late, axis)
     if a.outside > MAX_OUTSIDE:
         out += explain_reach(frames, a, axis)
     return Answer(tuple(out), sum_shares(a), is_certain(a)) if out else None
@@ -152,7 +153,7 @@ def _best_cell(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
     return best
 
 
-def _phase_shifted(frames: AxisFrames, a: Agreement, late: float, axis: Axis) -> list[Contradiction]:
+def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: Axis) -> list[Contradiction]:
     """Fringes and Gray code apart by ``late`` periods: either of them may begin elsewhere than described."""
     assert frames.fringe is not None
     period, steps = frames.fringe[0], len(frames.fringe[1])
@@ -180,11 +181,11 @@ def _phase_shifted(frames: AxisFrames, a: Agreement, late: float, axis: Axis) ->
 def explain_reach(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradiction]:
     """Coordinates beyond the projector."""
     assert frames.extent is not None
-    seen = (
+    observation = (
         f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector's {frames.extent} {LINES[axis]} and "
         f"reach {a.reach_px:.0f}"
     )
-    size = f"{seen}: give the size of the projector that was used"
+    size = f"{observation}: give the size of the projector that was used"
     out = [Contradiction("projector-size", size, axis, a.reach_px)]
     if frames.shifts:
         period = frames.shifts[-1][0] * frames.extent / a.reach_px
@@ -193,7 +194,7 @@ def explain_reach(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradi
     return out
 
 
-def _with_offset(
+def _fit_level_offset(
     reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
 ) -> Answer | None:  # fmt: skip
     """The same where several periods number the fringes."""
@@ -227,6 +228,7 @@ def _with_offset(
 
 
 def describe_turns(angle: float) -> str:
+    """An angle (rad) in words, as a share of a period."""
     turns = wrap(angle / (2 * np.pi))
     share = {0.25: "a quarter period", 0.5: "half a period"}.get(round(abs(turns) * 20) / 20)
     return f"{share or f'{abs(turns):.2f} periods'} {'later' if turns > 0 else 'earlier'}"

@@ -67,15 +67,15 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
     coded = coded_frames(sequence)
     illuminated = sample.swing(coded) > sample.least_swing
     clipped = np.array([float(np.mean(sample.frames[i][illuminated] >= sample.white)) for i in coded])
-    saturated = _saturated(coded, clipped) if np.mean(clipped) > MAX_CLIPPED else None
-    unsteady = _unsteadiness(sequence, sample, illuminated)
+    saturated = _describe_saturation(coded, clipped) if np.mean(clipped) > MAX_CLIPPED else None
+    unsteady = _measure_unsteadiness(sequence, sample, illuminated)
     terms = light.terms or light.unexplained
     if unsteady > UNSTEADY and terms and not (saturated and saturated.cause == "room-light"):
         return (Contradiction(*describe_disturbance(terms), None, unsteady),)
     return (saturated,) if saturated else contradictions
 
 
-def _saturated(coded: list[int], clipped: np.ndarray) -> Contradiction:
+def _describe_saturation(coded: list[int], clipped: np.ndarray) -> Contradiction:
     """What to say of ``coded`` frames in which these shares of the illuminated pixels are saturated."""
     k = max(range(2, len(coded) - 1), key=lambda k: float(np.median(clipped[k:]) - clipped[:k].max()))
     if clipped[:k].max() < SUDDENLY * np.median(clipped[k:]):
@@ -93,7 +93,7 @@ def _saturated(coded: list[int], clipped: np.ndarray) -> Contradiction:
     return Contradiction("saturation", text, None, share)
 
 
-def _unsteadiness(sequence: PatternSequence, sample: LineSample, illuminated: np.ndarray) -> float:
+def _measure_unsteadiness(sequence: PatternSequence, sample: LineSample, illuminated: np.ndarray) -> float:
     """The largest relative rms by which the mean brightness of the phase steps of one period differs: whatever their
     order, under equal light it does not, as long as several fringes are seen."""
     worst = 0.0
@@ -114,7 +114,7 @@ def find_contradictions(
         return ()
     sample = sample_lines(sequence, stack)
     readers = {axis: AxisReader(sample, coded_frames(sequence, axis)) for axis in sequence.axes}
-    if dark := _without_pattern(sequence, sample):
+    if dark := _detect_missing_pattern(sequence, sample):
         return dark
     likeness = FrameLikeness(sequence, sample)
     if repeated := detect_copies(sequence, readers, likeness):
@@ -125,10 +125,10 @@ def find_contradictions(
     strange = detect_unexplained_steps(sequence, sample) if with_steps and not disordered else set()
     uneven = [i for i in range(len(stack)) if not likeness.is_even(i, i)]
     if not any(failed.values()) and not disordered and not strange and not uneven:
-        return _mirrored(sequence, sample)
+        return _detect_mirroring(sequence, sample)
     if disordered and all(contradiction.cause in _OF_STEPS for contradiction in disordered):
         return tuple(disordered)  # steps of one period, which says all about them
-    if exchanged := _axes_exchanged(sequence, sample, failed):
+    if exchanged := _detect_exchanged_axes(sequence, sample, failed):
         return exchanged
     answers = {axis: explain_axis(readers[axis], sequence, axis) for axis in sequence.axes if failed[axis]}
     explained = [answers[axis][0].score if answers.get(axis) else sum_shares(stated[axis]) for axis in sequence.axes]
@@ -142,7 +142,7 @@ def find_contradictions(
         if answers.get(axis):
             out += [contradiction for answer in answers[axis] for contradiction in answer.contradictions]
         elif failed[axis] and not disordered:
-            out.append(_unexplained(axis, stated[axis], failed[axis]))
+            out.append(_describe_failed_tests(axis, stated[axis], failed[axis]))
     for i in uneven:
         kind = sequence.frames[i].kind
         text = f"frame {i + 1} should be {kind}, and is not: put the frames in order, or capture again"
@@ -150,10 +150,10 @@ def find_contradictions(
     return tuple(dict.fromkeys(out))
 
 
-def _without_pattern(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
+def _detect_missing_pattern(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
     """Captures that are dark, saturated, or show no pattern."""
-    seen = sample.grid[coded_frames(sequence)].astype(np.float32)
-    high, low = seen.max(axis=0), seen.min(axis=0)
+    grid = sample.grid[coded_frames(sequence)].astype(np.float32)
+    high, low = grid.max(axis=0), grid.min(axis=0)
     share = float(np.mean(high - low > sample.least_swing))
     if share >= LEAST_ILLUMINATED:
         return ()
@@ -180,7 +180,7 @@ def _without_pattern(sequence: PatternSequence, sample: LineSample) -> tuple[Con
     )
 
 
-def _axes_exchanged(
+def _detect_exchanged_axes(
     sequence: PatternSequence, sample: LineSample, failed: dict[Axis, set[str]]
 ) -> tuple[Contradiction, ...]:
     """Both axes fit with all frames of the other one, or with its phase steps or its Gray bits alone."""
@@ -208,7 +208,9 @@ def _axes_exchanged(
         ):
             continue
         if with_steps and with_bits:
-            return (_exchanged_axes("the codes along x fit the projector's rows, and those along y its columns"),)
+            return (
+                _describe_exchanged_axes("the codes along x fit the projector's rows, and those along y its columns"),
+            )
         which = "phase steps" if with_steps else "Gray frames"
         text = (
             f"x and y are exchanged in the {which} alone, which fit the other frames of the other axis: exchange the "
@@ -218,12 +220,13 @@ def _axes_exchanged(
     return ()
 
 
-def _exchanged_axes(seen: str) -> Contradiction:
+def _describe_exchanged_axes(seen: str) -> Contradiction:
+    """The contradiction of exchanged axes, from the observation that shows it."""
     text = f"{seen}: x and y are exchanged; exchange the x and y (V and H) frames in the description"
     return Contradiction("axes-swapped", text, None, None)
 
 
-def _mirrored(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
+def _detect_mirroring(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
     """Axes exchanged or reversed: of what camera and projector both see from the front, neither sees a mirror image."""
     if len(sequence.axes) < 2:
         return ()
@@ -244,37 +247,43 @@ def _mirrored(sequence: PatternSequence, sample: LineSample) -> tuple[Contradict
     share = float(np.mean(turn[known] < 0))
     if share < MIRRORED:
         return ()
-    seen = f"the projector's coordinates are a mirror image of what the camera sees ({100 * share:.0f} % of the pixels)"
+    observation = (
+        f"the projector's coordinates are a mirror image of what the camera sees ({100 * share:.0f} % of the pixels)"
+    )
     along, across = (float(np.median(np.abs(a[known]))) for a in (ux, uy))
     if across > along:  # devices that stand upright
-        return (_exchanged_axes(seen),)
+        return (_describe_exchanged_axes(observation),)
     reversed_x = float(np.median(ux[known])) < 0
     axis: Axis = "x" if reversed_x else "y"
     cure = f"number the projector's {LINES[axis]} from the other end, or switch off its mirror or rear mode"
-    out = [Contradiction("axis-reversed", f"{seen}, as if axis {axis} were reversed: {cure}", axis, None)]
+    out = [Contradiction("axis-reversed", f"{observation}, as if axis {axis} were reversed: {cure}", axis, None)]
     if not sequence.find("gray", axis):
         sign = -sequence.sign(axis)
-        text = f"{seen}, as if the phase of axis {axis} ran backwards: set phase_sign = {sign} for axis {axis}"
+        text = f"{observation}, as if the phase of axis {axis} ran backwards: set phase_sign = {sign} for axis {axis}"
         out.insert(0, Contradiction("step-order", text, axis, float(sign)))
     return tuple(out)
 
 
-def _unexplained(axis: Axis, a: Agreement, failed: set[str]) -> Contradiction:
+def _describe_failed_tests(axis: Axis, a: Agreement, failed: set[str]) -> Contradiction:
     """What was seen, where no hypothesis explains it."""
     if "bits" in failed:
-        seen = f"Gray bit {a.unreadable} of axis {axis} cannot be read though its stripes should be wide"
+        observation = f"Gray bit {a.unreadable} of axis {axis} cannot be read though its stripes should be wide"
     elif "inverse" in failed:
-        seen = f"a Gray bit of axis {axis} and its inverse are alike at {100 * (1 - a.opposed):.0f} % of the pixels"
+        observation = (
+            f"a Gray bit of axis {axis} and its inverse are alike at {100 * (1 - a.opposed):.0f} % of the pixels"
+        )
     elif "rule" in failed:
-        seen = f"a Gray bit of axis {axis} contradicts the other bits at {100 * (1 - a.rule):.0f} % of its edges"
+        observation = f"a Gray bit of axis {axis} contradicts the other bits at {100 * (1 - a.rule):.0f} % of its edges"
     elif failed & {"common", "rising", "cell"}:
-        seen = f"Gray code and fringes of axis {axis} do not fit together: the code's edges fall at no common phase"
+        observation = (
+            f"Gray code and fringes of axis {axis} do not fit together: the code's edges fall at no common phase"
+        )
     elif failed & {"levels", "level offset"}:
-        seen = f"the fringe periods of axis {axis} contradict each other"
+        observation = f"the fringe periods of axis {axis} contradict each other"
     else:
-        seen = f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector"
+        observation = f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector"
     text = (
-        f"{seen}, and no other order, numbering or size of the frames explains it: check that all frames belong to one "
-        "capture, that nothing moved, and the periods, steps and bits of the description"
+        f"{observation}, and no other order, numbering or size of the frames explains it: check that all frames belong "
+        "to one capture, that nothing moved, and the periods, steps and bits of the description"
     )
     return Contradiction("unreadable", text, axis, None)

@@ -69,6 +69,7 @@ class Bit:
 
     @property
     def images(self) -> tuple[int, ...]:
+        """The image of the bit, then that of its inverse."""
         return (self.image,) if self.inverse is None else (self.image, self.inverse)
 
 
@@ -81,13 +82,14 @@ class GrayBlock:
 
     @property
     def images(self) -> tuple[int, ...]:
+        """Images of all bits and inverses, in order of capture."""
         return tuple(sorted(image for bit in self.bits for image in bit.images))
 
     @property
     def direction(self) -> tuple[float, float]:
         """Edges (x, y) of the finest bit that can be read."""
-        seen = [bit for bit in self.bits if bit.is_readable and bit.even is None]
-        return seen[-1].edges
+        varying_bits = [bit for bit in self.bits if bit.is_readable and bit.even is None]
+        return varying_bits[-1].edges
 
 
 @dataclass(frozen=True)
@@ -114,14 +116,17 @@ class BlockReader:
         self.illuminated = swing > sample.least_swing
         if self.illuminated.any():  # dim pixels show noise and reflections of other stripes
             self.illuminated &= swing > DIM * float(np.quantile(swing[self.illuminated], 0.95))
-        seen = np.flatnonzero(self.illuminated)
-        self.levels = (2 * (sample.frames[:, seen] - low[seen]) / np.maximum(swing[seen], 1e-6) - 1).astype(np.float32)
-        line, place = sample.line[seen], sample.place[seen]
+        pixels = np.flatnonzero(self.illuminated)
+        self.levels = (2 * (sample.frames[:, pixels] - low[pixels]) / np.maximum(swing[pixels], 1e-6) - 1).astype(
+            np.float32
+        )
+        line, place = sample.line[pixels], sample.place[pixels]
         self.line, self.place, self.across = line, place, line >= sample.rows
         self.adjacent = (np.diff(place) == 1) & (np.diff(line) == 0)
 
     @property
     def count(self) -> int:
+        """Number of sampled pixels."""
         return self.levels.shape[1]
 
     def phasor(self, images: tuple[int, ...]) -> np.ndarray:
@@ -151,20 +156,22 @@ class BlockReader:
         return PhaseRun(images, (along, across), misfit)
 
     def bit(self, image: int, inverse: int | None) -> Bit:
+        """Measure the stripes of an image, compared with its inverse where there is one."""
         level = self.levels[image] if inverse is None else (self.levels[image] - self.levels[inverse]) / 2
         decided = np.abs(level) > DECIDED
         bright = float(np.mean(level > DECIDED))
         dark = float(np.mean(level < -DECIDED))
         even: Even | None = "white" if bright > EVEN else "black" if dark > EVEN else None
-        kept = np.flatnonzero(decided)
-        near = (np.diff(self.place[kept]) <= REACH) & (np.diff(self.line[kept]) == 0)
-        edge = near & np.diff(level[kept] > 0)
-        across = self.across[kept[1:]]
+        decided_pixels = np.flatnonzero(decided)
+        near = (np.diff(self.place[decided_pixels]) <= REACH) & (np.diff(self.line[decided_pixels]) == 0)
+        edge = near & np.diff(level[decided_pixels] > 0)
+        across = self.across[decided_pixels[1:]]
         total = np.array([np.count_nonzero(~self.across), np.count_nonzero(self.across)])
         x, y = np.array([np.count_nonzero(edge & ~across), np.count_nonzero(edge & across)]) / np.maximum(total, 1)
         return Bit(image, inverse, (float(x), float(y)), int(edge.sum()), float(decided.mean()) > READABLE, even)
 
     def are_opposite(self, first: int, second: int) -> bool:
+        """Whether one image is the inverse of the other."""
         a, b = self.levels[first], self.levels[second]
         decided = (np.abs(a) > DECIDED) & (np.abs(b) > DECIDED)
         if decided.mean() > READABLE:
@@ -176,23 +183,24 @@ class BlockReader:
 
 def group_frames(reader: BlockReader) -> FrameBlocks:
     """The images in blocks, in their order."""
-    runs = _phase_runs(reader)
-    taken = {image for run in runs for image in run.images}
+    runs = _find_phase_runs(reader)
+    grouped_images = {image for run in runs for image in run.images}
     codes: list[GrayBlock] = []
     even: dict[int, Even] = {}
     doubts: list[tuple[tuple[int, ...], str]] = []
     segment: list[int] = []
     for image in range(len(reader.levels) + 1):
-        if image < len(reader.levels) and image not in taken:
+        if image < len(reader.levels) and image not in grouped_images:
             segment.append(image)
             continue
         if segment:
-            _split_segment(_paired(reader, segment), codes, even, doubts)
+            _split_segment(_pair_inverses(reader, segment), codes, even, doubts)
         segment = []
     return FrameBlocks(tuple(runs), tuple(codes), even, tuple(doubts))
 
 
-def _phase_runs(reader: BlockReader) -> list[PhaseRun]:
+def _find_phase_runs(reader: BlockReader) -> list[PhaseRun]:
+    """Runs of successive images that are all steps of one period."""
     runs, start, count = [], 0, len(reader.levels)
     while start < count:
         fitting = [
@@ -207,7 +215,7 @@ def _phase_runs(reader: BlockReader) -> list[PhaseRun]:
     return runs
 
 
-def _paired(reader: BlockReader, images: list[int]) -> list[Bit]:
+def _pair_inverses(reader: BlockReader, images: list[int]) -> list[Bit]:
     """Images of a segment one by one, or each with the inverse that follows, or that lies half a block later."""
     bits = [reader.bit(image, None) for image in images]
     striped = [bit.image for bit in bits if bit.even is None]
@@ -242,6 +250,7 @@ def _split_segment(
     block: list[Bit] = []
 
     def close() -> None:
+        """Add the current block of bits, and begin a new one."""
         if block:
             _add_block(block, is_reversed, codes, doubts)
         block.clear()
@@ -254,23 +263,24 @@ def _split_segment(
         if bit.is_readable and last > FEWEST_EDGES and bit.count < DROP * last:
             close()
         # Stripes grow finer within a code: what is even between two of its bits is a bit as well.
-        block += waiting if block else _leading_bits(waiting, even, with_inverse)
+        block += waiting if block else _select_leading_bits(waiting, even, with_inverse)
         waiting = []
         block.append(bit)
     close()
-    _set_even(waiting, even)
+    _record_even_images(waiting, even)
 
 
-def _leading_bits(waiting: list[Bit], even: dict[int, Even], with_inverse: bool) -> list[Bit]:
+def _select_leading_bits(waiting: list[Bit], even: dict[int, Even], with_inverse: bool) -> list[Bit]:
     """Of the evenly illuminated images before a code, the most significant bits, which are 0 in all of the view."""
     leading: list[Bit] = []
     while waiting and waiting[-1].even == "black" and (waiting[-1].inverse is not None) == with_inverse:
         leading.insert(0, waiting.pop())
-    _set_even(waiting, even)
+    _record_even_images(waiting, even)
     return leading
 
 
-def _set_even(bits: list[Bit], even: dict[int, Even]) -> None:
+def _record_even_images(bits: list[Bit], even: dict[int, Even]) -> None:
+    """Record which images are evenly white or black, inverses included."""
     for bit in bits:
         assert bit.even is not None
         even[bit.image] = bit.even
@@ -281,6 +291,7 @@ def _set_even(bits: list[Bit], even: dict[int, Even]) -> None:
 def _add_block(
     block: list[Bit], is_reversed: bool, codes: list[GrayBlock], doubts: list[tuple[tuple[int, ...], str]]
 ) -> None:
+    """Add successive bits as a Gray code, or the doubt why they are none."""
     images = tuple(sorted(image for bit in block for image in bit.images))
     paired = {bit.inverse is not None for bit in block}
     readable = [bit for bit in block if bit.is_readable and bit.even is None]

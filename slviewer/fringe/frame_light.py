@@ -111,7 +111,7 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     check_stack(sequence, stack)
     steady = FrameLight(Light.constant(len(stack)), ())
     coarse = sample_light(sequence, stack, coarse=True)
-    if coarse is None or not _varies(coarse):
+    if coarse is None or not _is_light_varying(coarse):
         return steady
     sample = sample_light(sequence, stack)
     if sample is None:
@@ -129,10 +129,10 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
         return replace(steady, unexplained=fit.terms if _explains_most(sample, fit) else ())
     light = _estimate_fine_stripes(sample, _fill_unknown_frames(sample, fit))
     used = list(fit.informed)
-    room = _room_light(sample, light, used)
+    room_light = _compute_room_light(sample, light, used)
     drift = float(np.std(np.log(fit.light.gain[used])))
     wave = float(np.sqrt(np.mean(light.wave[used] ** 2)))
-    return FrameLight(light, fit.terms, drift, wave, room - room[used].min())
+    return FrameLight(light, fit.terms, drift, wave, room_light - room_light[used].min())
 
 
 def equalize_frames(
@@ -245,8 +245,10 @@ def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Su
                 if steps
                 else "corrected; keep the light of the room constant, or switch it off"
             )
-            seen = f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}"
-            text = f"{seen}: {outcome}"
+            observation = (
+                f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}"
+            )
+            text = f"{observation}: {outcome}"
             out.append(Suspect(k, "room-light", text))
     return out
 
@@ -260,7 +262,7 @@ def _few_steps_across(sequence: PatternSequence, k: int) -> int:
     return 0
 
 
-def _varies(sample: LightSample) -> bool:
+def _is_light_varying(sample: LightSample) -> bool:
     """Whether one step of any model, on a small sample, promises enough."""
     model, count = LightModel(sample), len(sample.frames)
     if not model.informed:
@@ -271,18 +273,18 @@ def _varies(sample: LightSample) -> bool:
         return True
     return any(
         fit_light(sample, terms, start, weight, most_steps=1).variance * BETTER < gains.variance
-        for terms, start in _candidates(sample, gains)
+        for terms, start in _list_candidate_models(sample, gains)
     )
 
 
-def _candidates(sample: LightSample, gains: Fit) -> Iterator[tuple[tuple[Term, ...], Light]]:
+def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tuple[Term, ...], Light]]:
     """The models beside gains alone, each with the light to start from."""
     constant = Light.constant(len(sample.frames))
-    left = LightModel(sample).eliminate(gains.light, gains.share, gains.weight)
+    remainder = LightModel(sample).eliminate(gains.light, gains.share, gains.weight)
     for terms in MODELS[1:]:
         start = replace(constant, gain=gains.light.gain) if "gain" in terms else constant
         if "wave" in terms:
-            yield terms, replace(start, cycles=_strongest_wave(left))
+            yield terms, replace(start, cycles=_estimate_strongest_wave(remainder))
         else:
             changes = locate_room_change(sample, constant, "gain" in terms, gains.weight)
             if changes:
@@ -310,11 +312,11 @@ def _needs_correction(sample: LightSample, fit: Fit) -> bool:
     light, used = fit.light, list(fit.informed)
     if "wave" in fit.terms and np.sqrt(np.mean(light.wave[used] ** 2)) > LEAST_WAVE:
         return True
-    room = _room_light(sample, light, used)
-    return any(abs(float(room[k] - room[k - 1])) > LEAST_ROOM for k in light.changes)
+    room_light = _compute_room_light(sample, light, used)
+    return any(abs(float(room_light[k] - room_light[k - 1])) > LEAST_ROOM for k in light.changes)
 
 
-def _room_light(sample: LightSample, light: Light, used: Sequence[int]) -> np.ndarray:
+def _compute_room_light(sample: LightSample, light: Light, used: Sequence[int]) -> np.ndarray:
     """(n,) room light of each frame as a share of the mean grey level."""
     albedo = float(np.mean(sample.albedo(light.changes)))
     return (light.uniform + light.albedo[:, 0] * albedo) / float(np.mean(sample.frames[list(used)]))
@@ -324,7 +326,7 @@ def _choose_model(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
     """The simplest model that explains the frames about as well as the best: chosen on a coarse sample."""
     weight = np.ones(coarse.frames.shape[1], np.float32)
     own = fit_light(coarse, ("gain",), first.light, weight, 2)
-    fits = [own, *(fit_light(coarse, terms, start, weight, 3) for terms, start in _candidates(coarse, own))]
+    fits = [own, *(fit_light(coarse, terms, start, weight, 3) for terms, start in _list_candidate_models(coarse, own))]
     best = min(fit.variance for fit in fits)
     is_noise = bool(coarse.shifts) or own.variance < LEFT * coarse.roughness**2
     if own.variance < (BETTER if is_noise else CLEARLY_BETTER) * best:
@@ -349,7 +351,7 @@ def _refine_wave(sample: LightSample, fit: Fit) -> Fit:
     return min(tried, key=lambda f: f.variance)
 
 
-def _strongest_wave(left: Remainder) -> float:
+def _estimate_strongest_wave(left: Remainder) -> float:
     """Cycles per image height of the wave that the frames' light has along the rows."""
     excess, rows = left.row_excess()
     excess = excess - excess.mean(axis=1, keepdims=True)
@@ -362,8 +364,8 @@ def _explains(sample: LightSample, fit: Fit) -> bool:
     if fit.terms == ("gain",) and not _has_large_gains(sample, fit):
         return False
     model = LightModel(sample)
-    left = model.eliminate(fit.light, fit.share, fit.weight)
-    energy = (fit.weight * left.left**2).sum(axis=1)
+    remainder = model.eliminate(fit.light, fit.share, fit.weight)
+    energy = (fit.weight * remainder.left**2).sum(axis=1)
     entries = np.full(len(energy), float(fit.weight.sum()))
     entries[len(model.phased) :] = (fit.weight * sample.interior).sum(axis=1)
     judged = np.isin(model.used, fit.informed)
@@ -409,11 +411,11 @@ def _estimate_fine_stripes(sample: LightSample, fit: Fit) -> Light:
     by what the camera's curve makes of blurred stripes, which all of them have in common.
     """
     model, light = LightModel(sample), fit.light
-    left = model.eliminate(light, fit.share, fit.weight)
+    remainder = model.eliminate(light, fit.share, fit.weight)
     inside = sample.interior.mean(axis=1) if sample.coded else np.zeros(0)
     fine = [i for i, share in zip(sample.coded, inside, strict=True) if share < FINE and i not in fit.informed]
-    dark, bright = left.levels
-    both = (left.counts[0] > 0) & (left.counts[1] > 0)
+    dark, bright = remainder.levels
+    both = (remainder.counts[0] > 0) & (remainder.counts[1] > 0)
     if "gain" not in fit.terms or not fine or np.count_nonzero(both) < MIN_PIXELS:
         return light
     middle = float(np.mean(0.5 * (dark + bright)[both]))

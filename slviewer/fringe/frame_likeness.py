@@ -29,12 +29,12 @@ class FrameLikeness:
         even = [i for i, frame in enumerate(sequence.frames) if frame.kind in ("white", "black")]
         self._images = sorted({*coded_frames(sequence), *even})
         high, low = (extreme(sample.frames[self._images], axis=0) for extreme in (np.max, np.min))
-        seen = np.flatnonzero((high - low > sample.least_swing) & (high < sample.white))
-        contrast = (high - low)[seen]
-        self._levels = (sample.frames[:, seen] - (high + low)[seen] / 2) / np.maximum(contrast, 1e-6)
+        pixels = np.flatnonzero((high - low > sample.least_swing) & (high < sample.white))
+        contrast = (high - low)[pixels]
+        self._levels = (sample.frames[:, pixels] - (high + low)[pixels] / 2) / np.maximum(contrast, 1e-6)
         self._weight = contrast / max(float(np.sum(contrast)), 1e-6)
         self._finest = {axis: self._finest_opposed(axis) for axis in sequence.axes}
-        self._near = (np.diff(sample.place[seen]) <= REACH[0]) & (np.diff(sample.line[seen]) == 0)
+        self._near = (np.diff(sample.place[pixels]) <= REACH[0]) & (np.diff(sample.line[pixels]) == 0)
 
     def repeated(self) -> list[tuple[int, int]]:
         """Pairs (i, j < i): image i is image j once more though another pattern is described. Phase steps are compared
@@ -65,6 +65,7 @@ class FrameLikeness:
         return mean > EVEN if kind == "white" else mean < -EVEN
 
     def _are_alike(self, i: int, j: int, difference: float, variance: float) -> bool:
+        """Whether image i shows the pattern of image j, beyond what blur explains."""
         frames = self._sequence.frames
         if frames[i].kind == frames[j].kind == "phase":
             return False
@@ -75,6 +76,7 @@ class FrameLikeness:
         return self._is_copy(i, j) or (difference < ALIKE * variance and self._is_striped(i))
 
     def _is_copy(self, i: int, j: int) -> bool:
+        """Whether two images are equal in every grey level."""
         return bool(np.array_equal(self._levels[i], self._levels[j]))
 
     def copied(self, i: int) -> int | None:
@@ -94,6 +96,7 @@ class FrameLikeness:
         return max((self._sequence.frames[i].bit for i, j in pairs if self._difference(i, j) > ALIKE), default=-1)
 
     def _difference(self, i: int, j: int) -> float:
+        """Weighted mean squared difference of two images."""
         return float(self._weight @ (self._levels[i] - self._levels[j]) ** 2)
 
     def _are_opposite(self, i: int, j: int) -> bool:

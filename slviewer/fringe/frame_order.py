@@ -62,11 +62,12 @@ def detect_copies(
         lost = {pair[which]: pair[1 - which] for pair in pairs}
         images = tuple(None if i in lost else i for i in range(len(sequence.frames)))
         if _score(sequence, readers, likeness, images) is not None:
-            return tuple(_duplicate(sequence, i, j) for i, j in lost.items())
+            return tuple(_describe_duplicate(sequence, i, j) for i, j in lost.items())
     return ()
 
 
-def _duplicate(sequence: PatternSequence, i: int, j: int) -> Contradiction:
+def _describe_duplicate(sequence: PatternSequence, i: int, j: int) -> Contradiction:
+    """The contradiction of frame i that repeats the pattern of frame j."""
     text = f"frame {i + 1} shows the pattern of frame {j + 1}: it is late or repeated; capture again"
     return Contradiction("duplicate-frame", text, sequence.frames[i].axis, float(i))
 
@@ -82,23 +83,23 @@ def search_order(
     """The order of the frames in which all tests are passed best; None if there is none. ``disordered``: what the phase
     steps alone say; ``strange``: those that no step explains.
     """
-    said = {(contradiction.cause, contradiction.value) for contradiction in disordered}
+    named_by_steps = {(contradiction.cause, contradiction.value) for contradiction in disordered}
     passed: list[Answer] = []
     orders: list[Images] = []
     for images, contradiction, penalty in _orders(sequence):
         score = _score(sequence, readers, likeness, images)
         if score is not None:
-            score += NAMED_BY_STEPS * ((contradiction.cause, contradiction.value) in said) - penalty
+            score += NAMED_BY_STEPS * ((contradiction.cause, contradiction.value) in named_by_steps) - penalty
             orders.append(images)
             passed.append(Answer((contradiction,), score))
     for i in sorted(range(len(passed)), key=lambda i: -round(passed[i].score / 0.02)):
         images = orders[i]
         ordered = not any(detect_misplaced_steps(sequence, axis, sample, images) for axis in sequence.axes)
         if ordered and not detect_unexplained_steps(sequence, sample, images):
-            (seen,) = passed[i].contradictions
-            k = int(seen.value or 0)
-            if seen.cause == "duplicate-frame" and (j := likeness.copied(k)) is not None:
-                return replace(passed[i], contradictions=(_duplicate(sequence, k, j),))
+            (contradiction_found,) = passed[i].contradictions
+            k = int(contradiction_found.value or 0)
+            if contradiction_found.cause == "duplicate-frame" and (j := likeness.copied(k)) is not None:
+                return replace(passed[i], contradictions=(_describe_duplicate(sequence, k, j),))
             return passed[i]
     return None
 

@@ -28,22 +28,22 @@ def measure_ghost_share(sampled: Fringe) -> tuple[float, float]:
     before = sampled.beside.get(sampled.shift.indices[0] - 1, sampled.fitted[0])
     if sampled.steps < 4:
         return np.nan, np.nan
-    keep = sampled.keep
-    left = keep.astype(np.float32) @ sampled.frames
+    projection = sampled.keep
+    residuals = projection.astype(np.float32) @ sampled.frames
     # The first step is off by the share of what the image before differs from the last step; and frames of other light
     # are not taken for a ghost: their gains are fitted together with it.
     regressors = np.concatenate([sampled.fitted, (before - sampled.fitted[-1])[None]])
     steps = [*range(sampled.steps), 0]
-    normal = keep[np.ix_(steps, steps)] * (regressors @ regressors.T)
-    moment = np.einsum("kp,kp->k", regressors, left[steps]).astype(float)
+    normal = projection[np.ix_(steps, steps)] * (regressors @ regressors.T)
+    moment = np.einsum("kp,kp->k", regressors, residuals[steps]).astype(float)
     gains = slice(0, sampled.steps)
     by_light = float(moment[gains] @ np.linalg.pinv(normal[gains, gains], rcond=1e-6) @ moment[gains])
     inverse = np.linalg.pinv(normal, rcond=1e-6)
     explained = float(moment @ inverse @ moment)
     if explained - by_light < MOSTLY * explained:
         return np.nan, np.nan
-    freedom = left.shape[1] * np.trace(keep)
-    variance = (float(np.sum(left.astype(float) ** 2)) - explained) / freedom * float(inverse[-1, -1])
+    freedom = residuals.shape[1] * np.trace(projection)
+    variance = (float(np.sum(residuals.astype(float) ** 2)) - explained) / freedom * float(inverse[-1, -1])
     return float(inverse[-1] @ moment), float(np.sqrt(max(variance, 0.0)))
 
 
@@ -54,14 +54,18 @@ def detect_ghosting(sampled: Fringe) -> list[Suspect]:
         return []
     i = sampled.shift.indices[0]
     if i == 0:
-        seen = f"the frames hold {100 * share:.0f} % of the image before them (ghosting), but for frame 1, the first"
+        observation = (
+            f"the frames hold {100 * share:.0f} % of the image before them (ghosting), but for frame 1, the first"
+        )
     else:
-        seen = f"frame {i + 1} holds {100 * share:.0f} % of the image before it (ghosting), and so may every frame"
+        observation = (
+            f"frame {i + 1} holds {100 * share:.0f} % of the image before it (ghosting), and so may every frame"
+        )
     return [
         Suspect(
             i,
             "strange",
-            f"{seen}: the projector "
+            f"{observation}: the projector "
             "changes its image slowly, or the camera exposes during the change; wait longer after each pattern",
         )
     ]

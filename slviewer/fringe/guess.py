@@ -69,7 +69,7 @@ def guess_sequence(stack: np.ndarray, projector: tuple[int, int] | None = None) 
     axes = _assign_axes(blocks, doubts)
     if not axes and not doubts:
         doubts.append((tuple(range(len(stack))), "no image shows phase steps or stripes of a code"))
-    return _described(stack, sample, reader, blocks, axes, doubts, projector)
+    return _propose_sequence(stack, sample, reader, blocks, axes, doubts, projector)
 
 
 def _assign_axes(blocks: FrameBlocks, doubts: list[tuple[tuple[int, ...], str]]) -> dict[Axis, _AxisBlocks]:
@@ -89,9 +89,9 @@ def _assign_axes(blocks: FrameBlocks, doubts: list[tuple[tuple[int, ...], str]])
             codes[axis].append(block)
     out: dict[Axis, _AxisBlocks] = {}
     for axis in ("x", "y"):
-        ordered = sorted(runs[axis], key=_frequency)
+        ordered = sorted(runs[axis], key=_fringe_frequency)
         for a, b in pairwise(ordered):
-            if _frequency(b) < (1 + SAME_PERIOD) * _frequency(a):
+            if _fringe_frequency(b) < (1 + SAME_PERIOD) * _fringe_frequency(a):
                 doubts.append((a.images + b.images, f"two runs of phase steps of axis {axis} have the same period"))
         if len(codes[axis]) > 1:
             images = tuple(image for code in codes[axis] for image in code.images)
@@ -101,11 +101,12 @@ def _assign_axes(blocks: FrameBlocks, doubts: list[tuple[tuple[int, ...], str]])
     return out
 
 
-def _frequency(run: PhaseRun) -> float:
+def _fringe_frequency(run: PhaseRun) -> float:
+    """Phase gradient, rad per camera px."""
     return float(np.hypot(*run.gradient))
 
 
-def _described(
+def _propose_sequence(
     stack: np.ndarray,
     sample: LineSample,
     reader: BlockReader,
@@ -114,6 +115,7 @@ def _described(
     doubts: list[tuple[tuple[int, ...], str]],
     projector: tuple[int, int] | None,
 ) -> Guess:
+    """The proposed sequence with the evidence for each of its entries."""
     frames: list[Frame | None] = [None] * len(stack)
     evidence: list[tuple[int, str]] = []
     notes: list[str] = []
@@ -231,7 +233,7 @@ def _with_conventions(
     if parts.code is None:
         gradient = parts.runs[-1].gradient[0 if axis == "x" else 1]
         if gradient < 0:
-            doubts.append((images, _reversed_text(axis, "the phase falls", "or phase_sign is -1")))
+            doubts.append((images, _describe_reversal(axis, "the phase falls", "or phase_sign is -1")))
         if len(parts.runs) == 1:
             notes.append(f"axis {axis}: one period without Gray code gives a phase that is not absolute")
             return replace(sequence, relative=True)
@@ -244,7 +246,7 @@ def _with_conventions(
     if not parts.runs:
         a = measure_agreement(reader, frames)
         _check_code(frames, a, images, axis, doubts)
-        notes.append(f"axis {axis}: Gray code alone, taken to number the projector's {_lines(axis)} one by one")
+        notes.append(f"axis {axis}: Gray code alone, taken to number the projector's {_name_lines(axis)} one by one")
         return sequence
     a = measure_agreement(reader, frames)
     turns = a.turns_per_cell
@@ -256,17 +258,17 @@ def _with_conventions(
     if abs(2 * turns - 1) < 0.12 / 2 + WHOLE:
         last = parts.code.bits[-1].image
         if parts.code.bits[-1].inverse is None:
-            sequence = _with_complementary(sequence, axis, last)
+            sequence = _mark_complementary(sequence, axis, last)
             evidence.append((last, f"its edges lie half way: {turns:.2f} fringes per cell of all bits"))
     else:
         cell = frames.fringe[0] * (round(turns) if turns > 0.9 and abs(turns - round(turns)) < 0.12 else turns)
         if abs(cell - sequence.gray_cell(axis)) > 0.01 * cell:
-            sequence = replace(sequence, gray_cell_px=_set(sequence.gray_cell_px, axis, float(f"{cell:.4g}")))
+            sequence = replace(sequence, gray_cell_px=_replace_axis(sequence.gray_cell_px, axis, float(f"{cell:.4g}")))
         evidence.append((parts.code.bits[-1].image, f"{turns:.3g} fringes per Gray cell"))
     frames = described_frames(sequence, axis)
     a = measure_agreement(reader, frames)
     if a.rising < 0.5:
-        sequence = replace(sequence, phase_sign=_set(sequence.phase_sign, axis, -1))
+        sequence = replace(sequence, phase_sign=_replace_axis(sequence.phase_sign, axis, -1))
         evidence.append((parts.runs[-1].images[0], "the phase falls where the code rises"))
         frames = described_frames(sequence, axis)
         a = measure_agreement(reader, frames)
@@ -278,7 +280,7 @@ def _with_conventions(
         )
         turn = snapped if abs(wrap(late - snapped)) < 0.06 else late
         offset = float(f"{TURN * turn:.4g}")
-        sequence = replace(sequence, phase_offset_rad=_set(sequence.phase_offset_rad, axis, offset))
+        sequence = replace(sequence, phase_offset_rad=_replace_axis(sequence.phase_offset_rad, axis, offset))
         notes.append(
             f"axis {axis}: the phase is {offset:g} rad where the Gray code begins; written as phase_offset, it may "
             "as well be gray_origin"
@@ -288,7 +290,7 @@ def _with_conventions(
     _check_code(frames, a, images, axis, doubts)
     gradient = parts.runs[-1].gradient[0 if axis == "x" else 1] * sequence.sign(axis)
     if gradient < 0:
-        doubts.append((images, _reversed_text(axis, "the code falls", "or a most significant bit is missing")))
+        doubts.append((images, _describe_reversal(axis, "the code falls", "or a most significant bit is missing")))
     return sequence
 
 
@@ -316,7 +318,7 @@ def _with_scale(
     covered = sequence.gray_cell(axis) * 2**bits if bits else periods[0]
     if not periods:
         if covered < extent or reach > extent + 1:
-            text = f"{bits} bits number {covered:g} {_lines(axis)}, of which {reach:.0f} are in view, not {extent}"
+            text = f"{bits} bits number {covered:g} {_name_lines(axis)}, of which {reach:.0f} are in view, not {extent}"
             doubts.append((images, f"{text}: correct projector, or add gray_cell_px"))
         return sequence
     low, high = extent / covered * periods[-1], extent / max(reach, 1.0) * periods[-1]
@@ -331,13 +333,18 @@ def _with_scale(
         for f in sequence.frames
     )
     cell = getattr(sequence.gray_cell_px, axis) if isinstance(sequence.gray_cell_px, PerAxis) else sequence.gray_cell_px
-    cells = sequence.gray_cell_px if cell is None else _set(sequence.gray_cell_px, axis, float(f"{cell * scale:.4g}"))
+    cells = (
+        sequence.gray_cell_px
+        if cell is None
+        else _replace_axis(sequence.gray_cell_px, axis, float(f"{cell * scale:.4g}"))
+    )
     return replace(sequence, frames=scaled, gray_cell_px=cells)
 
 
 def _check_code(
     frames: AxisFrames, a: Agreement, images: tuple[int, ...], axis: Axis, doubts: list[tuple[tuple[int, ...], str]]
 ) -> None:
+    """Add a doubt where the Gray code and the fringes of an axis do not agree."""
     failed = failed_tests(frames, a)
     if failed or not is_supported(frames, a):
         shares = f"{100 * a.rule:.0f} % of the edges obey the Gray code" if np.isfinite(a.rule) else "no edges are read"
@@ -346,7 +353,8 @@ def _check_code(
         doubts.append((images, f"axis {axis}: {shares}, of {100 * SURE:.0f} % that would be sure"))
 
 
-def _with_complementary(sequence: PatternSequence, axis: Axis, image: int) -> PatternSequence:
+def _mark_complementary(sequence: PatternSequence, axis: Axis, image: int) -> PatternSequence:
+    """The sequence with one Gray image as the complementary bit."""
     frames = []
     for index, frame in enumerate(sequence.frames):
         if index == image:
@@ -357,15 +365,18 @@ def _with_complementary(sequence: PatternSequence, axis: Axis, image: int) -> Pa
     return replace(sequence, frames=tuple(frames))
 
 
-def _reversed_text(axis: Axis, seen: str, other: str) -> str:
+def _describe_reversal(axis: Axis, seen: str, other: str) -> str:
+    """Evidence of an axis that is reversed by a device turned by 180 degrees."""
     side = "to the right" if axis == "x" else "downwards"
     return f"axis {axis}: {seen} {side} in the camera: camera or projector is turned by half a turn, {other}"
 
 
-def _lines(axis: Axis) -> str:
+def _name_lines(axis: Axis) -> str:
+    """What a coordinate of an axis counts: columns or rows."""
     return "columns" if axis == "x" else "rows"
 
 
-def _set(values: object, axis: Axis, value: float) -> PerAxis:  # type: ignore[type-arg]
+def _replace_axis(values: object, axis: Axis, value: float) -> PerAxis:  # type: ignore[type-arg]
+    """The pair of values with that of one axis replaced."""
     both = values if isinstance(values, PerAxis) else PerAxis(values, values)
     return both._replace(**{axis: value})

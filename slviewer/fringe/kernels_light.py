@@ -23,8 +23,8 @@ def equalize(stack, frames, gain, offset, along_rows, along_columns, albedo, sca
             if len(albedo):
                 a, b = np.float32(along_rows[k, row]), np.float32(along_columns[k])
                 for x in range(width):
-                    room = added + albedo[row, x] * (a + b * (np.float32(x) * per_column - np.float32(0.5)))
-                    level = (np.float32(source[x]) - room) * times + np.float32(0.5)
+                    room_light = added + albedo[row, x] * (a + b * (np.float32(x) * per_column - np.float32(0.5)))
+                    level = (np.float32(source[x]) - room_light) * times + np.float32(0.5)
                     target[x] = np.uint16(min(max(level, np.float32(0)), np.float32(65534)))
             else:
                 for x in range(width):

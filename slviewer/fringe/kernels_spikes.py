@@ -135,6 +135,7 @@ def list_changes(phase, rules, masking, columns, words, counts):
 
 @kernel()
 def _list_row(phase, row, rules, masking, columns, words):
+    """List the changes of one row: returns their number; columns and packed words are written."""
     width = phase.shape[1]
     low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
     suspect, examined = np.empty(width, np.bool_), np.empty(width, np.bool_)

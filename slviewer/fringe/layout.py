@@ -87,9 +87,9 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
         raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
     shifts = tuple(Shift(*shift) for shift in sequence.phase_shifts(axis))
     gray, inverse, complementary, white, black = (
-        _by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
+        _frames_by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
     )
-    found = Layout(
+    layout = Layout(
         axis,
         np.inf if sequence.projector_size is None else sequence.extent(axis),
         sequence.sign(axis),
@@ -107,8 +107,8 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
     if not shifts and not inverse and not (white and black):
         raise InputError(f"axis {axis}: Gray code alone needs its inverses, or a white and a black frame: add them")
     if gray or complementary:
-        _check_code(found)
-    return found
+        _check_code(layout)
+    return layout
 
 
 def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
@@ -149,11 +149,13 @@ def to_eight_bits(image: np.ndarray, largest: int | None = None) -> NDArray[np.u
     return (image >> (int(white).bit_length() - 8)).astype(np.uint8)
 
 
-def _by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:
+def _frames_by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:
+    """Indices of the frames of one kind, the most significant bit first."""
     return tuple(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
 
 
 def _check_code(layout: Layout) -> None:
+    """Raise InputError where the Gray bits cannot number the whole axis."""
     where = f"axis {layout.axis}"
     if not layout.gray:
         raise InputError(f"{where}: a complementary bit without Gray bits says nothing: add them")

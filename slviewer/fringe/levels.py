@@ -83,22 +83,24 @@ def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ..
     ``periods_px`` are longest first. Where none covers the extent, beats of two, then of three of the longest take
     their place (heterodyne). Raises InputError where these do not cover it either.
     """
-    singles = [_combine(periods_px, {i: 1}) for i in range(len(periods_px))]
+    singles = [_combine_periods(periods_px, {i: 1}) for i in range(len(periods_px))]
     if periods_px[0] >= extent:
         return tuple(singles)
     count = min(LONGEST, len(periods_px))
-    beats = [_combine(periods_px, {j: 1, i: -1}) for i, j in combinations(range(count), 2)]
+    beats = [_combine_periods(periods_px, {j: 1, i: -1}) for i, j in combinations(range(count), 2)]
     covering = [beat for beat in beats if beat.period_px >= extent]
     if covering:
         return (min(covering, key=lambda level: level.period_px), *singles)
     if count == LONGEST:
-        both = [_combine(periods_px, {0: 1, 1: -2, 2: 1})]
+        both = [_combine_periods(periods_px, {0: 1, 1: -2, 2: 1})]
         both = [level for level in both if extent <= level.period_px < np.inf]
         if both:
             beat = min(beats, key=lambda level: level.period_px if level.weights[1] else np.inf)
             return (both[0], beat, *singles)
     reached = max([periods_px[0], *(beat.period_px for beat in beats)])
-    raise InputError(f"fringe periods of {_listed(periods_px)} px tell only {reached:.0f} px apart, not {extent:g}")
+    raise InputError(
+        f"fringe periods of {_join_periods(periods_px)} px tell only {reached:.0f} px apart, not {extent:g}"
+    )
 
 
 def unwrap_levels(
@@ -128,14 +130,14 @@ def find_common_range(periods_px: tuple[float, ...]) -> float:
     """px after which all phases of the periods repeat, and up to which they tell coordinates apart: the longest period
     or a beat of two. Raises InputError where no such range holds whole numbers of all periods."""
     count = min(LONGEST, len(periods_px))
-    beats = [_combine(periods_px, {j: 1, i: -1}).period_px for i, j in combinations(range(count), 2)]
+    beats = [_combine_periods(periods_px, {j: 1, i: -1}).period_px for i, j in combinations(range(count), 2)]
     for reach in sorted({periods_px[0], *beats}, reverse=True):
         turns = reach / np.array(periods_px)
         if reach < np.inf and (np.abs(turns - np.rint(turns)) <= WHOLE).all():
             return float(reach)
     raise InputError(
-        f"fringe periods of {_listed(periods_px)} px share no range of which each is a whole part, so that even a "
-        "relative phase cannot be decoded: give the size of a projector that the longest covers, or leave out the "
+        f"fringe periods of {_join_periods(periods_px)} px share no range of which each is a whole part, so that even "
+        "a relative phase cannot be decoded: give the size of a projector that the longest covers, or leave out the "
         f"steps of all but {periods_px[-1]:g} px"
     )
 
@@ -155,11 +157,13 @@ def required_modulation(levels: tuple[Level, ...], steps: int) -> float:
     return float(spread * np.sqrt(2 / steps) / (2 * np.pi * LEVEL_SIGMA))
 
 
-def _listed(periods_px: tuple[float, ...]) -> str:
+def _join_periods(periods_px: tuple[float, ...]) -> str:
+    """Periods as text, separated by commas."""
     return ", ".join(f"{p:g}" for p in periods_px)
 
 
-def _combine(periods_px: tuple[float, ...], weights: dict[int, int]) -> Level:
+def _combine_periods(periods_px: tuple[float, ...], weights: dict[int, int]) -> Level:
+    """The beat of several periods whose phases are added with integer weights."""
     frequency = sum(w / periods_px[i] for i, w in weights.items())
     sign = 1 if frequency >= 0 else -1
     period = 1 / abs(frequency) if frequency else np.inf

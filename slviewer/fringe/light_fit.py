@@ -99,32 +99,32 @@ def fit_light(
     variance = max(sample.roughness**2, 1 / 12)
     model = LightModel(sample)
     for _ in range(most_steps):
-        left = model.eliminate(light, share, weight)
-        variance = max(left.variance, 1e-3)
-        change, share_change = left.solve(light, terms, variance, share)
+        remainder = model.eliminate(light, share, weight)
+        variance = max(remainder.variance, 1e-3)
+        change, share_change = remainder.solve(light, terms, variance, share)
         light, share = _moved(light, change, model), float(np.clip(share + share_change, 0.05, 0.95))
         if fixed is None:
-            weight = left.robust_weight()
-        if all(np.abs(values).max() < CONVERGED * left.scale(term) for term, values in change.items()):
+            weight = remainder.robust_weight()
+        if all(np.abs(values).max() < CONVERGED * remainder.scale(term) for term, values in change.items()):
             break
-    left = model.eliminate(light, share, weight)
-    return Fit(light, tuple(terms), left.variance, share, weight, model.informed)
+    remainder = model.eliminate(light, share, weight)
+    return Fit(light, tuple(terms), remainder.variance, share, weight, model.informed)
 
 
 def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
     """The frame from which on a change of the room's light, beside gains or alone, explains the most; empty if none."""
     model = LightModel(sample)
-    left = model.eliminate(light, SHARE_PRIOR[0], weight)
-    normal, moment = left.normal_equations(
-        light, ("gain", "uniform", "albedo"), max(left.variance, 1e-3), SHARE_PRIOR[0]
+    remainder = model.eliminate(light, SHARE_PRIOR[0], weight)
+    normal, moment = remainder.normal_equations(
+        light, ("gain", "uniform", "albedo"), max(remainder.variance, 1e-3), SHARE_PRIOR[0]
     )
     used, u = np.array(model.used), len(model.used)
-    beside = [*(range(u) if with_gain else ()), *range(5 * u, len(normal))]
+    free_columns = [*(range(u) if with_gain else ()), *range(5 * u, len(normal))]
     # Unknowns that every change has beside it are eliminated first.
-    inverse = np.linalg.inv(normal[np.ix_(beside, beside)])
-    cross = normal[u : 3 * u, beside] @ inverse
-    own = normal[u : 3 * u, u : 3 * u] - cross @ normal[beside, u : 3 * u]
-    target = moment[u : 3 * u] - cross @ moment[beside]
+    inverse = np.linalg.inv(normal[np.ix_(free_columns, free_columns)])
+    cross = normal[u : 3 * u, free_columns] @ inverse
+    own = normal[u : 3 * u, u : 3 * u] - cross @ normal[free_columns, u : 3 * u]
+    target = moment[u : 3 * u] - cross @ moment[free_columns]
     best, at = 0.0, tuple[int, ...]()
     if model.phased and not model.phase_freedom:  # three steps: nothing but the Gray code contradicts a change
         return at
@@ -145,7 +145,7 @@ def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weigh
 
 def equalize_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """(u, p) samples under equal light, and the gains that they were divided by."""
-    cosine, sine = _wave(sample, light.cycles)
+    cosine, sine = _row_wave(sample, light.cycles)
     wave = light.wave[used].astype(np.float32)
     gain = light.gain[used, None].astype(np.float32) * (1 + wave[:, :1] * cosine + wave[:, 1:] * sine)
     shapes = np.stack([np.ones_like(cosine), sample.column - 0.5, sample.row - 0.5])
@@ -153,7 +153,8 @@ def equalize_sample(sample: LightSample, light: Light, used: Sequence[int]) -> t
     return ((sample.frames[used] - added.astype(np.float32)) / gain), gain
 
 
-def _wave(sample: LightSample, cycles: float) -> tuple[np.ndarray, np.ndarray]:
+def _row_wave(sample: LightSample, cycles: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cosine and sine of a wave along the image rows, at the sampled pixels."""
     angle = np.float32(2 * np.pi * cycles) * sample.row
     return np.cos(angle), np.sin(angle)
 
@@ -208,13 +209,16 @@ class LightModel:
         self.keep = np.eye(n) - basis @ basis.T
         self.phase_freedom = n - basis.shape[1]
         least = MIN_ENTRIES * sample.frames.shape[1]
-        seen = (sample.interior & sample.bright).sum(axis=1) >= least  # dark stripes alone hardly depend on the gain
+        is_informed = (sample.interior & sample.bright).sum(
+            axis=1
+        ) >= least  # dark stripes alone hardly depend on the gain
         self.informed = (
             *(self.phased[k] for k in self.determined),
-            *(i for i, enough in zip(sample.coded, seen, strict=True) if enough),
+            *(i for i, enough in zip(sample.coded, is_informed, strict=True) if enough),
         )
 
     def eliminate(self, light: Light, share: float, weight: np.ndarray) -> "Remainder":
+        """Remove what pattern and surface explain of the frames under a light; what remains is of light and noise."""
         sample, n = self.sample, len(self.phased)
         frames, gain = equalize_sample(sample, light, self.used)
         shown, left = np.zeros_like(frames), np.zeros_like(frames)
@@ -276,6 +280,7 @@ class Remainder:
 
     @property
     def freedom(self) -> float:
+        """Weighted degrees of freedom of the remainder."""
         entries = sum(np.maximum(count - 1, 0) for count in self.counts)
         return float(np.sum(self.weight * (self.model.phase_freedom + entries)))
 
@@ -299,6 +304,7 @@ class Remainder:
         return sums[0] / np.maximum(sums[1], 1e-6), rows
 
     def robust_weight(self) -> np.ndarray:
+        """(p,) float32: weight of each pixel, small for those that deviate from most."""
         entries = sum(np.maximum(count - 1, 0) for count in self.counts)
         freedom = self.model.phase_freedom + entries
         ratio = (self.left**2).sum(axis=0) / np.maximum(freedom, 1)
@@ -326,7 +332,7 @@ class Remainder:
         """Normal matrix and moment, with priors: for each term each of its shapes (u,), harmonics, and the share."""
         model, sample = self.model, self.model.sample
         n, u = len(model.phased), len(model.used)
-        cosine, sine = _wave(sample, light.cycles)
+        cosine, sine = _row_wave(sample, light.cycles)
         albedo = sample.albedo(light.changes)
         one = np.ones_like(cosine)
         shapes: dict[Term, list[np.ndarray]] = {
@@ -391,6 +397,7 @@ class Remainder:
         return np.asarray(block_diag(*blocks, np.eye(total - len(blocks) * len(used))))
 
     def _link_weight(self, variance: float, share: float) -> np.ndarray:
+        """(p,) float32: weight of the equations that relate coded frames to phase steps."""
         dark, bright = (np.maximum(count, 1) for count in self.counts)
         parts = 1 / max(len(self.model.determined), 1) + (1 - share) ** 2 / dark + share**2 / bright
         error = (LINK_ERROR * self.contrast) ** 2
@@ -399,6 +406,7 @@ class Remainder:
     def _add_priors(
         self, normal: np.ndarray, moment: np.ndarray, light: Light, terms: Sequence[Term], share: float, total: int
     ) -> None:
+        """Add the priors of the light to the normal equations, in place."""
         model = self.model
         n, u = len(model.phased), len(model.used)
         now: dict[Term, np.ndarray] = {

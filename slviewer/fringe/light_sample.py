@@ -76,7 +76,7 @@ def sample_light(
         for size, count in ((height, ROWS // 2 if coarse else ROWS), (width, COLUMNS // 4 if coarse else COLUMNS))
     )
     row, column = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
-    shifts = _shifts(sequence)
+    shifts = _list_shifts(sequence)
     phased = [i for shift in shifts for i in shift]
     coded = tuple(i for i, f in enumerate(sequence.frames) if f.kind not in ("phase", "texture"))
     used = [*phased, *coded]
@@ -91,10 +91,12 @@ def sample_light(
     limit = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * rough)
     if phased:
         amplitudes = np.stack([np.abs(fit_cosine(frames[list(shift)])[1]) for shift in shifts])
-        seen = np.count_nonzero(amplitudes > limit, axis=1)
-        if seen.max() < MIN_PIXELS:
+        pixel_counts = np.count_nonzero(amplitudes > limit, axis=1)
+        if pixel_counts.max() < MIN_PIXELS:
             return None
-        shown = np.flatnonzero(seen > 0.5 * seen.max())  # an axis that was not shown, or is out of view, is no witness
+        shown = np.flatnonzero(
+            pixel_counts > 0.5 * pixel_counts.max()
+        )  # an axis that was not shown, or is out of view, is no witness
         amplitudes, shifts = amplitudes[shown], tuple(shifts[s] for s in shown)
         phased = [i for shift in shifts for i in shift]
         valid = (amplitudes.min(axis=0) > limit) & (frames[phased].max(axis=0) < white)
@@ -104,9 +106,9 @@ def sample_light(
     if np.count_nonzero(valid) < MIN_PIXELS:  # too few for statistics
         return None
     row, column, frames = row[valid], column[valid], frames[:, valid]
-    partner = _partners(sequence, coded)
+    partner = _find_partner_frames(sequence, coded)
     amplitudes = amplitudes[:, valid]
-    interior, bright = _interiors(
+    interior, bright = _find_stripe_interiors(
         sequence, stack, frames, coded, partner, row, column, gain, DECIDED * amplitudes[-1], phased
     )
     if coded:
@@ -131,12 +133,12 @@ def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequ
     The modulation of a phase shift between whose frames no light ``changes``, or half the range of the coded frames
     between two changes.
     """
-    shifts = _shifts(sequence)
+    shifts = _list_shifts(sequence)
     if shifts:
         chosen = np.stack([frames[i] for i in shifts[steady_shift(shifts, changes)]]).astype(np.float32)
         return np.abs(fit_cosine(chosen.reshape(len(chosen), -1))[1]).reshape(frames.shape[1:])
     coded = tuple(i for i, f in enumerate(sequence.frames) if f.kind != "texture")
-    return _half_range(frames, coded, _partners(sequence, coded), changes)
+    return _half_range(frames, coded, _find_partner_frames(sequence, coded), changes)
 
 
 def _half_range(
@@ -161,11 +163,13 @@ def steady_shift(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int
     )
 
 
-def _shifts(sequence: PatternSequence) -> tuple[tuple[int, ...], ...]:
+def _list_shifts(sequence: PatternSequence) -> tuple[tuple[int, ...], ...]:
+    """Frames of every phase-shifted period, of all axes."""
     return tuple(steps for axis in sequence.axes for _, steps in sequence.phase_shifts(axis))
 
 
-def _partners(sequence: PatternSequence, coded: tuple[int, ...]) -> tuple[int, ...]:
+def _find_partner_frames(sequence: PatternSequence, coded: tuple[int, ...]) -> tuple[int, ...]:
+    """For each coded frame the place of its inverse among them; -1 without one."""
     place = {(sequence.frames[i].kind, sequence.frames[i].axis, sequence.frames[i].bit): k for k, i in enumerate(coded)}
     other = {"gray": "inverse", "inverse": "gray"}
     return tuple(
@@ -173,7 +177,7 @@ def _partners(sequence: PatternSequence, coded: tuple[int, ...]) -> tuple[int, .
     )  # fmt: skip
 
 
-def _interiors(
+def _find_stripe_interiors(
     sequence: PatternSequence,
     stack: np.ndarray,
     frames: np.ndarray,
@@ -192,7 +196,9 @@ def _interiors(
     threshold = np.mean([frames[i] / np.float32(gain[i]) for i in reference], axis=0)
     alone = [k for k, i in enumerate(coded) if partner[k] < 0 and sequence.frames[i].kind not in ("white", "black")]
     levels = [frames[coded[k]] / np.float32(gain[coded[k]]) - threshold for k in alone]
-    offsets = dict(zip(alone, _room_offsets(levels, least / DECIDED) if phased else [0.0] * len(alone), strict=True))
+    offsets = dict(
+        zip(alone, _estimate_room_offsets(levels, least / DECIDED) if phased else [0.0] * len(alone), strict=True)
+    )
     around = [(0, 0), *((0, d) for d in AROUND), *((d, 0) for d in AROUND)]
     interior, bright = (np.zeros((len(coded), len(row)), bool) for _ in range(2))
     for k, (i, other) in enumerate(zip(coded, partner, strict=True)):
@@ -226,7 +232,7 @@ def _interiors(
     return interior, bright
 
 
-def _room_offsets(levels: list[np.ndarray], modulation: np.ndarray) -> list[float]:
+def _estimate_room_offsets(levels: list[np.ndarray], modulation: np.ndarray) -> list[float]:
     """Grey levels that the pixels (p,) of each frame have in common beside plus or minus the modulation (p,), where it
     is so much that dark stripes could be taken for bright ones; else 0. ``levels``: above the mean of the fringes.
     Frames that are dark, or bright, throughout have none: of these it cannot be told.

@@ -60,8 +60,8 @@ def sample_frames(stack: np.ndarray, coded: list[int], pixels: int = PIXELS) -> 
     height, width = stack.shape[1:]
     step = max(1, min(height, width) // GRID)
     grid = np.ascontiguousarray(stack[:, step // 2 :: step, step // 2 :: step])
-    seen = grid[coded]
-    swing = (seen.max(axis=0) - seen.min(axis=0)).astype(np.float32)
+    coded_grid = grid[coded]
+    swing = (coded_grid.max(axis=0) - coded_grid.min(axis=0)).astype(np.float32)
     white = white_level(grid, list(range(len(grid))))
     pattern = np.maximum(swing - 2 * limits.DARK_LEVELS * white / 255, 0)
     rows = _lines_through(pattern.sum(axis=1), step, height, round(pixels / width))

@@ -25,20 +25,23 @@ def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[floa
     rows, or columns, of the image.
     """
     if layout.steps >= 4:
-        levels, variances, freedom = _from_phase(sample(stack, layout.shifts[-1].indices), white)
+        levels, variances, freedom = _noise_from_phase_steps(sample(stack, layout.shifts[-1].indices), white)
     elif len(layout.inverse) >= 2:
-        levels, variances, freedom = _from_inverses(sample(stack, layout.gray), sample(stack, layout.inverse), white)
+        levels, variances, freedom = _noise_from_inverses(
+            sample(stack, layout.gray), sample(stack, layout.inverse), white
+        )
     else:
         frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
         indices = tuple(i for i in frames if i is not None)
-        along = [_from_differences(sample(s, indices), white) for s in (stack, stack.transpose(0, 2, 1))]
-        fits = [_binned(*differences) for differences in along if len(differences[0])]
+        along = [_noise_from_differences(sample(s, indices), white) for s in (stack, stack.transpose(0, 2, 1))]
+        fits = [_bin_variances(*differences) for differences in along if len(differences[0])]
         # Fringes and texture only ever add to the differences.
         return _fit_line(*min(fits, key=_mean_variance)) if fits else (0.0, 0.0)
-    return _fit_line(*_binned(levels, variances, freedom))
+    return _fit_line(*_bin_variances(levels, variances, freedom))
 
 
 def _mean_variance(bins: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+    """Mean variance of the bins, weighted by their counts."""
     _, variances, counts = bins
     return float(variances @ counts / counts.sum())
 
@@ -57,9 +60,10 @@ def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
     )
 
 
-def _from_phase(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _noise_from_phase_steps(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """(levels, variances, degrees of freedom) of blocks, from what a cosine leaves of the phase steps."""
     n = len(samples)
-    samples = samples[:, _usable(samples, white)]  # (n, blocks, BLOCK)
+    samples = samples[:, _select_unclipped_blocks(samples, white)]  # (n, blocks, BLOCK)
     own = max(1, min(OWN_HARMONICS, (n - 1) // 2 - 2))
     frames = samples.reshape(n, -1)
     background, phasor = fit_cosine(frames)
@@ -74,8 +78,9 @@ def _from_phase(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarr
     return samples.mean(axis=(0, 2)), variance, freedom * samples.shape[-1]
 
 
-def _from_inverses(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
-    usable = _usable(np.concatenate([gray, inverse]), white)
+def _noise_from_inverses(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """(levels, variances, degrees of freedom) of blocks, from sums of bits and their inverses."""
+    usable = _select_unclipped_blocks(np.concatenate([gray, inverse]), white)
     total = (gray + inverse)[:, usable]
     # What light of other surfaces and of the room adds to a frame hardly differs between neighbours.
     rest = total - total.mean(axis=0)
@@ -84,22 +89,24 @@ def _from_inverses(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple
     return total.mean(axis=(0, -1)) / 2, (rest**2).sum(axis=(0, -1)) / (2 * freedom), freedom
 
 
-def _from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _noise_from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Variance from third differences along a line: fringes and shading are nearly quadratic over four pixels."""
     if samples.shape[-1] < BLOCK:
         return np.zeros(0), np.zeros(0), 1.0
-    usable = _usable(samples, white)
+    usable = _select_unclipped_blocks(samples, white)
     samples = samples[:, usable].reshape(-1, samples.shape[-1])  # each frame has its own level
     third = np.diff(samples, n=3, axis=-1)
     return samples.mean(axis=-1), (third**2).mean(axis=-1) / 20, 2.5  # 1 + 9 + 9 + 1; five that overlap
 
 
-def _usable(samples: np.ndarray, white: float) -> np.ndarray:
+def _select_unclipped_blocks(samples: np.ndarray, white: float) -> np.ndarray:
     """(rows, blocks): neither clipped at white nor at black, which would hide noise."""
     return (samples.max(axis=(0, -1)) < white) & (samples.min(axis=(0, -1)) > 0)
 
 
-def _binned(levels: np.ndarray, variances: np.ndarray, freedom: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _bin_variances(
+    levels: np.ndarray, variances: np.ndarray, freedom: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean level, robust variance and number of blocks in bins of equal count."""
     order = np.argsort(levels)
     bins = [b for b in np.array_split(order, min(BINS, max(1, len(order) // 24))) if len(b)]

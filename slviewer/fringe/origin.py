@@ -45,19 +45,21 @@ def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axi
         )
     reader = AxisReader(sample_lines(sequence, stack, PIXELS), coded_frames(sequence, axis))
     frames = described_frames(sequence, axis)
-    seen = measure_agreement(reader, frames)
+    agreement = measure_agreement(reader, frames)
     assert frames.fringe is not None
-    if seen.edges < MIN_EDGES:
-        raise InputError(f"axis {axis}: {seen.edges} code edges are in view, too few to tell where the code begins")
-    if seen.rising < 1 - MIN_RISING:
+    if agreement.edges < MIN_EDGES:
+        raise InputError(
+            f"axis {axis}: {agreement.edges} code edges are in view, too few to tell where the code begins"
+        )
+    if agreement.rising < 1 - MIN_RISING:
         raise InputError(
             f"axis {axis}: the code falls where the phase rises: set phase_sign to {-sequence.sign(axis)}, "
             "or correct the order of the steps"
         )
-    if not (seen.common >= MIN_CONCENTRATION and seen.rising >= MIN_RISING):
+    if not (agreement.common >= MIN_CONCENTRATION and agreement.rising >= MIN_RISING):
         raise InputError(
             f"axis {axis}: the code edges fall at no common phase: check the period, the order of the bits, "
             "and which frames belong together"
         )
-    turns = seen.begin_turns
+    turns = agreement.begin_turns
     return float((turns - np.ceil(turns - LATEST_TURNS)) * frames.fringe[0])

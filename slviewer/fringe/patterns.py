@@ -31,10 +31,10 @@ def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndar
         angle = 2 * np.pi * turns + sequence.offset_rad(frame.axis)
         cosine = np.floor(127.5 + 127.5 * np.cos(angle) + 0.5).astype(np.uint8)
         return frame.axis, cosine if sequence.levels is None else np.array(sequence.levels, np.uint8)[cosine]
-    return frame.axis, np.where(_bit(sequence, frame.axis, frame), 255, 0).astype(np.uint8)
+    return frame.axis, np.where(_gray_bit_along_axis(sequence, frame.axis, frame), 255, 0).astype(np.uint8)
 
 
-def _bit(sequence: PatternSequence, axis: Axis, frame: Frame) -> np.ndarray:
+def _gray_bit_along_axis(sequence: PatternSequence, axis: Axis, frame: Frame) -> np.ndarray:
     """(extent,) bool: the Gray bit at the centre of each projector column or row."""
     bits = len(sequence.find("gray", axis))
     cell, origin = sequence.gray_cell(axis), sequence.origin_px(axis)

@@ -36,7 +36,7 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     white = full if factor == 1 else CLIPPED
     noise = measure_noise(layout, stack, white)
     if not layout.shifts:
-        phase, modulation, background, inconsistent, dark = _gray_alone(layout, stack, noise)
+        phase, modulation, background, inconsistent, dark = _decode_gray_alone(layout, stack, noise)
         wrapped = np.full_like(phase, np.nan)
         weakest, saturated = modulation, np.zeros(phase.shape, bool)
     else:
@@ -45,10 +45,10 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
         weakest = np.minimum.reduce([b for _, b, _, _ in shifted])
         saturated = np.logical_or.reduce([(peak >= white) & (a + b >= white) for _, b, a, peak in shifted])
         if layout.numbers_periods:
-            order, inconsistent = _order(layout, stack, wrapped, modulation, background)
+            order, inconsistent = _decode_period_order(layout, stack, wrapped, modulation, background)
         else:
-            cell = _cell(layout, stack, modulation, background) if layout.gray else None
-            order, inconsistent = _order_by_levels(layout, [psi for psi, _, _, _ in shifted], cell)
+            cell = _decode_cell(layout, stack, modulation, background) if layout.gray else None
+            order, inconsistent = _unwrap_by_levels(layout, [psi for psi, _, _, _ in shifted], cell)
         phase = (wrapped + TWO_PI * order).astype(np.float32)
         dark = np.zeros(phase.shape, bool)
     dark |= weakest < dark_limit(background, noise, full * factor, dark_sigmas(layout))
@@ -142,7 +142,7 @@ def bit_heights(layout: Layout, stack: np.ndarray, index: int, threshold: np.nda
     return frame - threshold
 
 
-def _order(
+def _decode_period_order(
     layout: Layout, stack: np.ndarray, wrapped: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """What to add to the wrapped phase, in periods, and where it cannot be known."""
@@ -160,7 +160,7 @@ def _order(
         order = np.where(middle, half >> 1, ((half + 1) >> 1) - (part >= 0.75))
         inconsistent = np.where(middle, least, np.abs(last)) < undecided
     else:
-        ahead, behind, _ = _on_border(layout, stack, code, heights)
+        ahead, behind, _ = _find_border_pixels(layout, stack, code, heights)
         order = code + (ahead & (part < np.float32(limits.EDGE))) - (behind & (part >= np.float32(1 - limits.EDGE)))
         inner = (part >= np.float32(limits.EDGE)) & (part < np.float32(1 - limits.EDGE))
         inconsistent = inner & (least < undecided)
@@ -177,7 +177,7 @@ def _read_code(
     return np.tensordot(places, digits.astype(np.int32), 1), digits[-1].astype(np.int32), heights
 
 
-def _on_border(
+def _find_border_pixels(
     layout: Layout, stack: np.ndarray, code: np.ndarray, heights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where a pixel lies on the upper and on the lower border of its cell, (h, w) bool, and the least height (h, w) of
@@ -202,13 +202,13 @@ def _on_border(
     return (upper < weak) & (upper < weaker * lower), (lower < weak) & (lower < weaker * upper), least
 
 
-def _cell(
+def _decode_cell(
     layout: Layout, stack: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(coordinate px, undecided): the middle of the cell that the Gray bits name, or its border where the bit that
     changes there lies near the middle of black and white. Undecided where any other bit is."""
     code, _, heights = _read_code(layout, stack, code_bits(layout), background)
-    ahead, behind, least = _on_border(layout, stack, code, heights)
+    ahead, behind, least = _find_border_pixels(layout, stack, code, heights)
     part = np.where(ahead, 1.0, np.where(behind, 0.0, 0.5))
     undecided = least < np.float32(limits.UNDECIDED_BIT) * modulation
     return layout.gray_origin_px + code_cell_px(layout) * (code + part), undecided
@@ -219,7 +219,7 @@ def code_bits(layout: Layout) -> tuple[int, ...]:
     return (*layout.gray, *(() if layout.complementary is None else (layout.complementary,)))
 
 
-def _order_by_levels(
+def _unwrap_by_levels(
     layout: Layout, wrapped: list[np.ndarray], cell: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """What to add to the finest wrapped phase, in periods, and where the levels contradict each other, or the cell (see
@@ -234,7 +234,7 @@ def _order_by_levels(
     return order, inconsistent
 
 
-def _gray_alone(
+def _decode_gray_alone(
     layout: Layout, stack: np.ndarray, noise: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(phase, modulation, background, inconsistent, dark) from Gray bits alone.

@@ -105,6 +105,7 @@ class _Frames:
 
 
 def _axis_residuals(frames: _Frames, axis: Axis) -> FrameResiduals:
+    """`frame_residuals` of one axis, of frames whose light is known."""
     sequence, light = frames.sequence, frames.light
     layout = axis_layout(sequence, axis)
     if not light.is_significant:
@@ -126,23 +127,23 @@ def _compare(frames: _Frames, layout: Layout) -> FrameResiduals:
     noise = measure_noise(layout, stack, white)
     residuals: list[FrameResidual] = []
     suspects: list[Suspect] = []
-    said: list[str] = []
+    remarks: list[str] = []
     for shift in layout.shifts:
         sampled = sample_fringe(stack, shift, noise, white)
         what = f"axis {axis}, period {shift.period_px:g} px"
         if sampled is None:
             residuals += [FrameResidual(i, np.nan, np.nan, np.nan) for i in shift.indices]
-            said.append(f"{what}: too few pixels see fringes to judge its frames")
+            remarks.append(f"{what}: too few pixels see fringes to judge its frames")
             continue
         if len(shift.indices) == 3:
-            said.append(f"{what}: three steps fit any three frames, so that only a repeated one can be told")
+            remarks.append(f"{what}: three steps fit any three frames, so that only a repeated one can be told")
         suspects += detect_misordered_steps(sampled) or detect_foreign_frames(sampled)
         gain = frames.light.light.gain[list(shift.indices)]
-        residuals += _residuals(sampled, _light(sampled) * gain, frames.factor)
+        residuals += _measure_residuals(sampled, _estimate_relative_light(sampled) * gain, frames.factor)
     suspects += describe_gamma(estimate_aliased_harmonics(layout, stack, white, noise), layout)
     if layout.gray and not suspects:
         suspects += _detect_code_faults(frames, axis)
-    return FrameResiduals(axis, tuple(residuals), tuple(_deduplicate(suspects)), "; ".join(said))
+    return FrameResiduals(axis, tuple(residuals), tuple(_deduplicate(suspects)), "; ".join(remarks))
 
 
 def _detect_code_faults(frames: _Frames, axis: Axis) -> list[Suspect]:
@@ -157,21 +158,22 @@ def _detect_code_faults(frames: _Frames, axis: Axis) -> list[Suspect]:
     return out
 
 
-def _residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list[FrameResidual]:
+def _measure_residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list[FrameResidual]:
+    """The residual of each frame of one period."""
     n = sampled.steps
     if n == 3:
         return [FrameResidual(i, np.nan, np.nan, np.nan) for i in sampled.shift.indices]
-    left = sampled.frames - sampled.fitted
+    differences = sampled.frames - sampled.fitted
     a, b = sampled.noise
     expected = np.maximum((a + b * sampled.fitted.mean(axis=0)) * (1 - 3 / n), 1e-6)
-    rms, sigmas = (np.sqrt(np.mean(square, axis=1)) for square in (left**2, left**2 / expected))
+    rms, sigmas = (np.sqrt(np.mean(square, axis=1)) for square in (differences**2, differences**2 / expected))
     return [
         FrameResidual(i, float(rms[k]) / factor, float(sigmas[k]), float(gain[k]))
         for k, i in enumerate(sampled.shift.indices)
     ]
 
 
-def _light(sampled: Fringe) -> np.ndarray:
+def _estimate_relative_light(sampled: Fringe) -> np.ndarray:
     """(n,) relative light of each frame, 1 in the middle; NaN where it cannot be told from a fringe.
 
     To first order a frame of light 1 + e leaves e times itself, less the part that the fit of the cosine takes up.
@@ -180,16 +182,16 @@ def _light(sampled: Fringe) -> np.ndarray:
     if n == 3 or not sampled.turns:
         return np.full(n, np.nan)
     predicted, keep = sampled.fitted, sampled.keep
-    left = keep.astype(np.float32) @ sampled.frames
+    residuals = keep.astype(np.float32) @ sampled.frames
     normal = keep * (predicted @ predicted.T)
-    moment = np.einsum("kp,kp->k", predicted, left)
+    moment = np.einsum("kp,kp->k", predicted, residuals)
     excess = np.linalg.pinv(normal.astype(float), rcond=1e-3) @ moment.astype(float)
     return 1 + excess - np.median(excess)
 
 
 def _deduplicate(suspects: list[Suspect]) -> list[Suspect]:
     """Of the findings about the order of a frame the first, and all about light; in the order of the frames."""
-    kept: dict[tuple[int, str], Suspect] = {}
+    first_by_frame: dict[tuple[int, str], Suspect] = {}
     for suspect in suspects:
-        kept.setdefault((suspect.frame, suspect.fault if suspect.fault in LIGHT_FAULTS else ""), suspect)
-    return [kept[key] for key in sorted(kept)]
+        first_by_frame.setdefault((suspect.frame, suspect.fault if suspect.fault in LIGHT_FAULTS else ""), suspect)
+    return [first_by_frame[key] for key in sorted(first_by_frame)]

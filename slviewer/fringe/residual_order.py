@@ -56,11 +56,11 @@ def detect_misordered_steps(sampled: Fringe) -> list[Suspect]:
     accepted = _Hypothesis("strange", {k: k for k in range(n)}, 0)
     suspects: list[Suspect] = []
     for _ in range(_MOST_FAULTS):
-        found = _choose_hypothesis(products, accepted, n)
-        if found is None:
+        chosen = _choose_hypothesis(products, accepted, n)
+        if chosen is None:
             break
-        accepted = found[0]
-        suspects.append(_name_fault(found, sampled.shift.indices))
+        accepted = chosen[0]
+        suspects.append(_name_fault(chosen, sampled.shift.indices))
     return suspects
 
 
@@ -99,13 +99,13 @@ def detect_foreign_frames(sampled: Fringe) -> list[Suspect]:
     steps = {k: k for k in range(n)}
     out: list[Suspect] = []
     while len(out) < _MOST_FAULTS:
-        left, freedom = products.left(steps)
+        residual, freedom = products.left(steps)
         without = {k: products.left({i: s for i, s in steps.items() if i != k}) for k in steps}
         k = min(without, key=lambda i: without[i][0])
         rest, more = without[k]
         if more < 1:
             break
-        gain = left - rest - (freedom - more) * rest / more
+        gain = residual - rest - (freedom - more) * rest / more
         if gain < max(_STRANGE**2 * products.strength, _STRANGE_NOISE * rest / more):
             break
         if _differs_in_light_only(sampled, k):
@@ -127,11 +127,11 @@ def _differs_in_light_only(sampled: Fringe, k: int) -> bool:
     n, others = sampled.steps, np.delete(np.arange(sampled.steps), k)
     weights = cosine_columns(np.array([k]), n, sampled.own) @ np.linalg.pinv(cosine_columns(others, n, sampled.own))
     expected = np.einsum("k,kp->p", weights[0].astype(np.float32), sampled.frames[others])
-    seen = sampled.frames[k]
-    scale = float(seen @ expected) / max(float(expected @ expected), 1e-9)
+    frame = sampled.frames[k]
+    scale = float(frame @ expected) / max(float(expected @ expected), 1e-9)
     if not _DARKEST < scale < 1 / _DARKEST:
         return False
-    return float(np.mean((seen - scale * expected) ** 2)) < _LIGHT_ALONE * float(np.mean((seen - expected) ** 2))
+    return float(np.mean((frame - scale * expected) ** 2)) < _LIGHT_ALONE * float(np.mean((frame - expected) ** 2))
 
 
 class _Products:
@@ -155,15 +155,15 @@ class _Products:
     def left(self, steps: dict[int, int]) -> tuple[float, int]:
         """Squared grey levels that remain at a pixel when the frames at these places show these steps; and freedom."""
         rows = [self._index[place] for place in steps]
-        keep, freedom = _keep(tuple(steps.values()), self._n, self._own)
-        return float(np.sum(keep * self._products[np.ix_(rows, rows)])), freedom
+        projection, freedom = _residual_projector(tuple(steps.values()), self._n, self._own)
+        return float(np.sum(projection * self._products[np.ix_(rows, rows)])), freedom
 
     def caused(self, before: dict[int, int], after: dict[int, int]) -> float:
         """What would remain of the fringe alone under `before`, where `after` is true; of the places of both."""
         shared = [place for place in before if place in after]
-        keep, _ = _keep(tuple(before[place] for place in shared), self._n, self._own)
+        projection, _ = _residual_projector(tuple(before[place] for place in shared), self._n, self._own)
         fringe = cosine_columns(np.array([after[place] for place in shared]), self._n, 1)[:, 1:]
-        return float(np.sum(keep * (fringe @ self._fringe @ fringe.T)))
+        return float(np.sum(projection * (fringe @ self._fringe @ fringe.T)))
 
     def least(self, steps: dict[int, int], n: int) -> float:
         """What the least of faults, one frame that is late, leaves."""
@@ -171,7 +171,7 @@ class _Products:
 
 
 @lru_cache(4096)
-def _keep(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
+def _residual_projector(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
     """(len(steps),) * 2, which takes from frames of these steps what they explain; and the freedom that remains."""
     basis, sizes, _ = np.linalg.svd(cosine_columns(np.array(steps), n, own), full_matrices=False)
     basis = basis[:, sizes > 1e-6 * sizes[0]]
@@ -186,20 +186,24 @@ def _choose_products(sampled: Fringe, products: _Products) -> _Products:
     raw = _Products(sampled, sampled.seen)
 
     def lowest(judge: _Products) -> float:
-        left = [judge.left(hypothesis.steps) for hypothesis in _hypotheses(nominal, judge.places, sampled.steps)]
-        return min((rest / more for rest, more in left if more >= 1), default=np.inf)
+        """The least residual, per degree of freedom, of any hypothesis."""
+        residuals = [
+            judge.left(hypothesis.steps) for hypothesis in _list_hypotheses(nominal, judge.places, sampled.steps)
+        ]
+        return min((rest / more for rest, more in residuals if more >= 1), default=np.inf)
 
     return min((products, raw), key=lowest)
 
 
 def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> list[_Hypothesis] | None:
     """The explanation to believe instead of `accepted`, if there is one, and those that are as good."""
-    left, freedom = products.left(accepted.steps)
+    residual, freedom = products.left(accepted.steps)
     least = products.least(accepted.steps, n)
-    if left < _AS_EXPECTED * least:
+    if residual < _AS_EXPECTED * least:
         return None
     judged = [
-        (hypothesis, *products.left(hypothesis.steps)) for hypothesis in _hypotheses(accepted.steps, products.places, n)
+        (hypothesis, *products.left(hypothesis.steps))
+        for hypothesis in _list_hypotheses(accepted.steps, products.places, n)
     ]
     judged = [each for each in judged if each[2] >= 1]
     if not judged:
@@ -210,7 +214,7 @@ def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> li
     # The one that explains the most frames is the most easily refuted, hence the one to believe.
     fine = _SAME * products.strength
     hypothesis, rest, more = min(fitting, key=lambda each: (-each[2], round(each[1] / fine), _rank(each[0])))
-    gain = (left - freedom * noise) - (rest - more * noise)
+    gain = (residual - freedom * noise) - (rest - more * noise)
     caused = products.caused(accepted.steps, hypothesis.steps)
     if caused > least / 2:
         believed = gain > _AS_EXPECTED * caused
@@ -224,13 +228,13 @@ def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> li
 
 def _rank(hypothesis: _Hypothesis) -> int:
     """Faults that happen often before those that do not."""
-    beside = abs(hypothesis.place - hypothesis.other) == 1
+    is_neighbour = abs(hypothesis.place - hypothesis.other) == 1
     if hypothesis.fault in ("late", "early"):
-        return (0 if hypothesis.fault == "late" else 4) if beside else 5
+        return (0 if hypothesis.fault == "late" else 4) if is_neighbour else 5
     return {"swapped": 1, "dropped": 2, "lag": 3}.get(hypothesis.fault, 6)
 
 
-def _hypotheses(accepted: dict[int, int], places: list[int], n: int) -> Iterator[_Hypothesis]:
+def _list_hypotheses(accepted: dict[int, int], places: list[int], n: int) -> Iterator[_Hypothesis]:
     """All that may have happened to the frames besides what is known already, the simplest first."""
     for k in range(n):
         for j in (k - 1, k + 1, *range(n)):
@@ -258,11 +262,13 @@ def _hypotheses(accepted: dict[int, int], places: list[int], n: int) -> Iterator
 
 
 def _name_fault(hypotheses: list[_Hypothesis], indices: tuple[int, ...]) -> Suspect:
+    """The suspect for hypotheses that explain the frames equally well."""
     texts = list(dict.fromkeys(_describe(hypothesis, indices) for hypothesis in hypotheses))
     return Suspect(indices[hypotheses[0].place], hypotheses[0].fault, ", or ".join(texts))
 
 
 def _describe(hypothesis: _Hypothesis, indices: tuple[int, ...]) -> str:
+    """The sentence for the operator; frames are counted from 1."""
     frame = indices[hypothesis.place] + 1
     other = indices[hypothesis.other] + 1 if hypothesis.other < len(indices) else frame
     if hypothesis.fault == "late":
@@ -291,6 +297,6 @@ def _detect_repeated(sampled: Fringe, products: _Products) -> list[int]:
     if n == 3 or len(alike) > _MOST_FAULTS:
         return alike[:1] if n == 3 else []
     nominal = {k: k for k in range(n)}
-    left, _ = products.left(nominal)
+    residual, _ = products.left(nominal)
     rest, _ = products.left({k: k for k in range(n) if k not in alike})
-    return alike if rest < left / 2 and left > products.least(nominal, n) / 3 else []
+    return alike if rest < residual / 2 and residual > products.least(nominal, n) / 3 else []

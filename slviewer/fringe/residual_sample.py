@@ -85,17 +85,17 @@ def sample_fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], w
     valid = modulated & ~clipped[counts].any(axis=0)
     if np.count_nonzero(valid) < FEWEST:
         return None
-    seen, background, phasor = frames[:, valid], background[valid], phasor[valid]
-    frames = seen
+    levels, background, phasor = frames[:, valid], background[valid], phasor[valid]
+    frames = levels
     # n steps leave harmonics of each pixel's own to fit, as long as enough remains to contradict.
     own = 2 if n >= 10 else 1
     if n > 3:
-        frames = seen - fit_common_harmonics(seen, phasor, own)
+        frames = levels - fit_common_harmonics(levels, phasor, own)
         background, phasor = fit_cosine(frames)
     angle = (2 * np.pi * np.arange(n) / n)[:, None]
     fitted = background + np.real(phasor * np.exp(1j * angle).astype(np.complex64))
-    beside = {i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _neighbours(shift.indices, len(stack))}
-    return Fringe(shift, seen, frames, fitted, beside, phasor, own, noise, rough)
+    neighbours = {i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _neighbours(shift.indices, len(stack))}
+    return Fringe(shift, levels, frames, fitted, neighbours, phasor, own, noise, rough)
 
 
 def estimate_roughness(frames: np.ndarray, width: int) -> float:
@@ -131,11 +131,11 @@ def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np
             continue
         wave = np.exp(-2j * np.pi * q * k / n).astype(np.complex64)
         scale = np.float32((1 if 2 * q == n else 2) / n)
-        seen = scale * (
+        residual = scale * (
             np.einsum("k,kp->p", wave.real.copy(), frames) + 1j * np.einsum("k,kp->p", wave.imag.copy(), frames)
         )
         design = np.stack(regressors)
-        normal, moment = design.conj() @ design.T, design.conj() @ seen
+        normal, moment = design.conj() @ design.T, design.conj() @ residual
         weights = np.linalg.pinv(normal, rcond=1e-4) @ moment
         common = np.einsum("r,rp->p", weights, design)
         added += np.real(common * np.conj(wave)[:, None])

@@ -51,9 +51,9 @@ class Scatter:
 
 def with_scatter(phase: PhaseMap) -> PhaseMap:
     """The same phase map with a ``sigma_scale`` as measured, where it is significant."""
-    found = measure_scatter(phase)
-    raised = found.ratio > (1.0 if found.is_compressed else SIGNIFICANT)
-    return replace(phase, sigma_scale=found.ratio) if raised else phase
+    scatter = measure_scatter(phase)
+    raised = scatter.ratio > (1.0 if scatter.is_compressed else SIGNIFICANT)
+    return replace(phase, sigma_scale=scatter.ratio) if raised else phase
 
 
 def measure_scatter(phase: PhaseMap) -> Scatter:
@@ -62,13 +62,13 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
     """
     if not phase.steps or min(phase.phase.shape) < WINDOW:
         return Scatter(np.nan, 1.0)
-    where, first = _valid_windows(phase)
+    where, first = _select_valid_windows(phase)
     if len(first) < FEWEST:
         return Scatter(np.nan, 1.0)
     values = phase.phase[where]
     values = values - values.mean(axis=(1, 2), keepdims=True)  # exact enough in float32
     third = [np.diff(values, n=3, axis=axis) for axis in (1, 2)]
-    blockiness = max(_blockiness(np.abs(np.moveaxis(third[i], i + 1, 2)), first[:, i]) for i in range(2))
+    blockiness = max(_measure_blockiness(np.abs(np.moveaxis(third[i], i + 1, 2)), first[:, i]) for i in range(2))
     a, b = phase.noise
     predicted = np.maximum(np.float32(a) + np.float32(b) * phase.background[where], np.float32(ROUNDING))
     predicted *= np.float32(2 / phase.steps) / np.maximum(phase.modulation[where], np.float32(1e-6)) ** 2
@@ -76,14 +76,14 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
     if blockiness > BLOCKINESS:
         ratio = float(np.median(_window_variance(values) / predicted.mean(axis=(1, 2))))
         return Scatter(float(np.sqrt(ratio)), blockiness)
-    ratios = np.sort(_block_variance(values) / _blocks(predicted).mean(axis=(1, 2)))
+    ratios = np.sort(_block_variance(values) / _split_blocks(predicted).mean(axis=(1, 2)))
     # A chi squared of so many degrees of freedom has its quantile here (Wilson and Hilferty 1931).
     spread = 2 / (9 * _FREEDOM)
     expected = (1 - spread - 0.6745 * np.sqrt(spread)) ** 3
     return Scatter(float(np.sqrt(ratios[int(QUANTILE * len(ratios))] / expected)), blockiness)
 
 
-def _valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+def _select_valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Indices (m, WINDOW, WINDOW) of rows and columns, and the first ones (m, 2), of evenly spread windows in which
     every pixel is valid."""
     height, width = phase.phase.shape
@@ -97,7 +97,7 @@ def _valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray], np.n
     return (rows[valid], columns[valid]), first[valid]
 
 
-def _blockiness(third: np.ndarray, first: np.ndarray) -> float:
+def _measure_blockiness(third: np.ndarray, first: np.ndarray) -> float:
     """From sizes of third differences (m, lines, WINDOW - 3) along the last axis of windows that begin at ``first``."""
     offset = (first[:, None] + np.arange(third.shape[2])) % BLOCK
     size = third.mean(axis=1)
@@ -121,12 +121,12 @@ def _window_variance(values: np.ndarray) -> np.ndarray:
 
 def _block_variance(values: np.ndarray) -> np.ndarray:
     """(4 m,) variance from third differences along rows and columns of each block of the windows."""
-    blocks = _blocks(values)
+    blocks = _split_blocks(values)
     squares = [(np.diff(blocks, n=3, axis=axis) ** 2).mean(axis=(1, 2)) for axis in (1, 2)]
     return np.asarray((squares[0] + squares[1]) / (2 * _VARIANCES))
 
 
-def _blocks(windows: np.ndarray) -> np.ndarray:
+def _split_blocks(windows: np.ndarray) -> np.ndarray:
     """(4 m, BLOCK, BLOCK) of (m, WINDOW, WINDOW)."""
     parts = WINDOW // BLOCK
     split = windows.reshape(-1, parts, BLOCK, parts, BLOCK)

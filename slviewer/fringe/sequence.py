@@ -175,19 +175,19 @@ class PatternSequence:
 
     def sign(self, axis: Axis) -> int:
         """``phase_sign`` of the axis."""
-        return _value(self.phase_sign, axis)
+        return _axis_value(self.phase_sign, axis)
 
     def offset_rad(self, axis: Axis) -> float:
         """``phase_offset_rad`` of the axis."""
-        return float(_value(self.phase_offset_rad, axis))
+        return float(_axis_value(self.phase_offset_rad, axis))
 
     def origin_px(self, axis: Axis) -> float:
         """``gray_origin_px`` of the axis."""
-        return _value(self.gray_origin_px, axis)
+        return _axis_value(self.gray_origin_px, axis)
 
     def gray_cell(self, axis: Axis) -> float:
         """px: width of the cells that the Gray bits of the axis number."""
-        cell = _value(self.gray_cell_px, axis)
+        cell = _axis_value(self.gray_cell_px, axis)
         if cell is not None:
             return float(cell)
         periods = self.periods_px(axis)
@@ -214,6 +214,7 @@ class PatternSequence:
         )
 
     def _check_values(self, axis: Axis) -> None:
+        """Raise InputError for signs, offsets and cell widths out of range."""
         if self.sign(axis) not in (1, -1):
             raise InputError(f"phase_sign is {self.sign(axis)}: use 1 or -1")
         if not isfinite(self.offset_rad(axis)) or not isfinite(self.origin_px(axis)):
@@ -221,22 +222,24 @@ class PatternSequence:
                 f"axis {axis}: phase_offset is {self.offset_rad(axis)} rad and gray_origin {self.origin_px(axis)} px: "
                 "give finite numbers"
             )
-        cell = _value(self.gray_cell_px, axis)
+        cell = _axis_value(self.gray_cell_px, axis)
         if cell is not None and not (isfinite(cell) and cell > 0):
             raise InputError(f"axis {axis}: a Gray cell of {cell} px does not exist: give its width in projector px")
 
     def _check_phase(self, axis: Axis) -> None:
+        """Raise InputError where phase steps of a period are missing, repeated or disagree."""
         for period in self.periods_px(axis):
             frames = [f for f in self.frames if f.kind == "phase" and f.axis == axis and f.period_px == period]
             counts = {f.steps for f in frames}
             where = f"axis {axis}, period {period:g} px"
             if len(counts) > 1:
                 raise InputError(
-                    f"{where}: the frames speak of {_listed(counts)} phase steps: they must all say the same"
+                    f"{where}: the frames speak of {_join_numbers(counts)} phase steps: they must all say the same"
                 )
             _check_complete([f.step for f in frames], range(counts.pop()), f"{where}: phase step")
 
     def _check_bits(self, axis: Axis) -> None:
+        """Raise InputError where Gray bits are missing, repeated or disagree."""
         gray = [f.bit for f in self.frames if f.kind == "gray" and f.axis == axis]
         inverse = [f.bit for f in self.frames if f.kind == "inverse" and f.axis == axis]
         complementary = len(self.find("complementary", axis))
@@ -244,7 +247,9 @@ class PatternSequence:
         # yet a least significant bit that was announced and is absent must not pass for a shorter code.
         said = {f.bits for f in self.frames if f.kind == "gray" and f.axis == axis and f.bits}
         if len(said) > 1:
-            raise InputError(f"axis {axis}: the frames speak of {_listed(said)} Gray bits: they must all say the same")
+            raise InputError(
+                f"axis {axis}: the frames speak of {_join_numbers(said)} Gray bits: they must all say the same"
+            )
         needed = max([b + 1 for b in gray + inverse], default=0)
         if said:
             needed = max(needed, said.pop() - min(complementary, 1))
@@ -261,15 +266,15 @@ class PatternSequence:
         so that descriptions that were written before, and their hashes, stay as they are."""
         size = self.projector_size
         values: dict[str, Any] = {"projector": f"{size[0]}x{size[1]}"} if size else {}
-        values["phase_sign"] = _plain(self.phase_sign)
-        values["gray_origin"] = _plain(self.gray_origin_px)
+        values["phase_sign"] = _plain_axes(self.phase_sign)
+        values["gray_origin"] = _plain_axes(self.gray_origin_px)
         values["frame"] = [frame.to_dict() for frame in self.frames]
         if self.levels is not None:
             values["levels"] = list(self.levels)
         if self.phase_offset_rad != 0:
-            values["phase_offset"] = _plain(self.phase_offset_rad)
+            values["phase_offset"] = _plain_axes(self.phase_offset_rad)
         if self.gray_cell_px is not None:
-            values["gray_cell_px"] = _plain(self.gray_cell_px)
+            values["gray_cell_px"] = _plain_axes(self.gray_cell_px)
         if self.relative:
             values["relative"] = True
         return values
@@ -309,11 +314,13 @@ def parse_size(text: Any) -> tuple[int, int]:
     return width, height
 
 
-def _value(values: Any, axis: Axis) -> Any:
+def _axis_value(values: Any, axis: Axis) -> Any:
+    """The value of one axis, of a common value or a pair."""
     return getattr(values, axis) if isinstance(values, PerAxis) else values
 
 
-def _plain(values: Any) -> Any:
+def _plain_axes(values: Any) -> Any:
+    """A pair as a dictionary of its axes; a common value as it is."""
     if not isinstance(values, PerAxis):
         return values
     return {axis: value for axis, value in values._asdict().items() if value is not None}
@@ -333,6 +340,7 @@ def _read_values(data: Mapping[str, Any], name: str, default: Any, kind: type) -
 
 
 def _check_levels(levels: tuple[int, ...]) -> None:
+    """Raise InputError for a table that is not 256 rising grey levels from 0 to 255."""
     whole = all(isinstance(level, int) and not isinstance(level, bool) for level in levels)
     if not whole or len(levels) != 256 or levels[0] != 0 or levels[-1] != 255 or list(levels) != sorted(levels):
         raise InputError(
@@ -342,17 +350,19 @@ def _check_levels(levels: tuple[int, ...]) -> None:
 
 
 def _check_complete(found: list[int], wanted: range, what: str) -> None:
+    """Raise InputError where numbers are missing or occur twice."""
     missing = sorted(set(wanted) - set(found))
     if missing:
         raise InputError(
-            f"{what} {_listed(missing)} of {len(wanted)} is missing: add the frame, or correct its description"
+            f"{what} {_join_numbers(missing)} of {len(wanted)} is missing: add the frame, or correct its description"
         )
     double = [value for value, count in Counter(found).items() if count > 1]
     if double:
-        raise InputError(f"{what} {_listed(double)} occurs more than once: keep one frame of each")
+        raise InputError(f"{what} {_join_numbers(double)} occurs more than once: keep one frame of each")
 
 
-def _listed(values: Any) -> str:
+def _join_numbers(values: Any) -> str:
+    """Numbers as text, sorted, separated by commas."""
     return ", ".join(f"{v:g}" for v in sorted(values))
 
 

@@ -209,8 +209,8 @@ def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.D
     fit = model.fits[axis]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         low, high = fit.phase_min.astype(float), fit.phase_max.astype(float)
-        seen = np.isfinite(low) & np.isfinite(high)
-        middle = float(np.median(0.5 * (low + high)[seen])) if seen.any() else 0.0
+        is_calibrated = np.isfinite(low) & np.isfinite(high)
+        middle = float(np.median(0.5 * (low + high)[is_calibrated])) if is_calibrated.any() else 0.0
         margin = MAX_EXTRAPOLATION * (high - low)
         bounds = np.stack([low - margin - middle, high + margin - middle]).astype(np.float32)
         c0, c1, c2, c3, c4 = fit.coefficients

@@ -118,12 +118,12 @@ class CudaPass(OnePass):
     def _defined(self, frames: np.ndarray, scan: PassResult) -> PassResult:
         """A stereo calibration's scan by the processor."""
         assert isinstance(self.model, StereoModel)
-        found = decode(self.sequence, frames, self.axis)
-        points = self.model.points(found)
-        sigma = self.model.sigma_z(found, points)
-        light = LightLevels(found.noise, scan.light.mean, scan.light.white)
+        decoded = decode(self.sequence, frames, self.axis)
+        points = self.model.points(decoded)
+        sigma = self.model.sigma_z(decoded, points)
+        light = LightLevels(decoded.noise, scan.light.mean, scan.light.white)
         return PassResult(
-            self.axis, self.model.name, points, found.phase, found.reason, sigma, found.modulation,
+            self.axis, self.model.name, points, decoded.phase, decoded.reason, sigma, decoded.modulation,
             texture(self.sequence, frames), light,
         )  # fmt: skip
 

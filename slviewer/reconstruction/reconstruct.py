@@ -85,8 +85,8 @@ def reconstruct(
         measured = _measure_all(model, phases)
         axis = _best_axis(measured)
         points, sigma_z, edges = measured[axis]
-    left = model.sigma_calibration(axis, points) if isinstance(model, HasCalibrationSigma) else None
-    return Cloud(points, axis, model.name, sigma_z, texture, left, edges)
+    sigma_calibration = model.sigma_calibration(axis, points) if isinstance(model, HasCalibrationSigma) else None
+    return Cloud(points, axis, model.name, sigma_z, texture, sigma_calibration, edges)
 
 
 def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:

@@ -78,12 +78,12 @@ def register(
     Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not hold the pose, or where
     a second pose fits alike.
     """
-    say = progress or (lambda share: None)
-    say(0.0)
+    report = progress or (lambda share: None)
+    report(0.0)
     scan = prepare_scan("scan", scan_points, scan_normals, sigma_mm)
     reference = prepare_scan("reference", reference_points, reference_normals, sigma_mm)
-    say(0.3)
-    return register_prepared(scan, reference, initial=initial, progress=lambda share: say(0.3 + 0.7 * share))
+    report(0.3)
+    return register_prepared(scan, reference, initial=initial, progress=lambda share: report(0.3 + 0.7 * share))
 
 
 def register_prepared(
@@ -100,13 +100,13 @@ def register_prepared(
     ``size``: of the object in mm, by default that of the smaller scan. ``starts``: result of an earlier
     ``search_starts``, which is run otherwise.
     """
-    say = progress or (lambda share: None)
+    report = progress or (lambda share: None)
     size = min(scan.size, reference.size) if size is None else size
     if starts is None:
         starts = search_starts(scan, reference, size, initial)
     refusal: Refused | None = None
     for attempt, start in enumerate(starts[:MOST_ATTEMPTS]):
-        say(0.4 + 0.15 * attempt)
+        report(0.4 + 0.15 * attempt)
         try:
             result = _judged(scan, reference, start, size)
         except Refused as error:
@@ -116,7 +116,7 @@ def register_prepared(
             continue
         if start.start in SEARCHED:
             _refuse_rivals(scan, reference, result, start, starts[attempt + 1 : MOST_ATTEMPTS + 1], size)
-        say(1.0)
+        report(1.0)
         return result
     raise refusal or Refused("overlap", "The scan and the reference share nothing to start from: pick point pairs.")
 
@@ -172,8 +172,8 @@ def _figures(
     height = np.abs(np.sum(reference.fine_normals[plane] * (points - counterpart), axis=1))
 
     overlapping = distance < gate
-    aside = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
-    facing = aside < spacing + 0.25 * height  # a point beyond the reference's rim faces nothing
+    lateral = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
+    facing = lateral < spacing + 0.25 * height  # a point beyond the reference's rim faces nothing
     rms = _rms(height[overlapping])
     held = estimate_freedom(scan, reference, T, counterpart[overlapping], rms)
     nowhere = Uncertainty(np.full((6, 6), np.inf), np.full(3, np.nan))

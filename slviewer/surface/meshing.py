@@ -81,7 +81,7 @@ class BuiltMesh:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
-        found: dict[str, Any] = {
+        plain: dict[str, Any] = {
             name: None if (step := getattr(self, name)) is None else asdict(step)
             for name in ("dropped", "trimmed", "filled", "smoothed", "thinned")
         }
@@ -90,7 +90,7 @@ class BuiltMesh:
             "cell_mm": self.cell_mm,
             "vertices": len(self.mesh.vertices),
             "triangles": len(self.mesh.faces),
-            **found,
+            **plain,
             "watertight": self.topology.watertight,
             "openings_mm": list(self.topology.openings_mm),
             "volume_mm3": self.topology.volume_mm3 if self.topology.watertight else None,
@@ -165,11 +165,11 @@ def build_mesh(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progres
         say(0.8, f"thinning to {plan.triangles} triangles")
         mesh, thinned = decimate(mesh, plan.triangles)
     say(0.95, "checking")
-    found = analyse_topology(mesh)
+    topology = analyse_topology(mesh)
     if plan.watertight:
-        _refuse_if_open(found, cut, method)
+        _refuse_if_open(topology, cut, method)
     say(1.0, "meshed")
-    return BuiltMesh(mesh, method, cell, dropped, cut, filled, smoothed, thinned, found)
+    return BuiltMesh(mesh, method, cell, dropped, cut, filled, smoothed, thinned, topology)
 
 
 def spacing(points: PointSet) -> float:
@@ -179,10 +179,10 @@ def spacing(points: PointSet) -> float:
     if not np.isfinite(points.points).all():
         raise InputError("Some points are NaN: select the valid ones first.")
     distance, _ = cKDTree(points.points).query(points.points[:: max(1, len(points) // 20_000)], k=2)
-    found = float(np.median(distance[:, 1]))
-    if not found > 0:
+    median_mm = float(np.median(distance[:, 1]))
+    if not median_mm > 0:
         raise InputError("Most points are there twice: merge the scans instead of joining them.")
-    return found
+    return median_mm
 
 
 def _refuse_if_open(found: Topology, cut: TrimmedPatches | None, method: Method) -> None:
@@ -206,15 +206,19 @@ def grid_mesh(cloud: Cloud) -> Mesh:
     neighbouring pixels lie on a surface.
     """
     normals = grid_normals(cloud.points)
-    kept, _ = clean(cloud, normals)
-    points = np.where(kept[..., None], cloud.points, np.float32(np.nan))
-    faces = triangulate_grid(points, JUMP * float(np.median(points[..., 2][kept]))) if kept.any() else np.zeros((0, 3))
+    cleaned, _ = clean(cloud, normals)
+    points = np.where(cleaned[..., None], cloud.points, np.float32(np.nan))
+    faces = (
+        triangulate_grid(points, JUMP * float(np.median(points[..., 2][cleaned])))
+        if cleaned.any()
+        else np.zeros((0, 3))
+    )
     if not len(faces):
         raise InputError("No two neighbouring pixels of this scan lie on a surface: reconstruct it again.")
     along = viewing_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]
-    sigma = (cloud.sigma * along)[kept]
-    colours = None if cloud.texture is None else cloud.texture[kept]
+    sigma = (cloud.sigma * along)[cleaned]
+    colours = None if cloud.texture is None else cloud.texture[cleaned]
     if colours is not None and colours.ndim == 1:
         colours = np.repeat(colours[:, None], 3, axis=1)
-    mesh = Mesh(points[kept], faces, normals[kept], colours, sigma if np.isfinite(sigma).all() else None)
+    mesh = Mesh(points[cleaned], faces, normals[cleaned], colours, sigma if np.isfinite(sigma).all() else None)
     return select_faces(mesh, np.ones(len(faces), bool))

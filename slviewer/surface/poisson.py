@@ -73,7 +73,7 @@ def trim_far_patches(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: f
     measured = np.zeros(len(mesh.vertices), bool)
     measured[mesh.faces[~imagined]] = True
     area = face_areas(mesh)
-    kept, filled, flattened, largest = ~imagined, 0, 0, 0.0
+    is_near, filled, flattened, largest = ~imagined, 0, 0, 0.0
     order = np.argsort(groups, kind="stable")
     starts = np.searchsorted(groups[order], np.arange(groups.max() + 2))
     for k in range(groups.max() + 1):
@@ -83,16 +83,16 @@ def trim_far_patches(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: f
         across = extent_across(mesh.vertices[rim]) if len(rim) else np.inf
         if len(rim) and across <= fill_mm:  # what has no rim floats by itself
             bulges = area[patch].sum() > BULGE * _flat_area(mesh.vertices, mesh.faces[patch])
-            kept[patch] = not bulges
+            is_near[patch] = not bulges
             filled, flattened, largest = filled + 1, flattened + bulges, max(largest, across)
-    left, cut = select_faces(mesh, kept), int(groups.max() + 1 - filled)
-    invented = area[kept & imagined].sum()
+    trimmed, cut = select_faces(mesh, is_near), int(groups.max() + 1 - filled)
+    invented = area[is_near & imagined].sum()
     if flattened:
-        open_area = face_areas(left).sum()
-        left, _ = fill_holes(left, fill_mm)
-        invented += face_areas(left).sum() - open_area
-    share = float(invented / max(face_areas(left).sum(), 1e-12))
-    return left, TrimmedPatches(filled, int(flattened), largest, share, cut)
+        open_area = face_areas(trimmed).sum()
+        trimmed, _ = fill_holes(trimmed, fill_mm)
+        invented += face_areas(trimmed).sum() - open_area
+    share = float(invented / max(face_areas(trimmed).sum(), 1e-12))
+    return trimmed, TrimmedPatches(filled, int(flattened), largest, share, cut)
 
 
 def _flat_area(vertices: np.ndarray, patch: np.ndarray) -> float:
