@@ -75,7 +75,7 @@ def draw_merged_cloud(view: CloudView) -> Figure:
     left.imshow(render_points(points, normals, np.broadcast_to(CLAY, points.shape), size, rotation))
     left.set_xlabel(_format_count(view), fontsize=TEXT_PT, color=INK, loc="left")
     style_image_axes(right, "by scan, in turns")
-    palette = np.array([_rgb(colour) for colour in SCANS])
+    palette = np.array([_parse_colour(colour) for colour in SCANS])
     shown = _select_mosaic(points, source) if len(points) else np.arange(0)
     points, normals, source = points[shown], normals[shown], source[shown]
     right.imshow(render_points(points, normals, palette[source % len(SCANS)], size, rotation))
@@ -128,9 +128,11 @@ def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
 
 
 def _format_count(view: CloudView) -> str:
+    """Text with the number of valid points of a view, and its note."""
     count = int(np.isfinite(view.points[..., 2]).sum())
     return f"{count:,} points" + (f"; {view.note}" if view.note else "")
 
 
-def _rgb(colour: str) -> tuple[float, ...]:
+def _parse_colour(colour: str) -> tuple[float, ...]:
+    """RGB, 0 to 1, of a colour ``#rrggbb``."""
     return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))

@@ -26,6 +26,7 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
     c0, c1, c2, c3, c4 = curve.coefficients
 
     def depth(at: np.ndarray) -> np.ndarray:
+        """Depth z in mm by the rational function, at projector coordinates (n,)."""
         return (c0 + c1 * at) / (1 + c2 * at)
 
     panels = (

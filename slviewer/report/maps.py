@@ -80,7 +80,7 @@ def error_maps(
     """
     if not maps or len({m.shape for m in maps.values()}) != 1:
         raise InputError(f"the error maps of '{title}' differ in size, or there are none: give each model's, one size")
-    rows, columns = _data_slices(list(maps.values()))
+    rows, columns = _crop_slices(list(maps.values()))
     cropped = {model: errors[rows, columns] for model, errors in maps.items()}
     limit = limit_mm or error_limit(list(cropped.values()))
     h, w = next(iter(cropped.values())).shape
@@ -139,6 +139,7 @@ def _arrange_axes(width: int, count: int, aspect: float) -> tuple[Any, Any, Any,
 def _draw_histogram(
     axes: Any, maps: Mapping[str, np.ndarray], rms_mm: Mapping[str, float], floor_mm: float, limit: float
 ) -> None:
+    """Draw the histogram of each model's errors, mm, with its RMS; dotted: the distribution of noise alone."""
     reach = 1.25 * limit
     edges = np.linspace(-reach, reach, BINS)
     centres = (edges[1:] + edges[:-1]) / 2
@@ -161,7 +162,7 @@ def _draw_histogram(
     legend(axes, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.3, ncols=4, columnspacing=1.1)
 
 
-def _data_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
+def _crop_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
     """Rows and columns around the finite pixels of any map, with a small margin; everything where there is none."""
     finite = np.logical_or.reduce([np.isfinite(m) for m in maps])
     if not finite.any():
@@ -175,8 +176,10 @@ def _data_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
 
 
 def _format_median(value: float) -> str:
+    """Text of a median RMS in mm; "no pixel fitted" for NaN."""
     return f"median {value:.3f} mm" if np.isfinite(value) else "no pixel fitted"
 
 
 def _describe_floor(floor_mm: float) -> str:
+    """The caption's part that explains the noise floor, mm; empty for NaN."""
     return f"; dotted: noise alone ({floor_mm:.3f} mm)" if np.isfinite(floor_mm) else ""

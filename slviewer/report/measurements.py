@@ -122,6 +122,7 @@ def deviations_section(deviations: Sequence[tuple[Measurement, Mapping[str, np.n
 
 
 def _deviation_items(view: Measurement, arrays: Mapping[str, np.ndarray]) -> list[Item]:
+    """Verdict, notices, pictures and table of one comparison with a nominal model."""
     verdict = view.data["verdict"]
     items: list[Item] = []
     if verdict is not None:
@@ -137,12 +138,14 @@ def _deviation_items(view: Measurement, arrays: Mapping[str, np.ndarray]) -> lis
 
 
 def _deviation_table(view: Measurement) -> Table:
+    """Table of the statistics of one comparison, with the decision for each where a tolerance is set."""
     data, verdict = view.data, view.data["verdict"]
     numbers = data["statistics_mm"]
     columns = [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns.append(Column("decision", align="left"))
 
     def end(key: str) -> str | Cell:
+        """The cell with the decision for a statistic; empty without a tolerance."""
         return "" if verdict is None else _decision_cell(verdict[key][1])
 
     rows: list[list[str | Cell]] = [
@@ -183,6 +186,7 @@ def _deviation_table(view: Measurement) -> Table:
 
 
 def _decision_cell(decision: str) -> Cell:
+    """The table cell, in words and colour, of a decision: pass, fail or undecided."""
     return Cell(DECIDED[decision], MARKS[decision])  # type: ignore[index]
 
 

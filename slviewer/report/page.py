@@ -34,16 +34,16 @@ class Figure:
     @property
     def png(self) -> bytes:
         """The picture as a PNG file."""
-        return _encode(self.pixels, format="PNG")
+        return _encode_image(self.pixels, format="PNG")
 
     @property
     def data(self) -> str:
         """The picture in 64 levels a channel as base64 of a lossless WebP file, half of the PNG's size."""
         levels = np.asarray(self.pixels & 0xFC | self.pixels >> 6, np.uint8)
-        return base64.b64encode(_encode(levels, format="WEBP", lossless=True, method=3, quality=50)).decode()
+        return base64.b64encode(_encode_image(levels, format="WEBP", lossless=True, method=3, quality=50)).decode()
 
 
-def _encode(pixels: NDArray[np.uint8], **options: Any) -> bytes:
+def _encode_image(pixels: NDArray[np.uint8], **options: Any) -> bytes:
     """An image file of pixels (h, w, 3) uint8 RGB, by Pillow's options."""
     from PIL import Image
 
@@ -121,6 +121,7 @@ class Section:
 
     @property
     def paragraphs(self) -> tuple[str, ...]:
+        """The text as a tuple of paragraphs; empty without text."""
         return ((self.text,) if self.text else ()) if isinstance(self.text, str) else tuple(self.text)
 
     @property
@@ -167,6 +168,7 @@ def write_page(
 
 
 def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: Sequence[Section]) -> str:
+    """The page as HTML, from the template."""
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 

@@ -121,6 +121,7 @@ def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:
 
 
 def _acceptance_items(view: AcceptanceView) -> list[Item]:
+    """Verdict, tables and notices of one acceptance test."""
     result = view.found
     artefact = result["artefact"]
     named = (
@@ -176,6 +177,7 @@ def _acceptance_items(view: AcceptanceView) -> list[Item]:
 
 
 def _budget_table(budget: Mapping[str, Any]) -> Table:
+    """Table of the uncertainty budget: contributions in mm, and the expanded uncertainty below."""
     rows: list[list[str | Cell]] = [
         [c["source"], UNKNOWN if c["u_mm"] is None else f"{c['u_mm']:.4f}", c["kind"], c["how"]]
         for c in budget["contributions"]

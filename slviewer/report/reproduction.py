@@ -92,6 +92,7 @@ def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
 
 
 def _calibration_section(data: ReproductionData) -> Section:
+    """The section about the calibration: notices, reprojection errors, per-pixel fits and curves."""
     items: list[Item] = [PageNotice(note) for note in data.notes]
     items += [PageNotice(f"{name} was excluded: {why}") for name, why in data.poses_left_out.items()]
     rows: list[list[str | Cell]] = [
@@ -132,6 +133,7 @@ def _calibration_section(data: ReproductionData) -> Section:
 
 
 def _planes_section(data: ReproductionData) -> Section:
+    """The section about the planes: table, bars, positions in space and error maps."""
     near, far = data.depth_range_mm
     lost = [row.name for row in data.planes if row.rms_mm.get(OURS, 0.0) > row.rms_mm.get(BASE, np.inf)]
     text = [
@@ -164,6 +166,7 @@ def _planes_section(data: ReproductionData) -> Section:
 
 
 def _spheres_section(data: ReproductionData) -> Section:
+    """The section about the spheres: table, distances between centres, and error maps."""
     items: list[Item] = []
     if data.spheres:
         items.append(sphere_table(data.spheres, "Table 2: RMS distance from the best sphere, and its radius"))
@@ -185,6 +188,7 @@ def _spheres_section(data: ReproductionData) -> Section:
 
 
 def _merged_section(data: ReproductionData) -> Section:
+    """The section about the merged object: alignment, scans and the merged cloud."""
     items: list[Item] = []
     if data.pairs:
         items.append(merge_table(data.pairs, "Alignment of the scans by point-to-plane ICP"))
@@ -205,23 +209,28 @@ def _merged_section(data: ReproductionData) -> Section:
 
 
 def _pair_headline(label: str, values: dict[str, float], note: str) -> Headline:
+    """Headline that compares the pixel-wise error with the stereo error, mm, marked better or worse."""
     better = values[OURS] < values[BASE]
     known = np.isfinite(list(values.values())).all()
     return Headline(_format_pair(values), label, note, ("better" if better else "worse") if known else "")
 
 
 def _format_pair(values: dict[str, float]) -> str:
+    """Text "stereo → pixelwise mm" of an error by model, mm."""
     base, ours = (format_number(values[model]) for model in (BASE, OURS))
     return f"{base if isinstance(base, str) else base.text} → {ours if isinstance(ours, str) else ours.text} mm"
 
 
 def _format_mm(value: float) -> str:
+    """Text of a length in mm to three decimals; "unknown" for NaN."""
     return f"{value:.3f} mm" if np.isfinite(value) else "unknown"
 
 
 def _format_size(size: tuple[int, int]) -> str:
+    """Text "width x height" of an image size in px."""
     return f"{size[0]}x{size[1]}"
 
 
 def _format_depths(data: ReproductionData) -> str:
+    """Text of the calibrated depth range, mm."""
     return f"{data.depth_range_mm[0]:.0f} to {data.depth_range_mm[1]:.0f} mm"

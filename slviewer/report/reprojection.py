@@ -64,7 +64,7 @@ def residual_arrows(title: str, pixels: np.ndarray, residuals: np.ndarray, size:
     lengths = np.hypot(away[:, 0], away[:, 1])
     rms = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else float("nan")
     scale = round_up(0.05 * size[0] / max(float(np.percentile(lengths, 95)), 1e-3)) if len(lengths) else 1.0
-    drawing, axes = _image_axes(size, f"{title}: RMS {rms:.3f} px")
+    drawing, axes = _new_image_axes(size, f"{title}: RMS {rms:.3f} px")
     if len(at):
         arrows = axes.quiver(
             *at.T, *(scale * away.T), lengths, angles="xy", scale_units="xy", scale=1, cmap="plasma", width=0.0035
@@ -108,7 +108,7 @@ def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> 
         coverage_count += filled
         hulls.append(np.vstack([hull, hull[:1]]))
     share = 100 * float((coverage_count > 0).mean())
-    drawing, axes = _image_axes(size, f"{title}: {share:.0f} % of the image covered")
+    drawing, axes = _new_image_axes(size, f"{title}: {share:.0f} % of the image covered")
     for hull in hulls:
         axes.plot(*hull.T, color=INK, linewidth=0.6, alpha=0.4)
     step = max(1, size[0] // 600)
@@ -130,7 +130,7 @@ def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> 
     )
 
 
-def _image_axes(size: tuple[int, int], title: str) -> tuple[Any, Any]:
+def _new_image_axes(size: tuple[int, int], title: str) -> tuple[Any, Any]:
     """A figure and its axes, framed as an image of ``size``."""
     drawing = new_figure(HALF, 420)
     axes = drawing.subplots()

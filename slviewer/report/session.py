@@ -114,6 +114,7 @@ def session_sections(data: SessionData) -> list[Section]:
 
 
 def _notice_section(data: SessionData) -> list[Section]:
+    """The section with warnings and with captures that are not used; an empty list if there are none."""
     unused = [row for row in data.captures if row.state in ("unused", "excluded")]
     items: list[Item] = [PageNotice(warning) for warning in data.warnings]
     items += [PageNotice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
@@ -121,6 +122,7 @@ def _notice_section(data: SessionData) -> list[Section]:
 
 
 def _captures_section(data: SessionData) -> Section:
+    """The section with the table of captures: role, state, sizes, frames and why one is not used."""
     marks: dict[str, Mark] = {"used": "better", "unused": "worse", "excluded": "worse"}
     columns = [Column("capture", align="left"), Column("role", align="left"), Column("state", align="left")]
     columns += [
@@ -150,6 +152,7 @@ def _captures_section(data: SessionData) -> Section:
 
 
 def _reprojection_section(calibration: CalibrationFigures) -> Section:
+    """The section about reprojection errors: bars of each pose, residual arrows and image coverage."""
     stereo, residuals = calibration.stereo, calibration.residuals
     rms, cameras, projectors = stereo.reprojection_rms_px, stereo.rig.camera.size, stereo.rig.projector.size
     items: list[Item] = []
@@ -180,6 +183,7 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
 
 
 def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
+    """Table of reprojection RMS by pose, px, with conspicuous poses marked."""
     typical = np.sqrt(np.nanmean(np.square(list(pose_rms_px.values())), axis=0))
     columns = [Column("pose", align="left"), Column("camera", "px"), Column("projector", "px")]
     rows: list[list[str | Cell]] = []
@@ -196,6 +200,7 @@ def lens_rows(stereo: StereoModel) -> list[tuple[str, str, str, str]]:
     """Both lenses' parameters in words: (name, unit, camera's, projector's)."""
 
     def values(lens: Lens, sigma: float) -> list[str]:
+        """Image size, focal lengths with standard deviation ``sigma``, principal point (px) and distortion as texts."""
         spread = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
         return [
             f"{lens.size[0]} x {lens.size[1]}",
@@ -227,12 +232,14 @@ def rig_rows(stereo: StereoModel) -> list[tuple[str, str]]:
 
 
 def _format_depths(stereo: StereoModel) -> str:
+    """Text of the calibrated depth range, mm; "unknown" without one."""
     if stereo.depth_range_mm is None:
         return "unknown"
     return "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm)
 
 
 def _parameters_section(stereo: StereoModel) -> Section:
+    """The section with the parameters of both lenses and the pose of the projector."""
     columns = [Column("parameter", align="left"), Column("unit", align="centre"), Column("camera"), Column("projector")]
     note = "± is one standard deviation, from the lens's own calibration."
     return Section(
@@ -246,6 +253,7 @@ def _parameters_section(stereo: StereoModel) -> Section:
 
 
 def _pixel_fits_section(data: SessionData) -> Section:
+    """The section about the pixel-wise fits: table by axis, RMS maps and the curves of one pixel."""
     columns = [Column("axis", align="left"), Column("pixels fitted", "%"), Column("poses a pixel, median")]
     columns += [Column(f"RMS in {name}", "mm") for name in "zxy"]
     rows: list[list[str | Cell]] = []
@@ -270,6 +278,7 @@ def _pixel_fits_section(data: SessionData) -> Section:
 
 
 def _verifications_section(data: SessionData) -> Section:
+    """The section about measured planes and spheres: tables, distances and error maps."""
     items: list[Item] = []
     for shape, caption in (
         ("plane", "Planes: RMS distance from the best plane"),
@@ -293,6 +302,7 @@ def _verifications_section(data: SessionData) -> Section:
 
 
 def _verification_table(verifications: list[VerificationView], caption: str) -> Table:
+    """Table of measured planes or spheres by model: RMS, noise floor and comparison with the first model."""
     models = models_of([v.rms_mm for v in verifications])
     sphere = verifications[0].shape == "sphere"
     columns = [
@@ -345,4 +355,5 @@ def _verification_table(verifications: list[VerificationView], caption: str) -> 
 
 
 def _format_count(count: int, word: str) -> str:
+    """Text of a count and its noun, in the plural unless the count is 1."""
     return f"{count} {word}{'s' * (count != 1)}"

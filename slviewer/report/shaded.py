@@ -40,7 +40,7 @@ def render_points(
     if known.sum() < 3:
         return np.full((height, width, 3), BACKGROUND, np.uint8)
     view = points[known] @ rotation.T
-    colours = colours[known] * _lambert(normals[known] @ rotation.T)[:, None]
+    colours = colours[known] * _shade_lambert(normals[known] @ rotation.T)[:, None]
     low, high = np.percentile(view, [0.3, 99.7], axis=0)
     scale = 0.92 * float(min(width / max(high[0] - low[0], 1e-6), height / max(high[1] - low[1], 1e-6)))
     uv = np.round((view[:, :2] - (low + high)[:2] / 2) * scale + np.array([width / 2, height / 2])).astype(np.intp)
@@ -65,7 +65,7 @@ def render_points(
     return (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8)
 
 
-def _lambert(normals: NDArray[np.floating]) -> NDArray[np.floating]:
+def _shade_lambert(normals: NDArray[np.floating]) -> NDArray[np.floating]:
     """(n,) factor of Lambert's law with ambient light, for unit normals (n, 3); NaN normals face the viewer."""
     facing = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, [0.0, 0.0, -1.0])
     return np.asarray(AMBIENT + (1.08 - AMBIENT) * np.clip(facing @ LIGHT, 0, 1))

@@ -77,7 +77,7 @@ def _draw_profile(
     ends = {name: hull[np.argmin(np.abs(hull[:, axis] - top))] for name, hull in hulls.items()}
     places = _spread_labels({name: float(end[2]) for name, end in ends.items()}, 0.032 * (right - left), right)
     for name, hull in hulls.items():
-        colour = REGIONS[_depth_region(hull, depth_range_mm)]
+        colour = REGIONS[_classify_depth(hull, depth_range_mm)]
         axes.fill(hull[:, 2], hull[:, axis], facecolor=(colour, 0.14), edgecolor=(colour, 0.9), linewidth=1.3)
         axes.plot([ends[name][2], places[name]], [ends[name][axis], top], color=colour, linewidth=0.5, alpha=0.6)
         axes.annotate(
@@ -121,7 +121,7 @@ def _draw_perspective(
 
     style_image_axes(axes)
     for i, (name, hull) in enumerate(hulls.items()):
-        colour = REGIONS[_depth_region(hull, depth_range_mm)]
+        colour = REGIONS[_classify_depth(hull, depth_range_mm)]
         shown = np.stack([hull[:, 2], hull[:, 0], -hull[:, 1]], axis=1)
         axes.add_collection3d(
             Poly3DCollection(
@@ -132,7 +132,7 @@ def _draw_perspective(
         end = shown[corner(shown[:, 2])]
         axes.text(*end, short[name], fontsize=SMALL_PT, color=colour, fontweight="bold", ha="center", va=side)
     for z in depth_range_mm:
-        wall = np.array([[z, x, -y] for x, y in _rectangle_corners(low, high)])
+        wall = np.array([[z, x, -y] for x, y in _list_corners(low, high)])
         axes.add_collection3d(
             Poly3DCollection(
                 [wall], facecolors=["#9fb4c6"], alpha=0.14, edgecolors=["#7f97ab"], linewidths=0.8, clip_on=False
@@ -164,11 +164,13 @@ def _convex_hull(name: str, points: np.ndarray) -> np.ndarray:
     return points[ConvexHull(centred @ directions[:2].T).vertices]
 
 
-def _rectangle_corners(low: np.ndarray, high: np.ndarray) -> list[tuple[float, float]]:
+def _list_corners(low: np.ndarray, high: np.ndarray) -> list[tuple[float, float]]:
+    """The four corners, in order, of the axis-aligned rectangle between two corners (2,)."""
     return [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
 
 
-def _depth_region(hull: np.ndarray, depth_range_mm: tuple[float, float]) -> str:
+def _classify_depth(hull: np.ndarray, depth_range_mm: tuple[float, float]) -> str:
+    """Depth region of the hull (n, 3) mm by its mean depth: R1 nearer, R2 inside, R3 beyond the range."""
     z = float(hull[:, 2].mean())
     return "R1" if z < depth_range_mm[0] else "R3" if z > depth_range_mm[1] else "R2"
 

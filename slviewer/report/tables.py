@@ -60,7 +60,7 @@ def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
     ]
     for model in rms:
         columns.append((Column("RMS", "mm", model), _error_cells(model, rms)))
-        columns.append((Column("floor", "mm", model), _muted_cells(floor.get(model, []), len(rows))))
+        columns.append((Column("floor", "mm", model), _format_muted_cells(floor.get(model, []), len(rows))))
     columns += _comparison_columns(rms, "against")
     if letter:
         group = "the Letter's rig"
@@ -74,7 +74,7 @@ def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
             for column, cells in _comparison_columns(letter, "against")
         ]
     note = "RMS over the pixels that every model measures; floor: what the capture's noise alone would give."
-    return _filled_table(columns, caption, [note])
+    return _build_table(columns, caption, [note])
 
 
 def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
@@ -88,7 +88,7 @@ def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
     ]
     for model in rms:
         columns.append((Column("RMS", "mm", model), _error_cells(model, rms)))
-        columns.append((Column("floor", "mm", model), _muted_cells(floor.get(model, []), len(rows))))
+        columns.append((Column("floor", "mm", model), _format_muted_cells(floor.get(model, []), len(rows))))
         columns.append(
             (Column("radius", "mm", model), [format_number(r) for r in radius.get(model, [np.nan] * (len(rows) + 1))])
         )
@@ -101,7 +101,7 @@ def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
         columns.append((Column("radius", "mm", group), [*(format_number(r, 2) for r in radii), format_number(mean)]))
     true = sorted({row.true_radius_mm for row in rows if np.isfinite(row.true_radius_mm)})
     known = f"True radius {' or '.join(f'{r:g} mm' for r in true)}; the mean of the errors is that of their sizes."
-    return _filled_table(columns, caption, [known if true else "The true radius is not known."])
+    return _build_table(columns, caption, [known if true else "The true radius is not known."])
 
 
 def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
@@ -111,7 +111,7 @@ def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
     names: _CellColumn = (Column("spheres", align="left"), [*(row.name for row in rows), "mean size of the error"])
     if not any(np.isfinite(row.known_mm) for row in rows):
         plain = [(Column(model, "mm"), [format_number(v) for v in values]) for model, values in measured.items()]
-        table = _filled_table([names, *plain], caption)
+        table = _build_table([names, *plain], caption)
         return replace(table, footer=())
     errors = _signed_errors(measured, measured, [row.known_mm for row in rows])
     columns: list[_CellColumn] = [
@@ -121,7 +121,7 @@ def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
     for model, values in measured.items():
         columns.append((Column("measured", "mm", model), [*(format_number(v) for v in values[:-1]), ""]))
         columns.append((Column("error", "mm", model), _error_cells(model, errors, signed=True)))
-    return _filled_table(columns + _comparison_columns(errors, "against"), caption)
+    return _build_table(columns + _comparison_columns(errors, "against"), caption)
 
 
 def spacing_error(rows: Sequence[SpacingRow], model: str) -> float:
@@ -153,7 +153,7 @@ _CellColumn = tuple[Column, list[str | Cell]]
 """A column with its cells, the last of which is that of the means."""
 
 
-def _filled_table(columns: Sequence[_CellColumn], caption: str, notes: Sequence[str] = ()) -> Table:
+def _build_table(columns: Sequence[_CellColumn], caption: str, notes: Sequence[str] = ()) -> Table:
     """The columns side by side; the means are a footer where there is more than one row."""
     *rows, means = zip(*(cells for _, cells in columns), strict=True)
     return Table([column for column, _ in columns], rows, caption, notes, [means] if len(rows) > 1 else [])
@@ -199,10 +199,12 @@ def _error_cells(model: str, errors: Mapping[str, Sequence[float]], signed: bool
     return cells
 
 
-def _muted_cells(values: Sequence[float], rows: int) -> list[str | Cell]:
+def _format_muted_cells(values: Sequence[float], rows: int) -> list[str | Cell]:
+    """Cells in muted colour of the Letter's values; dashes where ``values`` is empty."""
     texts = [format_number(value) for value in values or [np.nan] * (rows + 1)]
     return [text if isinstance(text, Cell) else Cell(text, "muted") for text in texts]
 
 
 def _remove_mark(cell: str | Cell) -> str | Cell:
+    """The cell without its mark, unless it is muted."""
     return cell if isinstance(cell, str) or cell.mark == "muted" else Cell(cell.text)
