@@ -81,7 +81,7 @@ class Access:
     def host(self, headers: Headers, local_address: str) -> str:
         """The request's Host, where it is one of this server's names; Refusal otherwise (DNS rebinding)."""
         hosts = headers.get_all("Host")
-        if len(hosts) != 1 or hosts[0].lower() not in self._hosts(local_address):
+        if len(hosts) != 1 or hosts[0].lower() not in self._list_hosts(local_address):
             raise Refusal(HTTPStatus.MISDIRECTED_REQUEST, "This server is not reached by that host name.")
         return hosts[0].lower()
 
@@ -99,7 +99,8 @@ class Access:
         if foreign and not (mode == ["navigate"] and destination == ["document"]):
             raise Refusal(HTTPStatus.FORBIDDEN, "Another page may not use this one.")
 
-    def _hosts(self, local_address: str) -> set[str]:
+    def _list_hosts(self, local_address: str) -> set[str]:
+        """All values of the Host header that name this server at the given local address."""
         address = ipaddress.ip_address(local_address.partition("%")[0])
         if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped:
             address = address.ipv4_mapped
@@ -114,6 +115,7 @@ class Access:
 
 
 def _check_token(token: str | None) -> str:
+    """The token, checked for its characters and length; a random one for None. Raises UsageError."""
     if token is None:
         return secrets.token_urlsafe(24)
     if not _TOKEN.fullmatch(token):

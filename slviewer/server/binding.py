@@ -28,14 +28,16 @@ def listen(host: str, port: int) -> socket.socket:
         sock.listen(128)
     except (OSError, OverflowError) as error:
         sock.close()
-        raise SlviewerError(_remedy(host, port, error)) from error
+        raise SlviewerError(_format_remedy(host, port, error)) from error
     return sock
 
 
 def _resolve(host: str, port: int) -> tuple[int, tuple]:
+    """Address family and socket address of host and port; raises SlviewerError if the name does not resolve in time."""
     candidates: list[tuple[int, tuple]] = []
 
     def look_up() -> None:
+        """Append what the name resolves to; nothing where it does not resolve."""
         try:
             infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         except (OSError, UnicodeError):
@@ -53,7 +55,8 @@ def _resolve(host: str, port: int) -> tuple[int, tuple]:
     return candidates[0]
 
 
-def _remedy(host: str, port: int, error: OSError | OverflowError) -> str:
+def _format_remedy(host: str, port: int, error: OSError | OverflowError) -> str:
+    """Message for an address that cannot be opened: the cause, and what to do."""
     number = getattr(error, "errno", None)
     if number in (errno.EADDRINUSE, getattr(errno, "WSAEADDRINUSE", -1)):
         return (

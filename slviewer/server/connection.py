@@ -75,6 +75,7 @@ class _Tail(Response):
     """The rest of an answer that was begun by hand."""
 
     def serialize(self) -> bytes:
+        """The bytes of the body, without status line and headers: those have been sent."""
         return bytes(self.body)
 
 
@@ -82,10 +83,11 @@ def quiet_logger() -> logging.Logger:
     """websockets' logger for this server: what strangers send it is no error of ours."""
     logger = logging.getLogger("slviewer.server.websockets")
     if not logger.filters:
-        logger.addFilter(_not_the_clients_fault)
+        logger.addFilter(_is_server_error)
     return logger
 
 
-def _not_the_clients_fault(record: logging.LogRecord) -> bool:
+def _is_server_error(record: logging.LogRecord) -> bool:
+    """Whether a log record reports an error other than a failed handshake or a lost connection."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, InvalidHandshake | ConnectionError)

@@ -39,7 +39,7 @@ class Downloads:
         links or "..", is elsewhere. It is read when it is fetched, so that the newest content arrives.
         """
         offer = Offer(Path(path), Path(within).resolve(), safe_name(name or Path(path).name, "download"))
-        _opened(offer).close()
+        _open_offer(offer).close()
         key = secrets.token_urlsafe(16)
         self._offers[key] = offer
         return PREFIX + key
@@ -54,7 +54,7 @@ class Downloads:
         if offer is None:
             return None
         try:
-            file = _opened(offer)
+            file = _open_offer(offer)
         except InputError:
             return None
         ascii_name = offer.name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_")
@@ -69,7 +69,7 @@ class Downloads:
         return headers, file
 
 
-def _opened(offer: Offer) -> BinaryIO:
+def _open_offer(offer: Offer) -> BinaryIO:
     """The opened file, checked after opening to be a regular one inside its folder, so that no link can change it."""
     with contextlib.suppress(OSError, ValueError):
         real = offer.path.resolve(strict=True)

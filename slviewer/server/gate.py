@@ -32,7 +32,7 @@ class ViserGate:
         self._connection = connection
         self._role = role
         self._client: int | None = None
-        self._uploads = Uploads(budget, self._forget)
+        self._uploads = Uploads(budget, self._forget_upload)
 
     def __call__(self, raw: Any) -> bytes | None:
         if self._client is None:
@@ -71,11 +71,11 @@ class ViserGate:
             case messages.GuiUpdateMessage():
                 if message.updates.keys() != {"value"}:
                     raise MessageRefused("only an input's value can be set")
-                check_value(self._enabled_input(message.uuid), message.updates["value"])
+                check_value(self._require_input(message.uuid), message.updates["value"])
             case messages.CommandTriggerMessage():
                 _check(inside.command(server, client, message.uuid) is not None)
             case messages.FileTransferStartUpload():
-                button = self._enabled_input(message.source_component_uuid)
+                button = self._require_input(message.source_component_uuid)
                 _check(isinstance(button, viser.GuiUploadButtonHandle))
                 return inside.encode(self._uploads.start(message))
             case messages.FileTransferPart():
@@ -92,6 +92,7 @@ class ViserGate:
         return raw
 
     def _check_scene_message(self, message: Any, client: int) -> None:
+        """Raise MessageRefused unless a visible scene element listens to this message."""
         scene = inside.scene_api(self._server, client, message.owner)
         _check(scene is not None)
         match message:
@@ -104,7 +105,8 @@ class ViserGate:
             case _:
                 raise MessageRefused("no message of clients")
 
-    def _enabled_input(self, uuid: str) -> Any:
+    def _require_input(self, uuid: str) -> Any:
+        """The visible, enabled input with this id; raises MessageRefused otherwise."""
         assert self._client is not None
         handle = inside.gui_input(self._server, self._client, uuid)
         if handle is None:
@@ -114,6 +116,7 @@ class ViserGate:
         return handle
 
     def _send_refusal(self, message: Any, refused: MessageRefused) -> None:
+        """Notify the client that its upload was refused, or send it the true value of an input."""
         assert self._client is not None
         if isinstance(message, messages.FileTransferStartUpload):
             inside.refuse_upload(
@@ -125,12 +128,14 @@ class ViserGate:
             if handle is not None:
                 inside.send_value(self._server, self._client, handle)
 
-    def _forget(self, transfer: str) -> None:
+    def _forget_upload(self, transfer: str) -> None:
+        """Let viser discard what was received of an upload, after the messages that are already waiting."""
         # viser handles what passed in tasks of its own, in their order: after those that are waiting.
         asyncio.get_running_loop().call_soon(inside.forget_upload, self._server, self._client, transfer)
 
 
 def _check_camera(message: messages.ViewerCameraMessage) -> None:
+    """Raise MessageRefused unless image size and orientation of the camera are plausible."""
     usable = 0 < message.image_height < 2**15 and 0 < message.image_width < 2**15 and math.hypot(*message.wxyz) > 1e-6
     if not usable:
         raise MessageRefused("no camera")
@@ -165,11 +170,13 @@ def check_value(handle: Any, value: Any) -> None:
 
 
 def _check(condition: bool, reason: str = "nothing listens to that", correct: bool = False) -> None:
+    """Raise MessageRefused with ``reason`` unless the condition holds."""
     if not condition:
         raise MessageRefused(reason, correct)
 
 
 def _check_number(value: Any, current: float, low: float | None, high: float | None) -> None:
+    """Raise MessageRefused unless the value is a finite number of the input's type within its range."""
     _check(isinstance(value, int | float) and not isinstance(value, bool), "not a number", correct=True)
     _check(abs(value) < 2**53 and math.isfinite(value), "not a finite number", correct=True)
     # viser would cut the fraction off in silence.
@@ -178,5 +185,6 @@ def _check_number(value: Any, current: float, low: float | None, high: float | N
 
 
 def _is_plain_text(text: str, multiline: bool) -> bool:
+    """Whether the text is short enough and free of control characters; line breaks only if ``multiline``."""
     allowed = "\n\r\t" if multiline else "\t"
     return len(text) <= TEXT_LIMIT and all(c.isprintable() or c in allowed or ord(c) > 159 for c in text)

@@ -48,7 +48,7 @@ class SafeServer:
     def link(self, path: str, role: Role = "operator") -> str:
         """The address of a page of this server with a token, to be opened once; as secret as a password."""
         token = self.access.token if role == "operator" else self.access.view_token
-        return f"http://{self._shown_host()}:{self.port}{path}?{urllib.parse.urlencode({'token': token})}"
+        return f"http://{self._format_host()}:{self.port}{path}?{urllib.parse.urlencode({'token': token})}"
 
     @property
     def loopback(self) -> bool:
@@ -65,9 +65,11 @@ class SafeServer:
         viser_internals.stop(self.viser)
 
     def _address(self) -> str:
+        """The IP address that the server listens at, without an IPv6 zone."""
         return self.viser.get_host().partition("%")[0]
 
-    def _shown_host(self) -> str:
+    def _format_host(self) -> str:
+        """The host part of links: the address, in brackets for IPv6; loopback if all addresses are open."""
         address = ipaddress.ip_address(self._address())
         if address.is_unspecified:
             return "127.0.0.1" if address.version == 4 else "[::1]"

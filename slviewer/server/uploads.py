@@ -23,6 +23,8 @@ class UploadBudget:
 
 @dataclass
 class _Transfer:
+    """An announced upload: its input, its size in bytes, its number of parts, and what has been received."""
+
     source: str
     size: int
     parts: int
@@ -70,18 +72,19 @@ class Uploads:
         transfer.received_parts.add(message.part_index)
         complete = len(transfer.received_parts) == transfer.parts
         if not fits or (complete and transfer.received != transfer.size):
-            self._end(message.transfer_uuid)
+            self._end_upload(message.transfer_uuid)
             self._forget(message.transfer_uuid)
             raise MessageRefused("a part that was not announced")
         if complete:
-            self._end(message.transfer_uuid)
+            self._end_upload(message.transfer_uuid)
 
     def close(self) -> None:
         """End all uploads of a disconnected client."""
         for transfer in list(self._transfers):
-            self._end(transfer)
+            self._end_upload(transfer)
             self._forget(transfer)
 
-    def _end(self, transfer: str) -> None:
+    def _end_upload(self, transfer: str) -> None:
+        """Remove an upload and return its bytes to the budget."""
         self._budget.used -= self._transfers.pop(transfer).size
         self._budget.names.discard(transfer)

@@ -55,6 +55,7 @@ class Viewers:
             return max([*self._durations.values(), *waiting], default=0.0)
 
     def _record_answer(self, number: int) -> None:
+        """Record the duration, s, until the client answered request ``number``, and call ``answered``."""
         with self._lock:
             sent_s = self._request_times.pop(number, None)
             if sent_s is not None:

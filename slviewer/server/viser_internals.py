@@ -71,7 +71,7 @@ class _Websockets:
 
 def start(serve: Callable[..., Any], host: str, port: int, label: str | None) -> viser.ViserServer:
     """viser's server, listening through `serve` (called as websockets' own); no share tunnel, nothing printed."""
-    with _starting, _silent():
+    with _starting, _silence_prints():
         _infra.websockets = _Websockets(serve)  # type: ignore[assignment]
         try:
             server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
@@ -82,7 +82,7 @@ def start(serve: Callable[..., Any], host: str, port: int, label: str | None) ->
     # A button that does nothing would be shown again by every later change of the theme.
     themed = partial(server.gui.configure_theme, show_logo=False, show_share_button=False)
     for owner, name, value in (
-        (server, "request_share_url", _no_tunnel),
+        (server, "request_share_url", _refuse_tunnel),
         (server.gui, "configure_theme", themed),
     ):
         setattr(owner, name, value)
@@ -107,16 +107,17 @@ def client_page() -> bytes:
 
 def stop(server: viser.ViserServer) -> None:
     """End viser's server and its threads, without a word."""
-    with _silent():
+    with _silence_prints():
         server.stop()
 
 
-def _no_tunnel(*_: Any, **__: Any) -> NoReturn:
+def _refuse_tunnel(*_: Any, **__: Any) -> NoReturn:
+    """Raise SlviewerError: replaces viser's request of a public share link."""
     raise SlviewerError("slviewer opens no tunnel to the internet: use --host, or ssh -L, to reach it from elsewhere.")
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
+def _silence_prints() -> Iterator[None]:
     """viser prints its own address, without the token, and its end: both only confuse the operator."""
     printing = rich.print
     rich.print = lambda *_, **__: None
@@ -246,6 +247,7 @@ def request_answer(client: viser.ClientHandle, answered: Callable[[], None]) -> 
     question = secrets.token_hex(8)
 
     def handle_answer(_: int, message: _messages.LocalStorageGetItemResponseMessage) -> None:
+        """Unregister this handler and call ``answered`` if the answer belongs to this question."""
         if message.request_uuid == question:
             connection.unregister_handler(kind, handle_answer)
             answered()
@@ -264,13 +266,13 @@ def send_value(server: viser.ViserServer, client_id: int, handle: Any) -> None:
     """Show one client the value that an input really has."""
     value = handle._impl.value
     if isinstance(value, bool | int | float | str | tuple) and not handle._impl.is_button:
-        _send(server, client_id, _messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+        _queue_message(server, client_id, _messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
 
 
 def refuse_upload(server: viser.ViserServer, client_id: int, source: str, transfer: str, size: int) -> None:
     """End the progress that a client shows for an upload, and its wait for more."""
-    _send(server, client_id, _messages.FileTransferPartAck(source, transfer, size, size))
-    _send(server, client_id, _messages.RemoveNotificationMessage(f"upload-{transfer}"))
+    _queue_message(server, client_id, _messages.FileTransferPartAck(source, transfer, size, size))
+    _queue_message(server, client_id, _messages.RemoveNotificationMessage(f"upload-{transfer}"))
 
 
 def notify(server: viser.ViserServer, client_id: int, title: str, body: str) -> None:
@@ -280,7 +282,8 @@ def notify(server: viser.ViserServer, client_id: int, title: str, body: str) -> 
         client.add_notification(title=title, body=body, color="red", auto_close_seconds=10.0)
 
 
-def _send(server: viser.ViserServer, client_id: int, message: Message) -> None:
+def _queue_message(server: viser.ViserServer, client_id: int, message: Message) -> None:
+    """Queue a message for one client; nothing if it has disconnected."""
     client = server._connected_clients.get(client_id)
     if client is not None:
         client._websock_connection.queue_message(message)
