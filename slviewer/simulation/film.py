@@ -20,7 +20,7 @@ def psf_taps(sigma_px: float) -> np.ndarray:
 
 
 @kernel()
-def _mix(x):
+def _hash_bits(x):
     """A 32-bit hash (Wellons' lowbias32)."""
     x ^= x >> np.uint32(16)
     x = np.uint32(x * np.uint32(0x7FEB352D))
@@ -85,8 +85,8 @@ def digitise(light, noise, top, quantiles, keys, out):
     for i in numba.prange(h):
         bits = np.empty(w, np.uint32)
         for j in range(w):
-            x = _mix(np.uint32(np.uint32(i * w + j) ^ key0))
-            bits[j] = _mix(np.uint32(x + key1)) >> np.uint32(16)
+            x = _hash_bits(np.uint32(np.uint32(i * w + j) ^ key0))
+            bits[j] = _hash_bits(np.uint32(x + key1)) >> np.uint32(16)
         for j in range(w):
             spread = np.sqrt(read + shot * max(light[i, j], np.float32(0)))
             value = dark + light[i, j] + spread * quantiles[bits[j]] + np.float32(0.5)

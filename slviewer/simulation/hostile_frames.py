@@ -79,7 +79,7 @@ def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
 
 def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
     """A lamp switched on half way through the phase steps of x: even light, as a share of the projector's."""
-    steps = _indices(shot, "phase", "x")
+    steps = _select_indices(shot, "phase", "x")
     illuminated = light.copy()
     illuminated[steps[len(steps) // 2] :] += np.float32(share) * shot.room_light
     return illuminated
@@ -189,13 +189,14 @@ def show_instead(frames: np.ndarray, places: Sequence[int], sources: Sequence[in
     return out
 
 
-def _indices(shot: Shot, kind: str, axis: str) -> list[int]:
+def _select_indices(shot: Shot, kind: str, axis: str) -> list[int]:
+    """Indices of the sequence's frames of a kind and an axis."""
     return [i for i, f in enumerate(shot.sequence.frames) if (f.kind, f.axis) == (kind, axis)]
 
 
 def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """A Gray frame of y lost (level 0), a phase step of x (1), both (2)."""
-    phase_x, gray_y = _indices(shot, "phase", "x"), _indices(shot, "gray", "y")
+    phase_x, gray_y = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "y")
     if level == 0:
         return drop_frame(frames, gray_y[2])
     frames = drop_frame(frames, phase_x[3])
@@ -204,14 +205,14 @@ def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 
 def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """A Gray frame of x repeated (level 0), a phase step (1), two phase steps and a Gray frame (2)."""
-    phase, gray = _indices(shot, "phase", "x"), _indices(shot, "gray", "x")
+    phase, gray = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "x")
     places = {0: [gray[-2]], 1: [phase[2]], 2: [phase[1], phase[-2], gray[-1]]}[int(level)]
     return show_instead(frames, places, [place - 1 for place in places])
 
 
 def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Two Gray frames of x swapped (level 0), two phase steps (1), the last phase step and the first Gray frame (2)."""
-    phase, gray = _indices(shot, "phase", "x"), _indices(shot, "gray", "x")
+    phase, gray = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "x")
     first = {0: gray[-2], 1: phase[1], 2: phase[-1]}[int(level)]
     return show_instead(frames, [first, first + 1], [first + 1, first])
 
@@ -219,14 +220,16 @@ def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """All frames of x and y exchanged (level 0), the phase steps alone (1), the Gray frames alone (2)."""
     kinds = {0: get_args(Kind), 1: ("phase",), 2: ("gray", "complementary")}[int(level)]
-    x, y = ([i for kind in kinds for i in _indices(shot, kind, axis)] for axis in ("x", "y"))
+    x, y = ([i for kind in kinds for i in _select_indices(shot, kind, axis)] for axis in ("x", "y"))
     return show_instead(frames, x + y, y + x)
 
 
 def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary one (2)."""
     for axis in ("x",) if level == 0 else ("x", "y"):
-        places = _indices(shot, "gray", axis) + (_indices(shot, "complementary", axis) if level == 2 else [])
+        places = _select_indices(shot, "gray", axis) + (
+            _select_indices(shot, "complementary", axis) if level == 2 else []
+        )
         frames = show_instead(frames, places, places[::-1])
     return frames
 
@@ -234,7 +237,7 @@ def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 def reorder_steps(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Phase steps that begin a quarter period late (level 0), run backwards (1), or come as 0 2 4 ... 1 3 5 (2)."""
     for axis in ("x", "y"):
-        places = _indices(shot, "phase", axis)
+        places = _select_indices(shot, "phase", axis)
         n = len(places)
         orders = ([(k + n // 4) % n for k in range(n)], [-k % n for k in range(n)], [*range(0, n, 2), *range(1, n, 2)])
         frames = show_instead(frames, places, [places[k] for k in orders[int(level)]])

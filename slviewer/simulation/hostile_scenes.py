@@ -100,13 +100,13 @@ class MirrorTable:
         """The thing, and below it its mirror image."""
         surface = self.scene.trace(rays)
         direct = np.isfinite(surface.points[..., 2])
-        image = _mirrored(self.scene, self.normal, self.offset_mm).trace(rays)
+        image = _mirror_scene(self.scene, self.normal, self.offset_mm).trace(rays)
         # The table lies between camera and mirror image, so that the image's points are behind the mirror.
         with np.errstate(invalid="ignore"):
             behind = image.points @ self.normal > self.offset_mm
         visible = ~direct & behind & np.isfinite(image.points[..., 2])
         points, normals, albedo = surface.points.copy(), surface.normals.copy(), surface.albedo.copy()
-        M, shift = _reflection(self.normal, self.offset_mm)
+        M, shift = _compute_reflection(self.normal, self.offset_mm)
         points[visible], normals[visible] = image.points[visible] @ M.T + shift, image.normals[visible] @ M.T
         albedo[visible] = np.float32(self.reflectivity) * image.albedo[visible]
         return Surface(points, normals, albedo)
@@ -121,7 +121,7 @@ class MirrorTable:
 
     def second_projector(self, rig: SimulatedRig) -> SimulatedRig:
         """The rig with the projector's mirror image in the table: its light is `reflectivity` as strong."""
-        M, shift = _reflection(self.normal, self.offset_mm)
+        M, shift = _compute_reflection(self.normal, self.offset_mm)
         light = replace(rig.light, ambient=0.0)
         return replace(rig, R=rig.R @ M, t=rig.R @ shift + rig.t, light=light)
 
@@ -159,14 +159,15 @@ def moved_scene(scene: Scene, by_mm: np.ndarray, turn_rad: np.ndarray) -> Scene:
     raise InputError(f"a scene of type {type(scene).__name__} cannot be moved: use a board, spheres or a mesh")
 
 
-def _reflection(normal: np.ndarray, offset_mm: float) -> tuple[np.ndarray, np.ndarray]:
+def _compute_reflection(normal: np.ndarray, offset_mm: float) -> tuple[np.ndarray, np.ndarray]:
     """M (3, 3) and shift (3,): X' = M X + shift is X mirrored in the plane n . X = offset."""
     n = np.asarray(normal, float)
     return np.eye(3) - 2 * np.outer(n, n), 2 * offset_mm * n
 
 
-def _mirrored(scene: Scene, normal: np.ndarray, offset_mm: float) -> Scene:
-    M, shift = _reflection(normal, offset_mm)
+def _mirror_scene(scene: Scene, normal: np.ndarray, offset_mm: float) -> Scene:
+    """The mirror image of a scene in the plane n . X = offset, mm; InputError for other than boards and spheres."""
+    M, shift = _compute_reflection(normal, offset_mm)
     if isinstance(scene, Spheres):
         return replace(scene, centres=scene.centres @ M.T + shift)
     if isinstance(scene, BoardScene):

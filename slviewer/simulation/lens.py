@@ -40,14 +40,14 @@ class SimulatedLens:
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels (..., 2) of `points` (..., 3) mm in this device's frame; NaN where z <= 0 or a coordinate is NaN."""
-        points = _checked(points, 3)
+        points = _check_shape(points, 3)
         with np.errstate(invalid="ignore", divide="ignore"):
             z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-            return self._apply(_project_kernel, points[..., :2] / z)
+            return self._map_points(_project_kernel, points[..., :2] / z)
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Normalised (..., 2) = (x/z, y/z) that project to `pixels` (..., 2), by Newton; NaN if it fails."""
-        return self._apply(_undistort_kernel, _checked(pixels, 2))
+        return self._map_points(_undistort_kernel, _check_shape(pixels, 2))
 
     def rays(self, margin: int = 0) -> np.ndarray:
         """(h + 2 margin, w + 2 margin, 2) float64: (x/z, y/z) of every pixel, and of so many beyond each edge."""
@@ -59,15 +59,18 @@ class SimulatedLens:
 
     @cached_property
     def _ray_grids(self) -> dict[int, np.ndarray]:
+        """Cache of ray grids by margin in px, empty at first."""
         return {}
 
-    def _apply(self, function: Any, values: np.ndarray) -> np.ndarray:
+    def _map_points(self, function: Any, values: np.ndarray) -> np.ndarray:
+        """Values (..., 2) mapped by a compiled kernel with this lens's parameters."""
         numbers = np.array([*self.focal_px, *self.centre_px, *self.brown, self.scale])
         flat = np.ascontiguousarray(values.reshape(-1, 2))
         return function(flat, numbers, self.waves).reshape(values.shape)
 
 
-def _checked(values: np.ndarray, last: int) -> np.ndarray:
+def _check_shape(values: np.ndarray, last: int) -> np.ndarray:
+    """The values as a float array; raises InputError unless the last axis has the length ``last``."""
     values = np.asarray(values, float)
     if values.ndim < 1 or values.shape[-1] != last:
         raise InputError(f"expected an array (..., {last}), got the shape {values.shape}")
@@ -75,7 +78,7 @@ def _checked(values: np.ndarray, last: int) -> np.ndarray:
 
 
 @kernel()
-def _forward(x, y, numbers, waves):
+def _project_point(x, y, numbers, waves):
     """Pixel (u, v) at the lens's scale, and its derivatives by x and y (4 numbers), for one normalised point."""
     fx, fy, cx, cy, k1, k2, p1, p2, k3, scale = numbers
     r2 = x * x + y * y
@@ -110,15 +113,17 @@ def _forward(x, y, numbers, waves):
 
 @kernel(parallel=True)
 def _project_kernel(normalised, numbers, waves):
+    """Pixels (n, 2) at the lens's scale of normalised points (n, 2)."""
     out = np.empty_like(normalised)
     for i in numba.prange(normalised.shape[0]):
-        u, v, _, _, _, _ = _forward(normalised[i, 0], normalised[i, 1], numbers, waves)
+        u, v, _, _, _, _ = _project_point(normalised[i, 0], normalised[i, 1], numbers, waves)
         out[i, 0], out[i, 1] = u, v
     return out
 
 
 @kernel(parallel=True)
 def _undistort_kernel(pixels, numbers, waves):
+    """Normalised points (n, 2) of pixels (n, 2) by Newton's method; NaN where it does not converge."""
     out = np.empty_like(pixels)
     fx, fy, cx, cy, scale = numbers[0], numbers[1], numbers[2], numbers[3], numbers[9]
     for i in numba.prange(pixels.shape[0]):
@@ -126,7 +131,7 @@ def _undistort_kernel(pixels, numbers, waves):
         y = ((pixels[i, 1] + 0.5) / scale - 0.5 - cy) / fy
         error = np.inf
         for _ in range(20):
-            u, v, ux, uy, vx, vy = _forward(x, y, numbers, waves)
+            u, v, ux, uy, vx, vy = _project_point(x, y, numbers, waves)
             du, dv = pixels[i, 0] - u, pixels[i, 1] - v
             determinant = ux * vy - uy * vx
             x += (vy * du - uy * dv) / determinant

@@ -42,14 +42,14 @@ def blurred_profile(values: np.ndarray, sigmas: np.ndarray) -> Profile:
 
     Beyond its ends the profile continues with its end values: `window` darkens what lies outside the projector.
     """
-    weights, reach = _weights(tuple(sigmas.tolist()))
+    weights, reach = _compute_weights(tuple(sigmas.tolist()))
     windows = sliding_window_view(np.pad(values.astype(np.float32), reach + _MARGIN, mode="edge"), 2 * reach + 1)
     table = np.tensordot(windows, weights, 1)  # (px, within, sigma)
     return Profile(np.ascontiguousarray(table.reshape(-1, len(sigmas)).T), _MARGIN * OVERSAMPLING)
 
 
 @lru_cache(8)
-def _weights(sigmas: tuple[float, ...]) -> tuple[np.ndarray, int]:
+def _compute_weights(sigmas: tuple[float, ...]) -> tuple[np.ndarray, int]:
     """(2 reach + 1, OVERSAMPLING, LEVELS) float32: what each projector px adds at each place within one; and reach."""
     reach = int(np.ceil(4.5 * max(sigmas))) + 1
     around = np.arange(-reach, reach + 1)[:, None, None]

@@ -52,7 +52,7 @@ class MeshScene:
         facing = (flat * along).sum(-1)
         points = along * ((flat * a).sum(-1) / facing)[:, None]
         s, t = hits["primitive_uvs"].numpy()[hit].T[..., None].astype(float)
-        n = self._vertex_normals
+        n = self._compute_normals
         smooth = (1 - s - t) * n[corners[:, 0]] + s * n[corners[:, 1]] + t * n[corners[:, 2]]
         smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
         front = facing < 0
@@ -69,7 +69,8 @@ class MeshScene:
         return self._caster.test_occlusions(open3d().core.Tensor(cast), 0.0, 1.0).numpy()
 
     @cached_property
-    def _vertex_normals(self) -> np.ndarray:
+    def _compute_normals(self) -> np.ndarray:
+        """Unit normals (n, 3) of the vertices in the camera frame, averaged over triangles by area."""
         corners = self.placed[self.triangles]
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # twice the area: a fair weight
         normals = np.zeros_like(self.placed)
@@ -79,6 +80,7 @@ class MeshScene:
 
     @cached_property
     def _caster(self) -> Any:
+        """Open3D ray-casting scene of the placed mesh."""
         core = open3d().core
         scene = open3d().t.geometry.RaycastingScene()
         scene.add_triangles(core.Tensor(self.placed.astype(np.float32)), core.Tensor(self.triangles.astype(np.uint32)))

@@ -49,12 +49,12 @@ def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
     depths = 512 + 176 * (rng.permutation(n) + 0.5) / n
     tilts = np.radians(6 + 22 * (rng.permutation(n) + 0.5) / n)
     towards = rng.permutation(n) * 2 * np.pi / n + rng.uniform(0, 2 * np.pi)
-    offsets = _directions(n)
+    offsets = _list_directions(n)
     poses = []
     for i in range(n):
         axis = tilts[i] * np.array([np.cos(towards[i]), np.sin(towards[i]), 0])
         R = rotation(axis) @ rotation(np.array([0, 0, np.radians(rng.uniform(-8, 8))]))
-        poses.append(_placed(rig, board, R, middle, depths[i], offsets[i], rng.uniform(0.95, 1)))
+        poses.append(_place_board(rig, board, R, middle, depths[i], offsets[i], rng.uniform(0.95, 1)))
     return poses
 
 
@@ -87,21 +87,21 @@ def rotation(vector: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(vector).as_matrix()
 
 
-def _directions(n: int) -> np.ndarray:
+def _list_directions(n: int) -> np.ndarray:
     """(n, 2) in -1 ... 1: where in its view each board stands; corners most, then edges, then the middle."""
     corners = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
     cycle = [*corners, (0, 0), *corners, (1, 0), *corners, (0, -1), *corners, (-1, 0), *corners, (0, 1)]
     return np.array([cycle[i % len(cycle)] for i in range(n)], float)
 
 
-def _placed(
+def _place_board(
     rig: SimulatedRig, board: Board, R: np.ndarray, middle: np.ndarray, depth: float, offset: np.ndarray, share: float
 ) -> Pose:
     """The pose with its middle at `depth`, as far towards `offset` as keeps the board in view, times `share`."""
     place = np.array([0.0, 0.0, depth])
     rim = ((board.points == board.points.min(0)) | (board.points == board.points.max(0)))[:, :2].any(1)
     features = (board.points[rim] - middle) @ R.T
-    if not _in_view(rig, board, features + place):
+    if not _is_in_view(rig, board, features + place):
         raise InputError(
             f"the board {board} does not fit into the view at {depth:.0f} mm: take a smaller one, "
             f"{np.ptp(board.points[:, 0]):.0f} x {np.ptp(board.points[:, 1]):.0f} mm is too much"
@@ -111,14 +111,14 @@ def _placed(
         while step > 0.02:
             trials = np.tile(place, (60, 1))
             trials[:, direction] = offset[direction] * (reach + step * np.arange(60))
-            visible = _in_view(rig, board, features + trials[:, None])
+            visible = _is_in_view(rig, board, features + trials[:, None])
             reach += step * (len(visible) - 1 if visible.all() else int(np.argmin(visible)) - 1)
             step /= 50
         place[direction] = offset[direction] * reach * share
     return Pose(R, place - R @ middle)
 
 
-def _in_view(rig: SimulatedRig, board: Board, points: np.ndarray) -> np.ndarray:
+def _is_in_view(rig: SimulatedRig, board: Board, points: np.ndarray) -> np.ndarray:
     """(...) bool: whether all features, (..., n, 3) mm in the camera frame, lie in both images, a margin inside."""
     radius = board.pitch_mm / 4  # circles are half a pitch wide
     fits = np.ones(points.shape[:-2], bool)

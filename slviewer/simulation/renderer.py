@@ -161,6 +161,7 @@ class Renderer:
 
     @cached_property
     def _taps(self) -> np.ndarray:
+        """(2 r + 1,) weights of the camera's point spread function in px at the present scale."""
         return psf_taps(self.rig.sensor.psf_px * self.rig.camera.scale)
 
     @property
@@ -171,10 +172,12 @@ class Renderer:
 
     @property
     def _rows_per_column(self) -> float:
+        """Ratio of the projector's focal lengths in px, vertical over horizontal."""
         return self.rig.projector.focal_px[1] / self.rig.projector.focal_px[0]
 
     @cached_property
     def _maps(self) -> _Maps:
+        """The traced scene: projector coordinates and light at unit exposure of every pixel."""
         rig, light = self.rig, self.rig.light
         rays = rig.camera.rays(len(self._taps) // 2)
         surface = self.scene.trace(rays)
@@ -202,10 +205,11 @@ class Renderer:
             even=(reflected * hit).astype(np.float32),
             level=level,
             sigmas=sigmas,
-            coordinates={"x": _finite(u), "y": _finite(v)},
+            coordinates={"x": _replace_nonfinite(u), "y": _replace_nonfinite(v)},
             truth=Truth(surface.points[self._frame], projector[self._frame], (hit & reached & inside)[self._frame]),
         )
 
 
-def _finite(values: np.ndarray) -> np.ndarray:
+def _replace_nonfinite(values: np.ndarray) -> np.ndarray:
+    """The values as contiguous float32 with 0 for NaN and infinity."""
     return np.ascontiguousarray(np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0), np.float32)

@@ -90,10 +90,10 @@ def letter(
     rms = local["rms_px"] if local_distortion_px is None else local_distortion_px
     streams = np.random.SeedSequence([seed, 0x51]).spawn(3)
     camera, projector = (
-        _lens(np.random.default_rng(stream), preset[name], local, tuple(local[texture]), rms)
+        _sample_lens(np.random.default_rng(stream), preset[name], local, tuple(local[texture]), rms)
         for name, stream in zip(("camera", "projector"), streams[:2], strict=True)
     )
-    R, t = _arrangement(np.random.default_rng(streams[2]), preset["arrangement"])
+    R, t = _compute_arrangement(np.random.default_rng(streams[2]), preset["arrangement"])
     light = Illumination(**preset["light"])
     if gamma is not None:
         light = dataclasses.replace(light, gamma=gamma)
@@ -103,13 +103,14 @@ def letter(
     return SimulatedRig(camera, projector, R, t, Sensor(**preset["sensor"]), light, seed)
 
 
-def _lens(
+def _sample_lens(
     rng: np.random.Generator,
     device: dict[str, Any],
     local: dict[str, Any],
     wavelengths: tuple[float, float],
     rms: float,
 ) -> SimulatedLens:
+    """A random lens of a device as its preset describes: with Brown distortion and local waves."""
     width, height = device["size"]
     focal = np.array(device["focal_px"]) * (1 + device["focal_spread"] * rng.uniform(-1, 1))
     middle = np.array([(width - 1) / 2, (height - 1) / 2]) + device["centre_offset_px"]
@@ -123,7 +124,7 @@ def _lens(
     )  # fmt: skip
 
 
-def _arrangement(rng: np.random.Generator, arrangement: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _compute_arrangement(rng: np.random.Generator, arrangement: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """R and t: the projector at the baseline's length, its axis through the camera's axis at the crossing depth."""
     direction = np.array(arrangement["direction"])
     centre = arrangement["baseline_mm"] * direction / np.linalg.norm(direction)

@@ -34,7 +34,7 @@ def scene_record(scene: Scene) -> dict[str, Any]:
         return {
             "shape": "plane",
             "board": str(scene.board) if scene.board else None,
-            "T_camera_board": _matrix(scene.pose),
+            "T_camera_board": _format_matrix(scene.pose),
             "bow_x_mm": scene.shape.bow_x_mm,
             "bow_y_mm": scene.shape.bow_y_mm,
             "twist_mm": scene.shape.twist_mm,
@@ -44,7 +44,7 @@ def scene_record(scene: Scene) -> dict[str, Any]:
     if isinstance(scene, Spheres):
         return {"shape": "sphere", "centres": scene.centres.tolist(), "radius_mm": scene.radius_mm}
     if isinstance(scene, MeshScene):
-        return {"shape": "mesh", "T_camera_object": _matrix(scene.pose)}
+        return {"shape": "mesh", "T_camera_object": _format_matrix(scene.pose)}
     raise InputError(f"a scene of type {type(scene).__name__} has no record: use a board, spheres or a mesh")
 
 
@@ -60,7 +60,8 @@ def _lens_record(lens: SimulatedLens) -> dict[str, Any]:
     }
 
 
-def _matrix(pose: Pose) -> list[list[float]]:
+def _format_matrix(pose: Pose) -> list[list[float]]:
+    """The pose as a nested list (4, 4), mm."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = pose.R, pose.t
     return T.tolist()
@@ -81,6 +82,7 @@ class PerfectModel:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
+        """The fringe axes that the model can use: both."""
         return ("x", "y")
 
     def points(self, phase: PhaseMap) -> np.ndarray:
@@ -91,10 +93,10 @@ class PerfectModel:
         measured = phase.coordinate[valid].astype(float)
         # In 1/z the coordinate is nearly linear, so that secants need few steps.
         nearer, inverse = np.full(len(rays), 1 / 500), np.full(len(rays), 1 / 700)
-        before = self._coordinate(rays, nearer, row) - measured
+        before = self._project_depths(rays, nearer, row) - measured
         off = before
         for _ in range(_STEPS):
-            off = self._coordinate(rays, inverse, row) - measured
+            off = self._project_depths(rays, inverse, row) - measured
             going = np.abs(off) > _SETTLED_PX
             if not going.any():
                 break
@@ -116,6 +118,7 @@ class PerfectModel:
             per_px = _NUDGE * X[..., 2] / moved
         return (per_px * phase.period_px / (2 * np.pi) * phase.sigma_phase).astype(np.float32)
 
-    def _coordinate(self, rays: np.ndarray, inverse: np.ndarray, row: int) -> np.ndarray:
+    def _project_depths(self, rays: np.ndarray, inverse: np.ndarray, row: int) -> np.ndarray:
+        """Projector coordinate (n,) px, of one row, of points on the rays (n, 3) at inverse depths (n,) 1/mm."""
         with np.errstate(divide="ignore"):
             return np.asarray(self.rig.project(rays / inverse[:, None])[:, row])
