@@ -105,17 +105,17 @@ def bench(
     size = f"{frames.shape[2]}x{frames.shape[1]}"
     rows = [row(f"render one frame, {size}", rendering, frames[0].nbytes / 1e6, target="15 ms")]
     progress(0.1, "decoding")
-    decoding, kernel = _decoding(sequence, frames)
+    decoding, kernel = _time_decoding(sequence, frames)
     rows += decoding
     progress(0.2, "measuring")
-    rows += _measuring(sequence, frames)
+    rows += _time_measuring(sequence, frames)
     progress(0.3, "live")
-    rows += _live(rig, renderer)
+    rows += _time_live(rig, renderer)
     progress(0.35, "peers")
-    peers, absent = _peers(rig, renderer, plan, kernel)
+    peers, absent = _time_peers(rig, renderer, plan, kernel)
     memory = None
     if calibration:
-        rows += _calibration(scale, part(progress, 0.4, 1.0))
+        rows += _time_calibration(scale, part(progress, 0.4, 1.0))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         memory = peak / (1e9 if sys.platform == "darwin" else 1e6)
     progress(1.0, "measured")
@@ -123,10 +123,10 @@ def bench(
     return Benchmark(rows + peers, memory, absent, streamed)
 
 
-def _decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:
+def _time_decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:
     """Phase steps and Gray code; the kernel's seconds apart."""
     coded = frames[:-1]  # without the texture
-    kernel, moved, least = _time_with_floor(_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
+    kernel, moved, least = _time_with_floor(_time_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
     whole = median(lambda: decode(sequence, frames, "x"), 5)
     defined = median(lambda: decode_reference(sequence, frames, "x"), 1, warm=False)
     alone = "phase, wrapped phase, modulation, background and reason, in arrays made before"
@@ -137,7 +137,7 @@ def _decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row],
     ], kernel
 
 
-def _kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
+def _time_kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
     """The decoding of axis x into arrays made before, with the noise known, and without a look at neighbours."""
     layout = axis_layout(sequence, "x")
     scale = grey_scale(layout, measure_noise(layout, frames, 255.0), 255.0)
@@ -150,11 +150,11 @@ def _kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[],
     return lambda: kernels_coded.decode_coded(frames, shifts, scale, rules, *maps)
 
 
-def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
+def _time_measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
     """Points from phases, and all in one pass, by both fast models; then a file of them."""
     rows = []
     phase = decode(sequence, frames, "x")
-    pixelwise, compiled, rays = _calibrations(frames.shape[1:])
+    pixelwise, compiled, rays = _make_calibrations(frames.shape[1:])
     fast = {
         "pixelwise": (13, lambda: pixelwise.points(phase)),  # coefficients of float64 count twice
         "splined": (6, lambda: compiled.depth(phase.phase, PERIOD_PX / (2 * np.pi), rays, True)),
@@ -165,16 +165,16 @@ def _measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
     one = OnePass(sequence, pixelwise, "x")
     light = one.light(frames)
     scan = one.run(frames, light)
-    rows.append(_one_pass(one, frames, 7))
-    rows.append(_one_pass(OnePass(sequence, _made_up(compiled, rays), "x"), frames, 5))
+    rows.append(_time_one_pass(one, frames, 7))
+    rows.append(_time_one_pass(OnePass(sequence, _make_splined(compiled, rays), "x"), frames, 5))
     rows += gpu_rows(sequence, pixelwise, frames)
     rows.append(row("second pass, over spikes", median(lambda: one.repair_spikes(scan), 9), megabytes(scan.phase)))
     rows.append(row("noise and fringe mean of a capture, sampled", median(lambda: one.light(frames), 5)))
-    rows.append(_file(scan.cloud()))
+    rows.append(_time_file(scan.cloud()))
     return rows
 
 
-def _one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
+def _time_one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
     """The fused kernel, which reads ``numbers`` float32 of calibration a pixel; nothing new is asked for in it."""
     light = one.light(frames)
     scan = one.run(frames, light)
@@ -196,10 +196,11 @@ def _time_with_floor(
     return seconds, megabytes(frames, values, grey, single, triple), least
 
 
-def _live(rig: SimulatedRig, renderer: Renderer) -> list[Row]:
+def _time_live(rig: SimulatedRig, renderer: Renderer) -> list[Row]:
+    """The row of a live scan: recorded frames of axis x to arrays in one fused pass of the pixel-wise model."""
     sequence = one_axis(multifrequency(rig.projector.size, 4), "x")
     frames = np.ascontiguousarray(renderer.capture(sequence)[: len(sequence.frames)])
-    pixelwise, _, _ = _calibrations(frames.shape[1:])
+    pixelwise, _, _ = _make_calibrations(frames.shape[1:])
     one = OnePass(sequence, pixelwise, "x")
     scan = one.run(frames)
     seconds = median(lambda: one.run(frames, scan.light, scan), 15)
@@ -214,7 +215,7 @@ def _live(rig: SimulatedRig, renderer: Renderer) -> list[Row]:
     ]
 
 
-def _peers(
+def _time_peers(
     rig: SimulatedRig, renderer: Renderer, plan: dict[str, Any], coded: float
 ) -> tuple[list[Row], tuple[str, ...]]:
     """Other programs; ``coded`` seconds took our kernel for phase steps and Gray code."""
@@ -224,7 +225,7 @@ def _peers(
         sequence = one_axis(multifrequency(rig.projector.size, 6), "x")
         frames = renderer.capture(sequence)
         count, size = len(frames) - 1, (frames.shape[2], frames.shape[1])
-        ours, moved, least = _time_with_floor(_kernel_alone(sequence, frames), frames[:-1], 0, (1, 4, 0))
+        ours, moved, least = _time_with_floor(_time_kernel_alone(sequence, frames), frames[:-1], 0, (1, 4, 0))
         note = "absolute and wrapped phase, modulation, background and reason, in arrays made before"
         rows.append(row(f"decode {count} frames of three periods, kernel", ours, moved, least, note=note))
         whole = median(lambda: decode(sequence, frames, "x"), 5)
@@ -236,7 +237,8 @@ def _peers(
     return rows, absent
 
 
-def _calibration(scale: float, progress: Progress) -> list[Row]:
+def _time_calibration(scale: float, progress: Progress) -> list[Row]:
+    """Rows of the pixel-wise fit, one pass of the splined model, and calibrating a whole simulated session."""
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
         simulate(session, scale=scale, progress=part(progress, 0.0, 0.5))
@@ -247,12 +249,12 @@ def _calibration(scale: float, progress: Progress) -> list[Row]:
             shot = store.load_capture(next(iter(stereo.poses)))
             splined = load_model(store, "splined")
             assert isinstance(splined, SplinedModel)
-            passed = _one_pass(
+            passed = _time_one_pass(
                 OnePass(one_axis(shot.sequence, "x"), splined, "x"),
                 shot.stack()[: len(one_axis(shot.sequence, "x").frames)],
                 5,
             )
-        fit, held = _fit(observations, stereo)
+        fit, held = _time_fit(observations, stereo)
     note = f"steps 2 to 5, both axes, phases in memory; at most {held:.2f} GB beside them"
     return [
         row(f"pixel-wise fit of {len(observations)} poses", fit, note=note, target="5 s, 1.5 GB"),
@@ -261,7 +263,7 @@ def _calibration(scale: float, progress: Progress) -> list[Row]:
     ]
 
 
-def _fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, float]:
+def _time_fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, float]:
     """Seconds of smoothing all poses' phases and fitting the pixels to them, and the GB that this takes at most."""
     rng = np.random.default_rng(0)
     measured = {
@@ -271,6 +273,7 @@ def _fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, f
     }
 
     def work() -> None:
+        """Smooth the phases of all poses and fit the pixel-wise model to them."""
         smoothed = []
         for o in observations:
             pitch = (o.box[2] - o.box[0]) / len(o.points) ** 0.5
@@ -288,14 +291,14 @@ def _fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, f
     return seconds, held
 
 
-def _made_up(compiled: CompiledAxis, rays: np.ndarray) -> SplinedModel:
+def _make_splined(compiled: CompiledAxis, rays: np.ndarray) -> SplinedModel:
     """A splined model of which there is only what one pass reads."""
     model = object.__new__(SplinedModel)
     vars(model).update(rays=rays, _compiled={"x": compiled})
     return model
 
 
-def _file(cloud: Cloud) -> Row:
+def _time_file(cloud: Cloud) -> Row:
     """A cloud with texture and noise as a PLY, beside writing as many bytes."""
     mask = cloud.mask
     with tempfile.TemporaryDirectory() as folder:
@@ -308,7 +311,7 @@ def _file(cloud: Cloud) -> Row:
     return row(f"write {np.count_nonzero(mask) / 1e6:.2f} M points as PLY", seconds, len(content) / 1e6, least)
 
 
-def _calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledAxis, np.ndarray]:
+def _make_calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledAxis, np.ndarray]:
     """Coefficients of a plausible rig: their values do not change the time."""
     height, width = shape
     v, u = np.mgrid[:height, :width] / width

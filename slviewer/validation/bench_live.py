@@ -89,17 +89,18 @@ def live_rate(scale: float = 0.5, seconds: float = 30.0, progress: Progress = ig
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
         true_calibration(session, scale)
-        with Operator(session, {"driver": "simulated", "scale": scale}) as operator, _served(operator) as server:
-            _wait(lambda: operator.snapshot().rig.state == "open", operator)
+        with Operator(session, {"driver": "simulated", "scale": scale}) as operator, _serve_wizard(operator) as server:
+            _wait_until(lambda: operator.snapshot().rig.state == "open", operator)
             operator.place("object")
             with _Viewer(server, draws=True):
-                _wait(lambda: len(server.viser.get_clients()) == 1, operator)
+                _wait_until(lambda: len(server.viser.get_clients()) == 1, operator)
                 operator.start_live()
-                _wait(lambda: _shown(operator) > 0, operator)
+                _wait_until(lambda: _get_shown_rate(operator) > 0, operator)
                 return _measure(operator, server, seconds, progress)
 
 
 def _measure(operator: Operator, server: SafeServer, seconds: float, progress: Progress) -> LiveFigures:
+    """Figures of the running live scan over so many seconds, with a second viewer that stops reading."""
     time.sleep(_WARM_S)
     begun, first = time.monotonic(), operator.live_captures
     memory: list[tuple[float, float]] = []
@@ -114,12 +115,12 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
             time.sleep(min(0.25, seconds / 20))
             live = operator.snapshot().live
             if live is None:
-                raise SlviewerError(f"the live scan ended: {_last_notice(operator)}")
+                raise SlviewerError(f"the live scan ended: {_get_last_notice(operator)}")
             made.append(live.clouds_per_s)
             shown.append(live.shown_per_s)
             behind += [] if live.latency_ms is None else [live.latency_ms]
             points = live.points
-            memory.append((passed / seconds, _memory_mb()))
+            memory.append((passed / seconds, _measure_memory_mb()))
             progress(min(passed / seconds, 0.999), f"live: {live.shown_per_s:.1f} clouds/s")
     captures = operator.live_captures
     camera = operator.snapshot().rig.camera
@@ -145,7 +146,7 @@ class _Viewer:
     def __init__(self, server: SafeServer, draws: bool) -> None:
         self._server, self._draws = server, draws
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="viewer", daemon=True)
+        self._thread = threading.Thread(target=self._run_client, name="viewer", daemon=True)
 
     def __enter__(self) -> "_Viewer":
         self._thread.start()
@@ -155,17 +156,19 @@ class _Viewer:
         self._closing.set()
         self._thread.join(5.0)
 
-    def _serve(self) -> None:
+    def _run_client(self) -> None:
+        """Connect again and again until closed, and draw or stall according to ``draws``."""
         while not self._closing.is_set():
             with contextlib.suppress(WebSocketException, OSError), self._connect() as connection:
                 connection.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **_VIEWPOINT}))
                 if self._draws:
-                    self._draw(connection)
+                    self._answer_requests(connection)
                 else:  # until the server gives it up, and once more then
                     while not self._closing.wait(0.1) and connection.state.name == "OPEN":
                         pass
 
-    def _draw(self, connection: Connection) -> None:
+    def _answer_requests(self, connection: Connection) -> None:
+        """Receive messages until closed, and answer the server's requests for acknowledgement."""
         unpack = zstandard.ZstdDecompressor()
         while not self._closing.is_set():
             try:
@@ -181,6 +184,7 @@ class _Viewer:
                     connection.send(msgspec.msgpack.encode({"type": kind, **answer}))
 
     def _connect(self) -> ClientConnection:
+        """An open WebSocket to the server with the view token, as viser's page opens it."""
         port, access = self._server.port, self._server.access
         host = f"127.0.0.1:{port}"
         return connect(
@@ -194,7 +198,8 @@ class _Viewer:
 
 
 @contextlib.contextmanager
-def _served(operator: Operator) -> Iterator[SafeServer]:
+def _serve_wizard(operator: Operator) -> Iterator[SafeServer]:
+    """Serve the wizard for an operator at its scan step; yields the server."""
     app = App(operator, port=0)
     try:
         app.shell.go("scan")
@@ -215,25 +220,28 @@ def true_calibration(folder: Path, scale: float) -> None:
         )
 
 
-def _wait(condition: Callable[[], bool], operator: Operator) -> None:
+def _wait_until(condition: Callable[[], bool], operator: Operator) -> None:
+    """Wait until the condition holds; raises SlviewerError when it takes too long."""
     end = time.monotonic() + _PATIENCE_S
     while not condition():
         if time.monotonic() > end:
-            raise SlviewerError(f"the live scan did not begin within {_PATIENCE_S:.0f} s: {_last_notice(operator)}")
+            raise SlviewerError(f"the live scan did not begin within {_PATIENCE_S:.0f} s: {_get_last_notice(operator)}")
         time.sleep(0.02)
 
 
-def _shown(operator: Operator) -> float:
+def _get_shown_rate(operator: Operator) -> float:
+    """Frames per s that the live scan shows at present; 0 without one."""
     live = operator.snapshot().live
     return 0.0 if live is None else live.shown_per_s
 
 
-def _last_notice(operator: Operator) -> str:
+def _get_last_notice(operator: Operator) -> str:
+    """Text of the operator's last notice."""
     notices = operator.snapshot().notices
     return notices[-1].text if notices else "nobody said why"
 
 
-def _memory_mb() -> float:
+def _measure_memory_mb() -> float:
     """Of this process, in use; NaN where the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])

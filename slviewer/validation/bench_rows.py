@@ -195,6 +195,7 @@ def icp_rows(points: np.ndarray) -> list[dict[str, Any]]:
     count = f"{len(points) / 1e6:.2f} M points"
 
     def theirs() -> object:
+        """Align the moved cloud with the original by small_gicp's point-to-plane ICP."""
         return small_gicp.align(
             points.astype(np.float64),
             moved.astype(np.float64),
@@ -213,6 +214,7 @@ def _measure_seconds(work: Callable[[], object]) -> float:
     """Median seconds; a cloud that may slide on itself is refused after the same work."""
 
     def tried() -> None:
+        """Run the work and ignore its refusal."""
         with suppress(SlviewerError):
             work()
 

@@ -143,7 +143,7 @@ def _describe_board(bench: FaultBench, columns: int, rows: int) -> DiagnosedCali
     return bench.attempt_disturbed(board=replace(bench.board, columns=columns, rows=rows))
 
 
-def _renumber(bench: FaultBench, order: FrameChange) -> DiagnosedCalibration:
+def _renumber_features(bench: FaultBench, order: FrameChange) -> DiagnosedCalibration:
     """Features of one pose in another order; ``order`` turns (rows, columns) indices."""
     captures = bench.examine_clean()
     observation = captures[2].observation
@@ -158,7 +158,7 @@ def _renumber(bench: FaultBench, order: FrameChange) -> DiagnosedCalibration:
     return bench.attempt(captures)
 
 
-def _move(bench: FaultBench, by_mm: Sequence[float], share: float) -> DiagnosedCalibration:
+def _move_board(bench: FaultBench, by_mm: Sequence[float], share: float) -> DiagnosedCalibration:
     """One pose whose board has moved after this share of the frames."""
     pose, frames = bench.poses[2], bench.frames(2).copy()
     from_frame = round(share * len(frames))
@@ -167,11 +167,12 @@ def _move(bench: FaultBench, by_mm: Sequence[float], share: float) -> DiagnosedC
 
 
 def _apply_gamma(bench: FaultBench, gamma: float) -> DiagnosedCalibration:
+    """The diagnosed calibration from captures of a projector with this gamma."""
     light = replace(bench.rig.light, gamma=gamma)
     return replace(bench, rig=replace(bench.rig, light=light)).attempt_disturbed()
 
 
-def _tilt_alike(bench: FaultBench, tilt_deg: float, spread_deg: float) -> DiagnosedCalibration:
+def _tilt_boards_alike(bench: FaultBench, tilt_deg: float, spread_deg: float) -> DiagnosedCalibration:
     """All boards tilted alike, but for a hand's unsteadiness."""
     rng = np.random.default_rng(5)
     middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
@@ -197,6 +198,7 @@ def _avoid_corner(bench: FaultBench) -> DiagnosedCalibration:
 
 
 def _exchange_halves(frames: np.ndarray) -> np.ndarray:
+    """Frames (n, h, w) with the first and the second half exchanged."""
     half = len(frames) // 2  # as many frames of one axis as of the other
     return show_instead(frames, range(2 * half), [*range(half, 2 * half), *range(half)])
 
@@ -212,14 +214,14 @@ FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]]
     "board of 20x16 given": ("board-size", lambda bench: _describe_board(bench, 20, 16)),
     "board of 21x15 given": ("board-size", lambda bench: _describe_board(bench, 21, 15)),
     "board of 22x16 given": ("board-size", lambda bench: _describe_board(bench, 22, 16)),
-    "board transposed in one pose": ("board-numbering", lambda bench: _renumber(bench, np.transpose)),
+    "board transposed in one pose": ("board-numbering", lambda bench: _renumber_features(bench, np.transpose)),
     "board shifted by a row in one pose": (
         "board-numbering",
-        lambda bench: _renumber(bench, lambda index: np.roll(index, 1, axis=0)),
+        lambda bench: _renumber_features(bench, lambda index: np.roll(index, 1, axis=0)),
     ),
-    "one pose moved between the axes": ("moved", lambda bench: _move(bench, (0.5, 0.2, 0.0), 0.5)),
-    "one pose moved among the frames of x": ("moved", lambda bench: _move(bench, (1.0, -0.5, 0.5), 0.18)),
-    "one pose moved a little": ("moved", lambda bench: _move(bench, (0.15, 0.0, 0.15), 0.5)),
+    "one pose moved between the axes": ("moved", lambda bench: _move_board(bench, (0.5, 0.2, 0.0), 0.5)),
+    "one pose moved among the frames of x": ("moved", lambda bench: _move_board(bench, (1.0, -0.5, 0.5), 0.18)),
+    "one pose moved a little": ("moved", lambda bench: _move_board(bench, (0.15, 0.0, 0.15), 0.5)),
     "lag of one frame": ("frame-lag", lambda bench: bench.attempt_disturbed(delay_frames)),
     "lag of one frame in one pose": ("frame-lag", lambda bench: bench.attempt_with(3, delay_frames(bench.frames(3)))),
     "fifth frame missing": (
@@ -234,8 +236,8 @@ FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]]
     "overexposed": ("saturation", lambda bench: bench.attempt_disturbed(exposure=1.8)),
     "much overexposed": ("saturation", lambda bench: bench.attempt_disturbed(exposure=4.0)),
     "gamma 2.2": ("gamma", lambda bench: _apply_gamma(bench, 2.2)),
-    "boards facing the camera": ("parallel-poses", lambda bench: _tilt_alike(bench, 0.0, 0.7)),
-    "boards tilted alike": ("parallel-poses", lambda bench: _tilt_alike(bench, 20.0, 3.0)),
+    "boards facing the camera": ("parallel-poses", lambda bench: _tilt_boards_alike(bench, 0.0, 0.7)),
+    "boards tilted alike": ("parallel-poses", lambda bench: _tilt_boards_alike(bench, 20.0, 3.0)),
     "no pose in one corner": ("empty-corner", _avoid_corner),
     "two poses": ("too-few-poses", lambda bench: bench.attempt(bench.examine_clean(2))),
     "four poses": ("too-few-poses", lambda bench: bench.attempt(bench.examine_clean(4))),

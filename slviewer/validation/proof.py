@@ -66,6 +66,7 @@ def prove_checks(
 
 
 def _without_nan(value: Any) -> Any:
+    """A copy of nested dicts and lists with None for NaN."""
     if isinstance(value, dict):
         return {key: _without_nan(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

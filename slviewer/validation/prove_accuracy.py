@@ -162,7 +162,7 @@ def judge_accuracy(rigs: Sequence[RigFigures], scale: float) -> Proof:
     """The proof from the figures of all rigs."""
     title = f"mean plane RMS in mm over pixels seen in {COVERED} poses or more, at scale {scale:g}"
     checks = [check for rig in rigs for check in check_rig(rig)]
-    return prove_checks(checks, scale, [_row(rig) for rig in rigs], {"rigs": rigs}, [title])
+    return prove_checks(checks, scale, [_make_row(rig) for rig in rigs], {"rigs": rigs}, [title])
 
 
 def check_rig(rig: RigFigures) -> tuple[BandCheck, ...]:
@@ -187,7 +187,8 @@ def check_rig(rig: RigFigures) -> tuple[BandCheck, ...]:
     return tuple(BandCheck(rig.rig, *bound) for bound in bounds)
 
 
-def _row(rig: RigFigures) -> Row:
+def _make_row(rig: RigFigures) -> Row:
+    """The printed table row of one rig: mean RMS by model, ratios to the floor and the largest errors."""
     radius, spacing = rig.largest_errors_mm
     return {
         "rig": rig.rig,
@@ -232,7 +233,7 @@ def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = ig
                 assert isinstance(result, SphereResult)
                 fits.setdefault(model, {})[name] = result
         else:
-            planes[name] = _plane_figures(comparison, measured)
+            planes[name] = _make_plane_figures(comparison, measured)
     spacings = {
         f"{a} - {b}": (a, b, float(np.linalg.norm(spheres[a].centres[0] - spheres[b].centres[0])))
         for a, b in combinations(spheres, 2)
@@ -296,7 +297,8 @@ def compare_models(
     return comparison, int(np.count_nonzero(comparison.common)) / max(to_score, 1)
 
 
-def _plane_figures(comparison: Comparison, measured: float) -> PlaneFigures:
+def _make_plane_figures(comparison: Comparison, measured: float) -> PlaneFigures:
+    """The figures of one plane from its comparison and the share of its pixels that were measured."""
     shares = comparison.incidence or {}
     splined = comparison.results["splined"]
     return PlaneFigures(

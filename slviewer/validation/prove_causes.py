@@ -75,4 +75,5 @@ def prove_causes(
 
 
 def _attempt_clean(bench: FaultBench) -> DiagnosedCalibration:
+    """The diagnosed calibration from captures without a fault."""
     return bench.attempt(bench.examine_clean())

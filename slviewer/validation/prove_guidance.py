@@ -65,7 +65,7 @@ def prove_guidance(
     total = rigs * len(_WAYS)
     for k in range(rigs):
         rig = letter(scale, seed + k)
-        targets = [_target_plane(rig, name, 100 + i) for i, name in enumerate(planes())]
+        targets = [_render_plane(rig, name, 100 + i) for i, name in enumerate(planes())]
         for way in _WAYS:
             label = f"rig {k + 1} of {rigs}, {way}"
             report = part(progress, len(figures) / total, (len(figures) + 1) / total, label)
@@ -122,7 +122,7 @@ def judge_guidance(figures: Sequence[WayFigures], scale: float) -> Proof:
 def _observe_random(rig: SimulatedRig, count: int, report: Progress) -> list[Observation]:
     """The observations of poses drawn as the Letter's were; unreadable ones are skipped."""
     observations = [
-        _observe(rig, pose, i, part(report, 0.9 * i / count, 0.9))
+        _observe_pose(rig, pose, i, part(report, 0.9 * i / count, 0.9))
         for i, pose in enumerate(target_poses(rig, BOARD, count))
     ]
     return [each for each in observations if each is not None]
@@ -134,22 +134,23 @@ def _observe_guided(rig: SimulatedRig, count: int, report: Progress) -> tuple[li
     observations: list[Observation] = []
     refused = 0
     while True:
-        features = {o.name: _pose_features(o) for o in observations}
+        features = {o.name: _extract_features(o) for o in observations}
         planned = plan(PlanInput(BOARD, rig.camera.size, rig.projector.size, features, refused=refused))
         if len(observations) == count:
             return observations, planned.sigma_mm
         i = len(observations) + refused
         if planned.suggestion is None or refused > count:
             raise InputError(f"{refused} of {i} suggested poses could not be read, at {rig.camera.size} px")
-        pose = _hand_held(rig, _suggested_pose(rig, planned.suggestion.outline_px), rng)
-        observation = _observe(rig, pose, i, part(report, 0.9 * len(observations) / count, 0.9))
+        pose = _vary_pose(rig, _solve_suggested_pose(rig, planned.suggestion.outline_px), rng)
+        observation = _observe_pose(rig, pose, i, part(report, 0.9 * len(observations) / count, 0.9))
         if observation is None:
             refused += 1
         else:
             observations.append(observation)
 
 
-def _observe(rig: SimulatedRig, pose: Pose, number: int, report: Progress) -> Observation | None:
+def _observe_pose(rig: SimulatedRig, pose: Pose, number: int, report: Progress) -> Observation | None:
+    """The observation of the board rendered at a pose; None if it was not detected."""
     report(0.0, f"pose {number + 1}")
     try:
         return observe_rendered(rig, printed_board(BOARD, pose, seed=rig.seed), f"pose_{number + 1:02d}", number)
@@ -157,12 +158,13 @@ def _observe(rig: SimulatedRig, pose: Pose, number: int, report: Progress) -> Ob
         return None
 
 
-def _pose_features(observation: Observation) -> PoseFeatures:
+def _extract_features(observation: Observation) -> PoseFeatures:
+    """Features of one observation, and its median phase noise; NaN where that is unknown."""
     noise = np.nan if observation.samples is None else float(np.nanmedian(observation.samples.sigma))
     return PoseFeatures(observation.points, observation.camera, observation.projector, noise)
 
 
-def _suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarray:
+def _solve_suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarray:
     """T_camera_board (4, 4) at which the board fills an outline (4, 2) px that is drawn into the picture: what a hand
     follows, whatever the program believes of the lens."""
     rays = rig.camera.undistort(outline_px)
@@ -172,7 +174,7 @@ def _suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarray:
     return T
 
 
-def _hand_held(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Generator) -> Pose:
+def _vary_pose(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Generator) -> Pose:
     """A pose near the given one with every feature in view, as a hand moves the board until it is detected."""
     middle = (BOARD.points.min(0) + BOARD.points.max(0)) / 2
     centre = T_camera_board[:3, :3] @ middle + T_camera_board[:3, 3]
@@ -198,7 +200,8 @@ class _TargetPlane:
     exact: np.ndarray
 
 
-def _target_plane(rig: SimulatedRig, name: str, number: int) -> _TargetPlane:
+def _render_plane(rig: SimulatedRig, name: str, number: int) -> _TargetPlane:
+    """A rendered scan of the plane ``name``, whose noise ``number`` seeds, and its true points."""
     renderer = Renderer(rig, planes()[name])
     phase = render_phase(renderer, name, number)
     exact = PerfectModel(rig).points(phase)
@@ -212,14 +215,14 @@ def _measure_plane(model: SplinedModel, target: _TargetPlane) -> tuple[float, fl
     known = target.illuminated & np.isfinite(points[..., 2])
     supported = model.support(target.phase) & target.illuminated
     return (
-        _plane_rms(points[known]),
-        _plane_rms(target.exact[known]),
+        _compute_plane_rms(points[known]),
+        _compute_plane_rms(target.exact[known]),
         float(np.count_nonzero(supported) / np.count_nonzero(target.illuminated)),
         int(np.count_nonzero(target.illuminated & ~known)),
     )
 
 
-def _plane_rms(points: np.ndarray) -> float:
+def _compute_plane_rms(points: np.ndarray) -> float:
     """Plane RMS in mm over all points (n, 3), outliers included."""
     plane = fit_plane(points.astype(float))
     return float(np.sqrt(np.mean(plane.distance(points.astype(float)) ** 2)))

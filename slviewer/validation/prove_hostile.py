@@ -181,7 +181,9 @@ class _Trial:
         start, report = perf_counter(), CaseReport()
         measured: Sequence[MeasuredScan] = ()
         try:
-            measured = (self._scan if direction == "scan" else self._calibrate)(FAULTS[name], severity, report)
+            measured = (self._measure_faulty_scans if direction == "scan" else self._measure_after_faulty_calibration)(
+                FAULTS[name], severity, report
+            )
         except Exception as error:  # the other cases still have to run
             report.error = error
         gauge = self._gauge if direction == "scan" or not measured else fit_gauge(measured)
@@ -193,12 +195,16 @@ class _Trial:
             name, severity, direction, outcome, outcome in PASSED, figures, self._floor, named, tuple(messages), seconds
         )
 
-    def _scan(self, fault: Fault, severity: Severity, report: CaseReport) -> Sequence[MeasuredScan]:
+    def _measure_faulty_scans(self, fault: Fault, severity: Severity, report: CaseReport) -> Sequence[MeasuredScan]:
+        """Measure all scans, captured with the fault, with the clean calibration."""
         shots = {name: self._bench.capture(name, fault, severity) for name in SCANS}
         self._bench.store(self._session, {name: shot[0] for name, shot in shots.items()}, report)
         return [self._bench.measure(self._session, name, shot[1:], report) for name, shot in shots.items()]
 
-    def _calibrate(self, fault: Fault, severity: Severity, report: CaseReport) -> Sequence[MeasuredScan]:
+    def _measure_after_faulty_calibration(
+        self, fault: Fault, severity: Severity, report: CaseReport
+    ) -> Sequence[MeasuredScan]:
+        """Calibrate from target poses of which some have the fault, and measure the clean scans."""
         bench, session = self._bench, self._bench.folder / "hostile"
         shutil.rmtree(session, ignore_errors=True)
         struck = bench.targets[: fault.struck[SEVERITIES.index(severity)]]

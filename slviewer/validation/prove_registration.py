@@ -70,22 +70,23 @@ class RegisteredScans:
             return float("nan"), float("nan")
         T = np.linalg.multi_dot([np.eye(4), *(pairs[step].T_reference_scan for step in steps)])
         D = T @ np.linalg.inv(pairs[names[-1], names[0]].T_reference_scan)
-        return _motion_size(D, self.poses[names[0]][:3, 3])
+        return _measure_motion(D, self.poses[names[0]][:3, 3])
 
     def error(self, scan: str, onto: str, T_onto_scan: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
         """Error of a registration (4, 4): mm at ``centre`` (3,) mm, and degrees."""
-        return _motion_size(T_onto_scan @ self.poses[scan] @ np.linalg.inv(self.poses[onto]), centre)
+        return _measure_motion(T_onto_scan @ self.poses[scan] @ np.linalg.inv(self.poses[onto]), centre)
 
     def rows(self) -> list[Row]:
         """A table row for each registered pair, true and predicted errors beside each other."""
         rows = []
         for (scan, onto), pair in self.alignment.pairs.items():
             shift, turn = self.error(scan, onto, pair.T_reference_scan, pair.uncertainty.centre)
-            rows.append(_row(scan, onto, pair, shift, turn))
+            rows.append(_make_row(scan, onto, pair, shift, turn))
         return rows
 
 
-def _row(scan: str, onto: str, pair: Registration, shift: float, turn: float) -> Row:
+def _make_row(scan: str, onto: str, pair: Registration, shift: float, turn: float) -> Row:
+    """The table row of a registered pair: true errors (mm, degrees) beside the predicted ones."""
     return {
         "scan": scan,
         "onto": onto,
@@ -119,9 +120,10 @@ def prove_registration(
         true.append(renderer.truth().points.reshape(-1, 3)[known])
     # A calibration's camera frame is a gauge: turned by a part of a milliradian it measures every distance the same.
     T_calibrated_camera = fit_rigid(np.concatenate(true), np.concatenate(measured))
-    truth = {name: T_calibrated_camera @ _matrix(scene.pose) for name, scene in scans.items()}
+    truth = {name: T_calibrated_camera @ _to_matrix(scene.pose) for name, scene in scans.items()}
 
     def register(kind: str, reference: str, starts: Starts | None, done: Progress) -> RegisteredScans:
+        """Register all scans of one kind onto the reference, and time it."""
         chosen = {name: cloud for name, cloud in clouds.items() if name.startswith(kind)}
         start = perf_counter()
         alignment = register_all(chosen, reference, starts, lambda share: done(share, "registering"))
@@ -133,13 +135,13 @@ def prove_registration(
     progress(0.88, "fusing and meshing")
     surfaces, lines, surface_record = _check_surfaces(depths, turn, scans)
     refusals = {}
-    for k, (what, (wanted, *pair)) in enumerate(_ambiguous_pairs().items()):
+    for k, (what, (wanted, *pair)) in enumerate(_make_ambiguous_pairs().items()):
         progress(0.95 + 0.01 * k, what)
         both = {
             name: reconstruct(model, {"x": render_phase(Renderer(rig, scene), name, 900 + k)})
             for name, scene in zip("ab", pair, strict=True)
         }
-        reason = _refusal(both)
+        reason = _describe_refusal(both)
         refusals[what] = {"wanted": wanted, "got": reason}
         is_right = float(reason in wanted.split("/"))
         surfaces.append(BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0))
@@ -208,7 +210,7 @@ def _check_surfaces(
     return checks, [line, meshed.text()], record
 
 
-def _refusal(pair: Mapping[str, Cloud]) -> str:
+def _describe_refusal(pair: Mapping[str, Cloud]) -> str:
     """Why two clouds "a" and "b" are not registered, or "accepted"."""
     try:
         register_all(pair, "b")
@@ -219,13 +221,13 @@ def _refusal(pair: Mapping[str, Cloud]) -> str:
     return "accepted"
 
 
-def _ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
+def _make_ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
     """Two scans each that must not be registered, and the reason."""
     near, far = np.array([0.0, 0.0, 560.0]), np.array([6.0, -4.0, 620.0])
     first, second = (
         Pose(rotation(np.radians(turns)), place) for turns, place in (((4.0, -6.0, 2.0), near), ((-5.0, 3.0, 6.0), far))
     )
-    cylinder = _cylinder_mesh(40.0, 150.0)
+    cylinder = _make_cylinder_mesh(40.0, 150.0)
     return {
         "two scans of a plane": ("plane", blank_board(first), blank_board(second)),
         "two scans of a sphere": ("sphere", sphere((4.0, -3.0, 640.0)), sphere((-8.0, 6.0, 690.0))),
@@ -238,7 +240,7 @@ def _ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
     }
 
 
-def _cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+def _make_cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
     """An open cylinder along y with facets smaller than the noise: vertices (n, 3) mm, triangles (m, 3)."""
     around = 720
     angles = np.arange(around) * 2 * np.pi / around
@@ -248,13 +250,14 @@ def _cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray
     return vertices, np.concatenate([np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)])
 
 
-def _motion_size(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
+def _measure_motion(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
     """How far a motion (4, 4) shifts a point (3,), mm, and its angle, degrees."""
     shift = np.linalg.norm(D[:3, :3] @ centre + D[:3, 3] - centre)
     return float(shift), float(np.degrees(Rotation.from_matrix(D[:3, :3]).magnitude()))
 
 
-def _matrix(pose: Pose) -> np.ndarray:
+def _to_matrix(pose: Pose) -> np.ndarray:
+    """The pose as a transform (4, 4), mm."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = pose.R, pose.t
     return T

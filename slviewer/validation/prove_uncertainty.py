@@ -85,7 +85,9 @@ def prove_uncertainty(
 def judge_uncertainty(rigs: Mapping[str, PredictedErrors], scale: float, poses: int) -> Proof:
     """The proof: whether the ratio of predicted to true errors, pooled over the rigs, lies in ``BAND``."""
     every = list(rigs.values())
-    pooled = PredictedErrors(*(_joined(every, what) for what in ("predicted", "true", "supported"))).row("pooled")
+    pooled = PredictedErrors(*(_concatenate_field(every, what) for what in ("predicted", "true", "supported"))).row(
+        "pooled"
+    )
     rows = [each.row(name) for name, each in rigs.items()] + ([pooled] if len(every) > 1 else [])
     table = [
         {
@@ -138,5 +140,6 @@ def true_errors(true: SimulatedRig, rig: Arrangement, volume: Volume, axis: Axis
     return view_pixels(rig, volume.pixels, z)[0] - points
 
 
-def _joined(rigs: Sequence[PredictedErrors], what: str) -> np.ndarray:
+def _concatenate_field(rigs: Sequence[PredictedErrors], what: str) -> np.ndarray:
+    """The field ``what`` (n,) of all rigs, concatenated."""
     return np.concatenate([getattr(rig, what) for rig in rigs])

@@ -79,7 +79,7 @@ def reproduce(
         pixelwise=calibration.pixelwise,
         planes=planes,
         spheres=spheres.captures,
-        spacings_mm=_spacings(session, spheres),
+        spacings_mm=_compare_spacings(session, spheres),
         merged=merged,
         report=out / "report.html",
     )
@@ -93,7 +93,7 @@ def reproduce(
 def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> None:
     """Fills the session, unless it holds this scale and seed already; refuses one that holds anything else."""
     if is_session(session):
-        made = _truth(session)
+        made = _load_truth(session)
         if (made.get("scale"), made.get("seed")) == (scale, seed):
             return
         with Session.open(session) as store:
@@ -103,15 +103,16 @@ def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> Non
     simulate(session, scale=scale, seed=seed, progress=progress)
 
 
-def _truth(session: Path) -> dict[str, Any]:
+def _load_truth(session: Path) -> dict[str, Any]:
+    """The stored ground truth of a simulated session; empty where there is none."""
     path = session / TRUTH
     truth: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
     return truth
 
 
-def _spacings(session: Path, spheres: Verification) -> dict[str, tuple[float, Mapping[str, float]]]:
+def _compare_spacings(session: Path, spheres: Verification) -> dict[str, tuple[float, Mapping[str, float]]]:
     """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the simulation's truth."""
-    centres = {name: np.array(record["centres"][0]) for name, record in _truth(session)["spheres"].items()}
+    centres = {name: np.array(record["centres"][0]) for name, record in _load_truth(session)["spheres"].items()}
     return {
         f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), measured)
         for (a, b), measured in spheres.centre_distances_mm().items()

@@ -93,11 +93,11 @@ class Reproduction:
                 f"(the Letter: {theirs['camera']:.3f}, {theirs['projector']:.3f}).",
                 "",
                 "Flat board (Table 1)",
-                render(_terminal_columns(letter_rows(self.planes))),
+                render(_select_columns(letter_rows(self.planes))),
                 f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
                 "",
                 f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
-                render(_terminal_columns(letter_rows(self.spheres))),
+                render(_select_columns(letter_rows(self.spheres))),
                 "Distances between the sphere centres, RMS error: "
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",
@@ -106,17 +106,18 @@ class Reproduction:
                 *pairs,
                 "",
                 f"Report: {self.report}",
-                f"Session: {self.report.parent / 'session'} ({_size_gb(self.report.parent / 'session'):.1f} GB)",
+                f"Session: {self.report.parent / 'session'} ({_folder_size_gb(self.report.parent / 'session'):.1f} GB)",
             ]
         )
 
 
-def _terminal_columns(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _select_columns(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The columns that fit a terminal; coverage and points set aside stand in the report."""
     return [{k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k} for row in table]
 
 
-def _size_gb(folder: Path) -> float:
+def _folder_size_gb(folder: Path) -> float:
+    """Size of all files below a folder, GB."""
     return sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 1e9
 
 
@@ -129,14 +130,15 @@ def write_reproduction(
     result: Reproduction, observations: Sequence[Observation], pixel: tuple[int, int], seed: int
 ) -> None:
     """Write ``result.report``; ``pixel`` (u, v) is the one whose curves are drawn."""
-    data = _data(result, observations, pixel, seed)
+    data = _make_report_data(result, observations, pixel, seed)
     title, subtitle = reproduction_title(data)
     write_page(result.report, title, subtitle, reproduction_headlines(data), reproduction_sections(data))
 
 
-def _data(
+def _make_report_data(
     result: Reproduction, observations: Sequence[Observation], pixel: tuple[int, int], seed: int
 ) -> ReproductionData:
+    """The report's input from the results, with the curves of one camera pixel (u, v)."""
     stereo, pixelwise, merged = result.stereo, result.pixelwise, result.merged
     fit = pixelwise.fits[pixelwise.depth_axis]
     clouds = [CloudView(name, cloud.points) for name, cloud in merged.clouds.items()]
@@ -151,9 +153,12 @@ def _data(
         reprojection_rms_px=stereo.reprojection_rms_px,
         letter_reprojection_rms_px=letter.REPROJECTION_RMS_PX,
         fit_rms_mm=pixelwise.median_rms_mm(pixelwise.depth_axis),
-        planes=[_plane_row(name, c, row) for (name, c), row in zip(result.planes.items(), letter.TABLE_1, strict=True)],
+        planes=[
+            _make_plane_row(name, c, row) for (name, c), row in zip(result.planes.items(), letter.TABLE_1, strict=True)
+        ],
         spheres=[
-            _sphere_row(name, c, row) for (name, c), row in zip(result.spheres.items(), letter.TABLE_2, strict=True)
+            _make_sphere_row(name, c, row)
+            for (name, c), row in zip(result.spheres.items(), letter.TABLE_2, strict=True)
         ],
         spacings=[SpacingRow(name, known, measured) for name, (known, measured) in result.spacings_mm.items()],
         pairs=[
@@ -170,7 +175,7 @@ def _data(
         rms_maps_mm=fit.rms_mm,
         plane_maps=[error_maps(f"plane_{i:02d}", result.planes[f"plane_{i:02d}"]) for i in SHOWN_PLANES],
         sphere_maps=[error_maps(name, c) for name, c in result.spheres.items()],
-        plane_outlines={name: _outline(c, stereo.rig.camera.rays()) for name, c in result.planes.items()},
+        plane_outlines={name: _outline_plane(c, stereo.rig.camera.rays()) for name, c in result.planes.items()},
         clouds=clouds,
         merged=CloudView("merged", whole.surface.points, whole.surface.normals, whole.source, whole.names),
         poses_left_out=stereo.excluded,
@@ -178,24 +183,26 @@ def _data(
     )
 
 
-def _plane_row(name: str, comparison: Comparison, theirs: letter.PlanePose) -> PlaneRow:
+def _make_plane_row(name: str, comparison: Comparison, theirs: letter.PlanePose) -> PlaneRow:
+    """The report's row of one plane, beside the Letter's values."""
     return PlaneRow(
         name=name,
         incidence=comparison.incidence or {},
-        rms_mm=_rms(comparison),
-        noise_floor_mm=_floor(comparison),
+        rms_mm=_get_rms(comparison),
+        noise_floor_mm=_get_noise_floor(comparison),
         letter_incidence=dict(zip(REGIONS, theirs.incidence, strict=True)),
         letter_rms_mm={"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
     )
 
 
-def _sphere_row(name: str, comparison: Comparison, theirs: letter.SpherePose) -> SphereRow:
+def _make_sphere_row(name: str, comparison: Comparison, theirs: letter.SpherePose) -> SphereRow:
+    """The report's row of one sphere, beside the Letter's values."""
     return SphereRow(
         name=name,
         region=theirs.region,
         true_radius_mm=letter.SPHERE_RADIUS_MM,
-        rms_mm=_rms(comparison),
-        noise_floor_mm=_floor(comparison),
+        rms_mm=_get_rms(comparison),
+        noise_floor_mm=_get_noise_floor(comparison),
         radius_mm={m: r.radius_mm for m, r in comparison.results.items() if isinstance(r, SphereResult)},
         letter_rms_mm={"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
         letter_radius_mm={"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
@@ -205,11 +212,11 @@ def _sphere_row(name: str, comparison: Comparison, theirs: letter.SpherePose) ->
 def error_maps(title: str, comparison: Comparison) -> ErrorMaps:
     """The signed errors of every model over the pixels that counted."""
     maps = {m: np.where(r.inliers, r.error_map, np.nan) for m, r in comparison.results.items()}
-    floors = list(_floor(comparison).values())
-    return ErrorMaps(title, maps, _rms(comparison), floors[-1])
+    floors = list(_get_noise_floor(comparison).values())
+    return ErrorMaps(title, maps, _get_rms(comparison), floors[-1])
 
 
-def _outline(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
+def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
     """Points (n, 3) mm of the stereo model's plane, where the pixels that counted look at it."""
     result = comparison.results["stereo"]
     assert isinstance(result, PlaneResult)
@@ -219,9 +226,11 @@ def _outline(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
     return d * (result.plane.offset / (d @ result.plane.normal))[:, None]
 
 
-def _rms(comparison: Comparison) -> Mapping[str, float]:
+def _get_rms(comparison: Comparison) -> Mapping[str, float]:
+    """RMS of each model, mm."""
     return {m: r.rms_mm for m, r in comparison.results.items()}
 
 
-def _floor(comparison: Comparison) -> Mapping[str, float]:
+def _get_noise_floor(comparison: Comparison) -> Mapping[str, float]:
+    """Noise floor of each model, mm."""
     return {m: r.noise_floor_mm for m, r in comparison.results.items()}
