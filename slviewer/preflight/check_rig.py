@@ -82,11 +82,13 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
     heard = progress or ignore_progress
 
     def tick(doing: str) -> None:
+        """Report progress by one more image."""
         nonlocal shown
         heard(min(0.99, shown / _EXPECTED_IMAGES), doing)
         shown += 1
 
     def add(*results: Check) -> None:
+        """Store the checks, and report each with its remedy."""
         for check in results:
             checks.append(check)
             if say is not None:

@@ -52,10 +52,10 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
             ),
             None,
         )
-    settle = _settle_ms([change.arrival_ms(0) for change in changes], bench.frame_ms)
+    settle = _compute_settle_ms([change.arrival_ms(0) for change in changes], bench.frame_ms)
     bench.stale = max(_count_stale(bench, settle, i) for i in range(_STALE_TRIALS))
     fresh = [change.arrival_ms(bench.stale) for change in changes]
-    settle = _settle_ms(fresh, bench.frame_ms)
+    settle = _compute_settle_ms(fresh, bench.frame_ms)
     bench.settle_ms = settle
     images = [len(change.begin_s) - 1 - bench.stale for change in changes]
     figures = {
@@ -101,7 +101,7 @@ def _time_change(bench: RigUnderTest, i: int) -> _Change:
     while True:
         start, image = bench.grab_timed()
         begin_s.append(start - shown)
-        if abs(bench.share(image, bench.illuminated) - target) < _change_tolerance(bench):
+        if abs(bench.share(image, bench.illuminated) - target) < _compute_tolerance(bench):
             return _Change(tuple(begin_s), True)
         if start - shown > _TIMEOUT_S:
             return _Change(tuple(begin_s), False)
@@ -113,16 +113,17 @@ def _count_stale(bench: RigUnderTest, settle_ms: float, i: int) -> int:
     bench.show(255 if target else None, "freshness of the images")
     time.sleep((2 * settle_ms + bench.frame_ms) / 1000)
     old = 0
-    while old < 8 and abs(bench.share(bench.grab(), bench.illuminated) - target) >= _change_tolerance(bench):
+    while old < 8 and abs(bench.share(bench.grab(), bench.illuminated) - target) >= _compute_tolerance(bench):
         old += 1
     return old
 
 
-def _change_tolerance(bench: RigUnderTest) -> float:
+def _compute_tolerance(bench: RigUnderTest) -> float:
+    """Largest deviation from the new level, as a share of white, at which an image counts as showing the change."""
     return min(_NEAREST, max(_NEAR, 5 * bench.unsteady))
 
 
-def _settle_ms(arrivals_ms: list[float], frame_ms: float) -> float:
+def _compute_settle_ms(arrivals_ms: list[float], frame_ms: float) -> float:
     """The worst arrival, and half a frame because another one may be worse; 0 where every first image was right."""
     worst = max(arrivals_ms)
     return float(math.ceil(worst + 0.5 * frame_ms)) if worst else 0.0

@@ -30,6 +30,7 @@ def capture_burst(bench: RigUnderTest) -> Burst:
 
 
 def _grab_images(bench: RigUnderTest, grey: int | None, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Start times (n,) s and images (n, h, w) of ``count`` images under even light."""
     bench.show(grey, "steadiness of the light")
     bench.wait()
     begin_s, images = zip(*(bench.grab_timed() for _ in range(count)), strict=True)
@@ -73,6 +74,7 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
 
 
 def _round_ms(milliseconds: float) -> float:
+    """Milliseconds rounded to three significant digits."""
     return float(f"{milliseconds:.3g}")
 
 
@@ -175,7 +177,7 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
         "drift": round(drift, 5),
         "mains_hz": hertz,
         "exposure_ms": present,
-        "exposures_ms": _mains_multiples(present, hertz),
+        "exposures_ms": _list_mains_multiples(present, hertz),
     }
     worst = max(swing, ambient)
     if worst <= _UNSTEADY:
@@ -189,18 +191,21 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
         "flicker",
         "bad" if worst > _FLICKERS else "warning",
         f"The {source} light flickers by {100 * worst:.1f} % from image to image{named}.",
-        _flicker_remedy(present, hertz) + ("" if source == "projector's" else ", or switch the room's lamps off") + ".",
+        _format_flicker_remedy(present, hertz)
+        + ("" if source == "projector's" else ", or switch the room's lamps off")
+        + ".",
         figures,
     )
 
 
-def _flicker_remedy(present: float | None, hertz: int | None) -> str:
-    choices = _mains_multiples(present, hertz)
+def _format_flicker_remedy(present: float | None, hertz: int | None) -> str:
+    """Text that recommends exposure times in ms, multiples of the mains period."""
+    choices = _list_mains_multiples(present, hertz)
     listed = " or ".join(f"{value:g} ms (a multiple of 1/{name} s)" for name, value in choices.items())
     return f"Set the exposure to {listed}, and less gain or aperture if that is too bright"
 
 
-def _mains_multiples(present: float | None, hertz: int | None) -> dict[str, float]:
+def _list_mains_multiples(present: float | None, hertz: int | None) -> dict[str, float]:
     """By frequency in Hz, the multiple of its period in ms that is nearest to the present exposure."""
     return {
         str(name): round(max(1, round((present or 0.0) * name / 1000)) * 1000 / name, 2)

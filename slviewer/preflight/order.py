@@ -35,6 +35,7 @@ def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
 
 
 def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -> Check:
+    """The check of the order of a captured stack (n, h, w): white and black frames, then fringe residuals."""
     n = len(stack)
     levels = {i: int(f.kind == "white") for i, f in enumerate(sequence.frames) if f.kind in ("white", "black")}
     shares = {
@@ -52,7 +53,7 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
         "light": [round(shares[i], 3) for i in sorted(shares)],
         "misplaced_frames": sorted({*(i + 1 for i in wrong), *(s.frame + 1 for s in misplaced)}),
     }
-    lag = next((lag for lag in _LAGS if wrong and _lags_by(shares, levels, lag)), 0)
+    lag = next((lag for lag in _LAGS if wrong and _is_lagging_by(shares, levels, lag)), 0)
     if lag:
         many = "one image" if lag == 1 else f"{lag} images"
         return Check(
@@ -85,7 +86,7 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
     return Check("order", "good", f"All {n} coded frames came in order.", "", figures)
 
 
-def _lags_by(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:
+def _is_lagging_by(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:
     """Whether each level is the one of `lag` frames before, where that was a level too."""
     pairs = [(shares[i], levels[i - lag]) for i in shares if i - lag in levels]
     return all(abs(share - on) < 0.3 for share, on in pairs)

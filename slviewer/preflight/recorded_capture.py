@@ -62,6 +62,7 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
 def _check_description(
     name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
 ) -> Check:  # fmt: skip
+    """Check that the frames (n, h, w) agree with the description of their patterns."""
     try:
         check_capture(name, sequence, frames, phases)
     except InputError as error:
@@ -71,6 +72,7 @@ def _check_description(
 
 
 def _check_order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> Check:
+    """Check that every frame shows the pattern of its place in the sequence."""
     others = _LIGHT_FAULTS + _ROOM_FAULTS + _RESPONSE_FAULTS
     suspects = [s for fit in fits for s in fit.suspects if s.fault not in others]
     n = len(sequence.frames)
@@ -86,6 +88,7 @@ def _check_order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> C
 
 
 def _check_light(fits: Sequence[FrameResiduals]) -> Check:
+    """Check that the projector's light and the exposure are constant over the frames."""
     known = np.array([f.light for fit in fits for f in fit.frames if np.isfinite(f.light)])
     spread = float(np.sqrt(np.mean((known - 1) ** 2))) if known.size else None
     figures = {"rms_from_frame_to_frame": None if spread is None else round(spread, 5)}
@@ -103,6 +106,7 @@ def _check_light(fits: Sequence[FrameResiduals]) -> Check:
 
 
 def _check_ambient_light(fits: Sequence[FrameResiduals]) -> Check:
+    """Check that the ambient light is constant over the frames."""
     suspects = [s for fit in fits for s in fit.suspects if s.fault in _ROOM_FAULTS]
     if suspects:
         findings = "; ".join(dict.fromkeys(s.sentence for s in suspects))
@@ -112,6 +116,7 @@ def _check_ambient_light(fits: Sequence[FrameResiduals]) -> Check:
 
 
 def _check_response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]) -> Check:
+    """Check the linearity of the projector's response by the second harmonic of the fringes."""
     remedy = "Straighten the projector's response, or use more steps."
     suspects = [s.sentence for fit in fits for s in fit.suspects if s.fault in _RESPONSE_FAULTS]
     harmonics = {axis: measure_second_harmonic(sequence, frames, axis) for axis in sequence.axes}
@@ -136,6 +141,7 @@ def _check_response(sequence: PatternSequence, frames: np.ndarray, fits: Sequenc
 
 
 def _check_noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
+    """The check of median noise and modulation, grey levels, and coordinate sigma, px, by axis."""
     figures: dict[str, Any] = {}
     lines, weak = [], False
     for axis, phase in phases.items():
@@ -167,6 +173,7 @@ def _check_noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[
 
 
 def _check_decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
+    """The check of the share of illuminated pixels that were decoded, by axis."""
     figures: dict[str, Any] = {}
     lines, worst, least = [], 1.0, 1.0
     for axis, phase in phases.items():

@@ -28,7 +28,7 @@ def check_screen(bench: RigUnderTest) -> Check:
         bench.illuminated = follows
     figures = {
         "share_that_follows": round(share, 4),
-        "contrast_levels": round(float(_median_where(amplitude, follows)), 1),
+        "contrast_levels": round(float(_compute_median(amplitude, follows)), 1),
     }
     if share < _NOTHING:
         return Check(
@@ -51,7 +51,8 @@ def check_screen(bench: RigUnderTest) -> Check:
     return Check("screen", "good", text, "", figures)
 
 
-def _median_where(values: np.ndarray, where: np.ndarray) -> float:
+def _compute_median(values: np.ndarray, where: np.ndarray) -> float:
+    """Median of the values at the selected pixels; 0 where there is none."""
     return float(np.median(values[where])) if where.any() else 0.0
 
 

@@ -14,7 +14,7 @@ _SOME_MOTION, _MUCH_MOTION = 0.004, 0.05  # shares of what is illuminated
 
 def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Check:
     """White images of the beginning, the middle and the end, block by block, whatever the light as a whole did."""
-    blocks = np.stack([_block_means(image, bench.illuminated) for image in (bench.white, *burst.white, last_white)])
+    blocks = np.stack([_average_blocks(image, bench.illuminated) for image in (bench.white, *burst.white, last_white)])
     measured = np.isfinite(blocks[0])
     if not measured.any():
         return Check("motion", "unknown", "Motion cannot be seen: too little is illuminated.", "", {})
@@ -48,7 +48,7 @@ def _match_light(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     return fitted
 
 
-def _block_means(image: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
+def _average_blocks(image: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
     """(n,) means of square blocks; NaN where not all of a block is illuminated."""
     height, width = (size // _BLOCK * _BLOCK for size in image.shape)
     shape = (height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
