@@ -151,6 +151,7 @@ def check_phases(
     warnings: list[str] = []
 
     def refuse(reason: str) -> None:
+        """Raise InputError with the reason, or append it to the warnings where contradictions are accepted."""
         if not accept:
             raise InputError(reason)
         warnings.append(reason)
@@ -257,6 +258,7 @@ def ray_depths(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> np.
 def _agreement(
     rig: StereoRig, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray, residual_px: float
 ) -> AxisAgreement:
+    """Return the axis agreement of undistorted coordinates (n, 2) with noise ``sigma`` (n, 2) px."""
     distance, normal = epipolar_distance(rig, camera, projector)
     known = np.isfinite(distance)
     if not known.any():
@@ -302,6 +304,7 @@ def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[np.nd
 
 
 def _depth_warning(name: str, depths: np.ndarray, depth_range: tuple[float, float] | None) -> tuple[str, ...]:
+    """Return a warning, in a tuple, where many ``depths`` (n,) mm are outside the range of the target poses."""
     if depth_range is None or len(depths) < LEAST_PIXELS:
         return ()
     near, far = depth_range
@@ -316,6 +319,7 @@ def _depth_warning(name: str, depths: np.ndarray, depth_range: tuple[float, floa
 
 
 def _contradiction(agreement: AxisAgreement) -> str:
+    """Describe how the capture contradicts the calibration: epipolar misfit or negative depths."""
     if agreement.misfit_px > max(REFUSED_PX, REFUSED_RATIO * agreement.predicted_px):
         return (
             f"the x and y patterns disagree by {agreement.misfit_px:.1f} px with this calibration, and noise explains "
@@ -380,6 +384,7 @@ def _hypotheses(
 
 
 def _size(size: tuple[int, int]) -> str:
+    """Format a size (width, height) px as "WxH"."""
     return f"{size[0]}x{size[1]}"
 
 

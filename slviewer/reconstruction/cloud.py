@@ -87,6 +87,7 @@ class Cloud:
 
 
 def _convert_texture(texture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a texture (h, w) or (h, w, 3) as uint8; InputError for another shape or dtype than allowed."""
     if texture.shape not in (shape, (*shape, 3)):
         raise InputError(
             f"A texture of shape {texture.shape} does not belong to a cloud of {shape[1]}x{shape[0]} pixels: "

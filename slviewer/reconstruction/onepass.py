@@ -153,6 +153,7 @@ class OnePass:
         kernels.mask_points(columns, counts, maps)
 
     def _check(self, frames: np.ndarray) -> None:
+        """Raise InputError unless the frames (n, h, w) fit the sequence and the calibrated resolution."""
         check_stack(self.sequence, frames)
         if frames.shape[1:] != self.shape:
             height, width = self.shape
@@ -174,6 +175,7 @@ class OnePass:
         return frames, scan
 
     def _allocate(self, dtype: np.dtype, light: LightLevels) -> PassResult:
+        """Return a result with uninitialised arrays of the camera's size, the texture of ``dtype``."""
         phase, sigma_z, modulation = (np.empty(self.shape, np.float32) for _ in range(3))
         points, reason = np.empty((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
         texture = np.empty(self.shape, dtype)
@@ -195,6 +197,7 @@ def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
 
 
 def _maps(scan: PassResult) -> kernels.Maps:
+    """Return the arrays of a result as the compiled kernels take them."""
     return kernels.Maps(scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture)
 
 

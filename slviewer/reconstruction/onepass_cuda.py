@@ -58,18 +58,22 @@ class CudaPass(OnePass):
 
     @property
     def shape(self) -> tuple[int, int]:
+        """(h, w) of the frames that the calibration belongs to."""
         if isinstance(self.model, StereoModel):
             width, height = self.model.rig.camera.size
             return height, width
         return super().shape
 
     def run(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
+        """Return the scan of frames (n, h, w) uint8 or uint16, spikes repaired; see `OnePass.run`."""
         return self._scan(frames, light, out, True)
 
     def sweep(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
+        """Return the scan of frames (n, h, w) after the first pass, without spike repair; see `OnePass.sweep`."""
         return self._scan(frames, light, out, False)
 
     def repair_spikes(self, scan: PassResult) -> None:
+        """Repair the spikes of a scan from `sweep` in place; InputError for a stereo calibration."""
         if isinstance(self.model, StereoModel):
             raise InputError("a stereo calibration's spikes are repaired where they are found: use run, not sweep")
         super().repair_spikes(scan)
@@ -86,6 +90,7 @@ class CudaPass(OnePass):
     def _scan(
         self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None, repaired: bool
     ) -> PassResult:
+        """Compute a scan on the CUDA device, or on the processor where there is no device or it fails."""
         frames, scan = self._begun(frames, light, out)
         if cuda_device.find_device() is not None:
             try:
@@ -98,6 +103,7 @@ class CudaPass(OnePass):
         return super().run(frames, scan.light, scan) if repaired else super().sweep(frames, scan.light, scan)
 
     def _on_card(self, frames: np.ndarray, scan: PassResult, repaired: bool) -> PassResult:
+        """Compute a scan of frames (n, h, w) on the CUDA device; its errors are not caught."""
         card = self.card(frames.dtype)
         card.load(frames)
         card.sweep(scan.light)
@@ -111,6 +117,7 @@ class CudaPass(OnePass):
         return scan
 
     def _job(self) -> Job:
+        """Return the description of the work from which the device's kernels are compiled."""
         depths = self.model.rig if isinstance(self.model, StereoModel) else self._depths
         frames = tuple(self.sequence.select(self.axis))
         return Job(self.shape, self.axis, self._layout, frames, self._ladder, depths, self._texture < 0)
@@ -128,6 +135,7 @@ class CudaPass(OnePass):
         )  # fmt: skip
 
     def _allocate(self, dtype: np.dtype, light: LightLevels) -> PassResult:
+        """Return a result with uninitialised arrays, in page-locked memory for fast transfers."""
         phase, sigma_z, modulation = (cuda_device.allocate_frames(self.shape, np.float32) for _ in range(3))
         points, reason = cuda_device.allocate_frames((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
         grey = cuda_device.allocate_frames(self.shape, dtype)

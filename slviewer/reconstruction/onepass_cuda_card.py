@@ -127,6 +127,7 @@ def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
 
     @cuda.jit(device=True)
     def measure_pixelwise(i, phase, c, bounds):
+        """Return (x, y, z, |dz/dphi|) of pixel ``i`` at a phase, by its rational function."""
         return pixelwise(i, phase, c, bounds, gain, centre)
 
     return measure_pixelwise, d.c, d.bounds.reshape(2, -1)
@@ -139,6 +140,7 @@ def _stereo(row: int, period_px: float) -> Callable[..., Any]:
 
     @cuda.jit(device=True)
     def measure(i, phase, c, extra):
+        """Return (x, y, z, |dz/dphi|) of pixel ``i`` at a phase, by triangulation; NaN where it fails."""
         measured, extent = np.float64(phase * px_per_rad), extra[5, row]
         if not (-0.5 - MARGIN * extent <= measured <= (1.0 + MARGIN) * extent - 0.5):
             return INVALID, INVALID, INVALID, INVALID

@@ -32,6 +32,7 @@ def spike_kernels(rules: SpikeRules, shape: tuple[int, int], measure: Callable[.
 
     @cuda.jit
     def list_moves(phase, words):
+        """Kernel: write to ``words`` (h w,) for each suspect pixel whether its phase moves up or down a period."""
         i = cuda.grid(1)
         if i < height * width:
             row = i // width
@@ -42,6 +43,7 @@ def spike_kernels(rules: SpikeRules, shape: tuple[int, int], measure: Callable[.
 
     @cuda.jit
     def move(words, c, extra, phase, points, sigma_z):
+        """Kernel: move the phases listed in ``words`` by one period, and update their points and sigma_z."""
         i = cuda.grid(1)
         if i >= height * width or words[i] == UNCHANGED:
             return
@@ -55,6 +57,7 @@ def spike_kernels(rules: SpikeRules, shape: tuple[int, int], measure: Callable[.
 
     @cuda.jit
     def list_masked(phase, words):
+        """Kernel: write to ``words`` (h w,) the reason to mask each pixel, or UNCHANGED."""
         i = cuda.grid(1)
         if i < height * width:
             row = i // width
@@ -65,6 +68,7 @@ def spike_kernels(rules: SpikeRules, shape: tuple[int, int], measure: Callable[.
 
     @cuda.jit
     def mask(words, phase, reason, points, sigma_z):
+        """Kernel: mask the pixels listed in ``words``: store the reason, set phase, point and sigma_z to NaN."""
         i = cuda.grid(1)
         if i >= height * width or words[i] == UNCHANGED:
             return

@@ -48,6 +48,7 @@ def sweep_kernel(job: Job, slots: int, measure: Callable[..., Any], deep: bool) 
 
     @cuda.jit
     def sweep(stack, light, c, extra, phase, reason, modulation, points, sigma_z, texture, highest):
+        """Kernel: decode one pixel per thread, measure its point, and fill all maps."""
         i = np.uint64(cuda.grid(1))  # signed indices would be tested for counting from the end
         if i >= stride:
             return
@@ -79,6 +80,7 @@ def sweep_kernel(job: Job, slots: int, measure: Callable[..., Any], deep: bool) 
 
 
 def _steps(layout: Layout) -> list[tuple[int, ...]]:
+    """Return the frame indices of each period's phase steps."""
     return [shift.indices for shift in layout.shifts]
 
 
@@ -90,6 +92,7 @@ def _shift(layout: Layout, pixels: int) -> Any:
 
     @cuda.jit(device=True)
     def shift(stack, i, first, last):
+        """Return (wrapped phase, modulation, background, largest sample) of pixel ``i``, frames ``first`` to ``last``."""
         cosine_of, sine_of = cuda.const.array_like(cosines), cuda.const.array_like(sines)
         at = i + np.uint64(first) * stride
         base = np.float32(stack[at])
@@ -131,6 +134,7 @@ def _coded(layout: Layout, pixels: int) -> Any:
 
     @cuda.jit(device=True)
     def height_of(stack, i, bit, threshold):
+        """Return the signed grey level of a Gray code bit: half its difference to the inverse, or above the threshold."""
         slot = np.uint64(bit)
         value = np.float32(stack[(code_from + slot) * stride + i])
         if inverses:
@@ -139,6 +143,7 @@ def _coded(layout: Layout, pixels: int) -> Any:
 
     @cuda.jit(device=True)
     def misread(stack, i, threshold, top, bottom, code, part, mean):
+        """Return whether the samples of pixel ``i`` contradict the Gray code that was read."""
         contrast = max(top / (ONE - mean), -bottom / mean)
         middle = (HALF - mean) * contrast
         zeros, ones = 0, 0
@@ -158,6 +163,7 @@ def _coded(layout: Layout, pixels: int) -> Any:
 
     @cuda.jit(device=True)
     def decode(stack, i, light):
+        """Return (absolute phase, reason, modulation, background) of pixel ``i``."""
         psi, B, A, peak = shift(stack, i, 0, steps)
         code, digit = 0, 0
         least, top, bottom = ENDLESS, ZERO, ZERO
@@ -202,6 +208,7 @@ def _levels(job: Job, pixels: int) -> Any:
 
     @cuda.jit(device=True)
     def decode(stack, i, light):
+        """Return (absolute phase, reason, modulation, background) of pixel ``i``."""
         begin, weight_of = cuda.const.array_like(starts), cuda.const.array_like(weights)
         period_of = cuda.const.array_like(periods)
         turns_of, px_of = cuda.const.array_like(per_px), cuda.const.array_like(per_rad)

@@ -30,7 +30,10 @@ class Model(Protocol):
     """What reconstruction asks of a calibration, whichever it is."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name of the model: stereo, pixelwise or splined."""
+        ...
+
     @property
     def axes(self) -> tuple[Axis, ...]:
         """The axes it was calibrated for."""
@@ -128,6 +131,7 @@ def _measure(model: Model, phase: PhaseMap) -> Measured:
 
 
 def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, Measured]:
+    """Measure points and sigmas along each axis that both the capture and the calibration have."""
     shared = [axis for axis in model.axes if axis in phases]
     if not shared:
         raise InputError(
@@ -138,6 +142,7 @@ def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, Me
 
 
 def _best_axis(measured: Mapping[Axis, Measured]) -> Axis:
+    """Return the axis with the lowest median sigma where both are valid, else the one with most valid pixels."""
     axes = list(measured)
     if len(axes) == 1:
         return axes[0]
@@ -149,6 +154,7 @@ def _best_axis(measured: Mapping[Axis, Measured]) -> Axis:
 
 
 def _listed(axes: Mapping[Axis, PhaseMap] | tuple[Axis, ...]) -> str:
+    """Format axis names as text: "x and y"."""
     return " and ".join(sorted(axes)) or "none"
 
 
