@@ -53,6 +53,7 @@ def allocate_frames(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def _probe_device() -> str | None:
+    """Return the name of a CUDA device that runs a kernel, simulated ones included; None without one."""
     simulated = os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
     if not simulated:
         if importlib.util.find_spec("numba_cuda") is None:
@@ -89,6 +90,7 @@ def _count_devices() -> tuple[int, str, int]:
 
 
 def _first_line(error: Exception) -> str:
+    """Return the first line of an error's message, or its type where it has none."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 

@@ -23,6 +23,7 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Calla
     options: dict[str, Any] = {"parallel": parallel, "fastmath": fastmath, "nogil": True}
 
     def compile_lazily(function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function compiled by numba at its first call, with its cache in the module's folder."""
         folder = cache_folder(function.__module__)
         if folder is None:
             return numba.njit(**options)(function)
@@ -44,6 +45,7 @@ def _fused_multiply_add(_typing: Any, a: Any, b: Any, c: Any) -> Any:
     """
 
     def build(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        """Emit a call of LLVM's ``fma`` intrinsic."""
         kind = arguments[0].type
         function = builder.module.declare_intrinsic("llvm.fma", [kind], ir.FunctionType(kind, [kind] * 3))
         return builder.call(function, arguments)
@@ -58,6 +60,7 @@ def _to_signed(_typing: Any, level: Any) -> Any:
     """Grey level as a signed integer of twice the width (uint8 -> int16, uint16 -> int32)."""
 
     def build(_context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        """Emit a zero extension to the width of the signed type."""
         return builder.zext(arguments[0], ir.IntType(signature.return_type.bitwidth))
 
     return numba.types.Integer.from_bitwidth(2 * level.bitwidth, True)(level), build
@@ -77,6 +80,7 @@ def _prefetch(_typing: Any, array: Any, index: Any) -> Any:
     """Prefetch the cache line of a 1-D array's element without waiting for it."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        """Emit a call of LLVM's ``prefetch`` intrinsic for the element's address."""
         view = context.make_array(signature.args[0])(context, builder, arguments[0])
         byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
         at = builder.bitcast(builder.gep(view.data, [arguments[1]]), byte)

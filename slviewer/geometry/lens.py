@@ -93,6 +93,7 @@ class Lens:
 
     @cached_property
     def _rays(self) -> np.ndarray:
+        """(h, w, 2) float64: undistorted normalised coordinates of every pixel, read-only."""
         width, height = self.size
         v, u = np.mgrid[:height, :width]
         rays = self.undistort(np.stack([u, v], axis=-1))

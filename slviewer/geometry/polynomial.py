@@ -66,6 +66,7 @@ def fit_polynomial(
     design = chebyshev.chebvander(t, degree)[:, i] * chebyshev.chebvander(s, degree)[:, j]
 
     def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the coefficients (m,) and fitted values (n,) of weighted least squares with weights (n,)."""
         weighted = design * w[:, None]
         solution = np.linalg.lstsq(weighted.T @ design, weighted.T @ values, rcond=1e-14)[0]
         return solution, design @ solution
@@ -114,5 +115,6 @@ def select_valid_samples(
 
 
 def _normalise_pixels(u: np.ndarray, v: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:
+    """Scale pixel coordinates ``u``, ``v`` linearly from the box to -1 ... 1."""
     u0, v0, u1, v1 = box
     return 2.0 * (u - u0) / (u1 - u0) - 1.0, 2.0 * (v - v0) / (v1 - v0) - 1.0

@@ -23,6 +23,7 @@ def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[P
     """
 
     def hypotheses(triples: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return normals (k, 3) and offsets (k,) mm of the planes through point triples (k, 3, 3)."""
         a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
         normals = np.cross(b - a, c - a)
         lengths = np.linalg.norm(normals, axis=1)
@@ -30,6 +31,7 @@ def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[P
         return normals, np.einsum("ij,ij->i", normals, a[lengths > 0])
 
     def distances(sample: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Return the signed distances (k, n) mm of the sample (n, 3) from each plane."""
         result: np.ndarray = normal @ sample.T - offset[:, None]
         return result
 
@@ -49,6 +51,7 @@ def ransac_sphere(
     low, high = (10.0 * tolerance, 0.5 * extent) if radius is None else (0.7 * radius, 1.4 * radius)
 
     def hypotheses(quads: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return centres (k, 3) and radii (k,) mm of the spheres through four points each (k, 4, 3)."""
         origin = quads[:, :1]
         edges = quads[:, 1:] - origin
         regular = np.abs(np.linalg.det(edges)) > 1e-12 * np.linalg.norm(edges, axis=2).prod(axis=1)
@@ -59,6 +62,7 @@ def ransac_sphere(
         return (origin + offset)[sized], radii[sized]
 
     def distances(sample: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """Return the signed radial distances (k, n) mm of the sample (n, 3) from each sphere."""
         middle = sample.mean(axis=0)  # centred: the difference of squares loses no digits
         x, c = sample - middle, centre - middle
         squares = np.einsum("ij,ij->i", x, x) + np.einsum("ij,ij->i", c, c)[:, None] - 2.0 * c @ x.T
@@ -66,6 +70,7 @@ def ransac_sphere(
         return result
 
     def fit(chosen: np.ndarray) -> Sphere:
+        """Fit a sphere to the inliers (n, 3); InputError where its radius is outside the allowed range."""
         sphere = fit_sphere(chosen, radius)
         if not low <= sphere.radius <= high:
             raise InputError(f"The detected sphere has a radius of {sphere.radius:.1f} mm, too large for its cloud.")

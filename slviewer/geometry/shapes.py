@@ -117,9 +117,11 @@ def _refine_sphere(
     """Levenberg-Marquardt on centre (and radius): (centre, radius, RMS of the radial distances)."""
 
     def distances(unknowns: np.ndarray) -> np.ndarray:
+        """Return the radial distances (n,) mm of the points from the sphere of the unknowns."""
         return _norms(points - unknowns[:3]) - (radius if fixed else unknowns[3])
 
     def jacobian(unknowns: np.ndarray) -> np.ndarray:
+        """Return the derivatives (n, 3 or 4) of the radial distances by centre and radius."""
         offsets = points - unknowns[:3]
         derivatives = np.full((len(points), len(unknowns)), -1.0)
         derivatives[:, :3] = -offsets / np.maximum(_norms(offsets), 1e-300)[:, None]

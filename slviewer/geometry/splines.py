@@ -89,6 +89,7 @@ def fit_spline(
     prior = (weights.sum() / reached) * (smooth * _second_differences(*shape) + RIDGE * _identity(*shape))
 
     def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the coefficients (ny + 3, nx + 3) and fitted values (n,) for sample weights (n,)."""
         band = prior.copy()
         right = np.zeros((ny + 3) * (nx + 3))
         _accumulate(cells_u, basis_u, cells_v, basis_v, w, rest, nx + 3, band, right)
@@ -118,6 +119,7 @@ def _basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple
 
 
 def _bandwidth(columns: int) -> int:
+    """Return the number of subdiagonals of the normal equations with so many columns of coefficients."""
     return 3 * columns + 3
 
 
@@ -166,6 +168,7 @@ def _accumulate(cells_u, basis_u, cells_v, basis_v, weights, values, columns, ba
 
 @kernel()
 def _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients):
+    """Return the spline's values (n,) at samples given by their cells (n,) and basis weights (n, 4)."""
     out = np.empty(cells_u.shape[0])
     for k in range(cells_u.shape[0]):
         total = 0.0

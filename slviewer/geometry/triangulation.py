@@ -98,12 +98,14 @@ def _solve(rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Liter
 
 
 def _axis_row(axis: str) -> int:
+    """Return the projector coordinate's index of an axis: 0 for x (columns), 1 for y (rows)."""
     if axis not in ("x", "y"):
         raise InputError(f"The axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows).")
     return 0 if axis == "x" else 1
 
 
 def _check_map(rig: StereoRig, values: np.ndarray, what: str) -> None:
+    """Raise InputError unless a map has the size (h, w) of the rig's camera."""
     width, height = rig.camera.size
     if np.shape(values) != (height, width):
         raise InputError(
@@ -185,6 +187,7 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
 
 @kernel(parallel=True)
 def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
+    """Fill ``z`` (n,) mm with the depths of rays (n, 2) at projector coordinates (n,); NaN where there is none."""
     size = extent[row]
     low, high = -0.5 - MARGIN * size, (1.0 + MARGIN) * size - 0.5
     for chunk in numba.prange((coordinate.shape[0] + CHUNK - 1) // CHUNK):
@@ -201,6 +204,7 @@ def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
 
 @kernel(parallel=True)
 def _coordinate_slopes(rays, depths, R, t, parameters, row, slopes):
+    """Fill ``slopes`` (n,) with d(projector coordinate)/dz in px per mm of rays (n, 2) at depths (n,) mm."""
     for i in numba.prange(depths.shape[0]):
         uc, vc = rays[i, 0], rays[i, 1]
         a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
