@@ -219,6 +219,7 @@ def _start_cluster() -> Iterator[Any]:
 
 
 def _check_installed() -> None:
+    """Raise SlviewerError where a package that batches need is not installed."""
     for package in ("distributed", "fsspec", "cryptography"):
         if find_spec(package) is None:
             raise SlviewerError(f"a batch needs the package {package}, which is missing: {INSTALL_COMMAND}")

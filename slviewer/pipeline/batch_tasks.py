@@ -107,11 +107,13 @@ def describe_error(error: Exception) -> str:
 
 
 def _check_version(version: str) -> None:
+    """Raise InputError where the batch was submitted by another version of slviewer than the worker's."""
     if version != __version__:
         raise InputError(f"the worker runs slviewer {__version__}, the batch {version}: install the same on both")
 
 
 def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> TaskResult:
+    """Reconstruct a capture to a cloud or mesh in the folder ``made``, and return its figures."""
     result = reconstruct(
         store,
         capture,
@@ -128,6 +130,7 @@ def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings:
 
 
 def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> TaskResult:
+    """Verify one capture of a plane or a sphere, and return its figures."""
     assert task.shape is not None
     verification = verify(
         store,

@@ -210,6 +210,7 @@ def calibrate_frames(
         raise InputError("no target pose was given: capture the board in at least three positions and tilts")
 
     def read() -> Iterator[Judged]:
+        """Yield the examined pose of each set of frames, decoded one after the other."""
         for name, frames in poses.items():
             phases = decode_frames(name, sequence, frames)
             texture = texture_8bit(sequence, frames)
@@ -236,6 +237,7 @@ def save_calibration(session: SessionLike, result: CalibrationResult) -> None:
 def _save_models(
     store: Session, result: CalibrationResult, inputs: Mapping[str, str], settings: Mapping[str, Any]
 ) -> None:
+    """Save the stereo model with its verdict, and each other model that was fitted."""
     save_stereo(store, result.stereo, inputs, settings, result.verdict)
     for model in (result.pixelwise, result.splined):
         if model is not None:
@@ -287,6 +289,7 @@ def _fit_after_stereo(
     """The models that follow from stereo; one that cannot be fitted is a warning, and stops no other."""
 
     def fit(name: str, calibrate_model: Fit[M], start: float, end: float, doing: str) -> M | None:
+        """Fit one model if it is requested; None, with a warning, where it cannot be fitted."""
         if name not in models:
             return None
         try:

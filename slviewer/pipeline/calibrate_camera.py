@@ -63,6 +63,7 @@ def calibrate_camera_alone(
 
 
 def _list_pictures(source: Path) -> list[str]:
+    """Return the names of a folder's images, or of a session's calibration captures."""
     if is_session(source):
         with Session.open(source) as store:
             return store.capture_names("calibration")
@@ -72,6 +73,7 @@ def _list_pictures(source: Path) -> list[str]:
 
 
 def _read_picture(source: Path, name: str) -> np.ndarray:
+    """Return a picture (h, w) or (h, w, 3) RGB by its name in the folder or session."""
     if is_session(source):
         with Session.open(source) as store:
             capture = store.load_capture(name)
@@ -89,6 +91,7 @@ _MEANINGS = {
 
 
 def _file_entries(calibration: CameraCalibration) -> Mapping[str, object]:
+    """Return the entries of the calibration file by name: lens, sizes, accuracy and verdict."""
     return {
         "program": f"slviewer {__version__}",
         "target": calibration.board,

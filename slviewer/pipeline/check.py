@@ -46,6 +46,7 @@ class CheckResult:
 
     @property
     def drift(self) -> Drift:
+        """The drift estimate of the latest check."""
         return self.latest.drift
 
     def to_json(self) -> dict[str, Any]:

@@ -243,6 +243,7 @@ def _save_comparison(
     points: np.ndarray,
     name: str,
 ) -> Measurement:
+    """Save a comparison as a measurement: figures, alignment, and each point's deviation."""
     numbers = result.statistics()
     quantities = [
         Quantity("mean", numbers["mean"], "mm"),

@@ -164,6 +164,7 @@ def draw_detection(board: Board, image: np.ndarray, detection: Detection | None)
 
 
 def _list_photographs(given: list[Path]) -> list[Path]:
+    """Return the given image files and the images in given folders; InputError for a missing path."""
     paths: list[Path] = []
     for path in given:
         if path.is_dir():
@@ -181,6 +182,7 @@ def _list_photographs(given: list[Path]) -> list[Path]:
 
 
 def _detect_board_in(board: Board, path: Path, picture: np.ndarray) -> BoardImageResult:
+    """Detect the board in a BGR or grey picture; the result holds the reason where that fails."""
     try:
         detection = detect(board, picture[..., ::-1] if picture.ndim == 3 else picture)
     except DetectionError as error:
@@ -190,6 +192,7 @@ def _detect_board_in(board: Board, path: Path, picture: np.ndarray) -> BoardImag
 
 
 def _describe_result(board: Board, image: BoardImageResult) -> str:
+    """Describe the detection in one photograph as a line of text."""
     if image.detection is None:
         return f"{image.path.name}: not detected: {image.refusal}"
     features = "circles" if board.kind in ("circles", "acircles") else "corners"
@@ -201,10 +204,12 @@ def _describe_result(board: Board, image: BoardImageResult) -> str:
 
 
 def _overlay_path(out: Path, photograph: Path, count: int) -> Path:
+    """Return the file for a photograph's overlay: ``out`` itself for a single image, else a PNG in that folder."""
     return out if count == 1 and out.suffix.lower() in IMAGE_SUFFIXES else out / f"{photograph.stem}_board.png"
 
 
 def _write_picture(path: Path, picture: np.ndarray) -> None:
+    """Write an image in the format of the suffix; InputError where that is no image format."""
     path.parent.mkdir(parents=True, exist_ok=True)
     done, data = cv2.imencode(path.suffix, picture)
     if not done:
@@ -213,6 +218,7 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
 
 
 def _write_csv(path: Path, detected: BoardsDetected) -> None:
+    """Write the detected features of all photographs as CSV, one row each."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         table = csv.writer(file)

@@ -45,6 +45,7 @@ def devices() -> str:
 
 
 def _view_driver(driver: Driver) -> DriverView:
+    """Return a driver's entry of the list, with its connected devices or the error that listing them raised."""
     offers = tuple(part for part in ("camera", "projector", "rig") if getattr(driver, part) is not None)
     connected, trouble = None, ""
     if driver.list_connected is not None and not driver.missing:

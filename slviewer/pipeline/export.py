@@ -166,6 +166,7 @@ def _write_shape(
     progress: Progress,
     warn: Warn,
 ) -> str:
+    """Write a scan or a merge as points or a mesh, and return a description of what was written."""
     making = part(progress, 0, 0.8)
     if what in ("cloud", "mesh"):
         made = scan_shape(store, name, model, plan, making, warn, accept_rejected)
@@ -177,6 +178,7 @@ def _write_shape(
 
 
 def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:
+    """Write a calibration, coefficients, poses or the table, and return a description of what was written."""
     if what == "calibration":
         chosen = model or preferred_model(store)
         return f"{chosen} calibration of camera and projector, {write_calibration_file(store, target, chosen)}"

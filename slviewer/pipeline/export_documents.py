@@ -142,6 +142,7 @@ def write_coefficients(store: Session, name: str, path: Path) -> str:
 
 
 def _pixelwise_arrays(model: PixelwiseModel) -> dict[str, np.ndarray]:
+    """Return the arrays of a pixelwise model's .npz file, with ``about`` as documentation."""
     about = (
         "slviewer, model pixelwise: for axis x or y and camera pixel (row, column), c = <axis>_coefficients[:, row, "
         "column], phi the absolute phase in rad of fringes of <axis>_period_px projector px, phi = 2 pi u/period: "
@@ -158,6 +159,7 @@ def _pixelwise_arrays(model: PixelwiseModel) -> dict[str, np.ndarray]:
 
 
 def _splined_arrays(model: SplinedModel) -> dict[str, np.ndarray]:
+    """Return the arrays of a splined model's .npz file, with ``about`` as documentation."""
     about = (
         "slviewer, model splined, compiled: for axis x or y and camera pixel (row, column), c = <axis>_coefficients[:, "
         "row, column], s = projector coordinate in px less <axis>_centre_px: z0 = (c0 + c1 s)/(1 + c2 s); "
@@ -196,6 +198,7 @@ def write_poses(store: Session, model: str, path: Path) -> None:
 
 
 def _target_pose_entries(store: Session, model: str) -> list[dict[str, Any]]:
+    """Return name, transform (4, 4) mm and reprojection RMS of each target pose by a model."""
     fitted = load_model(store, model)
     if isinstance(fitted, SplinedModel):
         bundle = fitted.bundle
@@ -216,6 +219,7 @@ def _target_pose_entries(store: Session, model: str) -> list[dict[str, Any]]:
 
 
 def _merge_entry(store: Session, name: str) -> dict[str, Any]:
+    """Return a merge's scans with their transforms (4, 4) mm to the reference and their registration figures."""
     meta = store.load_result(name, only=())[0]
     used = str(meta.get("model", ""))
     projector = np.linalg.inv(_projector_transform(store, used if used in available_models(store) else "stereo"))

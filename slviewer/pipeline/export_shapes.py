@@ -136,6 +136,7 @@ def read_merge(store: Session, result: str, warn: Warn) -> tuple[dict[str, Any],
 
 
 def _points_with_normals(merged: Ply) -> PointSet:
+    """Return the points of a merge that have normals; InputError for a merge without any."""
     if merged.normals is None:
         raise InputError("the merged cloud has no normals: merge the scans again")
     known, sigma = np.isfinite(merged.normals).all(axis=1), merged.scalars.get("sigma")
@@ -150,10 +151,12 @@ def _points_with_normals(merged: Ply) -> PointSet:
 
 
 def _describe_mesh(whose: str, made: BuiltMesh, notes: tuple[str, ...]) -> DescribedShape:
+    """Return a built mesh with its owner, file comments, and the lines on how it was made."""
     done = tuple(made.text().splitlines())
     return DescribedShape(made.mesh, whose, {}, (*notes, "sigma: expected error along the normal, mm", *done), done)
 
 
 def _model_notes(store: Session, model: str) -> tuple[str, ...]:
+    """Return file comments that name the calibration and its scale correction; empty without a model."""
     scale = describe_scale(store, model) if model else ""
     return (f"calibration {model}", *((scale,) if scale else ())) if model else ()

@@ -21,6 +21,7 @@ def part(progress: Progress, start: float, end: float, label: str = "") -> Progr
     """Map the progress 0 to 1 of a stage to ``start`` to ``end`` of the whole; ``label``: a prefix."""
 
     def report(done: float, doing: str) -> None:
+        """Report the share ``done`` (0 to 1) of the stage as a share of the whole."""
         progress(start + (end - start) * done, f"{label}: {doing}" if label else doing)
 
     return report

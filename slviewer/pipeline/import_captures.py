@@ -177,11 +177,13 @@ def _save_captures(
     stated: set[str] = set()
 
     def warn_once(message: str) -> None:
+        """Issue a warning unless the same message was issued before."""
         if message not in stated:
             stated.add(message)
             warn(message)
 
     def read() -> Iterator[NewCapture]:
+        """Yield the checked captures one by one; one that cannot be used is a warning, or raises with ``strict``."""
         for i, recording in enumerate(imports.recordings):
             progress(i / len(imports), f"reading {recording.name}")
             try:

@@ -77,6 +77,7 @@ def measure(
 
 
 def _raise_place_error(what: What, ends: int, which: str) -> NoReturn:
+    """Raise UsageError: the option --at does not have one place for each end of what is measured."""
     example = " ".join(("180 150", "220 150")[:ends]) if which == "pixel u v" else " ".join(("1200", "3400")[:ends])
     raise UsageError(
         f"a {what} needs --at with the {which} of {'its point' if ends == 1 else 'both its ends'}, "
@@ -118,6 +119,7 @@ def edit_measurements(
 
 
 def _list_measurements(session: SessionLike, csv: Path | None) -> str:
+    """Return the session's measurements as text, and write them to a CSV file where one is given."""
     lines = [describe_measurement(each) for each in load_measurements(session)] or ["nothing was measured yet"]
     if csv is not None:
         lines.append(f"{export_measurements(session, csv)} measurements -> {csv}")

@@ -233,6 +233,7 @@ def _save_measurement(
     arrays: dict[str, np.ndarray],
     name: str,
 ) -> Measurement:
+    """Save a measurement on a surface with its quantities, data and arrays, and the hashes of its inputs."""
     return save_measurement(
         store,
         kind,

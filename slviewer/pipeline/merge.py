@@ -274,6 +274,7 @@ def _initial_alignments(
     picked: Picked | None,
     warn: Warn,
 ) -> Starts:
+    """Return the initial alignments for the requested start; raises for options that do not fit it."""
     if (start == "turntable") != (angle is not None):
         raise UsageError("a turntable's start needs its angle from scan to scan: give both, or neither")
     if start == "identity" and poses is None:
@@ -291,6 +292,7 @@ def _initial_alignments(
 
 
 def _registration_figures(registration: Registration) -> dict[str, Any]:
+    """Return a registration's figures by name, as plain values for JSON."""
     return {
         "rms_mm": registration.rms_mm,
         "point_to_point_rms_mm": registration.inlier_rmse_mm,

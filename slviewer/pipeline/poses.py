@@ -144,8 +144,10 @@ def load_observations(store: Session, names: Sequence[str]) -> list[Observation]
 
 
 def _settings(smoothing: Smoothing) -> list[str | int]:
+    """Return the smoothing as plain values, to compare with stored ones."""
     return [smoothing.kind] if smoothing.kind == "spline" else [smoothing.kind, smoothing.degree]
 
 
 def _wxh(size: tuple[int, int]) -> str:
+    """Format a size (width, height) px as "WxH"."""
     return f"{size[0]}x{size[1]}"

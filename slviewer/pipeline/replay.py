@@ -72,6 +72,7 @@ def reel(
 
 
 def _recorded(folder: Path) -> dict[str, Callable[[], Shot]]:
+    """Return {name: function that reads frames and sequence} of a session's captures."""
     with Session.open(folder) as store:
         captures = store.captures()
     return {capture.name: lambda shot=capture: (shot.frames, shot.sequence) for capture in captures}  # type: ignore[misc]
@@ -80,7 +81,10 @@ def _recorded(folder: Path) -> dict[str, Callable[[], Shot]]:
 def _imported(
     folder: Path, layout: str | None, sequence: Path | str | None, projector: str | None
 ) -> dict[str, Callable[[], Shot]]:
+    """Return {name: function that reads frames and sequence} of a folder of imported captures."""
+
     def read(recording: ImportableRecording) -> Shot:
+        """Return the frames (n, h, w) and the sequence of a recording."""
         capture = check_imported_capture(recording.read(), ignore_warnings)
         return capture.frames, capture.sequence
 

@@ -83,6 +83,7 @@ def report(
 
 
 def _data(store: Session) -> SessionData:
+    """Collect everything that a report shows of a session."""
     stereo = load_stereo_if_complete(store)
     observations = {o.name: o for o in load_observations(store, list(stereo.poses))} if stereo and stereo.poses else {}
     stale = [
@@ -117,6 +118,7 @@ def _data(store: Session) -> SessionData:
 
 
 def _models(store: Session) -> ModelsView | None:
+    """Return the session's calibrations and their comparison; None where there is no calibration."""
     there = available_models(store)
     if not there:
         return None
@@ -132,6 +134,7 @@ def _models(store: Session) -> ModelsView | None:
 
 
 def _acceptances(store: Session) -> list[AcceptanceView]:
+    """Return the session's acceptance tests with their times, and whether each is stale."""
     views = []
     for name in numbered_results(store, "acceptance"):
         meta = store.load_result(name, only=())[0]
@@ -140,6 +143,7 @@ def _acceptances(store: Session) -> list[AcceptanceView]:
 
 
 def _drifts(store: Session) -> list[DriftRow]:
+    """Return the drift checks as rows, each with whether it is of the present calibration."""
     if "stereo" not in available_models(store):
         return []
     now = store.input_hashes("calibration/stereo")["calibration/stereo"]
@@ -167,6 +171,7 @@ def _verifications(store: Session) -> tuple[list[VerificationView], list[Spacing
 
 
 def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:
+    """Return the table row of a capture: sizes, frames, and whether and why it is used or excluded."""
     sequence = capture.sequence
     why = ""
     if capture.role == "scan":
@@ -202,6 +207,7 @@ def calibration_view(store: Session) -> CalibrationFigures:
 
 
 def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str, Observation]) -> CalibrationFigures:
+    """Return the stereo model with the residuals px of each pose that has an observation."""
     residuals = {}
     for name, r in load_residuals(store).items():
         if name in observations:

@@ -94,6 +94,7 @@ def _channel_option(driver: Driver, channel: Channel | None) -> dict[str, Channe
 
 
 def _simulated_setup(board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0) -> RigSetup:
+    """Return the simulated rig of a preset, with the board in its scene."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     rig = letter(scale, seed)

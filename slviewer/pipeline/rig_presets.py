@@ -112,6 +112,7 @@ def check_choice(choice: Choice, where: str) -> None:
 
 
 def _read_preset(name: str, path: Path) -> Preset:
+    """Read and check a preset's TOML; InputError where it is invalid."""
     try:
         choice = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -134,6 +135,7 @@ def _read_preset_or_problem(name: str, path: Path) -> Preset:
 
 
 def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:
+    """Raise InputError unless the driver exists, offers the part, and accepts the options."""
     if name not in drivers():
         offering = sorted(d.name for d in drivers().values() if _driver_factory(d, part) is not None)
         raise InputError(f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}")
@@ -157,14 +159,17 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
 
 
 def _driver_factory(driver: Driver, part: str) -> Any:
+    """Return the driver's function that makes the part (camera, projector or rig); None where it has none."""
     return rig_factory(driver) if part == "rig" else getattr(driver, part)
 
 
 def _driver_names(choice: Choice) -> list[str]:
+    """Return the drivers of a choice: that of the whole rig, or those of camera and projector."""
     if "driver" in choice:
         return [str(choice["driver"])]
     return [str(choice[part]["driver"]) for part in ("camera", "projector")]
 
 
 def _list_names(session: Session | None) -> str:
+    """Return the names of all presets, separated by commas."""
     return ", ".join(preset.name for preset in presets(session))

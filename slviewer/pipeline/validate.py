@@ -122,5 +122,6 @@ def cross_validate(
 
 
 def _depths(observation: Observation, stereo: StereoModel) -> np.ndarray:
+    """Return the depths (n,) mm in the camera's frame of a pose's board points, by the stereo model."""
     T = stereo.poses[observation.name]
     return np.asarray((observation.points @ T[:3, :3].T + T[:3, 3])[:, 2])

@@ -14,6 +14,7 @@ def read_verification(capture: str, meta: Mapping[str, Any], label: str, stale: 
     figures = meta["models"]
 
     def by_model(key: str) -> dict[str, float]:
+        """Return a figure of each model by the model's name; NaN where it is unknown."""
         return {m: np.nan if value[key] is None else float(value[key]) for m, value in figures.items()}
 
     return VerificationView(
