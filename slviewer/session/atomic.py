@@ -182,6 +182,7 @@ def recover(root: Path, trash: Path) -> None:
 
 
 def _move_away(target: Path, old_to: Path | None) -> None:
+    """Move a folder to ``old_to``, or delete it where that is None."""
     if old_to is not None:
         move(target, old_to)
         return
@@ -191,15 +192,18 @@ def _move_away(target: Path, old_to: Path | None) -> None:
 
 
 def _staging_path(target: Path, state: str) -> Path:
+    """Return a unique hidden path next to the target, for a state such as "tmp"."""
     return target.with_name(f".{target.name}.{state}-{os.getpid()}-{secrets.token_hex(4)}")
 
 
 def _require_space(folder: Path, needs_bytes: int) -> None:
+    """Raise SessionError unless the disk has ``needs_bytes`` and a reserve free."""
     if shutil.disk_usage(folder).free < needs_bytes + _SPARE_BYTES:
         raise _disk_full_error(folder, needs_bytes)
 
 
 def _disk_full_error(folder: Path, needs_bytes: int) -> SessionError:
+    """Return the error for a full disk, with the needed and the free space in words."""
     free = shutil.disk_usage(folder).free
     needs = (
         f"needs {format_megabytes(needs_bytes)} and {format_megabytes(_SPARE_BYTES)} to spare, " if needs_bytes else ""

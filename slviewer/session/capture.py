@@ -179,6 +179,7 @@ def _choose_exposures(path: Path, exposures_ms: tuple[float, ...], n: int, conte
     """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its content."""
 
     def frames(exposure: int) -> Iterator[np.ndarray]:
+        """Yield the frames (h, w) of one exposure, a few in memory at a time."""
         for first in range(0, n, _FRAMES_IN_MEMORY):
             yield from read_stack(path, range(exposure * n + first, exposure * n + min(first + _FRAMES_IN_MEMORY, n)))
 
@@ -190,6 +191,7 @@ def _choose_exposures(path: Path, exposures_ms: tuple[float, ...], n: int, conte
 
 
 def _encode_png(texture: np.ndarray) -> Any:
+    """Encode a texture (h, w, 3) RGB uint8 or uint16 as PNG; returns the file's bytes."""
     import cv2
 
     # the fastest setting: level 1 halves nothing that matters and PNG stays readable everywhere

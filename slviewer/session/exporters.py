@@ -53,6 +53,7 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
 
 
 def _describe_frame(frame: Frame) -> str:
+    """Return a frame's file name without suffix: kind, axis, and period and step or bit."""
     parts: list[Any] = [frame.kind, frame.axis]
     if frame.kind == "phase":
         parts += [f"{frame.period_px:g}px", f"{frame.step:02d}"]
@@ -62,6 +63,7 @@ def _describe_frame(frame: Frame) -> str:
 
 
 def _format_file_storage(suffix: str, entries: Mapping[str, Any], meanings: Mapping[str, str]) -> str:
+    """Return entries as the text of an OpenCV FileStorage file, each with its meaning as a comment."""
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for key, value in entries.items():
         if key in meanings:
@@ -71,6 +73,7 @@ def _format_file_storage(suffix: str, entries: Mapping[str, Any], meanings: Mapp
 
 
 def _write_entry(storage: Any, key: str, value: Any) -> None:
+    """Write one value, mapping, list or matrix to an OpenCV FileStorage."""
     if isinstance(value, str | int | float) and not isinstance(value, bool):
         storage.write(key, value)
     elif isinstance(value, Mapping):

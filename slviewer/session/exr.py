@@ -40,4 +40,5 @@ def write_exr(path: Path, values: np.ndarray) -> None:
 
 
 def _encode_attribute(name: str, kind: str, value: bytes) -> bytes:
+    """Return the bytes of one OpenEXR header attribute."""
     return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value

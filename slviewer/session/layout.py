@@ -73,4 +73,5 @@ def _is_leftover(entry: Path) -> bool:
 
 
 def _absolute_path(path: str | Path) -> Path:
+    """Return an absolute path, with "~" expanded."""
     return Path(path).expanduser().absolute()

@@ -40,9 +40,11 @@ class WriterLock:
 
     @property
     def held(self) -> bool:
+        """Whether this object holds the lock."""
         return self._lock.is_locked
 
     def _who(self) -> str:
+        """Describe the process that holds the lock."""
         try:
             holder = json.loads(self._holder.read_text())
             return f"process {holder['pid']} on {holder['host']}"

@@ -121,6 +121,7 @@ def restore_measurement(store: Session, identity: str = "") -> Measurement:
 
 
 def _list_ids(store: Session) -> list[str]:
+    """Return the ids of the saved measurements, in natural order."""
     names = [name for name in store.result_names() if name.startswith(f"{FOLDER}/m")]
     return sorted((name.removeprefix(f"{FOLDER}/") for name in names), key=natural_key)
 
@@ -132,6 +133,7 @@ def _list_trashed_numbers(store: Session) -> list[int]:
 
 
 def _result_name(store: Session, identity: str) -> str:
+    """Return the name of a measurement's result; InputError where it does not exist."""
     result = f"{FOLDER}/{identity}"
     if not store.has_result(result):
         raise InputError(f"there is no measurement {identity!r}: there are {', '.join(_list_ids(store)) or 'none'}")

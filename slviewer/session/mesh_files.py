@@ -102,6 +102,7 @@ def estimated_bytes(
 
 
 def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> None:
+    """Write points (n, 3) mm, with colours (n, 3) if given, as text, one point a line."""
     columns = np.round(points.astype(np.float64), DECIMALS) + 0.0  # no "-0.000000"
     lengths = [f"%.{DECIMALS}f"] * 3
     with arriving_file(path, estimated_bytes("xyz", len(points), colours=colours is not None)) as file:
@@ -128,6 +129,7 @@ def _to_trimesh(shape: PointSet | Mesh, scale: float = 1.0) -> Any:
 
 
 def _encode_stl(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
+    """Return a mesh as the bytes of a binary STL file in mm."""
     from trimesh.exchange.stl import export_stl
 
     # a header that began with "solid" would be read as a text file
@@ -136,6 +138,7 @@ def _encode_stl(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
 
 
 def _encode_obj(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
+    """Return a shape as the bytes of an OBJ file in mm, with the notes as comments."""
     from trimesh.exchange.obj import export_obj
 
     header = "\n# ".join(to_ascii(line) for line in (f"slviewer {__version__}: units mm", *notes))
@@ -155,6 +158,7 @@ def _encode_glb(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
         raise InputError(f"{size / 1e9:.1f} GB do not fit into a .glb, which ends at 4.3: write a .ply instead")
 
     def describe(tree: dict[str, Any]) -> None:
+        """Add generator, notes, material and axis convention to the glTF tree in place."""
         words = ["vertices in metres, in the frame of the camera", "the node turns y up and z towards the viewer"]
         tree["asset"] |= {"generator": f"slviewer {__version__}", "extras": {"notes": [*words, *notes]}}
         # scanned surfaces are open: they have no inside that need not be drawn

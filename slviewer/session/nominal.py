@@ -107,6 +107,7 @@ def _format_size(size: float) -> str:
 
 
 def _read_bytes(path: Path) -> bytes:
+    """Return the content of a model's file; SessionError for another format, or one too large to read."""
     if path.suffix.lower() not in FORMATS:
         raise SessionError(f"{path.name} is no nominal model that can be read: give an STL, PLY or OBJ file")
     try:
@@ -215,5 +216,6 @@ def _orient_by_majority(vertices: np.ndarray, before: np.ndarray, turned: np.nda
 
 
 def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the normals (m, 3) of triangles, with a length of twice their area."""
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     return np.cross(b - a, c - a)

@@ -130,9 +130,11 @@ def check_faces(faces: np.ndarray, count: int) -> None:
 
 
 def _parse_content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
+    """Return points, colours, normals, scalars and faces from the file's vertex and face records."""
     names = vertices.dtype.names or ()
 
     def join(*fields: str) -> np.ndarray | None:
+        """Return the named vertex fields as columns (n, k); None where one is missing."""
         return np.stack([vertices[name] for name in fields], axis=1) if set(fields) <= set(names) else None
 
     known = {"x", "y", "z", "nx", "ny", "nz", *COLOURS}
@@ -178,5 +180,6 @@ def _vertex_fields(
 
 
 def _check_length(fits: bool, what: str, values: np.ndarray, count: int) -> None:
+    """Raise InputError unless ``fits``: the values do not belong to ``count`` points."""
     if not fits:
         raise InputError(f"{what} of shape {values.shape} do not belong to {count} points: give one for each point.")

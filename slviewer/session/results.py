@@ -22,6 +22,7 @@ def list_results(root: Path) -> list[str]:
     """Names of the results under `root`, parts joined by `/`, in no order."""
 
     def under(folder: Path) -> list[str]:
+        """Return the names of the results in a folder and below."""
         if (folder / "meta.json").is_file():
             return [folder.relative_to(root).as_posix()]
         return [name for inner in inner_folders(folder) for name in under(folder / inner)]
@@ -51,6 +52,7 @@ def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.
     """Write a checked result into an empty folder, every file synced. Its hash covers meta and arrays."""
 
     def write(name: str) -> bytes:
+        """Write one array as .npy, synced, and return its digest."""
         array = np.asarray(arrays[name], order="C")
         header = io.BytesIO()
         np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))

@@ -33,6 +33,7 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
     _create_array(path, frames.shape, _DTYPES[frames.dtype])
 
     def write(index: int) -> bytes:
+        """Write one frame as a chunk and return its digest."""
         frame = _to_little_endian(np.ascontiguousarray(frames[index]))
         write_bytes(_chunk_path(path, _SEPARATOR, index), frame.data)
         return hashlib.blake2b(frame.data, digest_size=20).digest()
@@ -54,6 +55,7 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
     stack = np.empty((len(wanted), *shape[1:]), dtype)
 
     def read(slot: int) -> None:
+        """Read one frame into its slot of the stack; SessionError where its file is missing or damaged."""
         chunk = _chunk_path(path, separator, wanted[slot])
         try:
             with open(chunk, "rb", buffering=0) as file:
@@ -77,6 +79,7 @@ def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
 
 
 def _read_description(path: Path) -> tuple[tuple[int, int, int], np.dtype, str]:
+    """Return shape (n, h, w), dtype and chunk separator of a stack; SessionError for another layout."""
     description = read_json(path / "zarr.json")
     try:
         n, height, width = (int(extent) for extent in description["shape"])
@@ -100,6 +103,7 @@ def check_frames(frames: np.ndarray) -> None:
 
 
 def _create_array(path: Path, shape: tuple[int, ...], dtype: str) -> None:
+    """Create the metadata of an uncompressed Zarr v3 array with one chunk a frame."""
     import zarr  # half a second; needed only to write
 
     zarr.create_array(
@@ -120,10 +124,12 @@ def _create_array(path: Path, shape: tuple[int, ...], dtype: str) -> None:
 
 
 def _chunk_path(path: Path, separator: str, index: int) -> Path:
+    """Return the file of one frame's chunk."""
     return path / separator.join(("c", str(index), "0", "0"))
 
 
 def _read_into(file: RawIOBase, frame: np.ndarray) -> bool:
+    """Read a file into a frame's memory; returns whether it held enough bytes."""
     view = frame.data.cast("B")
     done = 0
     while done < len(view):
@@ -135,10 +141,12 @@ def _read_into(file: RawIOBase, frame: np.ndarray) -> bool:
 
 
 def _to_little_endian(frame: np.ndarray) -> np.ndarray:
+    """Return the frame with its bytes in little-endian order."""
     return frame if sys.byteorder == "little" else frame.byteswap()
 
 
 def _combine_digests(shape: tuple[int, ...], dtype: np.dtype, digests: list[bytes]) -> str:
+    """Return the content hash of a stack from its shape, dtype and the frames' digests."""
     whole = hashlib.blake2b(f"{shape} {_DTYPES[dtype]}".encode(), digest_size=20)
     for digest in digests:
         whole.update(digest)

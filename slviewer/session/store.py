@@ -330,6 +330,7 @@ class Session:
                 lock.release()
 
     def _require_writer(self) -> None:
+        """Raise SessionError unless the session is open for writing and the write is allowed."""
         if self._lock is None or not self._lock.held:
             raise SessionError(f"{self.folder} is open for reading only: open it with write=True")
         if self._allow is not None:
@@ -351,9 +352,11 @@ class Session:
         return staged
 
     def _capture_folder(self, name: str) -> Path:
+        """Return the folder of a capture; InputError for an unsafe name."""
         return self.folder / "captures" / safe_name(name)
 
     def _trash_place(self, name: str) -> Path:
+        """Return a new path in the trash, with the time of deletion behind the name."""
         return self.folder / "trash" / f"{name}-{datetime.now(UTC).strftime('%Y%m%dT%H%M%S%f')}"
 
     def _restorable(self) -> dict[str, Path]:
@@ -377,6 +380,7 @@ class Session:
         return content_hashes
 
     def _decide(self, what: str, change: Callable[[Any], Any]) -> None:
+        """Replace a decision by ``change`` of its present value (None without one)."""
         self._require_writer()
         path = self.folder / "decisions.json"
         with self._decisions_lock:

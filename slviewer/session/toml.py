@@ -52,5 +52,6 @@ def format_value(value: Any) -> str:
 
 
 def _format_key(key: Any) -> str:
+    """Return a key in TOML's notation, quoted where it needs to be."""
     text = str(key)
     return text if text and all(c.isascii() and (c.isalnum() or c in "-_") for c in text) else format_value(text)

@@ -54,6 +54,7 @@ def unpack(archive: IO[bytes], folder: Path, progress: Callable[[float], None]) 
 
 
 def _opened(archive: IO[bytes]) -> zipfile.ZipFile:
+    """Open a zip archive; InputError where it is none."""
     try:
         return zipfile.ZipFile(archive)
     except (zipfile.BadZipFile, OSError) as error:

@@ -31,10 +31,13 @@ class _Group(msgspec.Struct, tag_field="kind", forbid_unknown_fields=True, kw_on
 
 
 class _Phase(_Group, tag="phase"):
+    """Phase-shifted fringes of one or several periods, ``steps`` images each."""
+
     steps: Annotated[int, msgspec.Meta(ge=3, le=1000)]
     period_px: Annotated[float, msgspec.Meta(gt=0)] | list[Annotated[float, msgspec.Meta(gt=0)]]
 
     def frames(self) -> list[Frame]:
+        """Return the phase steps of all periods, period by period."""
         periods = self.period_px if isinstance(self.period_px, list) else [self.period_px]
         return [
             Frame("phase", self.axis, step=k, steps=self.steps, period_px=float(period))
@@ -44,12 +47,15 @@ class _Phase(_Group, tag="phase"):
 
 
 class _Gray(_Group, tag="gray"):
+    """Images of a Gray code's bits, optionally with inverse and complementary ones."""
+
     bits: Annotated[int, msgspec.Meta(ge=1, le=30)]
     inverse: bool = False
     complementary: bool = False
     msb_first: bool = True
 
     def frames(self) -> list[Frame]:
+        """Return the frames of the bits in their order, each followed by its inverse if there is one."""
         pairs = range(self.bits) if self.msb_first else reversed(range(self.bits))
         kinds: tuple[Kind, ...] = ("gray", "inverse") if self.inverse else ("gray",)
         frames = [Frame(kind, self.axis, bit=bit, bits=self.bits) for bit in pairs for kind in kinds]
@@ -58,27 +64,38 @@ class _Gray(_Group, tag="gray"):
 
 
 class _Inverse(_Group, tag="inverse"):
+    """Inverse images of a Gray code's bits, listed apart from the bits."""
+
     bits: Annotated[int, msgspec.Meta(ge=1, le=30)]
     msb_first: bool = True
 
     def frames(self) -> list[Frame]:
+        """Return the inverse frames in the order of the bits."""
         bits = range(self.bits) if self.msb_first else reversed(range(self.bits))
         return [Frame("inverse", self.axis, bit=bit, bits=self.bits) for bit in bits]
 
 
 class _Complementary(_Group, tag="complementary"):
+    """The complementary Gray code image."""
+
     pass
 
 
 class _White(_Group, tag="white"):
+    """The white image."""
+
     pass
 
 
 class _Black(_Group, tag="black"):
+    """The black image."""
+
     pass
 
 
 class _Texture(_Group, tag="texture"):
+    """The image of the scene's texture."""
+
     pass
 
 
@@ -193,6 +210,7 @@ def _read_group(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
 
 
 def _file_names(where: str, named: Any, ordered: bool) -> tuple[str, ...] | None:
+    """Return the checked file names of a group; None where the order of names determines them."""
     if ordered:
         if named is not None:
             raise InputError(f'{where} names files, and order = "name" takes them in order of their names: use one')

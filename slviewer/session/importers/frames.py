@@ -108,6 +108,7 @@ class Description:
         return tuple(matched[index] for index in self.files_order)
 
     def _check_selected(self, selected: Sequence[Sequence[Path]]) -> None:
+        """Raise InputError, naming the files, where a group has not as many files as frames."""
         missing: list[str] = []
         for group, files in zip(self.groups, selected, strict=True):
             assert group.files is not None
@@ -143,6 +144,7 @@ def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tupl
     described = read_description(toml, projector)
 
     def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
+        """Return the recording of a folder, and warnings about files that the TOML does not mention."""
         files = described.select_files(folder)
         settings: dict[str, Any] = {"gray_origin_given": described.gray_origin_given}
         exposures = described.exposures_ms
@@ -210,6 +212,7 @@ def _exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], list[in
 
 
 def _check_projector(toml: Path, data: Mapping[str, Any], projector: tuple[int, int] | None) -> None:
+    """Raise InputError where the TOML and the option state different projector sizes."""
     if "projector" in data and projector is not None and parse_size(data["projector"]) != tuple(projector):
         raise InputError(
             f"{toml.name} says that the projector is {data['projector']}, and {projector[0]}x{projector[1]} was given: "

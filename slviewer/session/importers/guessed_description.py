@@ -38,6 +38,7 @@ def guess_description(
 
 
 def _capture_folder(source: Path) -> Path:
+    """Return the source or its first inner folder with three images or more; InputError without one."""
     if not source.is_dir():
         raise InputError(f"{source} is no folder: give the folder of a capture")
     folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
@@ -48,6 +49,7 @@ def _capture_folder(source: Path) -> Path:
 
 
 def _span(names: list[str], indices: tuple[int, ...]) -> str:
+    """Format the names at some indices: "first to last" where they are consecutive, else a list."""
     whole = len(indices) > 1 and indices == tuple(range(indices[0], indices[-1] + 1))
     return f"{names[indices[0]]} to {names[indices[-1]]}" if whole else listed([names[i] for i in indices])
 
@@ -60,6 +62,7 @@ def _write_toml(
     projector: tuple[int, int] | None,
     doubts: tuple[str, ...],
 ) -> str:
+    """Return the text of the guessed TOML, with comments for its evidence and doubts."""
     described = guess.sequence.to_dict() if guess.sequence else {}
     lines = [f"# Guessed from the {len(names)} images of {folder.name}."]
     lines += [f"# UNSURE: {doubt}" for doubt in doubts]

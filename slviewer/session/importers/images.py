@@ -48,6 +48,7 @@ def read_frames(
     in_colour = np.zeros(len(paths), bool)
 
     def read(index: int) -> None:
+        """Read image ``index`` into the stack, and the texture if it is the colour frame."""
         image = first if index == 0 else read_image(paths[index])
         _check_alike(image, first, paths[index], paths[0])
         if image.ndim == 2:
@@ -100,6 +101,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def _check_alike(image: np.ndarray, first: np.ndarray, path: Path, first_path: Path) -> None:
+    """Raise InputError unless an image has the size, bit depth and channels of the first one."""
     if image.shape[:2] != first.shape[:2]:
         raise InputError(
             f"{_short(path)} is {_size(image)} px, {_short(first_path)} is {_size(first)}: "
@@ -164,10 +166,12 @@ def _jpeg_ends(data: bytes) -> bool:
 
 
 def _is_grey(image: np.ndarray) -> bool:
+    """Return whether the three channels of an image (h, w, 3) are equal."""
     return bool(np.array_equal(image[..., 0], image[..., 1]) and np.array_equal(image[..., 1], image[..., 2]))
 
 
 def _size(image: np.ndarray) -> str:
+    """Format an image's size as "WxH"."""
     return f"{image.shape[1]}x{image.shape[0]}"
 
 

@@ -99,6 +99,7 @@ def define_layout(
     def read(
         source: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None, **options: Any
     ) -> Imports:
+        """Return the captures of a source; InputError where the projector's size is needed and not given."""
         size = projector or default
         if size is None and needs_projector:
             raise InputError(f"{needs_projector} depend on the projector's size: give it with --projector 1280x800")
@@ -226,6 +227,7 @@ def listed(names: Sequence[str], most: int = 6) -> str:
 
 
 def _stem(folder: Path) -> str:
+    """Return a folder's name in lower case with every number replaced by "#"."""
     return re.sub(r"\d+", "#", folder.name.lower())
 
 

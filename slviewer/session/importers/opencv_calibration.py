@@ -106,6 +106,7 @@ def read_sizes(path: Path) -> dict[str, tuple[tuple[int, int], str]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
+    """Context manager: the root of an OpenCV FileStorage file; InputError where it cannot be read."""
     if not path.is_file():
         raise InputError(f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)")
     unreadable = f"{path.name} is no OpenCV FileStorage file (.yml, .xml or .json): export the calibration again"
@@ -125,6 +126,7 @@ def _matrix(node: Any, where: str) -> np.ndarray:
     """A FileStorage matrix, or numbers in (nested) lists, as float64."""
 
     def numbers(node: Any) -> Any:
+        """Return a node of numbers or nested sequences as a float or nested lists."""
         if node.isSeq():
             return [numbers(node.at(i)) for i in range(node.size())]
         if node.isInt() or node.isReal():
@@ -146,6 +148,7 @@ def _matrix(node: Any, where: str) -> np.ndarray:
 
 
 def _intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
+    """Return the camera matrix (3, 3); InputError where it is none, or has skew."""
     if matrix.shape != (3, 3):
         raise InputError(f"{where} has shape {matrix.shape}: a camera matrix is 3x3")
     fx, fy = matrix[0, 0], matrix[1, 1]
@@ -157,6 +160,7 @@ def _intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
 
 
 def _distortion(matrix: np.ndarray, where: str) -> np.ndarray:
+    """Return the distortion (5,) k1 k2 p1 p2 k3; InputError for other non-zero coefficients."""
     coefficients = matrix.ravel()
     if max(matrix.shape, default=0) != coefficients.size or coefficients.size not in (4, 5, 8, 12, 14):
         raise InputError(f"{where} has shape {matrix.shape}: OpenCV's distortion has 4, 5, 8, 12 or 14 coefficients")
@@ -169,6 +173,7 @@ def _distortion(matrix: np.ndarray, where: str) -> np.ndarray:
 
 
 def _rotation(matrix: np.ndarray, where: str) -> np.ndarray:
+    """Return the rotation (3, 3) nearest to a matrix; InputError where it is far from one."""
     if matrix.shape != (3, 3):
         raise InputError(f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3")
     U, _, Vt = np.linalg.svd(matrix)
@@ -182,6 +187,7 @@ def _rotation(matrix: np.ndarray, where: str) -> np.ndarray:
 
 
 def _translation(matrix: np.ndarray, where: str) -> np.ndarray:
+    """Return the translation (3,) mm; InputError for another shape or a length near zero."""
     if matrix.shape not in ((3, 1), (1, 3), (3,)):
         raise InputError(f"{where} has shape {matrix.shape}: the translation from camera to projector has 3 numbers")
     translation = matrix.ravel()

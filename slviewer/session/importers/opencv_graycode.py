@@ -47,9 +47,11 @@ def read(
     sequence = gray(projector)
 
     def select(folder: Path) -> list[Path]:
+        """Return the images of a capture's folder that match ``files``, or all of them."""
         return match_files(folder, files) if files else images_by_name(folder)
 
     def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
+        """Return the recording of a folder, and warnings about images that are not part of it."""
         files = select(folder)
         if len(kinds := {re.sub(r"\d+$", "", file.stem) for file in files}) > 1:
             shown = listed([f"{kind}N" for kind in sorted(kinds)])
@@ -60,6 +62,7 @@ def read(
         return recording, strangers_warning(folder, [file for file in images_by_name(folder) if file not in files])
 
     def looks_so(folder: Path) -> bool:
+        """Return whether a folder holds more than half of the images of a capture."""
         return 2 * len(select(folder)) > len(sequence.frames)
 
     return collect_captures(

@@ -80,6 +80,7 @@ def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
 
 
 def _is_capture(folder: Path) -> bool:
+    """Return whether a folder has an inner folder of an axis with images in it."""
     return any(
         entry.is_dir() and entry.name.lower() in _AXES and any(_FILE.match(file.stem) for file in visible(entry))
         for entry in visible(folder)

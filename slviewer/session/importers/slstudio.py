@@ -60,6 +60,7 @@ def describe(
 
 
 def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis: Axis) -> PatternSequence:
+    """Return the sequence that explains the number of images; InputError where none or several do."""
     if codec is None and images in _OTHERS:
         raise InputError(
             f"{images} frames may also be those of {_OTHERS[images]}, which cannot be imported: say with --codec what "
@@ -85,6 +86,7 @@ def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis
 
 
 def _frames(codec: Codec, projector: tuple[int, int], axes: tuple[Axis, ...]) -> tuple[Frame, ...]:
+    """Return the frames of a codec in the order in which SLStudio shows them."""
     frames = [Frame("white"), Frame("black")] if codec == "gray" else []
     for axis in axes:
         extent = projector[AXES.index(axis)]
