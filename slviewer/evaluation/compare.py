@@ -191,6 +191,7 @@ def _union(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _coverage(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | None) -> float:
+    """Return the share of the region's illuminated pixels that the cloud measures; NaN where unknown."""
     measurable = 0 if illuminated is None else np.count_nonzero(region & illuminated)
     if illuminated is None or measurable == 0:
         return float("nan")
@@ -198,4 +199,5 @@ def _coverage(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | None) 
 
 
 def _known(value: float) -> float | None:
+    """Return the value, or None for NaN and infinity."""
     return value if np.isfinite(value) else None

@@ -37,6 +37,7 @@ class ShapeResult:
 
     @property
     def set_aside_share(self) -> float:
+        """Share of the points that were excluded as outliers."""
         return self.set_aside / self.points
 
     @property

@@ -56,6 +56,7 @@ def find_sphere(
     noise = _typical(sigma_z, measured)
 
     def reach(shape: Sphere) -> float:
+        """Return the tolerance in mm for points on a sphere: by its radius, and at least six sigma of noise."""
         return max(min(PATCH_TOLERANCE_MM, SPHERE_TOLERANCE * shape.radius), 6.0 * noise)
 
     first = start or start_sphere(points, measured, sigma_z, radius)

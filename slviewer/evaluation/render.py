@@ -22,6 +22,7 @@ def render(table: Sequence[Row]) -> str:
     widths = [max(len(line[k]) for line in head + body) for k in range(len(titles))]
 
     def laid_out(line: list[str]) -> str:
+        """Return one row as text: the first cell aligned to the left, the others to the right."""
         return "  ".join(
             text.rjust(width) if k else text.ljust(width)
             for k, (text, width) in enumerate(zip(line, widths, strict=True))
@@ -35,6 +36,7 @@ def render(table: Sequence[Row]) -> str:
 
 
 def _cell(title: str, value: Any) -> str:
+    """Format a value for the table, with the digits that its column's title calls for."""
     if value is None or value != value:  # NaN
         return "-"
     if isinstance(value, str | int):

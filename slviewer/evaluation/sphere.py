@@ -17,6 +17,7 @@ class SphereResult(ShapeResult):
 
     @property
     def radius_mm(self) -> float:
+        """Radius of the fitted sphere."""
         return self.sphere.radius
 
 

@@ -32,6 +32,7 @@ def letter_rows(comparisons: Mapping[str, Comparison]) -> list[Row]:
 
 
 def _row(name: str, comparison: Comparison) -> Row:
+    """Return the table row of one capture: each model's RMS, noise floor, radius and coverage."""
     row: Row = {"capture": name}
     if comparison.incidence is not None:
         row["R1/R2/R3 %"] = "/".join(f"{share:.1f}".removesuffix(".0") for share in comparison.incidence.values())
@@ -55,6 +56,7 @@ def _ratio(row: Row, comparison: Comparison) -> Row:
 
 
 def _letter_figures(capture: str, shape: str) -> Row:
+    """Return the Letter's figures of the pose whose number the capture's name ends with; {} without one."""
     number = re.search(r"(\d+)$", capture)
     pose = int(number[1]) if number else 0
     if shape == "plane":
@@ -70,6 +72,7 @@ def _letter_figures(capture: str, shape: str) -> Row:
 
 
 def _letter_row(stereo: float, pixelwise: float, radii: tuple[float, float] | None = None) -> Row:
+    """Return the Letter's RMS of both models in mm, their ratio, and the sphere's radii if given."""
     row: Row = {"Letter stereo": stereo, "Letter pixelwise": pixelwise, "Letter ratio": stereo / pixelwise}
     if radii is not None:
         row["Letter stereo radius"], row["Letter pixelwise radius"] = radii
@@ -77,6 +80,7 @@ def _letter_row(stereo: float, pixelwise: float, radii: tuple[float, float] | No
 
 
 def _means(table: list[Row], comparisons: Mapping[str, Comparison]) -> Row:
+    """Return the row of the columns' means, ratios recomputed from the means."""
     row: Row = {"capture": "mean"}
     for title in dict.fromkeys(title for line in table for title in line):
         values = [line[title] for line in table if isinstance(line.get(title), float)]

@@ -170,4 +170,5 @@ def _scale(artefact: Artefact, positions: Sequence[Position]) -> ScaleEstimate |
 
 
 def _half(interval: tuple[float, float]) -> float:
+    """Return half the width of an interval."""
     return (interval[1] - interval[0]) / 2
