@@ -77,11 +77,13 @@ class Feature:
 
     @property
     def _direction(self) -> np.ndarray:
+        """Unit normal or axis (3,); InputError for a feature without one."""
         if self.direction is None:
             raise InputError(f"A {self.kind} has no direction: fit a plane or a cylinder.")
         return self.direction
 
     def _across(self, offsets: np.ndarray) -> np.ndarray:
+        """Return the offsets (n, 3) from the feature's place, for a cylinder only their part across the axis."""
         if self.kind != "cylinder":
             return offsets
         return np.asarray(offsets - (offsets @ self._direction)[..., None] * self._direction)

@@ -138,6 +138,7 @@ def _fit_robustly(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
     """The feature, and which of the points it was fitted to: repeated until the set is stable."""
 
     def fit(some: np.ndarray, start: Feature | None) -> Feature:
+        """Return the least-squares feature of some of the points, from a start if there is one."""
         return least_squares(kind, some, start)
 
     return fit_settled(fit, points, estimate_start(kind, points, fit))
@@ -159,6 +160,7 @@ def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
 
 
 def _estimate_spread(feature: Feature, points: np.ndarray, shared: Shared | None, calibration: str) -> Spread:
+    """Estimate the covariance of a fitted feature: own scatter, and the errors shared through the calibration."""
     J = feature.jacobian(points)
     own = scatter_covariance(points, J, feature.distance(points))
     if shared is None:
@@ -229,6 +231,7 @@ def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
     heights = plane.distance(points)
 
     def solve(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the heights (n,) mm of the weighted quadratic fit, as solution and as fitted values."""
         root = np.sqrt(weights)
         fitted = basis @ np.linalg.lstsq(basis * root[:, None], heights * root, rcond=None)[0]
         return fitted, fitted
@@ -237,6 +240,7 @@ def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
 
 
 def _refuse_uncertain_radius(kind: Kind, feature: Feature, spread: Spread) -> None:
+    """Raise InputError where the radius' standard deviation is too large a part of the radius."""
     if feature.radius is None:
         return
     sigma = float(spread.sigmas[-1])

@@ -46,6 +46,7 @@ class Region:
 
 
 def _vector(values: object) -> np.ndarray:
+    """Return a place (3,) float64 mm; InputError for another shape or values that are not finite."""
     vector = np.asarray(values, np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise InputError(f"{values!r} is no place: give x, y and z in mm.")
@@ -53,6 +54,7 @@ def _vector(values: object) -> np.ndarray:
 
 
 def _positive(values: object) -> np.ndarray:
+    """Return a size in mm as float64; InputError unless all its values are finite and above 0."""
     size = np.asarray(values, np.float64)
     if not (np.isfinite(size).all() and (size > 0).all()):
         raise InputError("A region needs a size above 0 mm in every direction: draw it larger.")

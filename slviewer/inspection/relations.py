@@ -27,6 +27,7 @@ class Meaning:
 
 
 def _distance(a: Feature, b: Feature) -> float:
+    """Return the distance in mm between the places of two features."""
     return float(np.linalg.norm(b.place - a.place))
 
 
@@ -37,18 +38,22 @@ def _angle(a: Feature, b: Feature) -> float:
 
 
 def _offset(a: Feature, axis: Feature) -> float:
+    """Return the distance in mm of a feature's place from an axis."""
     return float(np.linalg.norm(np.cross(a.place - axis.place, _directed(axis))))
 
 
 def _height(a: Feature, plane: Feature) -> float:
+    """Return the signed distance in mm of a feature's place from a plane."""
     return float((a.place - plane.place) @ _directed(plane))
 
 
 def _plane_gap(a: Feature, b: Feature) -> float:
+    """Return the distance in mm of two nearly parallel planes: mean of each place's distance from the other."""
     return 0.5 * (abs(_height(a, b)) + abs(_height(b, a)))
 
 
 def _axis_gap(a: Feature, b: Feature) -> float:
+    """Return the shortest distance in mm between two axes, which may be parallel."""
     if _angle(a, b) < PARALLEL_DEG:
         return 0.5 * (_offset(a, b) + _offset(b, a))
     across = np.cross(_directed(a), _directed(b))
@@ -56,10 +61,12 @@ def _axis_gap(a: Feature, b: Feature) -> float:
 
 
 def _size(feature: Feature) -> float:
+    """Return the feature's radius in mm; 0 where it has none."""
     return feature.radius or 0.0
 
 
 def _directed(feature: Feature) -> np.ndarray:
+    """Return the feature's direction (3,); InputError where it has none."""
     if feature.direction is None:
         raise InputError(f"A {feature.kind} has no direction.")
     return feature.direction
@@ -123,7 +130,10 @@ def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list
     p = a.parameters
 
     def quantity(meaning: Meaning) -> Quantity:
+        """Return the value of one quantity between both features, with its uncertainty."""
+
         def moved(step: np.ndarray) -> float:
+            """Return the quantity after the features' parameters change by a step (p + q,)."""
             return meaning.of(a.moved(step[:p]), b.moved(step[p:]))
 
         return Quantity(meaning.name, meaning.of(a, b), meaning.unit, propagate_covariance(moved, covariance), whole)

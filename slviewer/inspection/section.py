@@ -66,6 +66,7 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
 
 
 def _order_line(line: np.ndarray) -> np.ndarray:
+    """Return the line (k, 2) from left to right; closed lines as they are."""
     closed = np.array_equal(line[0], line[-1])
     return line if closed or line[0, 0] <= line[-1, 0] else line[::-1]
 

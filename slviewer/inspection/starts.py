@@ -101,6 +101,7 @@ def _cylinder_through(sample: np.ndarray, normals: np.ndarray, rng: np.random.Ge
 
 
 def _median_distance(feature: Feature, points: np.ndarray) -> float:
+    """Return the median absolute distance in mm of points (n, 3) from a feature."""
     return float(np.median(np.abs(feature.distance(points))))
 
 

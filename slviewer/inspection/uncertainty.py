@@ -97,6 +97,7 @@ def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: 
     moved = motion.weights.T @ bundle.point_jacobian(axis, reference.pixels, reference.z).toarray()
 
     def shared(points: np.ndarray, answers: np.ndarray) -> np.ndarray:
+        """Return (k, p): the calibration's part of the parameters' covariance, as its square root."""
         places = np.asarray(points, np.float64) / scale
         pixels = _pixels(bundle, places)
         jacobian = bundle.point_jacobian(axis, pixels, places[:, 2])
