@@ -26,7 +26,7 @@ def fold_radius_squared(D: np.ndarray) -> float:
 
 @kernel()
 def distort_point(x, y, parameters):
-    """Distorted normalised (x, y) and the derivatives (dx'/dx, dx'/dy, dy'/dy); the Jacobian is symmetric."""
+    """Return distorted normalised (x, y) and the derivatives (dx'/dx, dx'/dy, dy'/dy); the Jacobian is symmetric."""
     k1, k2, p1, p2, k3 = parameters[4], parameters[5], parameters[6], parameters[7], parameters[8]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -77,7 +77,7 @@ def undistort_point(xd, yd, parameters):
 
 @kernel(parallel=True)
 def distort_all(normalised, parameters, pixels):
-    """(n, 2) undistorted normalised coordinates to (n, 2) pixels; NaN at and past the fold."""
+    """Fill ``pixels`` (n, 2) from undistorted normalised coordinates (n, 2); NaN at and past the fold."""
     for i in numba.prange(normalised.shape[0]):
         x, y = normalised[i, 0], normalised[i, 1]
         if x * x + y * y < parameters[9]:
@@ -91,7 +91,7 @@ def distort_all(normalised, parameters, pixels):
 
 @kernel(parallel=True)
 def undistort_all(pixels, parameters, normalised):
-    """(n, 2) pixels to (n, 2) undistorted normalised coordinates; NaN where the inversion fails."""
+    """Fill ``normalised`` (n, 2) with undistorted coordinates of pixels (n, 2); NaN where the inversion fails."""
     for i in numba.prange(pixels.shape[0]):
         xd = (pixels[i, 0] - parameters[2]) / parameters[0]
         yd = (pixels[i, 1] - parameters[3]) / parameters[1]
@@ -100,7 +100,8 @@ def undistort_all(pixels, parameters, normalised):
 
 @kernel(parallel=True)
 def project_all(points, parameters, pixels):
-    """(n, 3) points in the lens's frame to (n, 2) pixels; NaN behind the lens and past the fold."""
+    """Fill ``pixels`` (n, 2) with projections of points (n, 3) in the lens's frame; NaN behind the lens and past the
+    fold."""
     for i in numba.prange(points.shape[0]):
         z = points[i, 2]
         pixels[i, 0] = np.nan

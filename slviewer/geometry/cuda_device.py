@@ -41,7 +41,7 @@ def disable_device(error: Exception) -> None:
 
 
 def allocate_frames(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Uninitialised array; in page-locked memory where there is a device, for transfers at full speed."""
+    """Return an uninitialised array, in page-locked memory where there is a device, for transfers at full speed."""
     if find_device() is not None:
         from numba import cuda
 
@@ -77,7 +77,7 @@ def _probe_device() -> str | None:
 
 
 def _count_devices() -> tuple[int, str, int]:
-    """(number of devices; where it is 0: the reason, and the log level to report it at)."""
+    """Return the number of CUDA devices, and where it is 0 the reason and the log level to report it at."""
     count = ctypes.c_int()
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
@@ -95,7 +95,7 @@ def _first_line(error: Exception) -> str:
 
 
 def device_function(function: Any) -> Any:
-    """A function compiled by numba for the processor, and those that it calls, for use in CUDA kernels.
+    """Convert a function compiled by numba for the processor, and those that it calls, for use in CUDA kernels.
 
     A rule for one pixel is written once: what such a function calls must exist on both sides (``math``, not ``numpy``).
     """

@@ -56,7 +56,7 @@ class Lens:
 
     @cached_property
     def parameters(self) -> np.ndarray:
-        """(10,) float64: what the compiled kernels take (see ``geometry.brown``)."""
+        """(10,) float64: the parameters of the compiled kernels (see ``geometry.brown``)."""
         K = self.K
         return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *self.D, fold_radius_squared(self.D)])
 
@@ -101,7 +101,8 @@ class Lens:
         return rays
 
     def resize(self, factor: float) -> "Lens":
-        """The same lens at another resolution: pixel centres stay at whole numbers, so c' = (c + 0.5) factor - 0.5."""
+        """Return the same lens at another resolution: pixel centres stay at whole numbers, so c' = (c + 0.5) factor -
+        0.5."""
         K = self.K.copy()
         K[:2, :2] *= factor
         K[:2, 2] = (K[:2, 2] + 0.5) * factor - 0.5

@@ -41,7 +41,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What came of one capture: its figures by name, or why it failed.
+    """The result of one capture: its figures by name, or why it failed.
 
     ``verification``: without its maps, to be joined with those of the session's other captures.
     """
@@ -102,7 +102,7 @@ def verification_file(task: Task) -> str:
 
 
 def describe_error(error: Exception) -> str:
-    """An error in words; of an unforeseen one its type too."""
+    """Describe an error in words; of an unforeseen one its type too."""
     return str(error) if isinstance(error, SlviewerError) else f"{type(error).__name__}: {error}"
 
 

@@ -107,7 +107,7 @@ def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, g
 
 
 def choose_sequence(bench: RigSetup, patterns: str) -> PatternSequence:
-    """What is shown: the sequence of that name for the rig's projector, or the only one that the rig answers to."""
+    """Return the sequence to project: the one of that name for the rig's projector, or the rig's only one."""
     if bench.reel is not None:
         return bench.reel.sequence
     if patterns not in PRESETS:

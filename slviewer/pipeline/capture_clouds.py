@@ -64,8 +64,8 @@ def absolute_phases(
     depth_range: tuple[float, float] | None = None,
     warn: Warn = ignore_warnings,
 ) -> dict[Axis, PhaseMap]:
-    """A capture's phases, those that repeat made absolute by the depths (near, far) mm between which the scene lies; by
-    default the calibrated ones. An axis that more than one depth fits is solved by the other axis, with a warning.
+    """Return a capture's phases, ambiguous ones made absolute by the depth range (near, far) mm of the scene; by
+    default the calibrated one. An axis that more than one depth fits is solved by the other axis, with a warning.
 
     Raises InputError where no axis is unique in the range, and where no range is known.
     """

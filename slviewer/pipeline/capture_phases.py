@@ -107,7 +107,7 @@ def check_capture(
 
 
 def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> list[str]:
-    """Why many pixels of a decoded capture (n, h, w) are masked, where saturation or weak fringes are the reason."""
+    """Return warnings where saturation or weak fringes mask many pixels of a decoded capture (n, h, w)."""
     messages = []
     reasons = [phase.reason[phase.illuminated] for phase in phases.values()]
     saturated = max((float(np.mean(each == Reason.SATURATED)) for each in reasons if each.size), default=0.0)
@@ -139,7 +139,8 @@ def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping
 
 
 def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:
-    """Where neighbouring pixels scatter more than the camera's noise explains: by how much, and what to do."""
+    """Return warnings where neighbouring pixels scatter more than the camera's noise explains: by how much, and what to
+    do."""
     worst = max(phases.values(), key=lambda phase: phase.sigma_scale, default=None)
     if worst is None or worst.sigma_scale <= SIGNIFICANT:
         return []
@@ -154,7 +155,7 @@ def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:
 
 
 def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
-    """(h, w) or (h, w, 3) uint8: what the scene looks like under white light."""
+    """Return the image of the scene under white light, (h, w) or (h, w, 3) uint8."""
     colour = capture.texture
     image = texture(capture.sequence, frames) if colour is None else colour
     choice = capture.exposure_choice

@@ -192,7 +192,7 @@ def _write_document(store: Session, what: What, name: str, target: Path, model: 
 
 
 def _resolve_name(store: Session, what: What, name: str) -> str:
-    """The name of what is meant: the scan that there is alone, the last merge."""
+    """Return the requested name, or by default that of the only scan, or of the last merge."""
     if what in ("merge", "merged-mesh"):
         return merge_name(store, name)
     if what not in ("cloud", "mesh"):
@@ -206,7 +206,7 @@ def _resolve_name(store: Session, what: What, name: str) -> str:
 
 
 def _output_path(store: Session, what: What, name: str, out: Path | str | None, chosen: str) -> Path:
-    """The file to write, with a suffix that fits."""
+    """Return the path of the file to write, with a suffix that fits the format."""
     given = None if out is None else Path(out).expanduser()
     if given is None or given.is_dir():
         return (given or store.exports) / default_file_name(what, name, chosen or FORMATS[what][0])

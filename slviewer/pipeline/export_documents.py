@@ -275,5 +275,5 @@ def write_table(store: Session, path: Path) -> None:
 
 
 def _safe_text(text: str) -> str:
-    """A name that a spreadsheet does not take for a formula."""
+    """Return a name that a spreadsheet does not interpret as a formula."""
     return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t") else text

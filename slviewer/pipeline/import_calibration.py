@@ -133,7 +133,7 @@ def _is_confirmed_by_captures(
 
 
 def _check_principal_point(device: str, K: np.ndarray, size: tuple[int, int], warn: Warn) -> None:
-    """Warn where the optical axis lies outside of the image: that is a shifted lens, or another pixel scale."""
+    """Warn where the optical axis is outside of the image: a shifted lens, or another pixel scale."""
     (width, height), (cx, cy) = size, K[:2, 2]
     if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
         warn(

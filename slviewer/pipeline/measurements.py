@@ -109,7 +109,8 @@ def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measur
 
 
 def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = "") -> Measurement:
-    """The surface cut along a line between two picked points, at right angles to it as nearly as the camera looks."""
+    """Add a section: the surface cut along a line between two picked points, as nearly parallel to the camera's viewing
+    direction as possible."""
     ends = [on.picked(place)[0].place for place in (a, b)]
     middle = (ends[0] + ends[1]) / 2
     plane = CutPlane.through(ends[0], ends[1], -middle)

@@ -252,7 +252,8 @@ def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, ke
 
 
 def merge_record(store: Session, merged: Merge, model: str) -> dict[str, Any]:
-    """What a session keeps of a merge made with that model: its figures, its file in the exports, and its inputs."""
+    """Return the stored record of a merge made with that model: its figures, its file in the exports, and its
+    inputs."""
     calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
     return {
         **merged.to_json(),

@@ -23,7 +23,7 @@ MERGE = "merge/"
 
 @dataclass(frozen=True, eq=False)
 class MeshResult:
-    """A mesh, what it was made of, and the file it went to. ``merged``: the merge of several scans."""
+    """A mesh, its source, and the file that it was written to. ``merged``: the merge of several scans."""
 
     meshed: BuiltMesh
     sources: tuple[str, ...]

@@ -158,7 +158,7 @@ def load_model(store: Session, name: str) -> Model:
 
 
 def best_model(store: Session, accept_rejected: bool = False) -> str:
-    """The calibration to use where none is named: see ``preferred_model``.
+    """Return the calibration to use where none is named: see ``preferred_model``.
 
     Raises CalibrationRejected, with the reason, for one that was rejected, unless that is accepted.
     """
@@ -240,7 +240,7 @@ def frame_of(store: Session, name: str) -> str:
 
 
 def warn_if_frame_changed(store: Session, before: str, warn: Warn) -> None:
-    """Warn where another model is used than ``before`` (empty: none was), whose clouds lie in another frame."""
+    """Warn where another model is used than ``before`` (empty: none was), whose clouds are in another frame."""
     after = preferred_model(store) if available_models(store) else ""
     if before and after and frame_family(before) != frame_family(after):
         warn(

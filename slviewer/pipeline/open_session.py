@@ -15,7 +15,7 @@ SessionLike = Path | str | Session
 
 @contextmanager
 def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
-    """The session; one that was opened here is closed again, one that was open stays so."""
+    """Context manager: the session; one that was opened here is closed at the end, one that was open stays so."""
     if isinstance(session, Session):
         yield session
     else:
@@ -25,7 +25,8 @@ def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
 
 @contextmanager
 def opened_or_made(session: SessionLike) -> Iterator[Session]:
-    """The session, open for writing, or one that is; one that had to be made goes again if nothing was saved in it."""
+    """Context manager: the session, open for writing; one created for the block is removed again if nothing was saved
+    in it."""
     if isinstance(session, Session):
         yield session
         return

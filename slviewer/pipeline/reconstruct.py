@@ -182,7 +182,8 @@ def segment_board(store: Session, shot: Capture, texture: np.ndarray, warn: Warn
 
 
 def illuminated_pixels(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:
-    """(h, w) bool: what a perfect decoder could have measured on the axis that the clouds came from."""
+    """Return the pixels (h, w) bool that a perfect decoder could have measured on the axis that the clouds came
+    from."""
     return phases[next(iter(clouds.values())).axis].illuminated
 
 

@@ -19,7 +19,7 @@ Shot = tuple[np.ndarray, PatternSequence]
 
 
 class Reel:
-    """A rig that shows what was recorded; it answers to `sequence` alone until it is wound on."""
+    """A rig that replays recorded captures; it has only the `sequence` of the current one until it is wound on."""
 
     def __init__(self, shots: dict[str, Callable[[], Shot]]) -> None:
         """`shots` read the frames (n, h, w) and the sequence of one capture each, by name, in order."""

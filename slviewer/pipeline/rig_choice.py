@@ -77,7 +77,7 @@ def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = Non
 
 
 def needs_page(choice: Choice) -> bool:
-    """Whether one of a choice's devices is reached through the projector page."""
+    """Return whether one of a choice's devices is reached through the projector page."""
     parts = [choice, *(part for key in ("camera", "projector") if isinstance(part := choice.get(key), Mapping))]
     return any(drivers()[str(part["driver"])].channel for part in parts if str(part.get("driver")) in drivers())
 

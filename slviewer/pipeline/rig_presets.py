@@ -125,7 +125,7 @@ def _read_preset(name: str, path: Path) -> Preset:
 
 
 def _read_preset_or_problem(name: str, path: Path) -> Preset:
-    """The preset in a file its `problem` where it cannot be used."""
+    """Return the preset in a file, with its `problem` where it cannot be used."""
     try:
         preset = _read_preset(name, path)
         needed = (drivers()[driver_name] for driver_name in dict.fromkeys(_driver_names(preset.choice)))

@@ -12,13 +12,14 @@ from slviewer.session.store import Session
 
 
 def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
-    """What was applied to a calibration, as ``record_scale`` stored it; None where it was made anew."""
+    """Return the scale correction of a calibration, as ``record_scale`` stored it; None where the calibration is
+    newer."""
     name = f"scale/{model}"
     return store.load_result(name, only=())[0] if store.state_of(name) == "fresh" else None
 
 
 def scale_factor(store: Session, model: str) -> float:
-    """What a calibration's clouds are multiplied by: 1 where no correction was applied."""
+    """Return the scale factor of a calibration's clouds: 1 where no correction was applied."""
     applied = load_scale_correction(store, model)
     return 1.0 if applied is None else float(applied["factor"])
 
@@ -31,7 +32,7 @@ def scale_sigma(store: Session, model: str) -> float:
 
 
 def describe_scale(store: Session, model: str) -> str:
-    """What was applied to a calibration, in words; empty where nothing was."""
+    """Describe the scale correction of a calibration in words; empty where there is none."""
     applied = load_scale_correction(store, model)
     if applied is None:
         return ""

@@ -104,7 +104,7 @@ def simulate(
 
 
 def turn_plan(rig: SimulatedRig, board: Board, poses: int) -> dict[str, Scene]:
-    """What the preset "turn" puts before its rig, by name."""
+    """Return the scenes of the preset "turn", by name of the capture."""
     targets = {
         f"pose_{i:02d}": printed_board(board, pose, seed=rig.seed)
         for i, pose in enumerate(target_poses(rig, board, poses), 1)

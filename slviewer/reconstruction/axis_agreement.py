@@ -63,7 +63,7 @@ LEAST_WITHIN = 0.5
 
 
 class Calibration(Protocol):
-    """A calibration as far as rays are concerned. ``rig``: its pinholes and their arrangement."""
+    """Camera and projector rays of a calibration. ``rig``: its pinholes and their arrangement."""
 
     def undistort_pairs(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and of ``projector`` pixels (n, 2);
@@ -96,7 +96,7 @@ class AxisAgreement:
 
     @property
     def ratio(self) -> float:
-        """Misfit over what is predicted."""
+        """Ratio of the measured misfit to the predicted one."""
         return self.misfit_px / self.predicted_px
 
     @property
@@ -142,7 +142,7 @@ def check_phases(
     depth_range: tuple[float, float] | None = None,
     accept: bool = False,
 ) -> CaptureCheck:
-    """Whether the decoded axes of a capture agree with each other by a calibration.
+    """Check whether the decoded axes of a capture agree with each other by a calibration.
 
     ``depth_range`` mm: the calibrated depths. With both axes their misfit decides, with one the share of its pixels
     that the projector could have lit. Raises InputError, with the likely reason, where the capture cannot belong to the
@@ -199,8 +199,8 @@ def check_phases(
 def local_misfit(
     calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
 ) -> NDArray[np.float32] | None:
-    """The px of the projector, `TILES` of the image, by which the axes miss each other in each tile beyond what is
-    predicted there; 0 where noise and the calibration's residuals explain it, None where they do so everywhere.
+    """Return the misfit of the axes in px of the projector for each of `TILES` of the image, beyond what is predicted
+    there; 0 where noise and the calibration's residuals explain it, None where they do so everywhere.
 
     ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_agreement` takes them. What disturbs one axis disturbs the
     other about as much.
@@ -231,8 +231,8 @@ def measure_agreement(
 
 
 def epipolar_distance(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) px, signed: how far projector points lie from the epipolar lines of their camera rays, and (n, 2) the lines'
-    unit normals. ``camera``, ``projector`` (n, 2): undistorted normalised coordinates."""
+    """Return signed distances (n,) px of projector points from the epipolar lines of their camera rays, and the lines'
+    unit normals (n, 2). ``camera``, ``projector`` (n, 2): undistorted normalised coordinates."""
     along = np.column_stack([camera, np.ones(len(camera))]) @ rig.R.T
     line = np.cross(rig.t, along)
     K = rig.projector.K
@@ -330,7 +330,7 @@ def _contradiction(agreement: AxisAgreement) -> str:
 
 
 def _likely_reason(agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray, measured: np.ndarray) -> str:
-    """The hypothesis that explains the frames best, in words."""
+    """Return in words the hypothesis that explains the frames best."""
     best, reason = np.inf, ""
     for words, other, at, coordinates in _hypotheses(rig, pixels, measured):
         tried = _agreement(
@@ -350,7 +350,7 @@ def _likely_reason(agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray,
 def _hypotheses(
     rig: StereoRig, pixels: np.ndarray, measured: np.ndarray
 ) -> Iterator[tuple[str, StereoRig, np.ndarray, np.ndarray]]:
-    """What may be wrong, in words, and rig, pixels and coordinates as they would be without."""
+    """Yield each hypothesis of what is wrong, in words, with rig, pixels and coordinates corrected accordingly."""
     size, image = np.array(rig.projector.size), np.array(rig.camera.size)
     exchanged = "x and y are exchanged; exchange them in the description of the frames"
     yield exchanged, rig, pixels, measured[:, ::-1]
@@ -389,7 +389,7 @@ def _size(size: tuple[int, int]) -> str:
 
 
 def _scale(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
-    """In words, where one is a simple multiple of the other."""
+    """Describe the ratio of two sizes where it is a quarter, half, twice or four times; empty otherwise."""
     for factor, words in ((0.5, "half"), (2.0, "twice"), (0.25, "a quarter of"), (4.0, "four times")):
         if size[0] == factor * calibrated[0] and size[1] == factor * calibrated[1]:
             return f" (the capture's is {words} the calibrated size)"

@@ -11,7 +11,7 @@ from slviewer.fringe.layout import to_eight_bits
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """What one capture measured.
+    """The organised cloud of one capture.
 
     ``points``: (h, w, 3) float32 mm in the camera's frame, NaN where invalid. ``axis``: the one that depth came from.
     ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm, predicted from the capture's noise.
@@ -61,8 +61,8 @@ class Cloud:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(h, w) float32 mm: the standard deviation of z from noise, calibration and edges together, as far as they are
-        known; NaN where invalid."""
+        """(h, w) float32 mm: standard deviation of z from the known ones of noise, calibration and edges; NaN where
+        invalid."""
         lasting = self.sigma_lasting
         return self.sigma_z if lasting is None else np.asarray(np.hypot(self.sigma_z, lasting))
 

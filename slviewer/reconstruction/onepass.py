@@ -22,8 +22,8 @@ from slviewer.reconstruction.cloud import Cloud
 
 @dataclass(frozen=True)
 class LightLevels:
-    """What a rig's frames say about themselves: ``noise`` (a, b) and ``mean`` as `measure_noise` and `fringe_mean`
-    have them, and the grey level ``white`` at which the camera clips. It changes when the camera is set anew."""
+    """Noise and light levels of a rig's frames: ``noise`` (a, b) and ``mean`` as returned by `measure_noise` and
+    `fringe_mean`, and the grey level ``white`` at which the camera clips. They change with the camera's settings."""
 
     noise: tuple[float, float]
     mean: float
@@ -32,7 +32,7 @@ class LightLevels:
 
 @dataclass(frozen=True, eq=False)
 class PassResult:
-    """What one pass leaves on the camera's grid; the next pass into the same arrays writes over it.
+    """Maps of one pass on the camera's pixel grid; the next pass into the same arrays overwrites them.
 
     ``points`` (h, w, 3) float32 mm, NaN where invalid; ``phase`` (h, w) float32 rad, absolute, NaN where ``reason``
     (uint8, a `fringe.phase.Reason`) is not VALID; ``sigma_z`` float32 mm, the depth's noise where there is a phase;
@@ -57,8 +57,9 @@ class PassResult:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What a device is made ready for: the ``shape`` (h, w) of a camera's frames, their layout, all ``frames`` that the
-    axis is decoded from, whether the texture is the background of the fringes (``is_shaded``), and the calibration."""
+    """Description of the work that a device is prepared for: the ``shape`` (h, w) of a camera's frames, their layout,
+    all ``frames`` that the axis is decoded from, whether the texture is the background of the fringes (``is_shaded``),
+    and the calibration."""
 
     shape: tuple[int, int]
     axis: Axis
@@ -70,7 +71,7 @@ class Job:
 
 
 class OnePass:
-    """One rig and sequence, made ready: frames of one axis become a cloud by a pixelwise or a splined calibration.
+    """Reconstruct the frames of one axis in one pass, by a pixelwise or a splined calibration, with prepared tables.
 
     The results are those of `fringe.decode.decode` and the model's ``points``. Raises InputError for other models, an
     axis that sequence or model lacks, and Gray code without phase steps.
@@ -101,8 +102,8 @@ class OnePass:
         return height, width
 
     def light(self, frames: np.ndarray) -> LightLevels:
-        """What the frames (n, h, w) say about camera and light, from a sample of their pixels; of uint16 frames the
-        largest grey level is sought in all of them."""
+        """Estimate noise and light levels of frames (n, h, w) from a sample of their pixels; of uint16 frames the
+        largest grey level is searched in all of them."""
         self._check(frames)
         white = white_level(frames, self.sequence.select(self.axis))
         mean = fringe_mean(self._layout, frames) if self._layout.is_plain else MIDDLE
@@ -165,7 +166,7 @@ class OnePass:
     def _begun(
         self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None
     ) -> tuple[np.ndarray, PassResult]:
-        """The frames, checked and in one piece, and the arrays to write into."""
+        """Return the checked, contiguous frames and the arrays to write into."""
         self._check(frames)
         frames = np.ascontiguousarray(frames)
         light = light or self.light(frames)
@@ -208,7 +209,8 @@ def texture_frame(sequence: PatternSequence) -> int:
 
 
 def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.Depths:
-    """Coefficients about the middle of all phases, where float32 holds depths to some 1e-5 mm."""
+    """Return a pixelwise model's coefficients about the middle of all phases, where float32 represents depths to some
+    1e-5 mm."""
     fit = model.fits[axis]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         low, high = fit.phase_min.astype(float), fit.phase_max.astype(float)
@@ -224,7 +226,7 @@ def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.D
 
 
 def _splined(model: SplinedModel, axis: Axis, period_px: float) -> kernels.Depths:
-    """The compiled form; pixels that look where no target pose was are masked."""
+    """Return a splined model's compiled coefficients; pixels outside the calibrated region are masked."""
     fast = model.fast_axis(axis)
     c = np.concatenate([fast.coefficients, model.rays.astype(np.float32)])
     per_mm = (fast.supported_grid.shape[2] - 1) / (fast.far - fast.near)

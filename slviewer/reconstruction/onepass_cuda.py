@@ -22,7 +22,7 @@ Fast = PixelwiseModel | SplinedModel | StereoModel
 
 
 def one_pass(sequence: PatternSequence, model: Fast, axis: Axis) -> OnePass:
-    """What makes clouds of a sequence's frames fastest here: the CUDA device's pass, or else the processor's.
+    """Return the fastest one-pass reconstruction available: on the CUDA device, or else on the processor.
 
     Raises InputError as `OnePass` does; so does a stereo calibration where there is no device, see `has_pass`.
     """
@@ -79,7 +79,8 @@ class CudaPass(OnePass):
         super().repair_spikes(scan)
 
     def card(self, dtype: np.dtype) -> "Card":
-        """What lies on the device for frames of a dtype, to be used step by step: its errors are not caught."""
+        """Return the buffers and kernels on the device for frames of a dtype, for use step by step; its errors are not
+        caught."""
         if self._card is None or self._card.dtype != dtype:
             from slviewer.reconstruction.onepass_cuda_card import Card
 
@@ -123,7 +124,7 @@ class CudaPass(OnePass):
         return Job(self.shape, self.axis, self._layout, frames, self._ladder, depths, self._texture < 0)
 
     def _defined(self, frames: np.ndarray, scan: PassResult) -> PassResult:
-        """A stereo calibration's scan by the processor."""
+        """Compute a stereo calibration's scan on the processor."""
         assert isinstance(self.model, StereoModel)
         decoded = decode(self.sequence, frames, self.axis)
         points = self.model.points(decoded)

@@ -22,7 +22,7 @@ THREADS = 256
 
 
 class Card:
-    """One job and one kind of frames, uint8 or uint16, on the device.
+    """Buffers and kernels on the CUDA device for one job and one dtype of frames, uint8 or uint16.
 
     All that it does is queued in ``stream``; only `fetch` waits. Errors are those of numba's CUDA.
     """
@@ -57,7 +57,7 @@ class Card:
 
     @property
     def bytes_moved(self) -> int:
-        """What the first pass reads and writes in the device's memory, each number once."""
+        """Bytes that the first pass reads and writes in the device's memory, each number once."""
         read = self._frames, self._c, self._extra
         written = self._phase, self._modulation, self._sigma_z, self._points, self._reason, self._texture
         return sum(array.size * array.dtype.itemsize for array in (*read, *written))
@@ -68,7 +68,7 @@ class Card:
             room.copy_to_device(frames[first:last].reshape(-1), stream=self.stream)
 
     def sweep(self, light: LightLevels) -> None:
-        """The first pass over the frames that were loaded."""
+        """Run the first pass over the loaded frames."""
         if self._deep:
             self._highest.copy_to_device(self._none, stream=self.stream)
         numbers = (*light.noise, limits.DARK_LEVELS * light.white / 255, self._dark_sigmas, light.white, light.mean)
@@ -78,7 +78,7 @@ class Card:
         )  # fmt: skip
 
     def repair_spikes(self) -> None:
-        """The second: what `OnePass.repair_spikes` does."""
+        """Run the second pass on the device: see `OnePass.repair_spikes`."""
         list_moves, move, list_masked, mask = self._spikes
         if self._is_plain:
             list_moves[self._grid](self._phase_map, self._words)
@@ -87,7 +87,8 @@ class Card:
         mask[self._grid](self._words, self._phase, self._reason, self._points, self._sigma_z)
 
     def fetch(self, scan: PassResult) -> int:
-        """Fill a scan's arrays, texture only where it is made of fringes; the largest grey level, 0 of uint8 frames."""
+        """Copy the maps into a scan's arrays, the texture only where it is computed from fringes; returns the largest
+        grey level, 0 for uint8 frames."""
         pairs = [
             (self._points, scan.points),
             (self._phase, scan.phase),
@@ -105,9 +106,9 @@ class Card:
 
 
 def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
-    """How a pixel is measured, as a device function of (pixel, phase, c, extra) that returns what `pixel_depths` does,
-    and these two arrays: ``c`` (m, h, w) of the camera's pixels, and what else it needs. The pixel is a uint64, as
-    unsigned indices are taken as they are."""
+    """Return the device function (pixel, phase, c, extra) that measures a pixel like `pixel_depths`, and two arrays:
+    ``c`` (m, h, w) of the camera's pixels, and ``extra``. The pixel is a uint64, so that indices are not tested for
+    their sign."""
     width, d = job.shape[1], job.depths
     if isinstance(d, StereoRig):
         extra = np.zeros((6, 10))
@@ -134,8 +135,8 @@ def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
 
 
 def _stereo(row: int, period_px: float) -> Callable[..., Any]:
-    """By `geometry.triangulation` in float64; ``c`` (2, n): the camera's rays; ``extra`` (6, 10): the rows of R, t, the
-    projector's parameters, and its size."""
+    """Compile the device function that triangulates a pixel by `geometry.triangulation` in float64; ``c`` (2, n): the
+    camera's rays; ``extra`` (6, 10): the rows of R, t, the projector's parameters, and its size."""
     px_per_rad, depth_of = np.float32(period_px / (2 * np.pi)), device_function(ray_depth)
 
     @cuda.jit(device=True)
@@ -154,7 +155,7 @@ def _stereo(row: int, period_px: float) -> Callable[..., Any]:
 
 
 def _runs(slots: list[int]) -> Iterator[tuple[int, int, int]]:
-    """(slot, first frame, frame after the last) of frames that lie one after the other in the capture too."""
+    """Return (slot, first frame, frame after the last) of each run of consecutive frames of the capture."""
     at = 0
     for k in range(1, len(slots) + 1):
         if k == len(slots) or slots[k] != slots[k - 1] + 1:

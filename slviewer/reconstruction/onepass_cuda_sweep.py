@@ -85,14 +85,16 @@ def _steps(layout: Layout) -> list[tuple[int, ...]]:
 
 
 def _shift(layout: Layout, pixels: int) -> Any:
-    """Device function: wrapped phase, modulation, background and largest sample of the period in some frames."""
+    """Compile the device function that returns wrapped phase, modulation, background and largest sample of one period's
+    frames."""
     angles = np.concatenate([TWO_PI * layout.sign * np.arange(n) / n for n in map(len, _steps(layout))])
     cosines, sines = (f(angles + layout.offset_rad).astype(np.float32) for f in (np.cos, np.sin))
     stride = np.uint64(pixels)
 
     @cuda.jit(device=True)
     def shift(stack, i, first, last):
-        """Return (wrapped phase, modulation, background, largest sample) of pixel ``i``, frames ``first`` to ``last``."""
+        """Return (wrapped phase, modulation, background, largest sample) of pixel ``i`` from frames ``first`` to
+        ``last``, the last one excluded."""
         cosine_of, sine_of = cuda.const.array_like(cosines), cuda.const.array_like(sines)
         at = i + np.uint64(first) * stride
         base = np.float32(stack[at])
@@ -115,7 +117,7 @@ def _shift(layout: Layout, pixels: int) -> Any:
 
 @cuda.jit(device=True)
 def _verdict(B, A, clipped, inconsistent, light):
-    """Why a pixel is masked: the first reason that applies."""
+    """Return the reason to mask a pixel, the first that applies: saturated, dark, inconsistent; VALID without one."""
     sigma = np.float32(math.sqrt(light[NOISE_A] + light[NOISE_B] * A))
     if clipped:
         return SATURATED
@@ -125,7 +127,8 @@ def _verdict(B, A, clipped, inconsistent, light):
 
 
 def _coded(layout: Layout, pixels: int) -> Any:
-    """Device function: (absolute phase, reason, modulation, background) of a pixel by Gray code."""
+    """Compile the device function that decodes a pixel by Gray code: (absolute phase, reason, modulation,
+    background)."""
     shift = _shift(layout, pixels)
     steps, bits, inverses, complementary = layout.steps, len(layout.gray), bool(layout.inverse), not layout.is_plain
     stride, code_from, inverse_from = (np.uint64(number) for number in (pixels, steps, steps + bits))
@@ -134,7 +137,8 @@ def _coded(layout: Layout, pixels: int) -> Any:
 
     @cuda.jit(device=True)
     def height_of(stack, i, bit, threshold):
-        """Return the signed grey level of a Gray code bit: half its difference to the inverse, or above the threshold."""
+        """Return the signed grey level of a Gray code bit: half the difference to its inverse frame, or the level above
+        the threshold."""
         slot = np.uint64(bit)
         value = np.float32(stack[(code_from + slot) * stride + i])
         if inverses:
@@ -143,7 +147,7 @@ def _coded(layout: Layout, pixels: int) -> Any:
 
     @cuda.jit(device=True)
     def misread(stack, i, threshold, top, bottom, code, part, mean):
-        """Return whether the samples of pixel ``i`` contradict the Gray code that was read."""
+        """Return the correction (-1, 0 or 1) of a code whose bit that switches next to the pixel is weak."""
         contrast = max(top / (ONE - mean), -bottom / mean)
         middle = (HALF - mean) * contrast
         zeros, ones = 0, 0
@@ -198,7 +202,8 @@ def _coded(layout: Layout, pixels: int) -> Any:
 
 
 def _levels(job: Job, pixels: int) -> Any:
-    """Device function: (absolute phase, reason, modulation, background) of a pixel by several periods."""
+    """Compile the device function that decodes a pixel by several periods: (absolute phase, reason, modulation,
+    background)."""
     shift, ladder = _shift(job.layout, pixels), job.ladder
     count, levels = len(job.layout.shifts), len(ladder.periods)
     starts = np.cumsum([0, *map(len, _steps(job.layout))]).astype(np.int32)

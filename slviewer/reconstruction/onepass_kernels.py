@@ -38,7 +38,7 @@ class Depths(NamedTuple):
 
 
 class Maps(NamedTuple):
-    """What is written, (h, w) each, and ``points`` (h, w, 3); see `onepass.Scan`."""
+    """Output arrays, (h, w) each, and ``points`` (h, w, 3); see `onepass.Scan`."""
 
     phase: np.ndarray
     reason: np.ndarray
@@ -75,7 +75,7 @@ def sweep(stack, shifts, ladder, rules, scale, depths, maps, texture, frames, pe
 
 @kernel()
 def _measure(first, last, background, depths, scale, per_step, maps):
-    """Points and their depth noise: each pixel's own rational function, and what the grid adds to it, if any."""
+    """Compute points and their depth noise by each pixel's rational function, and the grid's correction, if any."""
     one, zero, none = np.float32(1), np.float32(0), np.float32(np.nan)
     gain, centre, c, grid = np.float32(depths.gain), np.float32(depths.centre), depths.c, depths.grid
     # the phase's standard deviation is the square root of the noise's variance times 2/n, over the modulation
@@ -111,7 +111,7 @@ def _measure(first, last, background, depths, scale, per_step, maps):
 
 @kernel()
 def _fill_texture(stack, texture, first, last, background, maps):
-    """The frame ``texture``, or the background of the fringes where it is -1."""
+    """Fill the texture with the frame ``texture``, or the background of the fringes where it is -1."""
     for row in range(first, last):
         if texture >= 0:
             seen = stack[texture, row]
@@ -124,7 +124,7 @@ def _fill_texture(stack, texture, first, last, background, maps):
 
 @kernel()
 def _brightest(stack, frames, first, last):
-    """The largest grey level of some rows of the frames."""
+    """Return the largest grey level of some rows of the frames."""
     highest = np.int32(0)
     for frame in frames:
         for row in range(first, last):
@@ -136,7 +136,7 @@ def _brightest(stack, frames, first, last):
 
 @kernel()
 def measure_moved(columns, words, counts, depths, maps):
-    """Measure the pixels anew whose phases `kernels_spikes.move_phases` has moved."""
+    """Measure again the pixels whose phases `kernels_spikes.move_phases` has moved."""
     width, gain, centre = maps.phase.shape[1], np.float32(depths.gain), np.float32(depths.centre)
     near, per_mm, c = np.float32(depths.near), np.float32(depths.per_mm), depths.c.reshape(5, -1)
     bounds = depths.bounds.reshape(2, -1)

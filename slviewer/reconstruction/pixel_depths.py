@@ -15,7 +15,7 @@ ZERO, ONE, INVALID = np.float32(0), np.float32(1), np.float32(math.nan)
 
 @numba.njit
 def pixelwise_point(i, phase, c, bounds, gain, centre):
-    """By the pixel's rational function alone; ``c`` (5, n), ``bounds`` (2, n)."""
+    """Return (x, y, z, |dz/dphi|) of a pixel by its rational function alone; ``c`` (5, n), ``bounds`` (2, n)."""
     s, z, slope = _rational_depth(i, phase, c, gain, centre)
     if not (s >= bounds[0, i] and s <= bounds[1, i] and z > ZERO):
         z = INVALID
@@ -24,7 +24,8 @@ def pixelwise_point(i, phase, c, bounds, gain, centre):
 
 @numba.njit
 def splined_point(i, phase, c, grid, gain, centre, width, step, near, per_mm):
-    """By the rational function and the trilinear correction of the ``grid`` (nv, nu, nz); ``c`` (5, n)."""
+    """Return (x, y, z, |dz/dphi|) of a pixel by its rational function and the trilinear correction of the ``grid`` (nv,
+    nu, nz); ``c`` (5, n)."""
     _, z, slope = _rational_depth(i, phase, c, gain, centre)
     depth = (z - near) * per_mm
     if not (depth >= ZERO and depth <= np.float32(grid.shape[2] - 1.0001)):
@@ -49,7 +50,7 @@ def _rational_depth(i, phase, c, gain, centre):
 
 @numba.njit
 def _blend_rows(grid, j, q, k, down, rest):
-    """The grid at column ``q``, between rows ``j`` and layers ``k`` and those after."""
+    """Interpolate the grid at column ``q`` between rows ``j``, ``j + 1`` and layers ``k``, ``k + 1``."""
     row, layer = j + np.uint64(1), k + np.uint64(1)
     a = grid[j, q, k] + down * (grid[row, q, k] - grid[j, q, k])
     b = grid[j, q, layer] + down * (grid[row, q, layer] - grid[j, q, layer])

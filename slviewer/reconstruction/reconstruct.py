@@ -27,11 +27,11 @@ JUMP = 0.01
 
 
 class Model(Protocol):
-    """What reconstruction asks of a calibration, whichever it is."""
+    """Interface of a calibration for reconstruction, whichever it is."""
 
     @property
     def name(self) -> str:
-        """Name of the model: stereo, pixelwise or splined."""
+        """Name of the model, such as stereo or pixelwise."""
         ...
 
     @property
@@ -47,18 +47,18 @@ class Model(Protocol):
 
 @runtime_checkable
 class Scattered(Protocol):
-    """A calibration that knows what phases scatter by beyond their predicted noise."""
+    """A calibration that knows the scatter of phases beyond their predicted noise."""
 
     def excess_px(self, axis: Axis) -> float:
-        """Projector px, 1 sigma."""
+        """Scatter of the phase beyond its predicted noise, in projector px (1 sigma)."""
 
 
 @runtime_checkable
 class HasCalibrationSigma(Protocol):
-    """A calibration that knows how far it may be off."""
+    """A calibration that knows its own uncertainty."""
 
     def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
-        """(h, w) float32 mm: standard deviation of the depth of organised points that the calibration leaves."""
+        """(h, w) float32 mm: standard deviation of the depth of organised points due to the calibration."""
 
 
 def reconstruct(

@@ -15,7 +15,7 @@ SAMPLE = 4000
 
 @dataclass(frozen=True)
 class Resolved:
-    """An absolute phase, and what it rests on.
+    """An absolute phase, and the evidence for it.
 
     ``outside``: share of the decoded pixels that have no depth in the range, and are masked as OUTSIDE. ``spacing_mm``:
     distance in depth of the next candidates, in the median: a surface outside of the range is displaced by about that.
@@ -76,7 +76,7 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
 
 
 def _stretch(rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str) -> tuple[np.ndarray, np.ndarray]:
-    """The lowest and the highest projector coordinate (...,) px that rays (..., 2) pass between two depths."""
+    """Return the lowest and the highest projector coordinate (...,) px of rays (..., 2) between two depths."""
     row = 0 if axis == "x" else 1
     at_near, at_far = (
         rig.project(points_from_depth(rays, np.full(rays.shape[:-1], depth)))[..., row] for depth in (near, far)
@@ -85,7 +85,7 @@ def _stretch(rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: st
 
 
 def _unique_far(rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str, reach: float) -> float:
-    """The depth up to which the phase is unique from ``near`` on, mm."""
+    """Return the depth in mm up to which the phase is unique from ``near`` on."""
     rays = rays[:: max(1, len(rays) // SAMPLE)]
     least, most = near, far
     for _ in range(30):

@@ -24,7 +24,7 @@ _SPARE_BYTES = 1 << 20  # metadata, folders, the file system's own rounding
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in `folder` durable."""
+    """Sync a folder to disk, so that the names in it survive a power failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -128,7 +128,7 @@ def staged_folder(target: Path, needs_bytes: int) -> Iterator[Path]:
 
 
 def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
-    """Rename a staged folder to `target`. What stood there goes to `old_to`, or is deleted where that is None."""
+    """Rename a staged folder to `target`. An existing one is moved to `old_to`, or deleted where that is None."""
     with _disk_errors(target.parent):
         if target.exists():
             decided = _staging_path(target, "new")
@@ -215,13 +215,13 @@ def _disk_full_error(folder: Path, needs_bytes: int) -> SessionError:
 
 
 def format_megabytes(size: int) -> str:
-    """A size for people: `96 MB`."""
+    """Format a size in bytes for people: `96 MB`."""
     return f"{size / 1e6:.0f} MB" if size >= 1e7 else f"{size / 1e6:.1f} MB"
 
 
 @contextmanager
 def _disk_errors(folder: Path, needs_bytes: int = 0) -> Iterator[None]:
-    """Raise errors of the disk as SessionError."""
+    """Context manager: raise errors of the disk as SessionError."""
     try:
         yield
     except OSError as error:

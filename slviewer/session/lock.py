@@ -33,7 +33,7 @@ class WriterLock:
         self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
 
     def release(self) -> None:
-        """Let the next writer in."""
+        """Release the lock for the next writer."""
         if self._lock.is_locked:
             self._holder.unlink(missing_ok=True)
             self._lock.release()

@@ -93,12 +93,12 @@ def measurement_from_meta(identity: str, meta: Mapping[str, Any], names: Mapping
 
 
 def measurement_arrays(store: Session, identity: str) -> dict[str, np.ndarray]:
-    """What a measurement keeps besides numbers and words, by name."""
+    """Return the stored arrays of a measurement, by name."""
     return store.load_result(_result_name(store, identity))[1]
 
 
 def rename_measurement(store: Session, identity: str, name: str) -> Measurement:
-    """Give a measurement another name; an empty one gives back the name that it was made with."""
+    """Give a measurement another name; an empty one restores its original name."""
     _result_name(store, identity)
     store.decide(NAMES, {**(store.decision(NAMES) or {}), identity: name.strip()})
     return load_measurement(store, identity)

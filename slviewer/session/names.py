@@ -8,7 +8,7 @@ _SAFE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}")
 
 
 def safe_name(name: str) -> str:
-    """`name` itself if it can stand as a folder name: letters, digits, `_`, `-`, `.`, no dot or dash first.
+    """Return `name` itself if it is valid as a folder name: letters, digits, `_`, `-`, `.`, no dot or dash first.
 
     Raises InputError otherwise.
     """

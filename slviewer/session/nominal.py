@@ -43,11 +43,11 @@ class Nominal:
 
     @property
     def size_mm(self) -> np.ndarray:
-        """(3,): of the box around it."""
+        """(3,): size of the bounding box."""
         return np.ptp(self.mesh.vertices.astype(np.float64), axis=0)
 
     def text(self) -> str:
-        """In words."""
+        """Describe the model in words."""
         size = " x ".join(f"{side:.1f}" for side in self.size_mm)
         kind = "closed" if self.closed else "open"
         return f"{self.name}: {len(self.mesh.faces):,} triangles, {kind}, {size} mm"
@@ -124,7 +124,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float64 and faces (m, 3) int64 as they are in the file, duplicate vertices merged."""
+    """Return vertices (n, 3) float64 and faces (m, 3) int64 of a file, unchanged but for merged duplicate vertices."""
     import trimesh
 
     form = name.rpartition(".")[2].lower()
@@ -175,7 +175,7 @@ def _drop_degenerate(
 
 
 def _orient_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, bool]:
-    """Faces wound consistently, outwards where the model is closed; and whether it is closed."""
+    """Return the faces wound consistently, outwards where the model is closed; and whether it is closed."""
     o3d = open3d()
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices.astype(np.float64)), o3d.utility.Vector3iVector(faces)

@@ -75,7 +75,7 @@ def write_ply(
 
 
 def read_ply(path: str | Path) -> Ply:
-    """What a PLY that ``write_ply`` wrote holds.
+    """Read the content of a PLY that ``write_ply`` wrote.
 
     Raises InputError for an absent or truncated file and for other kinds of PLY (text, big endian, polygons).
     """
@@ -110,12 +110,12 @@ def read_ply(path: str | Path) -> Ply:
 
 
 def to_ascii(note: str) -> str:
-    """A sentence as one line of printable ASCII, for the comments of a file."""
+    """Convert a sentence to one line of printable ASCII, for the comments of a file."""
     return " ".join(note.encode("ascii", "replace").decode().split())
 
 
 def replace_nan(name: str, values: np.ndarray) -> np.ndarray:
-    """Values of a vertex property with what stands for those that are not known: see ``write_ply``."""
+    """Replace unknown values of a vertex property by their code in the file: see ``write_ply``."""
     if values.dtype.kind != "f" or name in ("x", "y", "z"):
         return values
     return np.where(np.isfinite(values), values, 0.0 if name in ("nx", "ny", "nz") else UNKNOWN_SIGMA)

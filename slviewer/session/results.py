@@ -31,7 +31,7 @@ def list_results(root: Path) -> list[str]:
 
 
 def check_place(root: Path, name: str) -> None:
-    """Raise InputError where a result called `name` would lie inside another, or hold others."""
+    """Raise InputError where a result called `name` would be inside another, or hold others."""
     for other in list_results(root):
         if name.startswith(f"{other}/") or other.startswith(f"{name}/"):
             raise InputError(f"result {name!r} and result {other!r} would lie inside each other: choose another name")

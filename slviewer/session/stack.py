@@ -74,7 +74,7 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
 
 
 def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
-    """Shape (n, h, w) and type of a stack; SessionError where its layout is not the one written here."""
+    """Return shape (n, h, w) and type of a stack; SessionError where its layout is not the one written here."""
     return _read_description(path)[:2]
 
 

@@ -10,7 +10,7 @@ from slviewer.fringe.sequence import PatternSequence
 
 
 def to_toml(table: Mapping[str, Any]) -> str:
-    """The TOML text of a table, inner tables as sections. What is None is omitted.
+    """Return the TOML text of a table, inner tables as sections. None is omitted.
 
     Raises InputError for values that TOML does not hold.
     """
@@ -32,12 +32,12 @@ def describe_sequence(sequence: PatternSequence, files: list[str]) -> str:
 
 
 def table_lines(table: Mapping[str, Any]) -> list[str]:
-    """The line ``key = value`` of each entry that is not None."""
+    """Return the line ``key = value`` of each entry that is not None."""
     return [f"{_format_key(key)} = {format_value(value)}" for key, value in table.items() if value is not None]
 
 
 def format_value(value: Any) -> str:
-    """A value in TOML's notation; mappings as inline tables."""
+    """Format a value in TOML's notation; mappings as inline tables."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):

@@ -62,7 +62,7 @@ def _opened(archive: IO[bytes]) -> zipfile.ZipFile:
 
 
 def _members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]:
-    """What is unpacked, and the names of what is not."""
+    """Return the members of a zip to unpack, and the names of all others."""
     members, others = [], []
     for info in zipped.infolist():
         path = PurePosixPath(info.filename)
@@ -91,7 +91,7 @@ def _members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]
 
 
 def _innermost(folder: Path) -> Path:
-    """The folder itself, or the one inside that alone holds everything, as a zip of a folder has it."""
+    """Return the folder itself, or the inner one that alone holds everything, as in a zip of a folder."""
     while not any(layout.is_capture(folder) for layout in LAYOUTS.values()):
         inside = visible(folder)
         if len(inside) != 1 or not inside[0].is_dir():

@@ -26,7 +26,7 @@ class _Group(msgspec.Struct, tag_field="kind", forbid_unknown_fields=True, kw_on
     exposure_ms: _Exposure = None
 
     def frames(self) -> list[Frame]:
-        """The frames that the group's images show: one, unless the kind says otherwise."""
+        """Return the frames that the group's images show: one, unless the kind defines several."""
         return [Frame(self.__struct_config__.tag, self.axis)]  # type: ignore[arg-type]
 
 
@@ -155,7 +155,7 @@ def read_groups(name: str, data: Mapping[str, Any]) -> tuple[FrameGroup, ...]:
 
 
 def has_wildcard(name: str) -> bool:
-    """Whether * or ? stands for other characters."""
+    """Return whether a name contains the wildcards * or ?."""
     return "*" in name or "?" in name
 
 
@@ -176,7 +176,7 @@ def images_by_name(folder: Path) -> list[Path]:
 
 
 def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGroup:
-    """A `[[frame]]` table: one image."""
+    """Read a `[[frame]]` table: one image."""
     if "files" in entry:
         raise InputError(f"{where}: files belongs to [[frames]]: name the one file of a [[frame]] with file")
     files = _file_names(where, entry.get("file"), ordered)
@@ -195,7 +195,7 @@ def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
 
 
 def _read_group(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGroup:
-    """A `[[frames]]` table: all images of one kind and axis."""
+    """Read a `[[frames]]` table: all images of one kind and axis."""
     words = " ".join(str(entry[key]) for key in ("kind", "axis") if key in entry)
     where = f"{where} ({words})" if words else where
     try:

@@ -80,7 +80,7 @@ _KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
 
 @dataclass(frozen=True)
 class Description:
-    """What a TOML says of every capture of a source.
+    """The content of a TOML that describes every capture of a source.
 
     `files_order`: index of each stack frame's file among the files of all groups. `gray_origin_given`: whether the TOML
     states where Gray code 0 begins.
@@ -94,7 +94,7 @@ class Description:
     gray_origin_given: bool
 
     def select_files(self, folder: Path) -> tuple[Path, ...]:
-        """The files of one capture in the order of its stack; InputError that says what is missing or too many."""
+        """Return the files of one capture in the order of its stack; InputError names missing or surplus files."""
         if self.groups[0].files is None:
             matched, count = images_by_name(folder), len(self.files_order)
             if len(matched) != count:
@@ -125,7 +125,7 @@ class Description:
             raise InputError(f"it lacks {listed(missing)}, which the TOML names: add them")
 
     def is_capture(self, folder: Path) -> bool:
-        """Whether a folder looks like a capture: a file that is named is there, or more than half of the images."""
+        """Return whether a folder holds a named file, or more than half of a capture's images."""
         if self.groups[0].files is None:
             return 2 * len(images_by_name(folder)) > len(self.files_order)
         names = [name for group in self.groups for name in group.files or () if not has_wildcard(name)]

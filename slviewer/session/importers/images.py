@@ -26,7 +26,8 @@ _JPEG = b"\xff\xd8"
 
 @dataclass(frozen=True)
 class FrameImages:
-    """Image files as frames of one channel. ``in_colour``: whether the files hold colours, of which one was taken."""
+    """Image files as frames of one channel. ``in_colour``: whether the files hold colours, of which one channel was
+    used."""
 
     stack: np.ndarray  # (n, h, w) uint8 or uint16
     texture: np.ndarray | None  # (h, w, 3) RGB of the frame that was asked for, where it is in colour
@@ -115,7 +116,7 @@ def _check_alike(image: np.ndarray, first: np.ndarray, path: Path, first_path: P
 
 
 def _fault(data: bytes) -> str | None:
-    """What is wrong with the file as a whole, where the decoder would not say."""
+    """Describe a fault of the file as a whole that the decoder would not report."""
     if not data:
         return "empty"
     if data.startswith(_PNG):
@@ -134,7 +135,7 @@ def _fault(data: bytes) -> str | None:
 
 
 def _png_fault(data: bytes) -> str | None:
-    """Walk the chunks of a PNG: each says its length and carries a checksum, and the last is IEND."""
+    """Describe a fault in the chunks of a PNG: each states its length and carries a checksum, and the last is IEND."""
     at, view = len(_PNG), memoryview(data)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
@@ -150,7 +151,8 @@ def _png_fault(data: bytes) -> str | None:
 
 
 def _jpeg_ends(data: bytes) -> bool:
-    """Whether an end-of-image marker follows the scan; one inside a thumbnail, which comes before, does not count."""
+    """Return whether an end-of-image marker follows the scan; one inside a thumbnail, which comes before, does not
+    count."""
     at = 2
     while at + 4 <= len(data):
         if data[at] != 0xFF:
@@ -176,5 +178,5 @@ def _size(image: np.ndarray) -> str:
 
 
 def _short(path: Path) -> str:
-    """The file with the two folders above it: enough to find it in a source of many captures."""
+    """Format a path as the file with the two folders above it: enough to identify it in a source of many captures."""
     return "/".join(path.parts[-3:])

@@ -89,7 +89,7 @@ def define_layout(
     projector: tuple[int, int] | None = None,
     needs_projector: str = "",
 ) -> FolderLayout:
-    """A layout whose captures are recognised by their file names alone.
+    """Return a layout whose captures are recognised by their file names alone.
 
     ``describe(folder, name, projector, **options)`` returns the recording of one folder and warnings;
     ``needs_projector``: what depends on the projector's size, if anything does.
@@ -168,7 +168,7 @@ def collect_captures(
 
 
 def none_usable(skipped: Sequence[Skipped]) -> InputError:
-    """The error that states why each capture of a source was skipped; each reason once."""
+    """Return the error that states why each capture of a source was skipped; each reason once."""
     if len(skipped) == 1:
         return InputError(str(skipped[0]))
     reasons: dict[str, list[str]] = {}
@@ -205,7 +205,7 @@ def capture_name(folder: Path, prefix: str | None) -> str:
 
 
 def visible(folder: Path) -> list[Path]:
-    """What is in a folder, without hidden files; InputError where it cannot be listed."""
+    """Return the entries of a folder without hidden files; InputError where it cannot be listed."""
     try:
         return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
@@ -222,7 +222,7 @@ def strangers_warning(folder: Path, files: Sequence[Path]) -> list[str]:
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
-    """Names in a sentence, the first few of many."""
+    """Format names for a sentence, the first few of many."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
@@ -232,6 +232,6 @@ def _stem(folder: Path) -> str:
 
 
 def _colour_frame(sequence: PatternSequence) -> int | None:
-    """Index of the frame that shows the scene as it looks: the texture, else white."""
+    """Return the index of the frame for the scene's colours: the texture, else white."""
     kinds = [frame.kind for frame in sequence.frames]
     return next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), None)

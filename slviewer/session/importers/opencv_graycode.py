@@ -76,7 +76,7 @@ def is_capture(folder: Path) -> bool:
 
 
 def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
-    """Raise InputError where white and black stand where stripes are expected, or the other way round.
+    """Raise InputError where white and black images are in place of stripes, or the other way round.
 
     A projector of another size may take two images more or less, as many as white and black are. In a pair of the
     finest stripes the first image is the brighter in half of the places, in white and black everywhere.
@@ -96,7 +96,7 @@ def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
 
 
 def _shown(sequence: PatternSequence, images: int) -> PatternSequence:
-    """The sequence of so many images: with or without white and black at its end."""
+    """Return the sequence of so many images: with or without white and black at its end."""
     needed = len(sequence.frames)
     if images == needed:
         return sequence

@@ -72,7 +72,7 @@ def describe(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Importa
 
 
 def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
-    """V, then H, whichever are there."""
+    """Return the axis folders that exist, V before H."""
     there = [entry for entry in visible(pose) if entry.is_dir() and entry.name.lower() in _AXES]
     if len({entry.name.lower() for entry in there}) < len(there):
         raise InputError(f"it holds {listed(sorted(entry.name for entry in there))}: keep one folder an axis")

@@ -22,7 +22,7 @@ _FILE = re.compile(r"graycode_?(\d+)", re.IGNORECASE)
 
 
 def describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
-    """The recording of one folder. The projector's size says how many bits, and so how many images, there are."""
+    """Return the recording of one folder. The projector's size determines the numbers of bits and of images."""
     images, others = match_images(folder, _FILE)
     sequence = gray(projector)
     check_complete(images, "graycode_")

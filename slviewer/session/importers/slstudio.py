@@ -98,7 +98,7 @@ def _frames(codec: Codec, projector: tuple[int, int], axes: tuple[Axis, ...]) ->
 
 
 def _gray_cell(axis: Axis, projector: tuple[int, int]) -> float:
-    """px: the width of the finest cell; SLStudio does not show the least significant bits."""
+    """Return the width in px of the finest Gray code cell; SLStudio does not show the least significant bits."""
     extent = projector[AXES.index(axis)]
     hidden = ceil(log2(extent)) - _SHOWN_BITS[axis]
     if hidden < 0:
