@@ -35,8 +35,8 @@ def test_odd_lengths_keep_every_digit() -> None:
 @pytest.mark.parametrize(
     ("notation", "says"),
     [
-        ("", "starts with none of"),
-        ("squares:3x3:4", "starts with none of"),
+        ("", "start it with one of"),
+        ("squares:3x3:4", "start it with one of"),
         ("circles", "0 fields"),
         ("circles:21x16", "columns x rows and the pitch"),
         ("circles:21:9", "'21' is not columns x rows"),
