@@ -153,7 +153,7 @@ def scan(page: Page, operator: Operator) -> None:
     button(page, "4. Calibrate").click()  # its curves, at a pixel of this cloud
     choose(page, "Cloud", "scan_01")
     field(page, "Pixel u").fill("20")  # far from the click: the pixel that is shown first may be the clicked one
-    for _ in range(20):
+    for _ in range(100):  # a busy machine draws the cloud late
         page.mouse.click(*ON_THE_CLOUD)
         page.wait_for_timeout(500)
         if field(page, "Pixel u").input_value() != "20":
