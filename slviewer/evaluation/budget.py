@@ -33,13 +33,13 @@ class ErrorBudget:
 
     @property
     def U_mm(self) -> float:
-        """Expanded uncertainty (k = 2) of all that is known."""
+        """Expanded uncertainty (k = 2) of all known contributions."""
         known = [c.u_mm for c in self.contributions if c.u_mm is not None]
         return COVERAGE * float(np.sqrt(np.sum(np.square(known))))
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Sources of which nothing is known, and which U leaves out."""
+        """Sources of unknown uncertainty, which U does not include."""
         return tuple(c.source for c in self.contributions if c.u_mm is None)
 
     def text(self) -> str:

@@ -33,7 +33,7 @@ doubtful too."""
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """One capture of a plane or a sphere, seen through several models.
+    """One capture of a plane or a sphere, measured with several models.
 
     ``results`` by model name, each over the pixels of ``common`` ``(h, w)`` bool: those of ``region`` ``(h, w)`` bool
     that every model measures. ``coverage`` by model: share of the region's illuminated pixels that it measures, NaN
@@ -53,8 +53,8 @@ class Comparison:
 
     @property
     def warnings(self) -> list[str]:
-        """Where more than 2 % was set aside, where a plane is a minor part of the scene, and where the RMS is far above
-        the noise floor by every model."""
+        """Warnings where more than 2 % of the points were excluded, where a plane is a minor part of the scene, and
+        where the RMS is far above the noise floor by every model."""
         messages = [f"{model}: {result.warning}" for model, result in self.results.items() if result.warning]
         if self.is_searched and self.shape == "plane" and self.share < LEAST_SHARE:
             messages.append(
@@ -72,7 +72,7 @@ class Comparison:
         return messages
 
     def region_text(self) -> str:
-        """Where the measured region lies in the image, in words; empty where its map is not at hand."""
+        """Position of the measured region in the image, in words; empty where its map is not available."""
         rows, columns = np.flatnonzero(self.region.any(axis=1)), np.flatnonzero(self.region.any(axis=0))
         if not len(rows):
             return ""
@@ -137,7 +137,7 @@ def compare(
     if len(sizes) > 1:
         raise InputError(f"The models' clouds have different sizes, {sizes}: reconstruct them from the same capture.")
 
-    every, sigma_z = _union(clouds)
+    every, sigma_z = _merge_clouds(clouds)
     shared = np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
     if len(clouds) > 1 and region is None and np.count_nonzero(shared) < LEAST_PIXELS:
         raise InputError(
@@ -173,15 +173,15 @@ def compare(
         results=results,
         region=region,
         common=common,
-        coverage={model: _coverage(cloud, region, illuminated) for model, cloud in clouds.items()},
+        coverage={model: _coverage_share(cloud, region, illuminated) for model, cloud in clouds.items()},
         incidence=None if depth_range is None else incidence(every, region, depth_range),
         share=int(np.count_nonzero(common)) / max(1, int(np.count_nonzero(shared))),
         is_searched=is_searched,
     )
 
 
-def _union(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
-    """The first cloud's points and their noise, and where it has none, the next one's."""
+def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first cloud's points and their noise, and the next cloud's where it has none."""
     first, *others = clouds.values()
     points, sigma_z = first.points.copy(), first.sigma_z.copy()
     for cloud in others:
@@ -190,7 +190,7 @@ def _union(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
     return points, sigma_z
 
 
-def _coverage(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | None) -> float:
+def _coverage_share(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | None) -> float:
     """Return the share of the region's illuminated pixels that the cloud measures; NaN where unknown."""
     measurable = 0 if illuminated is None else np.count_nonzero(region & illuminated)
     if illuminated is None or measurable == 0:

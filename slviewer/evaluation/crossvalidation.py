@@ -33,7 +33,7 @@ BETTER = 0.98
 
 @dataclass(frozen=True)
 class HeldOutPose:
-    """What one model makes of one pose that it was not made from.
+    """Errors of one model on one pose that was not used to fit it.
 
     ``plane_mm``: RMS distance of the board's pixels from their plane. ``board_mm``: RMS distance of the features from
     the board laid over them, flatness, shape and scale included. ``scale_ppm``: how much too long the board's own
@@ -51,8 +51,8 @@ class HeldOutPose:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """``poses``: {model: {pose: what it made of it}}, every model over the same pixels. ``folds``: poses left out
-    together. ``failed``: {model: why it could not be fitted to some fold}."""
+    """``poses``: {model: {pose: its errors}}, every model over the same pixels. ``folds``: poses held out together.
+    ``failed``: {model: why it could not be fitted to some fold}."""
 
     poses: Mapping[str, Mapping[str, HeldOutPose]]
     folds: tuple[tuple[str, ...], ...]
@@ -105,7 +105,7 @@ class CrossValidation:
 
 
 def split_folds(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tuple[str, ...], ...]:
-    """Poses dealt into folds in the order of their depths, so that each fold holds near and far ones.
+    """Deal the poses into folds in the order of their depths, so that each fold holds near and far ones.
 
     Raises InputError for fewer than ``LEAST_POSES`` poses.
     """
@@ -122,7 +122,7 @@ def split_folds(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tup
 
 
 def smoothed_phases(observation: Observation) -> dict[Axis, PhaseMap]:
-    """Phase maps over the board alone, from the smoothed phase of a pose that was kept."""
+    """Return phase maps over the board alone, from the stored smoothed phase of a pose."""
     width, height = observation.size
     u0, v0, u1, v1 = observation.box
     phases: dict[Axis, PhaseMap] = {}
@@ -148,9 +148,8 @@ def smoothed_phases(observation: Observation) -> dict[Axis, PhaseMap]:
 def measure_held_out(
     models: Mapping[str, Model], observation: Observation, axis: Axis, rig: StereoRig
 ) -> dict[str, HeldOutPose]:
-    """What each model makes of a pose, all from the same axis and over the pixels and features that all of them
-    measure; empty where these are too few. ``rig`` turns millimetres into pixels.
-    """
+    """Measure the errors of each model on a pose, all from the same axis and over the pixels and features that all of
+    them measure; empty where these are too few. ``rig`` converts millimetres to pixels."""
     phase = smoothed_phases(observation)[axis]
     clouds = {name: np.asarray(model.points(phase)) for name, model in models.items()}
     common = np.logical_and.reduce([np.isfinite(points[..., 2]) for points in clouds.values()])
@@ -168,10 +167,10 @@ def measure_held_out(
         placed, scale = _align_board(board, X)
         results[name] = HeldOutPose(
             plane_mm=float(np.sqrt(np.mean(fit_plane(measured).distance(measured) ** 2))),
-            board_mm=_rms(X - placed),
+            board_mm=_rms_length(X - placed),
             scale_ppm=1e6 * (scale - 1),
-            camera_px=_rms(rig.camera.project(X) - rig.camera.project(placed)),
-            projector_px=_rms(rig.project(X) - rig.project(placed)),
+            camera_px=_rms_length(rig.camera.project(X) - rig.camera.project(placed)),
+            projector_px=_rms_length(rig.project(X) - rig.project(placed)),
             pixels=len(measured),
             depth_mm=float(X[:, 2].mean()),
         )
@@ -184,7 +183,7 @@ def gather_results(
     folds: tuple[tuple[str, ...], ...],
     failed: Mapping[str, str],
 ) -> CrossValidation:
-    """One result from what each fold measured, {pose: {model: ...}}; models in the order of ``names``.
+    """Combine the results of the folds, {pose: {model: ...}}; models in the order of ``names``.
 
     Raises InputError where no model could be judged.
     """
@@ -213,6 +212,6 @@ def _align_board(board: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, f
     return laid, scale
 
 
-def _rms(differences: np.ndarray) -> float:
-    """Root mean square length."""
+def _rms_length(differences: np.ndarray) -> float:
+    """Return the root mean square length of differences (n, 3)."""
     return float(np.sqrt(np.mean(np.sum(differences**2, axis=1))))

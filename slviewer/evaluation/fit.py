@@ -42,7 +42,7 @@ class ShapeResult:
 
     @property
     def warning(self) -> str | None:
-        """A sentence if so much was set aside that the RMS is not representative of the shape."""
+        """A warning if so many points were excluded that the RMS is not representative of the shape."""
         if self.set_aside_share <= SET_ASIDE_WARNING:
             return None
         return (

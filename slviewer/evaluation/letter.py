@@ -22,7 +22,7 @@ class PlanePose:
 
 @dataclass(frozen=True)
 class SpherePose:
-    """A row of Table 2: where the sphere stood; RMS and fitted radius in mm."""
+    """A row of Table 2: position of the sphere; RMS and fitted radius in mm."""
 
     pose: int
     region: str

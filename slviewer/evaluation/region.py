@@ -38,10 +38,10 @@ def find_plane(
     start for fits, not a result. Raises ``InputError`` where no plane fills a patch.
     """
     measured = measured_pixels(points, mask)
-    noise = _typical(sigma_z, measured)
+    noise = _typical_noise(sigma_z, measured)
     reach = max(PATCH_TOLERANCE_MM, 6.0 * noise)
     first = start or start_plane(points, measured, sigma_z)
-    return _grow(points, measured, first, fit_plane, lambda shape: reach, "flat")
+    return _grow_patch(points, measured, first, fit_plane, lambda shape: reach, "flat")
 
 
 def find_sphere(
@@ -53,14 +53,14 @@ def find_sphere(
 ) -> tuple[Sphere, np.ndarray]:
     """The sphere that holds most pixels, and its region, as ``find_plane``; ``radius`` in mm narrows the search."""
     measured = measured_pixels(points, mask)
-    noise = _typical(sigma_z, measured)
+    noise = _typical_noise(sigma_z, measured)
 
     def reach(shape: Sphere) -> float:
         """Return the tolerance in mm for points on a sphere: by its radius, and at least six sigma of noise."""
         return max(min(PATCH_TOLERANCE_MM, SPHERE_TOLERANCE * shape.radius), 6.0 * noise)
 
     first = start or start_sphere(points, measured, sigma_z, radius)
-    return _grow(points, measured, first, fit_sphere, reach, "round")
+    return _grow_patch(points, measured, first, fit_sphere, reach, "round")
 
 
 def find_spheres(
@@ -79,7 +79,9 @@ def find_spheres(
 def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None) -> Plane:
     """The plane that most points under ``mask`` agree with."""
     measured = measured_pixels(points, mask)
-    return ransac_plane(sample_points(points, measured), max(RANSAC_TOLERANCE_MM, 2.0 * _typical(sigma_z, measured)))[0]
+    return ransac_plane(
+        sample_points(points, measured), max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
+    )[0]
 
 
 def start_sphere(
@@ -87,11 +89,11 @@ def start_sphere(
 ) -> Sphere:
     """The sphere that most points under ``mask`` agree with."""
     measured = measured_pixels(points, mask)
-    tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical(sigma_z, measured))
+    tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
     return ransac_sphere(sample_points(points, measured), tolerance, radius)[0]
 
 
-def _typical(sigma_z: np.ndarray | None, measured: np.ndarray) -> float:
+def _typical_noise(sigma_z: np.ndarray | None, measured: np.ndarray) -> float:
     """Median noise of the measured pixels in mm; 0 where none is known."""
     if sigma_z is None:
         return 0.0
@@ -102,7 +104,8 @@ def _typical(sigma_z: np.ndarray | None, measured: np.ndarray) -> float:
 
 
 def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """Which pixels ``(h, w)`` of a cloud hold a point, under a mask if there is one; ``InputError`` if too few do."""
+    """Return which pixels ``(h, w)`` of a cloud hold a point, under a mask if there is one; ``InputError`` if too few
+    do."""
     if points.ndim != 3 or points.shape[2] != 3:
         raise InputError(f"The cloud has shape {points.shape}: an organised cloud (h, w, 3) is needed.")
     if mask is not None and mask.shape != points.shape[:2]:
@@ -118,12 +121,12 @@ def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
 
 
 def sample_points(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Some 40,000 of the measured points, (n, 3) float64."""
+    """Return some 40,000 of the measured points, (n, 3) float64."""
     chosen = points[measured]
     return chosen[:: -(-len(chosen) // _SAMPLE)].astype(np.float64)
 
 
-def _grow(
+def _grow_patch(
     points: np.ndarray,
     measured: np.ndarray,
     shape: Fitted,
@@ -131,13 +134,13 @@ def _grow(
     tolerance: Callable[[Fitted], float],
     kind: str,
 ) -> tuple[Fitted, np.ndarray]:
-    """Patch and least squares over it in turn, until the patch is stable."""
+    """Alternate between a patch of agreeing pixels and least squares over it, until the patch is stable."""
     patch = np.zeros_like(measured)
     for _ in range(20):
         before = patch
         agreeing = measured & (np.abs(shape.distance(np.where(measured[..., None], points, 0.0))) < tolerance(shape))
         patch = _largest_patch(agreeing)
-        region = _without_rim(patch)
+        region = _remove_rim(patch)
         shown = np.count_nonzero(region & agreeing)
         if shown < LEAST_PIXELS or shown < 0.5 * np.count_nonzero(region & measured):
             raise InputError(
@@ -151,7 +154,8 @@ def _grow(
 
 
 def _largest_patch(agreeing: np.ndarray) -> np.ndarray:
-    """The largest 4-connected patch; gaps of up to four unmeasured pixels do not cut it, and small holes are filled."""
+    """Return the largest 4-connected patch; gaps of up to four unmeasured pixels do not cut it, and small holes are
+    filled."""
     closed = cv2.morphologyEx(agreeing.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
     if count < 2:
@@ -167,7 +171,7 @@ def _largest_patch(agreeing: np.ndarray) -> np.ndarray:
     return filled
 
 
-def _without_rim(patch: np.ndarray) -> np.ndarray:
-    """The patch less its outermost pixels, where it ends inside the image."""
+def _remove_rim(patch: np.ndarray) -> np.ndarray:
+    """Return the patch without its outermost pixels, where it ends inside the image."""
     kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     return cv2.erode(patch.astype(np.uint8), kernel, borderValue=1).astype(bool)

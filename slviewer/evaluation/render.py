@@ -8,7 +8,7 @@ Row = dict[str, Any]
 
 
 def render(table: Sequence[Row]) -> str:
-    """Rows as text with aligned columns: names to the left, figures to the right, ``-`` for what is not known.
+    """Format rows as text with aligned columns: names to the left, figures to the right, ``-`` for unknown values.
 
     Titles stand above their columns one word a line, so that wide tables stay narrow.
     """
@@ -18,7 +18,7 @@ def render(table: Sequence[Row]) -> str:
     words = [title.split() for title in titles]
     height = max(len(w) for w in words)
     head = [list(line) for line in zip(*([""] * (height - len(w)) + w for w in words), strict=True)]
-    body = [[_cell(title, row.get(title)) for title in titles] for row in table]
+    body = [[_format_cell(title, row.get(title)) for title in titles] for row in table]
     widths = [max(len(line[k]) for line in head + body) for k in range(len(titles))]
 
     def laid_out(line: list[str]) -> str:
@@ -35,7 +35,7 @@ def render(table: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def _cell(title: str, value: Any) -> str:
+def _format_cell(title: str, value: Any) -> str:
     """Format a value for the table, with the digits that its column's title calls for."""
     if value is None or value != value:  # NaN
         return "-"

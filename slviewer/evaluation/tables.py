@@ -19,19 +19,21 @@ from slviewer.evaluation.sphere import SphereResult
 
 
 def letter_rows(comparisons: Mapping[str, Comparison]) -> list[Row]:
-    """One row a capture and, for more than one, a row of means; keys are the columns' titles, None is an empty cell.
+    """Return one row a capture and, for more than one, a row of means; keys are the columns' titles, None is an empty
+    cell.
 
     RMS and noise floor of each model in mm, for spheres the radius; ``ratio`` is the first model's RMS over pixelwise's
     or, without that, the last one's (in the last row, the ratio of the means). Beside them the Letter's figures of the
     pose whose number ends the capture's name (``plane_03``, ``sphere_3``), stereo and pixelwise.
     """
     table = [
-        _row(name, comparison) | _letter_figures(name, comparison.shape) for name, comparison in comparisons.items()
+        _make_row(name, comparison) | _letter_figures(name, comparison.shape)
+        for name, comparison in comparisons.items()
     ]
-    return [*table, _means(table, comparisons)] if len(table) > 1 else table
+    return [*table, _average_rows(table, comparisons)] if len(table) > 1 else table
 
 
-def _row(name: str, comparison: Comparison) -> Row:
+def _make_row(name: str, comparison: Comparison) -> Row:
     """Return the table row of one capture: each model's RMS, noise floor, radius and coverage."""
     row: Row = {"capture": name}
     if comparison.incidence is not None:
@@ -44,11 +46,11 @@ def _row(name: str, comparison: Comparison) -> Row:
         if np.isfinite(comparison.coverage[model]):
             row[f"{model} coverage %"] = 100.0 * comparison.coverage[model]
         row[f"{model} set aside %"] = 100.0 * result.set_aside_share
-    return row | _ratio(row, comparison)
+    return row | _rms_ratio(row, comparison)
 
 
-def _ratio(row: Row, comparison: Comparison) -> Row:
-    """The first model's RMS over that of the model to compare it with; nothing for a single model."""
+def _rms_ratio(row: Row, comparison: Comparison) -> Row:
+    """Return the ratio of the first model's RMS to that of the model to compare it with; {} for a single model."""
     first, *others = comparison.results
     if not others:
         return {}
@@ -79,7 +81,7 @@ def _letter_row(stereo: float, pixelwise: float, radii: tuple[float, float] | No
     return row
 
 
-def _means(table: list[Row], comparisons: Mapping[str, Comparison]) -> Row:
+def _average_rows(table: list[Row], comparisons: Mapping[str, Comparison]) -> Row:
     """Return the row of the columns' means, ratios recomputed from the means."""
     row: Row = {"capture": "mean"}
     for title in dict.fromkeys(title for line in table for title in line):
@@ -87,7 +89,7 @@ def _means(table: list[Row], comparisons: Mapping[str, Comparison]) -> Row:
         if values and "ratio" not in title and not title.startswith("Letter"):
             row[title] = float(np.mean(values))
     first = next(iter(comparisons.values()))
-    row |= _ratio(row, first)
+    row |= _rms_ratio(row, first)
     if first.shape == "plane":
         return row | _letter_row(*TABLE_1_MEAN_MM) | {"Letter ratio": TABLE_1_RATIO_OF_MEANS}
     return row | _letter_row(*TABLE_2_MEAN_MM, (TABLE_2_RADIUS_MM[0][0], TABLE_2_RADIUS_MM[1][0]))

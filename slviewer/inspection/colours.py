@@ -24,7 +24,7 @@ def deviation_colours(signed: np.ndarray, limit: float) -> np.ndarray:
 
 
 def colour_limit(signed: np.ndarray, tolerance_mm: float | None = None) -> float:
-    """Half the range that the colours cover, mm: the tolerance, else where 99.5 % of the points lie."""
+    """Return half the range of the colour scale, mm: the tolerance, or the value that contains 99.5 % of the points."""
     if tolerance_mm is not None:
         return tolerance_mm
     known = np.abs(signed[np.isfinite(signed)])

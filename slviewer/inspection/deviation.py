@@ -121,9 +121,11 @@ def deviation(
     if initial is None:
         start = search_start(points, normals, surface, sigma_mm, lambda share: report(0.6 * share))
         initial = start.T_reference_scan
-    T, alignment = _best_fit(points, normals, surface, initial, reach_mm, lambda share: report(0.6 + 0.2 * share))
+    T, alignment = _refine_best_fit(
+        points, normals, surface, initial, reach_mm, lambda share: report(0.6 + 0.2 * share)
+    )
     report(0.8)
-    signed, towards = _signed(points, normals, surface, T, reach_mm)
+    signed, towards = _signed_distances(points, normals, surface, T, reach_mm)
     counted = np.isfinite(signed)
     if not counted.any():
         raise InputError(
@@ -131,7 +133,7 @@ def deviation(
         )
     report(0.95)
     feet = move_points(T, points[counted]) - signed[counted, None] * towards[counted]
-    measured, uncovered = _coverage(feet, surface)
+    measured, uncovered = _measure_coverage(feet, surface)
     back = np.linalg.inv(T)
     report(1.0)
     return Deviation(
@@ -146,7 +148,7 @@ def deviation(
     )
 
 
-def _signed(
+def _signed_distances(
     points: np.ndarray, normals: np.ndarray | None, surface: NominalSurface, T: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances (n,) and the nominal's normals (n, 3), NaN where a point does not belong to it."""
@@ -160,7 +162,7 @@ def _signed(
     return away, towards
 
 
-def _best_fit(
+def _refine_best_fit(
     points: np.ndarray,
     normals: np.ndarray | None,
     surface: NominalSurface,
@@ -176,7 +178,7 @@ def _best_fit(
     T = np.array(T, np.float64)
     for turn in range(MAX_ITERATIONS):
         report(turn / MAX_ITERATIONS)
-        away, towards = _signed(points, normals, surface, T, reach)
+        away, towards = _signed_distances(points, normals, surface, T, reach)
         counted = np.isfinite(away)
         if np.count_nonzero(counted) < 100:
             raise InputError(
@@ -195,7 +197,7 @@ def _best_fit(
     return T, float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean()))
 
 
-def _coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndarray]:
+def _measure_coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndarray]:
     """Share of the nominal's area that was measured, and places (k, 3) in its frame of the rest. ``feet`` (n, 3): where
     on the nominal the scan's points were measured."""
     places, _ = surface.sample(COVERAGE_SAMPLES, seed=1)

@@ -28,14 +28,15 @@ class Feature:
     radius: float | None = None
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """(n,) mm: how far points (n, 3) lie off it: from a plane signed by the normal, of the others outwards."""
+        """Return distances (n,) mm of points (n, 3) from the feature: from a plane signed by the normal, else positive
+        outwards."""
         offsets = np.asarray(points, np.float64) - self.place
         if self.kind == "plane":
             return np.asarray(offsets @ self._direction)
         return np.linalg.norm(self._across(offsets), axis=-1) - (self.radius or 0.0)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3): unit vectors along which ``distance`` grows."""
+        """Return the unit vectors (n, 3) along which ``distance`` grows."""
         offsets = np.asarray(points, np.float64) - self.place
         if self.kind == "plane":
             return np.broadcast_to(self._direction, offsets.shape)
@@ -43,7 +44,7 @@ class Feature:
         return np.asarray(across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300))
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """(n, p): how ``distance`` of the points (n, 3) answers to the parameters."""
+        """Return the derivatives (n, p) of ``distance`` of the points (n, 3) by the parameters."""
         offsets, normals = np.asarray(points, np.float64) - self.place, self.normals(points)
         minus = -np.ones((len(offsets), 1))
         if self.kind == "point":
@@ -57,7 +58,7 @@ class Feature:
         return np.hstack([(offsets @ self._direction)[:, None] * shifts, shifts, minus])
 
     def moved(self, step: np.ndarray) -> "Feature":
-        """The feature with its parameters changed by a step (p,)."""
+        """Return the feature with its parameters changed by a step (p,)."""
         step = np.asarray(step, np.float64)
         if self.kind in ("point", "sphere"):
             radius = None if self.radius is None else self.radius + step[3]
@@ -72,7 +73,7 @@ class Feature:
 
     @property
     def parameters(self) -> int:
-        """How many parameters it has."""
+        """Number of the feature's parameters."""
         return {"point": 3, "plane": 3, "sphere": 4, "cylinder": 5}[self.kind]
 
     @property
@@ -89,7 +90,7 @@ class Feature:
         return np.asarray(offsets - (offsets @ self._direction)[..., None] * self._direction)
 
     def _tangents(self) -> np.ndarray:
-        """(2, 3): unit vectors across the direction and each other."""
+        """Return two unit vectors (2, 3) perpendicular to the direction and to each other."""
         least = np.eye(3)[np.argmin(np.abs(self._direction))]
         first = np.cross(self._direction, least)
         first /= np.linalg.norm(first)

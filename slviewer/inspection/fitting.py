@@ -199,7 +199,7 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
 
 
 def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
-    """What the region holds instead of a shape that could not be fitted at all."""
+    """Describe which other shape the region holds where the requested one could not be fitted at all."""
     some = points[:: -(-len(points) // MAX_COMPARED_POINTS)]
     other: Kind = "cylinder" if kind == "sphere" else "sphere"
     flat, rival = _residual_of("plane", some), _residual_of(other, some)
@@ -214,7 +214,8 @@ def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> 
 
 
 def _residual_of(kind: Kind, points: np.ndarray) -> float:
-    """How far points lie off another shape, robust sigma in mm; infinite where it does not fit at all."""
+    """Return the robust sigma in mm of the points' distances from another shape; infinite where it does not fit at
+    all."""
     try:
         return robust_sigma(_fit_robustly(kind, points)[0].distance(points))
     except (InputError, np.linalg.LinAlgError):
@@ -222,7 +223,7 @@ def _residual_of(kind: Kind, points: np.ndarray) -> float:
 
 
 def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
-    """Robust sigma in mm about the quadratic surface over a plane: curvature removed, noise remains."""
+    """Return the robust sigma in mm about the quadratic surface over a plane: curvature removed, noise remains."""
     assert plane.direction is not None
     offsets = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets - (offsets @ plane.direction)[:, None] * plane.direction, full_matrices=False)

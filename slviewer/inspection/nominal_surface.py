@@ -75,8 +75,8 @@ class NominalSurface:
         return away, normals
 
     def seen_from(self, places: np.ndarray, facing: np.ndarray, view: np.ndarray, least: float) -> np.ndarray:
-        """(n,) bool: which places (n, 3) on the surface, facing (n, 3), are seen from far away, in the direction
-        ``view`` (3,); ``least``: cosine between the two."""
+        """Return which places (n, 3) on the surface, facing (n, 3), are visible from far away in the direction ``view``
+        (3,); ``least``: cosine between the two. Returns (n,) bool."""
         is_visible: np.ndarray = facing @ view > least
         lift = 1e-4 * self.diagonal
         origins = (places[is_visible] - self.middle + lift * facing[is_visible]).astype(np.float32)
@@ -93,7 +93,7 @@ class NominalSurface:
 
 
 def _rim_vertices(faces: np.ndarray, count: int) -> np.ndarray:
-    """(count,) bool: the vertices at sides that one triangle alone has."""
+    """Return the vertices (count,) bool at edges of one triangle alone."""
     sides = np.sort(half_edges(faces), axis=1)
     edges, triangles = np.unique(sides, axis=0, return_counts=True)
     is_rim = np.zeros(count, bool)

@@ -55,7 +55,7 @@ def search_start(
             continue
         camera = surface.middle + AWAY * surface.diagonal * view
         try:
-            result = _register(scan, prepare_scan("nominal model", places[visible] - camera, facing[visible]))
+            result = _register_symmetric(scan, prepare_scan("nominal model", places[visible] - camera, facing[visible]))
         except SlviewerError as error:
             refusal = refusal or error
             continue
@@ -76,9 +76,9 @@ def search_start(
     return best
 
 
-def _register(scan: PreparedScan, reference: PreparedScan) -> Registration:
-    """As ``register_prepared``; of a part that looks alike from several sides the pose that leaves least: which of them
-    it is makes no difference to how far the scan lies off."""
+def _register_symmetric(scan: PreparedScan, reference: PreparedScan) -> Registration:
+    """Register as ``register_prepared``; of a part with symmetries return the pose of least residuals: the choice among
+    them does not change the deviations."""
     size = min(scan.size, reference.size)
     starts = search_starts(scan, reference, size)
     try:

@@ -20,14 +20,14 @@ class Region:
 
     @classmethod
     def ball(cls, centre: ArrayLike, radius: float) -> "Region":
-        """What lies within ``radius`` mm of ``centre`` (3,)."""
-        return cls("ball", _vector(centre), _positive([radius]))
+        """Return the region within ``radius`` mm of ``centre`` (3,)."""
+        return cls("ball", _check_place(centre), _check_size([radius]))
 
     @classmethod
     def box(cls, low: ArrayLike, high: ArrayLike) -> "Region":
-        """What lies between two corners (3,) mm."""
-        a, b = _vector(low), _vector(high)
-        return cls("box", (a + b) / 2, _positive(np.abs(b - a) / 2))
+        """Return the region between two corners (3,) mm."""
+        a, b = _check_place(low), _check_place(high)
+        return cls("box", (a + b) / 2, _check_size(np.abs(b - a) / 2))
 
     def within(self, points: np.ndarray) -> np.ndarray:
         """Bool like points (h, w, 3) or (n, 3) without their last axis; False for NaN."""
@@ -45,7 +45,7 @@ class Region:
         return f"box of {' x '.join(f'{2 * s:.4g}' for s in self.size)} mm at ({at})"
 
 
-def _vector(values: object) -> np.ndarray:
+def _check_place(values: object) -> np.ndarray:
     """Return a place (3,) float64 mm; InputError for another shape or values that are not finite."""
     vector = np.asarray(values, np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
@@ -53,7 +53,7 @@ def _vector(values: object) -> np.ndarray:
     return vector
 
 
-def _positive(values: object) -> np.ndarray:
+def _check_size(values: object) -> np.ndarray:
     """Return a size in mm as float64; InputError unless all its values are finite and above 0."""
     size = np.asarray(values, np.float64)
     if not (np.isfinite(size).all() and (size > 0).all()):

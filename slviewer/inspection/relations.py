@@ -32,19 +32,19 @@ def _distance(a: Feature, b: Feature) -> float:
 
 
 def _angle(a: Feature, b: Feature) -> float:
-    """Between two directions, 0 to 90 degrees."""
-    u, v = _directed(a), _directed(b)
+    """Return the angle between two directions, 0 to 90 degrees."""
+    u, v = _axis_of(a), _axis_of(b)
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), abs(u @ v))))
 
 
 def _offset(a: Feature, axis: Feature) -> float:
     """Return the distance in mm of a feature's place from an axis."""
-    return float(np.linalg.norm(np.cross(a.place - axis.place, _directed(axis))))
+    return float(np.linalg.norm(np.cross(a.place - axis.place, _axis_of(axis))))
 
 
 def _height(a: Feature, plane: Feature) -> float:
     """Return the signed distance in mm of a feature's place from a plane."""
-    return float((a.place - plane.place) @ _directed(plane))
+    return float((a.place - plane.place) @ _axis_of(plane))
 
 
 def _plane_gap(a: Feature, b: Feature) -> float:
@@ -56,7 +56,7 @@ def _axis_gap(a: Feature, b: Feature) -> float:
     """Return the shortest distance in mm between two axes, which may be parallel."""
     if _angle(a, b) < PARALLEL_DEG:
         return 0.5 * (_offset(a, b) + _offset(b, a))
-    across = np.cross(_directed(a), _directed(b))
+    across = np.cross(_axis_of(a), _axis_of(b))
     return float(abs((b.place - a.place) @ across) / np.linalg.norm(across))
 
 
@@ -65,7 +65,7 @@ def _size(feature: Feature) -> float:
     return feature.radius or 0.0
 
 
-def _directed(feature: Feature) -> np.ndarray:
+def _axis_of(feature: Feature) -> np.ndarray:
     """Return the feature's direction (3,); InputError where it has none."""
     if feature.direction is None:
         raise InputError(f"A {feature.kind} has no direction.")
@@ -119,7 +119,7 @@ MEANINGS: dict[tuple[str, str], tuple[Meaning, ...]] = {
 
 
 def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list[Quantity]:
-    """All quantities between two features, in either order, with what is known of their uncertainty.
+    """Compute all quantities between two features, in either order, with their uncertainty where it is known.
 
     The uncertainty that both share through one calibration counts once.
     """
@@ -142,5 +142,5 @@ def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list
 
 
 def distance(a: np.ndarray, b: np.ndarray, a_spread: Spread, b_spread: Spread) -> Quantity:
-    """Between two picked points (3,) mm, with its uncertainty."""
+    """Return the distance between two picked points (3,) mm, with its uncertainty."""
     return relation(Feature("point", np.asarray(a)), a_spread, Feature("point", np.asarray(b)), b_spread)[0]

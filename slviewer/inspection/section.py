@@ -33,11 +33,11 @@ class CutPlane:
 
     @property
     def normal(self) -> np.ndarray:
-        """(3,)."""
+        """(3,): unit normal of the plane."""
         return np.cross(self.along, self.up)
 
     def drawn(self, points: np.ndarray) -> np.ndarray:
-        """(n, 2) mm: points (n, 3) in the drawing, along and up."""
+        """Return points (n, 3) in the drawing, (n, 2) mm: along and up."""
         return np.asarray((points - self.origin) @ np.stack([self.along, self.up]).T)
 
 
@@ -66,7 +66,7 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
 
 
 def _order_line(line: np.ndarray) -> np.ndarray:
-    """Return the line (k, 2) from left to right; closed lines as they are."""
+    """Return an open line (k, 2) from left to right; closed lines unchanged."""
     closed = np.array_equal(line[0], line[-1])
     return line if closed or line[0, 0] <= line[-1, 0] else line[::-1]
 
@@ -99,7 +99,7 @@ def _join_segments(segments: np.ndarray, count: int) -> list[list[int]]:
 
 
 def measure_cursors(a: np.ndarray, b: np.ndarray) -> list[Quantity]:
-    """What two cursors (2,) mm on a section read."""
+    """Return the distance between two cursors (2,) mm on a section, along it and in height."""
     width, height = (float(value) for value in np.subtract(b, a))
     return [
         Quantity("distance", float(np.hypot(width, height)), "mm"),
@@ -109,7 +109,8 @@ def measure_cursors(a: np.ndarray, b: np.ndarray) -> list[Quantity]:
 
 
 def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Quantity:
-    """The radius of the circle through three cursors (2,) mm. Raises InputError where they lie on a line."""
+    """Return the radius of the circle through three cursors (2,) mm. Raises InputError for cursors on a straight
+    line."""
     edges = np.stack([np.subtract(b, a), np.subtract(c, a)])
     area = abs(float(np.linalg.det(edges)))
     sides = [float(np.linalg.norm(v)) for v in (edges[0], edges[1], edges[1] - edges[0])]

@@ -18,7 +18,7 @@ NEAR = 2.5
 
 
 def estimate_start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Feature | None], Feature]) -> Feature:
-    """The shape that at least half of the points (n, 3) lie closest to; the same points give the same answer.
+    """Estimate the shape that is closest to at least half of the points (n, 3); the same points give the same result.
 
     ``fit``: least squares over points, from a start. Raises InputError, the last one's, where no sample holds a shape.
     """
@@ -65,7 +65,7 @@ def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _fit_sample(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator) -> Feature | None:
-    """The shape through as few points as fix it; None where they do not."""
+    """Return the shape through a minimal sample of points; None where they do not determine it."""
     if kind == "cylinder":
         assert normals is not None
         return _cylinder_through(sample, normals, rng)
@@ -81,8 +81,8 @@ def _fit_sample(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng:
 
 
 def _cylinder_through(sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> Feature | None:
-    """Normals of a cylinder lie on a great circle about its axis (Gauss map): two of them give the axis, and the circle
-    through three points, seen along it, the rest."""
+    """Return the cylinder through a sample of three points with normals: two normals give the axis (Gauss map), and the
+    circle through the points, projected along it, the rest."""
     i, j, k = rng.integers(0, len(sample), 3)
     axis = np.cross(normals[i], normals[j])
     length = np.linalg.norm(axis)
@@ -112,7 +112,7 @@ def fit_sphere_feature(points: np.ndarray) -> Feature:
 
 
 def fit_plane_feature(points: np.ndarray) -> Feature:
-    """The least-squares plane of points (n, 3); its place is their middle."""
+    """Return the least-squares plane of points (n, 3); its place is their centroid."""
     plane = fit_plane(points)
     middle = points.mean(axis=0)
     return Feature("plane", middle - plane.distance(middle) * plane.normal, plane.normal)

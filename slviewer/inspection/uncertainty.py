@@ -30,7 +30,7 @@ class Spread:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(p, p)."""
+        """(p, p): total covariance."""
         return self.scatter if self.shared is None else self.scatter + self.shared.T @ self.shared
 
     @property
@@ -51,7 +51,7 @@ def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
 
 
 def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:
-    """Standard deviation of f(step) at step 0, for steps (p,) of a covariance.
+    """Return the standard deviation of f(step) at step 0, for steps (p,) of a covariance.
 
     Along each principal direction f is asked one standard deviation to both sides, which also holds where f has a kink
     there (an angle at zero, a distance at zero).
@@ -66,7 +66,7 @@ def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarra
 
 
 def scatter_covariance(points: np.ndarray, jacobian: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """(p, p): covariance of parameters fitted to points (n, 3) by least squares, from what the fit leaves over.
+    """Return the covariance (p, p) of parameters fitted to points (n, 3) by least squares, from the fit's residuals.
 
     The residuals (n,) of one patch count together: form and smooth errors do not average out over neighbours as noise
     does. Never below what independent residuals would give.
@@ -88,9 +88,10 @@ def scatter_covariance(points: np.ndarray, jacobian: np.ndarray, residuals: np.n
 
 
 def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: float = 0.0) -> Shared:
-    """What a splined calibration leaves uncertain in points measured through one axis, rigid motion apart: that of the
-    working volume's places is taken from all, so that distances and angles are as they were. ``scale``: by what factor
-    the points were enlarged after their reconstruction, and ``scale_sigma`` the standard uncertainty of that factor."""
+    """Return the function for the uncertainty that a splined calibration causes in points measured through one axis,
+    without the rigid motion of the working volume, so that distances and angles are not affected by it. ``scale``: by
+    what factor the points were enlarged after their reconstruction, and ``scale_sigma`` the standard uncertainty of
+    that factor."""
     rig = bundle.state.rig
     reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
     motion = BestMotion.fit(reference.points)
@@ -112,7 +113,7 @@ def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: 
 
 
 def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
-    """(n, 2): where the camera sees points (n, 3), by Newton on what its pixels look at."""
+    """Return the camera pixels (n, 2) of points (n, 3), by Newton steps on the rays of the pixels."""
     rig = bundle.state.rig
     width, height = (float(n) for n in rig.camera.size)
     # the rays of a coarse grid give a start that is linear in the normalised point

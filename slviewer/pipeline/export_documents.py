@@ -133,7 +133,7 @@ def write_coefficients(store: Session, name: str, path: Path) -> str:
         raise InputError("only the pixelwise and the splined model have coefficients for each pixel: calibrate these")
     model = load_model(store, name or there[0])
     assert isinstance(model, PixelwiseModel | SplinedModel)
-    arrays = _pixelwise_arrays(model) if isinstance(model, PixelwiseModel) else _splined_arrays(model)
+    arrays = _collect_pixelwise_arrays(model) if isinstance(model, PixelwiseModel) else _collect_splined_arrays(model)
     factor = scale_factor(store, model.name)
     arrays |= {"scale_factor": np.array(factor)}
     with arriving_file(path, sum(array.nbytes for array in arrays.values())) as file:
@@ -141,7 +141,7 @@ def write_coefficients(store: Session, name: str, path: Path) -> str:
     return model.name
 
 
-def _pixelwise_arrays(model: PixelwiseModel) -> dict[str, np.ndarray]:
+def _collect_pixelwise_arrays(model: PixelwiseModel) -> dict[str, np.ndarray]:
     """Return the arrays of a pixelwise model's .npz file, with ``about`` as documentation."""
     about = (
         "slviewer, model pixelwise: for axis x or y and camera pixel (row, column), c = <axis>_coefficients[:, row, "
@@ -158,7 +158,7 @@ def _pixelwise_arrays(model: PixelwiseModel) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _splined_arrays(model: SplinedModel) -> dict[str, np.ndarray]:
+def _collect_splined_arrays(model: SplinedModel) -> dict[str, np.ndarray]:
     """Return the arrays of a splined model's .npz file, with ``about`` as documentation."""
     about = (
         "slviewer, model splined, compiled: for axis x or y and camera pixel (row, column), c = <axis>_coefficients[:, "

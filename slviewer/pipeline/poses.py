@@ -82,7 +82,7 @@ def read_stored_pose(
         save_evidence(store, capture, board, judged.evidence)
     meta = {
         "target": str(board),
-        "smoothing": _settings(smoothing),
+        "smoothing": _list_settings(smoothing),
         "reading": READING_VERSION,
         "refused": judged.refused,
         "inputs": {capture.name: capture.hash},
@@ -98,7 +98,11 @@ def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -
     if store.state_of(result) != "fresh":
         return None
     meta = store.load_result(result, only=())[0]
-    if (meta["target"], meta["smoothing"], meta.get("reading")) != (str(board), _settings(smoothing), READING_VERSION):
+    if (meta["target"], meta["smoothing"], meta.get("reading")) != (
+        str(board),
+        _list_settings(smoothing),
+        READING_VERSION,
+    ):
         return None
     if meta["refused"]:
         return Judged(name, None, meta["refused"])
@@ -143,7 +147,7 @@ def load_observations(store: Session, names: Sequence[str]) -> list[Observation]
     return observations
 
 
-def _settings(smoothing: Smoothing) -> list[str | int]:
+def _list_settings(smoothing: Smoothing) -> list[str | int]:
     """Return the smoothing as plain values, to compare with stored ones."""
     return [smoothing.kind] if smoothing.kind == "spline" else [smoothing.kind, smoothing.degree]
 

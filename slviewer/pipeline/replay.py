@@ -60,9 +60,9 @@ def reel(
     """
     folder = Path(source).expanduser()
     if layout == "session" or (layout is None and is_session(folder)):
-        shots = _recorded(folder)
+        shots = _read_recorded(folder)
     else:
-        shots = _imported(folder, layout, sequence, projector)
+        shots = _read_imported(folder, layout, sequence, projector)
     if capture is not None and capture not in shots:
         raise InputError(f"there is no capture {capture!r} in {folder}: the captures are {', '.join(shots) or 'none'}")
     chosen = shots if capture is None else {capture: shots[capture]}
@@ -71,14 +71,14 @@ def reel(
     return Reel(chosen)
 
 
-def _recorded(folder: Path) -> dict[str, Callable[[], Shot]]:
+def _read_recorded(folder: Path) -> dict[str, Callable[[], Shot]]:
     """Return {name: function that reads frames and sequence} of a session's captures."""
     with Session.open(folder) as store:
         captures = store.captures()
     return {capture.name: lambda shot=capture: (shot.frames, shot.sequence) for capture in captures}  # type: ignore[misc]
 
 
-def _imported(
+def _read_imported(
     folder: Path, layout: str | None, sequence: Path | str | None, projector: str | None
 ) -> dict[str, Callable[[], Shot]]:
     """Return {name: function that reads frames and sequence} of a folder of imported captures."""

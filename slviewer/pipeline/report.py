@@ -72,7 +72,7 @@ def report(
         raise InputError(f"{out} is no HTML file: end its name in .html")
     with opened(session) as store:
         progress(0.1, "reading the session")
-        data = _data(store)
+        data = _collect_data(store)
         for message in data.warnings:
             warn(message)
         progress(0.4, "drawing")
@@ -82,7 +82,7 @@ def report(
     return f"report written to {out}"
 
 
-def _data(store: Session) -> SessionData:
+def _collect_data(store: Session) -> SessionData:
     """Collect everything that a report shows of a session."""
     stereo = load_stereo_if_complete(store)
     observations = {o.name: o for o in load_observations(store, list(stereo.poses))} if stereo and stereo.poses else {}
@@ -99,25 +99,25 @@ def _data(store: Session) -> SessionData:
     excluded = store.excluded()
     verdict = load_last_verdict(store)
     judged = store.load_result("calibration/stereo", only=())[0].get("verdict") if stereo is not None else None
-    views, spacings = _verifications(store)
+    views, spacings = _list_verifications(store)
     return SessionData(
         name=store.folder.name,
-        captures=[_capture_row(c, stereo, excluded) for c in store.captures()],
-        calibration=None if stereo is None else _calibration(store, stereo, observations),
+        captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
+        calibration=None if stereo is None else _load_calibration(store, stereo, observations),
         pixel_fits=fits,
         verifications=views,
         spacings=spacings,
         warnings=stale,
         verdict=verdict,
         verdict_of_calibration=verdict is not None and judged is not None and from_plain(judged, Verdict) == verdict,
-        models=_models(store),
-        acceptances=_acceptances(store),
-        drifts=_drifts(store),
+        models=_load_models(store),
+        acceptances=_list_acceptances(store),
+        drifts=_list_drifts(store),
         **measured_views(store),
     )
 
 
-def _models(store: Session) -> ModelsView | None:
+def _load_models(store: Session) -> ModelsView | None:
     """Return the session's calibrations and their comparison; None where there is no calibration."""
     there = available_models(store)
     if not there:
@@ -133,7 +133,7 @@ def _models(store: Session) -> ModelsView | None:
     )
 
 
-def _acceptances(store: Session) -> list[AcceptanceView]:
+def _list_acceptances(store: Session) -> list[AcceptanceView]:
     """Return the session's acceptance tests with their times, and whether each is stale."""
     views = []
     for name in numbered_results(store, "acceptance"):
@@ -142,7 +142,7 @@ def _acceptances(store: Session) -> list[AcceptanceView]:
     return views
 
 
-def _drifts(store: Session) -> list[DriftRow]:
+def _list_drifts(store: Session) -> list[DriftRow]:
     """Return the drift checks as rows, each with whether it is of the present calibration."""
     if "stereo" not in available_models(store):
         return []
@@ -150,7 +150,7 @@ def _drifts(store: Session) -> list[DriftRow]:
     return [DriftRow(each.drift, each.time, each.calibration == now) for each in load_drift_history(store)]
 
 
-def _verifications(store: Session) -> tuple[list[VerificationView], list[SpacingRow]]:
+def _list_verifications(store: Session) -> tuple[list[VerificationView], list[SpacingRow]]:
     """The planes and spheres that were measured with the present calibrations, the first MOST_MAPS with error maps."""
     labels = store.decision("names") or {}
     views: list[VerificationView] = []
@@ -170,7 +170,7 @@ def _verifications(store: Session) -> tuple[list[VerificationView], list[Spacing
     return views, centre_spacings(views)
 
 
-def _capture_row(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:
+def _describe_capture(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:
     """Return the table row of a capture: sizes, frames, and whether and why it is used or excluded."""
     sequence = capture.sequence
     why = ""
@@ -203,10 +203,12 @@ def calibration_view(store: Session) -> CalibrationFigures:
     Raises InputError where there is none.
     """
     stereo = load_stereo(store)
-    return _calibration(store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))})
+    return _load_calibration(store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))})
 
 
-def _calibration(store: Session, stereo: StereoModel, observations: Mapping[str, Observation]) -> CalibrationFigures:
+def _load_calibration(
+    store: Session, stereo: StereoModel, observations: Mapping[str, Observation]
+) -> CalibrationFigures:
     """Return the stereo model with the residuals px of each pose that has an observation."""
     residuals = {}
     for name, r in load_residuals(store).items():

@@ -12,8 +12,8 @@ from slviewer.session.store import Session
 
 
 def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
-    """Return the scale correction of a calibration, as ``record_scale`` stored it; None where the calibration is
-    newer."""
+    """Return the scale correction of a calibration, as ``record_scale`` stored it; None where it is missing or
+    outdated."""
     name = f"scale/{model}"
     return store.load_result(name, only=())[0] if store.state_of(name) == "fresh" else None
 

@@ -93,7 +93,7 @@ def cross_validate(
     progress: Progress = ignore_progress,
 ) -> CrossValidation:
     """The same for poses that are at hand, with circles at their centres, and the calibration made from all of them."""
-    depths = {o.name: float(np.median(_depths(o, stereo))) for o in observations}
+    depths = {o.name: float(np.median(_board_depths(o, stereo))) for o in observations}
     parts = split_folds(depths, folds)
     axis = best_axis(observations, stereo)
     failed: dict[str, str] = {}
@@ -121,7 +121,7 @@ def cross_validate(
     return gather_results(models, measured, parts, failed)
 
 
-def _depths(observation: Observation, stereo: StereoModel) -> np.ndarray:
+def _board_depths(observation: Observation, stereo: StereoModel) -> np.ndarray:
     """Return the depths (n,) mm in the camera's frame of a pose's board points, by the stereo model."""
     T = stereo.poses[observation.name]
     return np.asarray((observation.points @ T[:3, :3].T + T[:3, 3])[:, 2])

@@ -176,7 +176,7 @@ def check_phases(
     if agreement is None:
         return CaptureCheck()
     if agreement.is_refused:
-        refuse(f"{name}: {_contradiction(agreement)}: {_likely_reason(agreement, rig, pixels, measured)}")
+        refuse(f"{name}: {_describe_contradiction(agreement)}: {_likely_reason(agreement, rig, pixels, measured)}")
     factor = agreement.ratio if agreement.ratio > RAISED_RATIO else 1.0
     if factor > 1.0 and not agreement.is_refused:
         warnings.append(
@@ -226,7 +226,7 @@ def measure_agreement(
     """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px, of noise ``sigma``
     (n, 2) px, miss each other; None where fewer than 200 are calibrated."""
     rig = calibration.pinholes
-    agreement = _agreement(rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px)
+    agreement = _compute_agreement(rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px)
     return agreement if agreement.pixels >= LEAST_PIXELS else None
 
 
@@ -255,7 +255,7 @@ def ray_depths(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> np.
         return np.column_stack([(ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant])
 
 
-def _agreement(
+def _compute_agreement(
     rig: StereoRig, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray, residual_px: float
 ) -> AxisAgreement:
     """Return the axis agreement of undistorted coordinates (n, 2) with noise ``sigma`` (n, 2) px."""
@@ -318,7 +318,7 @@ def _depth_warning(name: str, depths: np.ndarray, depth_range: tuple[float, floa
     )
 
 
-def _contradiction(agreement: AxisAgreement) -> str:
+def _describe_contradiction(agreement: AxisAgreement) -> str:
     """Describe how the capture contradicts the calibration: epipolar misfit or negative depths."""
     if agreement.misfit_px > max(REFUSED_PX, REFUSED_RATIO * agreement.predicted_px):
         return (
@@ -333,7 +333,7 @@ def _likely_reason(agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray,
     """Return in words the hypothesis that explains the frames best."""
     best, reason = np.inf, ""
     for words, other, at, coordinates in _hypotheses(rig, pixels, measured):
-        tried = _agreement(
+        tried = _compute_agreement(
             other, other.camera.undistort(at), other.projector.undistort(coordinates), np.zeros_like(at), 0.0
         )
         enough = tried.pixels > 0.5 * agreement.pixels and tried.in_front >= LEAST_IN_FRONT

@@ -131,7 +131,7 @@ class OnePass:
             code_rules(self._layout, scan.light.mean),
             grey_scale(self._layout, scan.light.noise, scan.light.white),
             self._depths,
-            _maps(scan),
+            _collect_maps(scan),
             self._texture,
             np.array(self.sequence.select(self.axis)),
             peaks,
@@ -143,7 +143,7 @@ class OnePass:
 
     def repair_spikes(self, scan: PassResult) -> None:
         """The second pass, over few pixels: spikes of one period are moved, lonely and outside pixels masked."""
-        rules, maps = spikes.spike_rules(self._layout), _maps(scan)
+        rules, maps = spikes.spike_rules(self._layout), _collect_maps(scan)
         columns, words, counts = self._lists
         if rules.is_plain:
             spikes.list_changes(scan.phase, rules, False, columns, words, counts)
@@ -197,7 +197,7 @@ def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
     raise InputError(f"{what} is not measured in one pass: decode and reconstruct it")
 
 
-def _maps(scan: PassResult) -> kernels.Maps:
+def _collect_maps(scan: PassResult) -> kernels.Maps:
     """Return the arrays of a result as the compiled kernels take them."""
     return kernels.Maps(scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture)
 

@@ -95,15 +95,15 @@ class CudaPass(OnePass):
         frames, scan = self._begun(frames, light, out)
         if cuda_device.find_device() is not None:
             try:
-                return self._on_card(frames, scan, repaired)
+                return self._scan_on_device(frames, scan, repaired)
             except Exception as error:  # of the driver, the compiler, or memory: whatever it is, there is a processor
                 cuda_device.disable_device(error)
         self._card = None
         if isinstance(self.model, StereoModel):
-            return self._defined(frames, scan)
+            return self._scan_on_processor(frames, scan)
         return super().run(frames, scan.light, scan) if repaired else super().sweep(frames, scan.light, scan)
 
-    def _on_card(self, frames: np.ndarray, scan: PassResult, repaired: bool) -> PassResult:
+    def _scan_on_device(self, frames: np.ndarray, scan: PassResult, repaired: bool) -> PassResult:
         """Compute a scan of frames (n, h, w) on the CUDA device; its errors are not caught."""
         card = self.card(frames.dtype)
         card.load(frames)
@@ -114,7 +114,7 @@ class CudaPass(OnePass):
             np.copyto(scan.texture, frames[self._texture])
         highest = card.fetch(scan)
         if clip_level(frames.dtype, highest) > scan.light.white:  # a camera of more bits than it seemed
-            return self._on_card(frames, replace(scan, light=self.light(frames)), repaired)
+            return self._scan_on_device(frames, replace(scan, light=self.light(frames)), repaired)
         return scan
 
     def _job(self) -> Job:
@@ -123,7 +123,7 @@ class CudaPass(OnePass):
         frames = tuple(self.sequence.select(self.axis))
         return Job(self.shape, self.axis, self._layout, frames, self._ladder, depths, self._texture < 0)
 
-    def _defined(self, frames: np.ndarray, scan: PassResult) -> PassResult:
+    def _scan_on_processor(self, frames: np.ndarray, scan: PassResult) -> PassResult:
         """Compute a stereo calibration's scan on the processor."""
         assert isinstance(self.model, StereoModel)
         decoded = decode(self.sequence, frames, self.axis)

@@ -44,8 +44,9 @@ class Card:
         self._c = cuda.to_device(np.ascontiguousarray(c.reshape(len(c), pixels)))
         self._extra = cuda.to_device(np.ascontiguousarray(extra))
         self._frames = cuda.device_array(len(slots) * pixels, dtype)
-        self._runs = [
-            (first, last, self._frames[at * pixels : (at + last - first) * pixels]) for at, first, last in _runs(slots)
+        self._list_runs = [
+            (first, last, self._frames[at * pixels : (at + last - first) * pixels])
+            for at, first, last in _list_runs(slots)
         ]
         self._phase, self._modulation, self._sigma_z = (cuda.device_array(pixels, np.float32) for _ in range(3))
         self._phase_map = self._phase.reshape(job.shape)
@@ -64,7 +65,7 @@ class Card:
 
     def load(self, frames: np.ndarray) -> None:
         """Copy the frames (n, h, w) that are read, each once."""
-        for first, last, room in self._runs:
+        for first, last, room in self._list_runs:
             room.copy_to_device(frames[first:last].reshape(-1), stream=self.stream)
 
     def sweep(self, light: LightLevels) -> None:
@@ -114,7 +115,11 @@ def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
         extra = np.zeros((6, 10))
         for row, numbers in zip(extra, (*d.R, d.t, d.projector.parameters, d.projector.size), strict=True):
             row[: len(numbers)] = numbers
-        return _stereo(0 if job.axis == "x" else 1, job.layout.period_px), np.moveaxis(d.camera.rays(), 2, 0), extra
+        return (
+            _compile_stereo(0 if job.axis == "x" else 1, job.layout.period_px),
+            np.moveaxis(d.camera.rays(), 2, 0),
+            extra,
+        )
     gain, centre, near, per_mm = (np.float32(number) for number in (d.gain, d.centre, d.near, d.per_mm))
     if d.grid.size:
         splined, step = device_function(splined_point), d.step
@@ -134,7 +139,7 @@ def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
     return measure_pixelwise, d.c, d.bounds.reshape(2, -1)
 
 
-def _stereo(row: int, period_px: float) -> Callable[..., Any]:
+def _compile_stereo(row: int, period_px: float) -> Callable[..., Any]:
     """Compile the device function that triangulates a pixel by `geometry.triangulation` in float64; ``c`` (2, n): the
     camera's rays; ``extra`` (6, 10): the rows of R, t, the projector's parameters, and its size."""
     px_per_rad, depth_of = np.float32(period_px / (2 * np.pi)), device_function(ray_depth)
@@ -154,7 +159,7 @@ def _stereo(row: int, period_px: float) -> Callable[..., Any]:
     return measure
 
 
-def _runs(slots: list[int]) -> Iterator[tuple[int, int, int]]:
+def _list_runs(slots: list[int]) -> Iterator[tuple[int, int, int]]:
     """Return (slot, first frame, frame after the last) of each run of consecutive frames of the capture."""
     at = 0
     for k in range(1, len(slots) + 1):

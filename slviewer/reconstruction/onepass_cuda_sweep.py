@@ -42,7 +42,7 @@ def sweep_kernel(job: Job, slots: int, measure: Callable[..., Any], deep: bool) 
     writes: maps (n,), points (n, 3), and the largest grey level (1,) int32.
     """
     pixels, shaded = job.shape[0] * job.shape[1], job.is_shaded
-    decode = _coded(job.layout, pixels) if job.layout.gray else _levels(job, pixels)
+    decode = _compile_coded(job.layout, pixels) if job.layout.gray else _compile_levels(job, pixels)
     per_step = np.float32(2.0 / job.layout.steps)
     least, stride = np.float32(1e-6), np.uint64(pixels)
 
@@ -84,7 +84,7 @@ def _steps(layout: Layout) -> list[tuple[int, ...]]:
     return [shift.indices for shift in layout.shifts]
 
 
-def _shift(layout: Layout, pixels: int) -> Any:
+def _compile_shift(layout: Layout, pixels: int) -> Any:
     """Compile the device function that returns wrapped phase, modulation, background and largest sample of one period's
     frames."""
     angles = np.concatenate([TWO_PI * layout.sign * np.arange(n) / n for n in map(len, _steps(layout))])
@@ -126,10 +126,10 @@ def _verdict(B, A, clipped, inconsistent, light):
     return INCONSISTENT if inconsistent else VALID
 
 
-def _coded(layout: Layout, pixels: int) -> Any:
+def _compile_coded(layout: Layout, pixels: int) -> Any:
     """Compile the device function that decodes a pixel by Gray code: (absolute phase, reason, modulation,
     background)."""
-    shift = _shift(layout, pixels)
+    shift = _compile_shift(layout, pixels)
     steps, bits, inverses, complementary = layout.steps, len(layout.gray), bool(layout.inverse), not layout.is_plain
     stride, code_from, inverse_from = (np.uint64(number) for number in (pixels, steps, steps + bits))
     extra_at = np.uint64(steps + bits + len(layout.inverse))
@@ -201,10 +201,10 @@ def _coded(layout: Layout, pixels: int) -> Any:
     return decode
 
 
-def _levels(job: Job, pixels: int) -> Any:
+def _compile_levels(job: Job, pixels: int) -> Any:
     """Compile the device function that decodes a pixel by several periods: (absolute phase, reason, modulation,
     background)."""
-    shift, ladder = _shift(job.layout, pixels), job.ladder
+    shift, ladder = _compile_shift(job.layout, pixels), job.ladder
     count, levels = len(job.layout.shifts), len(ladder.periods)
     starts = np.cumsum([0, *map(len, _steps(job.layout))]).astype(np.int32)
     weights, periods = ladder.weights, ladder.periods

@@ -77,16 +77,16 @@ def reconstruct(
     """
     if axis is not None:
         if axis not in phases:
-            raise InputError(f"The capture holds no axis {axis}, only {_listed(phases)}: choose one of these.")
+            raise InputError(f"The capture holds no axis {axis}, only {_join_axes(phases)}: choose one of these.")
         if axis not in model.axes:
             raise InputError(
-                f"The {model.name} calibration has no axis {axis}, only {_listed(model.axes)}: "
+                f"The {model.name} calibration has no axis {axis}, only {_join_axes(model.axes)}: "
                 f"choose one of these, or calibrate with captures of axis {axis}."
             )
         points, sigma_z, edges = _measure(model, phases[axis])
     else:
         measured = _measure_all(model, phases)
-        axis = _best_axis(measured)
+        axis = _select_axis(measured)
         points, sigma_z, edges = measured[axis]
     sigma_calibration = model.sigma_calibration(axis, points) if isinstance(model, HasCalibrationSigma) else None
     return Cloud(points, axis, model.name, sigma_z, texture, sigma_calibration, edges)
@@ -135,13 +135,13 @@ def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, Me
     shared = [axis for axis in model.axes if axis in phases]
     if not shared:
         raise InputError(
-            f"The capture holds axis {_listed(phases)} and the {model.name} calibration {_listed(model.axes)}: "
+            f"The capture holds axis {_join_axes(phases)} and the {model.name} calibration {_join_axes(model.axes)}: "
             "capture along an axis that is calibrated, or calibrate with the captured one."
         )
     return {axis: _measure(model, phases[axis]) for axis in shared}
 
 
-def _best_axis(measured: Mapping[Axis, Measured]) -> Axis:
+def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
     """Return the axis with the lowest median sigma where both are valid, else the one with most valid pixels."""
     axes = list(measured)
     if len(axes) == 1:
@@ -153,7 +153,7 @@ def _best_axis(measured: Mapping[Axis, Measured]) -> Axis:
     return max(axes, key=lambda axis: int(valid[axis].sum()))
 
 
-def _listed(axes: Mapping[Axis, PhaseMap] | tuple[Axis, ...]) -> str:
+def _join_axes(axes: Mapping[Axis, PhaseMap] | tuple[Axis, ...]) -> str:
     """Format axis names as text: "x and y"."""
     return " and ".join(sorted(axes)) or "none"
 

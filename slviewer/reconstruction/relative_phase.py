@@ -47,7 +47,7 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
             f"the capture has {width}x{height} px and the camera was calibrated at {rays.shape[1]}x{rays.shape[0]}: "
             "use captures of the same camera, at the same resolution and without cropping"
         )
-    low, high = _stretch(rig, rays, near, far, phase.axis)
+    low, high = _coordinate_range(rig, rays, near, far, phase.axis)
     longest = float(np.nanmax(np.where(phase.mask, high - low, np.nan), initial=0.0))
     if longest >= reach:
         limit = _unique_far(rig, rays[phase.mask], near, far, phase.axis, reach)
@@ -75,7 +75,9 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
     )
 
 
-def _stretch(rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str) -> tuple[np.ndarray, np.ndarray]:
+def _coordinate_range(
+    rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest projector coordinate (...,) px of rays (..., 2) between two depths."""
     row = 0 if axis == "x" else 1
     at_near, at_far = (
@@ -90,7 +92,7 @@ def _unique_far(rig: StereoRig, rays: np.ndarray, near: float, far: float, axis:
     least, most = near, far
     for _ in range(30):
         middle = 0.5 * (least + most)
-        low, high = _stretch(rig, rays, near, middle, axis)
+        low, high = _coordinate_range(rig, rays, near, middle, axis)
         if np.nanmax(high - low) < 0.98 * reach:
             least = middle
         else:

@@ -22,7 +22,7 @@ from slviewer.errors import SlviewerError
 
 @cache
 def open3d() -> Any:
-    """The ``open3d`` module, quiet below errors; the first call takes about a second.
+    """Return the ``open3d`` module, quiet below errors; the first import needs about a second.
 
     Raises ``SlviewerError`` with the remedy where it cannot be imported.
     """
@@ -44,15 +44,15 @@ def open3d() -> Any:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits for the end of the block: an Open3D that is imported in part is told of as missing, or ends the
-    process with a status and pages of its own."""
+    """Context manager: delay Ctrl-C to the end of the block, because an interrupted import of Open3D is reported as a
+    missing package, or ends the process with its own messages."""
     if threading.current_thread() is not threading.main_thread():  # signals come to the main thread alone
         yield
         return
     came = False
 
     def keep(*_: object) -> None:
-        """Remember the signal."""
+        """Store the signal until the end of the block."""
         nonlocal came
         came = True
 

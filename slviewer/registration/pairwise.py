@@ -34,7 +34,7 @@ _STATISTICS_POINTS = 50_000
 
 @dataclass(frozen=True)
 class Registration:
-    """How a scan lies on a reference.
+    """The pose of a scan on a reference, and its figures.
 
     ``T_reference_scan`` (4, 4) maps scan points into the reference frame, in mm. ``rms_mm`` is the root mean square of
     the point-to-plane distances (along the reference's normal) of the overlapping points; it holds the noise of both
@@ -108,7 +108,7 @@ def register_prepared(
     for attempt, start in enumerate(starts[:MOST_ATTEMPTS]):
         report(0.4 + 0.15 * attempt)
         try:
-            result = _judged(scan, reference, start, size)
+            result = _refine_start(scan, reference, start, size)
         except Refused as error:
             refusal = refusal or error  # the best start's refusal says most
             if error.reason in WORDS:  # the surfaces agree, and every other start would slide or turn as well
@@ -133,27 +133,27 @@ def search_starts(
     return rank_starts(scan, reference, float(f"{coarse:.3g}"), initial)
 
 
-def _judged(scan: PreparedScan, reference: PreparedScan, start: Candidate, size: float) -> Registration:
+def _refine_start(scan: PreparedScan, reference: PreparedScan, start: Candidate, size: float) -> Registration:
     """Run ICP from an initial pose, and compute its figures; raises ``Refused`` where the result is not reliable."""
     scale = scale_of(size)
     T = start.T
     for voxel, gate in LEVELS_MM:
-        widest = max(gate * scale, 2.0 * max(scan.spacing, reference.spacing), 3.0 * _noise(scan, reference))
+        widest = max(gate * scale, 2.0 * max(scan.spacing, reference.spacing), 3.0 * _pair_noise(scan, reference))
         loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
         T = align_icp(scan.thinned(voxel * scale), reference.thinned(voxel * scale), T, widest, loss, 1e-6, 40)
-    narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * _noise(scan, reference))
+    narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * _pair_noise(scan, reference))
     end = refine_pose(scan, reference, T, widest, narrowest)
-    result, held = _figures(scan, reference, end.T, end.gate_mm, end.uncertainty, start.start)
+    result, held = _compute_figures(scan, reference, end.T, end.gate_mm, end.uncertainty, start.start)
     _refuse_if_doubtful(result, held, size)
     return result
 
 
-def _noise(scan: PreparedScan, reference: PreparedScan) -> float:
+def _pair_noise(scan: PreparedScan, reference: PreparedScan) -> float:
     """Return the standard deviation in mm of the distance of two corresponding points; unknown sigmas count as 0."""
     return float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
 
 
-def _figures(
+def _compute_figures(
     scan: PreparedScan,
     reference: PreparedScan,
     T: np.ndarray,
@@ -234,7 +234,7 @@ def _refuse_rivals(
         if not other.score >= RIVAL_SCORE * start.score:
             continue
         try:
-            rival = _judged(scan, reference, other, size)
+            rival = _refine_start(scan, reference, other, size)
         except Refused:
             continue
         gap = pose_distance(scan.fine_points, result.T_reference_scan, rival.T_reference_scan)

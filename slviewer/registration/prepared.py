@@ -33,22 +33,22 @@ class PreparedScan:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of all points."""
+        """Search tree of all points."""
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     @cached_property
     def fine_points(self) -> np.ndarray:
-        """(m, 3) float64 mm, of the thinned cloud."""
+        """(m, 3) float64 mm: points of the thinned cloud."""
         return np.asarray(self.fine.points)
 
     @cached_property
     def fine_normals(self) -> np.ndarray:
-        """(m, 3) float64, of the thinned cloud."""
+        """(m, 3) float64: normals of the thinned cloud."""
         return np.asarray(self.fine.normals)
 
     @cached_property
     def fine_tree(self) -> cKDTree:
-        """Of the thinned cloud's points."""
+        """Search tree of the thinned cloud's points."""
         return cKDTree(self.fine_points)
 
     @cached_property
@@ -67,7 +67,8 @@ class PreparedScan:
 
     @property
     def scale(self) -> float:
-        """1 for objects of 75 to 300 mm; smaller and larger ones have voxels and gates in proportion."""
+        """Scale factor of voxels and gates: 1 for objects of 75 to 300 mm, in proportion for smaller and larger
+        ones."""
         return scale_of(self.size)
 
     def features(self, voxel: float) -> Any:
@@ -97,13 +98,13 @@ def prepare_scan(
     ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for errors. Raises
     ``InputError`` for points that cannot be used.
     """
-    _check(name, points, normals)
+    _check_arrays(name, points, normals)
     points = np.ascontiguousarray(points, dtype=np.float64)
     size = _size(points)
     if not size > 0:
         raise InputError(f"Nearly all points of the {name} are one: give those that were measured, each once.")
     voxel = FINEST_MM * scale_of(size)
-    fine = _cloud(points, normals, voxel)
+    fine = _make_cloud(points, normals, voxel)
     if len(fine.points) < LEAST_POINTS // 5:
         raise InputError(
             f"Nearly all of the {len(points)} points of the {name} are seen at grazing angles or have no normal "
@@ -119,7 +120,7 @@ def scale_of(size: float) -> float:
     return 1.0 if 75.0 <= size <= 300.0 else size / (75.0 if size < 75.0 else 300.0)
 
 
-def _check(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
+def _check_arrays(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
     """Raise InputError for arrays of wrong shapes, too few points, or points that are not finite."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
@@ -143,8 +144,8 @@ def _spacing(tree: cKDTree, points: np.ndarray) -> float:
     return float(np.median(distance[:, 1]))
 
 
-def _cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
-    """Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the origin."""
+def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
+    """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the origin."""
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     if normals is not None:

@@ -18,7 +18,7 @@ _NOISE = 4.0
 
 @dataclass(frozen=True)
 class Scan:
-    """The valid points of one scan, in the frame of the camera that took it.
+    """The valid points of one scan, in its camera's frame.
 
     ``points`` (n, 3) mm and ``normals`` (n, 3) towards the camera, float32 without NaN in the points; a normal is NaN
     where the grid gives none. ``colours`` (n, 3) uint8 or None; ``sigma_mm`` the median expected error of a point.
@@ -33,7 +33,7 @@ class Scan:
 
     @classmethod
     def from_cloud(cls, cloud: Cloud) -> "Scan":
-        """The measured pixels of an organised cloud, with the normals of its grid."""
+        """Return the measured pixels of an organised cloud, with the normals of its grid."""
         mask = cloud.mask
         sigma = cloud.sigma_z[mask]
         sigma = sigma[np.isfinite(sigma)]
@@ -47,7 +47,7 @@ class Scan:
 
 
 def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np.ndarray:
-    """(h, w) bool: the pixels of an organised cloud (h, w, 3) mm that lie two pixels or more inside the surface.
+    """Return the pixels (h, w) bool of an organised cloud (h, w, 3) mm that are two pixels or more inside the surface.
 
     Edges are invalid pixels, the image's border, and steps that are steep for the pixels' pitch and exceed the noise
     ``sigma_z`` (h, w) mm of both pixels, where it is known.

@@ -37,7 +37,7 @@ class Candidate:
 
 
 def candidates(scan: PreparedScan, reference: PreparedScan, voxel: float) -> Iterator[Candidate]:
-    """The poses worth trying, features first, from the clouds thinned to ``voxel`` mm."""
+    """Return the initial poses to try, features first, from the clouds thinned to ``voxel`` mm."""
     for T in _feature_poses(scan, reference, voxel):
         yield Candidate(T, "features")
     shift = np.median(reference.fine_points, axis=0) - np.median(scan.fine_points, axis=0)
@@ -60,7 +60,7 @@ def rank_starts(
         for gate in (6.0 * voxel, 3.0 * voxel, 1.5 * voxel):
             T = align_icp(scan, reference, T, gate, open3d().pipelines.registration.L2Loss(), 1e-5, 20)
         if all(pose_distance(np.asarray(scan.points), T, other.T) > 0.5 * voxel for other in found):
-            found.append(Candidate(T, candidate.start, _score(scan, reference, tree, T, voxel)))
+            found.append(Candidate(T, candidate.start, _score_pose(scan, reference, tree, T, voxel)))
     return sorted(found, key=lambda candidate: -candidate.score)
 
 
@@ -70,8 +70,9 @@ def pose_distance(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float
     return float(np.abs(probe @ (T - other)[:3, :3].T + (T - other)[:3, 3]).max())
 
 
-def _score(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
-    """Share of the scan that lies on the reference, times the share of agreement where the two face each other."""
+def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
+    """Return the share of the scan that overlaps the reference, times the share of agreement where the two face each
+    other."""
     points = np.asarray(scan.points) @ T[:3, :3].T + T[:3, 3]
     normals = np.asarray(scan.normals) @ T[:3, :3].T
     distance, nearest = tree.query(points, distance_upper_bound=3.0 * voxel)
@@ -86,7 +87,7 @@ def _score(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float
 
 
 def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) -> list[np.ndarray]:
-    """Up to six different poses, those on which most feature matches agree; none where there is nothing to match."""
+    """Return up to six different poses, those on which most feature matches agree; none without matches."""
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
     features = [one.features(voxel) for one in (scanned, referred)]
     pipeline = open3d().pipelines.registration
@@ -98,7 +99,7 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
 
     triplets = np.random.default_rng(_SEED).integers(0, len(p), (_TRIPLETS, 3))
     span = float(np.linalg.norm(np.ptp(p, axis=0)))
-    triplets = triplets[_same_triangle(p[triplets], q[triplets], 0.1 * span, voxel)][:2000]
+    triplets = triplets[_match_triangles(p[triplets], q[triplets], 0.1 * span, voxel)][:2000]
     if len(triplets) == 0:
         return []
     motions = fit_rigid(p[triplets], q[triplets])
@@ -119,7 +120,8 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
     return poses
 
 
-def _same_triangle(p: np.ndarray, q: np.ndarray, shortest: float, slack: float) -> np.ndarray:
-    """Which pairs of triangles ``(k, 3, 3)`` have sides longer than ``shortest`` that agree within ``slack`` mm."""
+def _match_triangles(p: np.ndarray, q: np.ndarray, shortest: float, slack: float) -> np.ndarray:
+    """Return which pairs of triangles ``(k, 3, 3)`` have sides longer than ``shortest`` that agree within ``slack``
+    mm."""
     a, b = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))
     return np.all((a > shortest) & (np.abs(a - b) < slack), axis=1)

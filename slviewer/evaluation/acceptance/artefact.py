@@ -30,7 +30,7 @@ class Length:
 
 @dataclass(frozen=True)
 class Expansion:
-    """How much the artefact grows, relative, with its expanded uncertainty (k = 2)."""
+    """Relative thermal expansion of the artefact, with its expanded uncertainty (k = 2)."""
 
     ppm_per_kelvin: float
     U_ppm_per_kelvin: float
@@ -46,7 +46,7 @@ class Temperature:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the operator allows, mm; None: no decision is asked for."""
+    """The operator's limits, mm; None: no decision."""
 
     form_mm: float | None = None
     size_mm: float | None = None
@@ -56,7 +56,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Artefact:
-    """What the certificate says and how the test was made.
+    """The content of an artefact's certificate, and how the test was made.
 
     ``spacing`` of a ball bar's centres; ``diameters``: one a ball; ``form``: how far its balls (or its plane) are from
     ideal ones, range, mm. All at ``reference_celsius``. ``positions``: {position: capture, or a pattern of captures}.
@@ -91,7 +91,8 @@ class Artefact:
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> "Artefact":
-        """An artefact as its file says it. Raises InputError for what is missing, unknown or impossible."""
+        """Return an artefact from the table of its file. Raises InputError for what is missing, unknown or
+        impossible."""
         for table, known in _KEYS.items():
             part = given if not table else given.get(table, {})
             if not isinstance(part, Mapping):

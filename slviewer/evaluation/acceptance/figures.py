@@ -44,13 +44,13 @@ class AcceptanceFigure:
 
     @classmethod
     def of_form(cls, name: str, position: str, deviations: np.ndarray, U_mm: float) -> "AcceptanceFigure":
-        """The form that points' deviations from their shape show."""
+        """Return the figure of form from points' deviations (n,) mm from their shape."""
         inner, outer = narrowest_range(deviations, 0.95), narrowest_range(deviations, 0.997)
         return cls(name, position, inner, U_mm, (0.0, inner), (0.0, outer))
 
     @classmethod
     def of_length(cls, name: str, position: str, error_mm: float, u_mm: float) -> "AcceptanceFigure":
-        """A length's error with its standard uncertainty."""
+        """Return the figure of a length error with its standard uncertainty."""
         inner, outer = K_95 * u_mm, K_997 * u_mm
         return cls(
             name,

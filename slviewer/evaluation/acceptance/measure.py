@@ -17,7 +17,7 @@ FORM, SIZE, SPACING, FLATNESS = "probing error of form", "probing error of size"
 
 @dataclass(frozen=True)
 class Position:
-    """What an artefact at one place gave.
+    """The figures of an artefact at one position.
 
     ``rms_mm`` and ``floor_mm``: RMS of the points' deviations and what noise alone would leave, one a ball or the
     plane's; ``noise_mm``: standard uncertainty of a length here by the cloud's noise alone; ``incidence``: percent in
@@ -47,7 +47,7 @@ def measure(
     depth_range: tuple[float, float] | None = None,
     plate: np.ndarray | None = None,
 ) -> Position:
-    """The figures of one position. ``plate`` (h, w) bool: where the plane is, if that is known.
+    """Measure the figures of one position. ``plate`` (h, w) bool: the plane's pixels, if these are known.
 
     Raises InputError where the artefact is not found in the cloud.
     """
@@ -59,7 +59,7 @@ def measure(
     else:
         nominal = float(np.mean([diameter.mm for diameter in artefact.diameters])) / 2
         shown = evaluate_spheres(cloud.points, len(artefact.diameters), cloud.sigma_z, nominal)
-        figures, noise = _of_balls(artefact, cloud, shown, position)
+        figures, noise = _measure_balls(artefact, cloud, shown, position)
     region = np.logical_or.reduce([np.isfinite(result.error_map) for result in shown])
     return Position(
         position,
@@ -74,7 +74,7 @@ def measure(
     )
 
 
-def _of_balls(
+def _measure_balls(
     artefact: Artefact, cloud: Cloud, balls: list[SphereResult], position: str
 ) -> tuple[list[AcceptanceFigure], float]:
     """The figures of one ball or two, and the noise of a length between their centres (of a diameter, for one)."""

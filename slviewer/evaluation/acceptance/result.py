@@ -22,7 +22,8 @@ OUTSIDE = 50.0
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """How much too long the instrument measures, ppm; ``u_ppm`` is its standard uncertainty.
+    """Relative scale error of the instrument, ppm, positive where it measures too long; ``u_ppm`` is its standard
+    uncertainty.
 
     From the errors of one length at several positions: their mean, with the scatter between positions (widened for
     their number by Student's t) and what all of them share, the certificate and the temperature.
@@ -49,7 +50,7 @@ class ScaleEstimate:
 
 @dataclass(frozen=True)
 class Acceptance:
-    """What an acceptance test found with one artefact and one calibration ("model")."""
+    """The result of an acceptance test with one artefact and one calibration ("model")."""
 
     artefact: Artefact
     model: str
@@ -68,7 +69,7 @@ class Acceptance:
 
     @property
     def lacks(self) -> tuple[str, ...]:
-        """What the positions leave untested."""
+        """What the positions do not test."""
         gaps = []
         needed = POSITIONS[self.artefact.kind]
         if len(self.positions) < needed:
@@ -92,12 +93,12 @@ class Acceptance:
             else:
                 form, size = position.error(FORM), position.error(SIZE)
                 row |= {"form (95 %)": form.within_95_mm[1], "form (99.7 %)": form.within_997_mm[1]}
-                row |= {"size error": size.error_mm, "size +- (95 %)": _half(size.within_95_mm)}
-                row["size +- (99.7 %)"] = _half(size.within_997_mm)
+                row |= {"size error": size.error_mm, "size +- (95 %)": _half_width(size.within_95_mm)}
+                row["size +- (99.7 %)"] = _half_width(size.within_997_mm)
                 if self.artefact.spacing is not None:
                     spacing = position.error(SPACING)
-                    row |= {"spacing error": spacing.error_mm, "spacing +- (95 %)": _half(spacing.within_95_mm)}
-                    row["spacing +- (99.7 %)"] = _half(spacing.within_997_mm)
+                    row |= {"spacing error": spacing.error_mm, "spacing +- (95 %)": _half_width(spacing.within_95_mm)}
+                    row["spacing +- (99.7 %)"] = _half_width(spacing.within_997_mm)
             row |= {"RMS": max(position.rms_mm), "noise floor": max(position.floor_mm), "points": position.points}
             table.append(row)
         return table
@@ -150,11 +151,11 @@ def conclude_test(artefact: Artefact, model: str, positions: Sequence[Position])
     allowed = {FORM: limits.form_mm, SIZE: limits.size_mm, SPACING: limits.spacing_mm, FLATNESS: limits.flatness_mm}
     present = {figure.property for figure in figures}
     judgements = tuple(judge(name, figures, limit) for name, limit in allowed.items() if name in present)
-    return Acceptance(artefact, model, tuple(positions), judgements, _scale(artefact, positions))
+    return Acceptance(artefact, model, tuple(positions), judgements, _estimate_scale(artefact, positions))
 
 
-def _scale(artefact: Artefact, positions: Sequence[Position]) -> ScaleEstimate | None:
-    """By the spacing of a ball bar's centres, by a sphere's diameter; None for a plane."""
+def _estimate_scale(artefact: Artefact, positions: Sequence[Position]) -> ScaleEstimate | None:
+    """Estimate the scale by the spacing of a ball bar's centres, by a sphere's diameter; None for a plane."""
     length = artefact.spacing or (artefact.diameters[0] if artefact.diameters else None)
     if length is None:
         return None
@@ -169,6 +170,6 @@ def _scale(artefact: Artefact, positions: Sequence[Position]) -> ScaleEstimate |
     return ScaleEstimate(1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n)
 
 
-def _half(interval: tuple[float, float]) -> float:
+def _half_width(interval: tuple[float, float]) -> float:
     """Return half the width of an interval."""
     return (interval[1] - interval[0]) / 2

@@ -24,8 +24,8 @@ _EXTRACTED_SUFFIXES = IMAGE_SUFFIXES | {".toml"}
 
 def unpacked_size(archive: IO[bytes]) -> int:
     """Bytes that the images and TOMLs of a zip take. Raises InputError as `unpack` does."""
-    with _opened(archive) as zipped:
-        return sum(info.file_size for info in _members(zipped)[0])
+    with _open_zip(archive) as zipped:
+        return sum(info.file_size for info in _select_members(zipped)[0])
 
 
 def unpack(archive: IO[bytes], folder: Path, progress: Callable[[float], None]) -> tuple[Path, list[str]]:
@@ -34,8 +34,8 @@ def unpack(archive: IO[bytes], folder: Path, progress: Callable[[float], None]) 
 
     Raises InputError for what is no zip, is damaged or encrypted, is too large, or names a place outside of itself.
     """
-    with _opened(archive) as zipped:
-        members, others = _members(zipped)
+    with _open_zip(archive) as zipped:
+        members, others = _select_members(zipped)
         total, done = sum(info.file_size for info in members), 0
         for info in members:
             target = folder.joinpath(*PurePosixPath(info.filename).parts)
@@ -50,10 +50,10 @@ def unpack(archive: IO[bytes], folder: Path, progress: Callable[[float], None]) 
             done += info.file_size
             progress(done / max(total, 1))
     warnings = [f"{listed(others)} in the zip: neither an image nor a TOML, and not used"] if others else []
-    return _innermost(folder), warnings
+    return _innermost_folder(folder), warnings
 
 
-def _opened(archive: IO[bytes]) -> zipfile.ZipFile:
+def _open_zip(archive: IO[bytes]) -> zipfile.ZipFile:
     """Open a zip archive; InputError where it is none."""
     try:
         return zipfile.ZipFile(archive)
@@ -61,7 +61,7 @@ def _opened(archive: IO[bytes]) -> zipfile.ZipFile:
         raise InputError("the file is no zip, or is cut short: put the folder of captures into a zip") from error
 
 
-def _members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]:
+def _select_members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]:
     """Return the members of a zip to unpack, and the names of all others."""
     members, others = [], []
     for info in zipped.infolist():
@@ -90,7 +90,7 @@ def _members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]
     return members, others
 
 
-def _innermost(folder: Path) -> Path:
+def _innermost_folder(folder: Path) -> Path:
     """Return the folder itself, or the inner one that alone holds everything, as in a zip of a folder."""
     while not any(layout.is_capture(folder) for layout in LAYOUTS.values()):
         inside = visible(folder)

@@ -178,7 +178,7 @@ def read_description(toml: Path, projector: tuple[int, int] | None = None) -> De
     _check_projector(toml, data, projector)
     groups = read_groups(toml.name, data)
     try:
-        exposures, order = _exposures(groups)
+        exposures, order = _list_exposures(groups)
         frames = [frame for group in groups for frame in group.frames]
         shown = [frames[index].to_dict() for index in order[: len(order) // max(1, len(exposures))]]
         size = {"projector": projector} if projector else {}
@@ -188,7 +188,7 @@ def read_description(toml: Path, projector: tuple[int, int] | None = None) -> De
     return Description(sequence, groups, tuple(order), exposures, data.get("channel"), "gray_origin" in data)
 
 
-def _exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], list[int]]:
+def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], list[int]]:
     """The exposures, none where no entry states one, and the frames' indices, one exposure after the other, all in the
     order of the first."""
     frames = [(frame, group.exposure_ms) for group in groups for frame in group.frames]

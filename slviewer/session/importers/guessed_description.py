@@ -33,8 +33,8 @@ def guess_description(
     guess = guess_sequence(images.stack, projector)
     names = [file.name for file in files]
     shown = (channel or DEFAULT_CHANNEL) if images.in_colour else channel
-    doubts = tuple(f"{_span(names, indices)}: {text}" for indices, text in guess.doubts)
-    return GuessedDescription(_write_toml(folder, names, guess, shown, projector, doubts), doubts)
+    doubts = tuple(f"{_format_span(names, indices)}: {text}" for indices, text in guess.doubts)
+    return GuessedDescription(_format_toml(folder, names, guess, shown, projector, doubts), doubts)
 
 
 def _capture_folder(source: Path) -> Path:
@@ -48,13 +48,13 @@ def _capture_folder(source: Path) -> Path:
     raise InputError(f"{source} and the folders in it hold fewer than three images: give the folder of a capture")
 
 
-def _span(names: list[str], indices: tuple[int, ...]) -> str:
+def _format_span(names: list[str], indices: tuple[int, ...]) -> str:
     """Format the names at some indices: "first to last" where they are consecutive, else a list."""
     whole = len(indices) > 1 and indices == tuple(range(indices[0], indices[-1] + 1))
     return f"{names[indices[0]]} to {names[indices[-1]]}" if whole else listed([names[i] for i in indices])
 
 
-def _write_toml(
+def _format_toml(
     folder: Path,
     names: list[str],
     guess: Guess,

@@ -85,19 +85,21 @@ def read_image(path: Path) -> np.ndarray:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{_short(path)} cannot be read ({error.strerror}): check the file") from error
-    if fault := _fault(data):
-        raise InputError(f"{_short(path)} is {fault}: copy or record it again")
+        raise InputError(f"{_short_path(path)} cannot be read ({error.strerror}): check the file") from error
+    if fault := _describe_fault(data):
+        raise InputError(f"{_short_path(path)} is {fault}: copy or record it again")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
-        raise InputError(f"{_short(path)} is not a readable image: copy or record it again")
+        raise InputError(f"{_short_path(path)} is not a readable image: copy or record it again")
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{_short(path)} has pixels of type {image.dtype}: save frames with 8 or 16 bits")
+        raise InputError(f"{_short_path(path)} has pixels of type {image.dtype}: save frames with 8 or 16 bits")
     if image.ndim == 3 and image.shape[2] != 3:
-        raise InputError(f"{_short(path)} has {image.shape[2]} channels: save frames in grey or RGB, without alpha")
+        raise InputError(
+            f"{_short_path(path)} has {image.shape[2]} channels: save frames in grey or RGB, without alpha"
+        )
     return image
 
 
@@ -105,22 +107,22 @@ def _check_alike(image: np.ndarray, first: np.ndarray, path: Path, first_path: P
     """Raise InputError unless an image has the size, bit depth and channels of the first one."""
     if image.shape[:2] != first.shape[:2]:
         raise InputError(
-            f"{_short(path)} is {_size(image)} px, {_short(first_path)} is {_size(first)}: "
+            f"{_short_path(path)} is {_format_size(image)} px, {_short_path(first_path)} is {_format_size(first)}: "
             "all frames of a capture must have one size"
         )
     if image.dtype != first.dtype:
         raise InputError(
-            f"{_short(path)} has {8 * image.itemsize} bits, {_short(first_path)} has {8 * first.itemsize}: "
+            f"{_short_path(path)} has {8 * image.itemsize} bits, {_short_path(first_path)} has {8 * first.itemsize}: "
             "all frames of a capture must have one bit depth"
         )
 
 
-def _fault(data: bytes) -> str | None:
+def _describe_fault(data: bytes) -> str | None:
     """Describe a fault of the file as a whole that the decoder would not report."""
     if not data:
         return "empty"
     if data.startswith(_PNG):
-        return _png_fault(data)
+        return _describe_png_fault(data)
     if data.startswith(_JPEG):
         return None if _jpeg_ends(data) else "cut short (its end-of-image marker is missing)"
     if data.startswith(b"BM") and len(data) >= 54:
@@ -134,7 +136,7 @@ def _fault(data: bytes) -> str | None:
     return None
 
 
-def _png_fault(data: bytes) -> str | None:
+def _describe_png_fault(data: bytes) -> str | None:
     """Describe a fault in the chunks of a PNG: each states its length and carries a checksum, and the last is IEND."""
     at, view = len(_PNG), memoryview(data)
     while at + 12 <= len(data):
@@ -172,11 +174,11 @@ def _is_grey(image: np.ndarray) -> bool:
     return bool(np.array_equal(image[..., 0], image[..., 1]) and np.array_equal(image[..., 1], image[..., 2]))
 
 
-def _size(image: np.ndarray) -> str:
+def _format_size(image: np.ndarray) -> str:
     """Format an image's size as "WxH"."""
     return f"{image.shape[1]}x{image.shape[0]}"
 
 
-def _short(path: Path) -> str:
+def _short_path(path: Path) -> str:
     """Format a path as the file with the two folders above it: enough to identify it in a source of many captures."""
     return "/".join(path.parts[-3:])

@@ -192,9 +192,9 @@ def _capture_folders(
     captures = [folder for folder in inner if is_capture(folder)]
     if not captures:
         raise InputError(f"{source} holds no captures: {looks_like} was looked for in it and in the folders inside")
-    stems = {_stem(folder) for folder in captures}
+    stems = {_name_pattern(folder) for folder in captures}
     others = [folder for folder in inner if folder not in captures]
-    empty = [folder for folder in others if _stem(folder) in stems]
+    empty = [folder for folder in others if _name_pattern(folder) in stems]
     return captures, empty, [f"folder {f.name} was left aside: it holds no capture ({looks_like})"
                              for f in others if f not in empty]  # fmt: skip
 
@@ -226,7 +226,7 @@ def listed(names: Sequence[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _stem(folder: Path) -> str:
+def _name_pattern(folder: Path) -> str:
     """Return a folder's name in lower case with every number replaced by "#"."""
     return re.sub(r"\d+", "#", folder.name.lower())
 

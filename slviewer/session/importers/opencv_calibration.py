@@ -51,22 +51,22 @@ def read(path: Path, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]
     keys = identify_keys(path) if keys is None else keys
     if len(keys) != len(ENTRIES):
         raise InputError(f"{len(keys)} keys were given: name those of {' '.join(ENTRIES)}, in this order")
-    with _opened(Path(path)) as storage:
+    with _open_storage(Path(path)) as storage:
         there = list(storage.root().keys())
         if missing := [key for key in keys if key not in there]:
             raise InputError(
                 f"{Path(path).name} has no {', '.join(missing)}: its keys are {', '.join(there) or 'none'}"
             )
-        matrices = [_matrix(storage.getNode(key), f"{Path(path).name}: {key}") for key in keys]
+        matrices = [_read_matrix(storage.getNode(key), f"{Path(path).name}: {key}") for key in keys]
     where = {entry: f"{Path(path).name}: {key}" for entry, key in zip(ENTRIES, keys, strict=True)}
     values = dict(zip(ENTRIES, matrices, strict=True))
     return {
-        "K_camera": _intrinsics(values["K_camera"], where["K_camera"]),
-        "D_camera": _distortion(values["D_camera"], where["D_camera"]),
-        "K_projector": _intrinsics(values["K_projector"], where["K_projector"]),
-        "D_projector": _distortion(values["D_projector"], where["D_projector"]),
-        "R": _rotation(values["R"], where["R"]),
-        "T": _translation(values["T"], where["T"]),
+        "K_camera": _check_intrinsics(values["K_camera"], where["K_camera"]),
+        "D_camera": _check_distortion(values["D_camera"], where["D_camera"]),
+        "K_projector": _check_intrinsics(values["K_projector"], where["K_projector"]),
+        "D_projector": _check_distortion(values["D_projector"], where["D_projector"]),
+        "R": _check_rotation(values["R"], where["R"]),
+        "T": _check_translation(values["T"], where["T"]),
     }
 
 
@@ -75,7 +75,7 @@ def identify_keys(path: Path) -> tuple[str, ...]:
 
     Raises InputError where they are none of these, or where several would do.
     """
-    with _opened(Path(path)) as storage:
+    with _open_storage(Path(path)) as storage:
         there = list(storage.root().keys())
     rows = [(*row[:4], *transform) for row in _SPELLINGS for transform in dict.fromkeys((row[4:], *_TRANSFORMS))]
     matches = list(dict.fromkeys(row for row in rows if set(row) <= set(there)))
@@ -90,14 +90,14 @@ def identify_keys(path: Path) -> tuple[str, ...]:
 def read_sizes(path: Path) -> dict[str, tuple[tuple[int, int], str]]:
     """What a file states as sizes (width, height) px: {"camera" or "projector": (the size, the key that states it)}."""
     sizes = {}
-    with _opened(Path(path)) as storage:
+    with _open_storage(Path(path)) as storage:
         there = list(storage.root().keys())
         for device, spellings in _SIZES.items():
             for spelling in spellings:
                 keys = (spelling,) if isinstance(spelling, str) else spelling
                 if not set(keys) <= set(there):
                     continue
-                values = np.concatenate([_matrix(storage.getNode(key), key).ravel() for key in keys])
+                values = np.concatenate([_read_matrix(storage.getNode(key), key).ravel() for key in keys])
                 if values.shape == (2,) and (values >= 1).all() and (values == values.round()).all():
                     sizes[device] = (int(values[0]), int(values[1])), " and ".join(keys)
                     break
@@ -105,7 +105,7 @@ def read_sizes(path: Path) -> dict[str, tuple[tuple[int, int], str]]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_storage(path: Path) -> Iterator[Any]:
     """Context manager: the root of an OpenCV FileStorage file; InputError where it cannot be read."""
     if not path.is_file():
         raise InputError(f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)")
@@ -122,7 +122,7 @@ def _opened(path: Path) -> Iterator[Any]:
         storage.release()
 
 
-def _matrix(node: Any, where: str) -> np.ndarray:
+def _read_matrix(node: Any, where: str) -> np.ndarray:
     """A FileStorage matrix, or numbers in (nested) lists, as float64."""
 
     def numbers(node: Any) -> Any:
@@ -147,7 +147,7 @@ def _matrix(node: Any, where: str) -> np.ndarray:
     return matrix
 
 
-def _intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
+def _check_intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the camera matrix (3, 3); InputError where it is none, or has skew."""
     if matrix.shape != (3, 3):
         raise InputError(f"{where} has shape {matrix.shape}: a camera matrix is 3x3")
@@ -159,7 +159,7 @@ def _intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     return matrix
 
 
-def _distortion(matrix: np.ndarray, where: str) -> np.ndarray:
+def _check_distortion(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the distortion (5,) k1 k2 p1 p2 k3; InputError for other non-zero coefficients."""
     coefficients = matrix.ravel()
     if max(matrix.shape, default=0) != coefficients.size or coefficients.size not in (4, 5, 8, 12, 14):
@@ -172,7 +172,7 @@ def _distortion(matrix: np.ndarray, where: str) -> np.ndarray:
     return np.concatenate([coefficients[:5], np.zeros(max(0, 5 - coefficients.size))])
 
 
-def _rotation(matrix: np.ndarray, where: str) -> np.ndarray:
+def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the rotation (3, 3) nearest to a matrix; InputError where it is far from one."""
     if matrix.shape != (3, 3):
         raise InputError(f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3")
@@ -186,7 +186,7 @@ def _rotation(matrix: np.ndarray, where: str) -> np.ndarray:
     return nearest
 
 
-def _translation(matrix: np.ndarray, where: str) -> np.ndarray:
+def _check_translation(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the translation (3,) mm; InputError for another shape or a length near zero."""
     if matrix.shape not in ((3, 1), (1, 3), (3,)):
         raise InputError(f"{where} has shape {matrix.shape}: the translation from camera to projector has 3 numbers")

@@ -56,7 +56,7 @@ def read(
         if len(kinds := {re.sub(r"\d+$", "", file.stem) for file in files}) > 1:
             shown = listed([f"{kind}N" for kind in sorted(kinds)])
             raise InputError(f'it holds images named {shown}: choose one with --files "{min(kinds)}*"')
-        shown_sequence = _shown(sequence, len(files))
+        shown_sequence = _fit_sequence(sequence, len(files))
         _check_shadow_images(files, shown_sequence)
         recording = ImportableRecording(name, shown_sequence, tuple(files), folder)
         return recording, strangers_warning(folder, [file for file in images_by_name(folder) if file not in files])
@@ -95,7 +95,7 @@ def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
         )
 
 
-def _shown(sequence: PatternSequence, images: int) -> PatternSequence:
+def _fit_sequence(sequence: PatternSequence, images: int) -> PatternSequence:
     """Return the sequence of so many images: with or without white and black at its end."""
     needed = len(sequence.frames)
     if images == needed:

@@ -55,11 +55,11 @@ def describe(
     """
     images, others = match_images(folder, _FILE)
     check_complete(images, "frameSeq_")
-    sequence = _sequence(projector, len(images), codec, axis)
+    sequence = _identify_sequence(projector, len(images), codec, axis)
     return ImportableRecording(name, sequence, tuple(images.values()), folder), strangers_warning(folder, others)
 
 
-def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis: Axis) -> PatternSequence:
+def _identify_sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis: Axis) -> PatternSequence:
     """Return the sequence that explains the number of images; InputError where none or several do."""
     if codec is None and images in _OTHERS:
         raise InputError(
@@ -70,7 +70,7 @@ def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis
         (each, axes)
         for each in get_args(Codec)
         for axes in ([(axis,)] if each in _SINGLE_AXIS else [(axis,), AXES])
-        if codec in (None, each) and len(_frames(each, projector, axes)) == images
+        if codec in (None, each) and len(_list_frames(each, projector, axes)) == images
     ]
     if not candidates:
         what = f"codec {codec}" if codec else "any codec"
@@ -82,10 +82,10 @@ def _sequence(projector: tuple[int, int], images: int, codec: Codec | None, axis
     cells: PerAxis[float | None] | None = (
         PerAxis(*(_gray_cell(each, projector) for each in AXES)) if sequence == "gray" else None
     )
-    return PatternSequence(projector, _frames(sequence, projector, axes), phase_sign=-1, gray_cell_px=cells)
+    return PatternSequence(projector, _list_frames(sequence, projector, axes), phase_sign=-1, gray_cell_px=cells)
 
 
-def _frames(codec: Codec, projector: tuple[int, int], axes: tuple[Axis, ...]) -> tuple[Frame, ...]:
+def _list_frames(codec: Codec, projector: tuple[int, int], axes: tuple[Axis, ...]) -> tuple[Frame, ...]:
     """Return the frames of a codec in the order in which SLStudio shows them."""
     frames = [Frame("white"), Frame("black")] if codec == "gray" else []
     for axis in axes:
