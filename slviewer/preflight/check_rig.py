@@ -71,7 +71,7 @@ _CHECK_ORDER = ("latency", "exposure", "flicker", "gamma", "pixels", "order", "r
 
 
 def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: Progress | None = None) -> Preflight:
-    """Look at an open rig, on the thread that owns its devices; about 10 s.
+    """Check an open rig, on the thread that owns its devices; about 10 s.
 
     `say` receives one sentence for each check. `progress` may raise Cancelled. Raises DeviceError where a
     device does not answer. Patterns are loaded and light is shown; what was loaded and shown before is for the caller

@@ -28,7 +28,7 @@ class _Change:
     arrived: bool
 
     def arrival_ms(self, stale: int) -> float:
-        """When the first right image began, where images are so many behind; 0 for the very first."""
+        """Start time, ms, of the first image that shows the change, ``stale`` images earlier; 0 for the very first."""
         place = len(self.begin_s) - 1 - stale
         return 1000 * self.begin_s[place] if place > 0 else 0.0
 
@@ -108,7 +108,7 @@ def _time_change(bench: RigUnderTest, i: int) -> _Change:
 
 
 def _count_stale(bench: RigUnderTest, settle_ms: float, i: int) -> int:
-    """How many images are still old after a wait that is long enough."""
+    """Number of images that still show the old light after a sufficiently long wait."""
     target = 0.0 if i % 2 == 0 else 1.0
     bench.show(255 if target else None, "freshness of the images")
     time.sleep((2 * settle_ms + bench.frame_ms) / 1000)
@@ -124,6 +124,6 @@ def _compute_tolerance(bench: RigUnderTest) -> float:
 
 
 def _compute_settle_ms(arrivals_ms: list[float], frame_ms: float) -> float:
-    """The worst arrival, and half a frame because another one may be worse; 0 where every first image was right."""
+    """Settling time, ms: the latest arrival plus half a frame as margin; 0 if every first image was right."""
     worst = max(arrivals_ms)
     return float(math.ceil(worst + 0.5 * frame_ms)) if worst else 0.0

@@ -1,4 +1,4 @@
-"""Light of the projector and of the room: exposure, response to grey levels, ambient light, flicker."""
+"""Projector light and ambient light: exposure, response to grey levels, ambient light, flicker."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class Burst:
 
 
 def capture_burst(bench: RigUnderTest) -> Burst:
-    """Images in white light, then in the dark."""
+    """Capture images in white light, then in the dark."""
     white_s, white = _grab_images(bench, 255, _WHITE)
     dark_s, dark = _grab_images(bench, None, _DARK)
     return Burst(white, dark, white_s, dark_s)
@@ -130,7 +130,7 @@ _DRIFTS = 0.8
 
 
 def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
-    """Light in the dark frames, and whether it was the same at the end."""
+    """The check of ambient light: its level in the dark frames, and whether it changed until the end."""
     where = bench.illuminated
     ambient = float(np.median(bench.dark[where])) / max(bench.contrast, 1e-6)
     step = float(np.median((last_dark - bench.dark)[where])) / max(bench.contrast, 1e-6)
@@ -156,7 +156,7 @@ def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
 
 
 def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
-    """Brightness of whole images from one to the next, beyond what noise makes of it."""
+    """The check of brightness changes from image to image beyond the noise."""
     where, span = bench.usable(), max(bench.contrast, 1e-6)
     if not where.any():
         return Check("flicker", "unknown", "Flicker cannot be measured: all that is illuminated is saturated.", "", {})
@@ -215,7 +215,7 @@ def _list_mains_multiples(present: float | None, hertz: int | None) -> dict[str,
 
 
 def _remove_drift(values: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, float]:
-    """The values less a straight line, if that is what they mostly follow, and its rise per second."""
+    """The values without their linear trend, if it dominates, and the slope per second."""
     line = np.polyfit(seconds - seconds[0], values, 1)
     rest = values - np.polyval(line, seconds - seconds[0])
     if np.var(rest) < (1 - _DRIFTS) * np.var(values):
@@ -224,7 +224,7 @@ def _remove_drift(values: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _identify_mains(values: np.ndarray, seconds: np.ndarray) -> int | None:
-    """100 or 120, where one of these frequencies explains the values and the other does not; else None."""
+    """100 or 120, where only one of these frequencies, Hz, explains the values; else None."""
     explained = {}
     for hertz in (100, 120):
         angle = 2 * np.pi * hertz * (seconds - seconds[0])

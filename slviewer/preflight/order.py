@@ -87,13 +87,13 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
 
 
 def _is_lagging_by(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:
-    """Whether each level is the one of `lag` frames before, where that was a level too."""
+    """Whether every white or black frame shows the level of `lag` frames before, where that was one too."""
     pairs = [(shares[i], levels[i - lag]) for i in shares if i - lag in levels]
     return all(abs(share - on) < 0.3 for share, on in pairs)
 
 
 def check_repeats(sequence: PatternSequence, stack: np.ndarray) -> Check:
-    """Images that are the very one before, although another pattern was shown; a camera may be without noise."""
+    """The check of images identical to the one before although the pattern changed; a camera may be without noise."""
     changed = [k for k in range(1, len(stack)) if sequence.frames[k] != sequence.frames[k - 1]]
     same = [k for k in changed if np.array_equal(stack[k], stack[k - 1])]
     figures = {"detect_copies": [k + 1 for k in same], "frames": len(stack)}

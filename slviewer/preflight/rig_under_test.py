@@ -1,4 +1,4 @@
-"""The rig under test: light shown, images grabbed and timed, and what the checks know of each other's findings."""
+"""The rig under test: projects light, grabs and times images, and shares results between the checks."""
 
 import math
 import time
@@ -21,7 +21,7 @@ _SIGMAS = 6.0
 class RigUnderTest:
     """An open rig. Images come as (h, w) float32 grey levels of every `stride`-th row and column.
 
-    ``settle_ms`` and ``stale`` are what the latency check finds: the time to wait after a change, and how many images
+    ``settle_ms`` and ``stale`` are the results of the latency check: the time to wait after a change, and how many images
     to throw away. ``dark`` and ``white`` are the references, ``illuminated`` (h, w) bool sees the projector's light;
     ``noise`` of one grey level, and ``unsteady``, by how much whole images differ, as a share of the white light (rms).
     """
@@ -45,29 +45,29 @@ class RigUnderTest:
         return self._frame[:: self.stride, :: self.stride].astype(np.float32)
 
     def grab_timed(self) -> tuple[float, np.ndarray]:
-        """When grabbing began, in s of the monotonic clock, and the image."""
+        """The start time of grabbing, s of the monotonic clock, and the image (h, w), sampled."""
         start_s = time.monotonic()
         return start_s, self.grab()
 
     def show(self, grey: int | None, doing: str) -> None:
-        """Even light, without waiting for it. May raise Cancelled."""
+        """Project even light of a grey level, without waiting for it. May raise Cancelled."""
         self._tick(doing)
         self.rig.projector.show_level(grey)
 
     def grab_mean(self, grey: int | None, doing: str, images: int = 1) -> np.ndarray:
-        """The mean image under even light that has arrived."""
+        """The mean of ``images`` images (h, w) under even light, after it has settled."""
         self.show(grey, doing)
         self.wait()
         return np.mean([self.grab() for _ in range(images)], axis=0) if images > 1 else self.grab()
 
     def wait(self) -> None:
-        """Let the light arrive, and the images that are older than it pass."""
+        """Wait until the light has settled, and discard images that are older."""
         time.sleep(self.settle_ms / 1000)
         for _ in range(self.stale):
             self.grab()
 
     def measure_references(self) -> None:
-        """Measure dark and white, with patience: nothing is known yet of the rig's delays."""
+        """Measure the dark and white images with long waits, since the rig's delays are not known yet."""
         bursts = []
         for grey, doing in ((None, "dark"), (255, "white light")):
             self.show(grey, doing)

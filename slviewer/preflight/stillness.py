@@ -37,7 +37,7 @@ def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> C
 
 
 def _match_light(image: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Blocks as they would be with the lamp and the room of the other image; most of them see the same scene."""
+    """Block means with the projector and ambient light of the other image, fitted by robust regression."""
     here = np.ones(len(image), bool)
     fitted = image
     for _ in range(3):

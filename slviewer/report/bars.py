@@ -1,4 +1,4 @@
-"""Who wins where: RMS of each plane by model, beside the noise floor and what the Letter found."""
+"""Bar charts: RMS of each plane by model, with the noise floor and the Letter's value."""
 
 from collections.abc import Sequence
 

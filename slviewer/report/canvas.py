@@ -30,7 +30,7 @@ _drawing = threading.Lock()
 
 
 def model_colour(model: str) -> str:
-    """The colour that stands for a model in every figure."""
+    """The colour that represents a model in every figure."""
     return MODELS.get(model) or _OTHERS[sum(model.encode()) % len(_OTHERS)]
 
 
@@ -53,7 +53,7 @@ def finish_figure(drawing: Any, caption: str, alt: str) -> Figure:
 
 
 def style_axes(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK) -> None:
-    """Quiet axes: a light grid, two spines, labels in the page's sizes; ``x`` and ``y`` name quantity and unit."""
+    """Style axes plainly: a light grid, two spines, labels in the page's sizes; ``x`` and ``y`` name quantity and unit."""
     axes.set_title(title, fontsize=TITLE_PT, color=colour, loc="left", fontweight="bold", pad=7)
     axes.set_xlabel(x, fontsize=TEXT_PT, color=SOFT)
     axes.set_ylabel(y, fontsize=TEXT_PT, color=SOFT)
@@ -68,7 +68,7 @@ def style_axes(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bo
 
 
 def style_image_axes(axes: Any, title: str = "", colour: str = INK) -> None:
-    """Axes of an image: a title and nothing else."""
+    """Style the axes of an image: a title, no ticks and no frame."""
     style_axes(axes, title, grid=False, colour=colour)
     axes.set_xticks([])
     axes.set_yticks([])
@@ -77,13 +77,13 @@ def style_image_axes(axes: Any, title: str = "", colour: str = INK) -> None:
 
 
 def legend(axes: Any, **options: Any) -> None:
-    """The legend of what the axes hold, in the page's type."""
+    """Add a legend of the labelled artists to the axes, in the page's type."""
     if axes.get_legend_handles_labels()[0]:
         axes.legend(**{"fontsize": SMALL_PT, "labelcolor": INK, "frameon": False, **options})
 
 
 def colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) -> None:
-    """A colour bar beside ``axes``, in the page's type."""
+    """Add a colour bar beside ``axes``, in the page's type."""
     bar = drawing.colorbar(image, ax=axes, **{"shrink": 0.9, "aspect": 24, "pad": 0.02, **options})
     bar.ax.tick_params(labelsize=SMALL_PT, colors=SOFT, length=3, width=0.7)
     bar.set_label(label, fontsize=TEXT_PT, color=SOFT)
@@ -91,7 +91,7 @@ def colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) 
 
 
 def draw_map(axes: Any, image: NDArray[np.floating], colours: str, levels: int, low: float, high: float) -> Any:
-    """Draw a map (h, w), grey where NaN, in so many levels of a colour map from ``low`` to ``high``; returns the image.
+    """Draw a map (h, w), grey where NaN, with ``levels`` levels of a colour map from ``low`` to ``high``; returns the image.
 
     Maps that are finer than the figure are averaged.
     """
@@ -108,7 +108,7 @@ def draw_map(axes: Any, image: NDArray[np.floating], colours: str, levels: int, 
 
 
 def round_up(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten; 1 for nothing finite above zero."""
+    """The value rounded up to 1, 1.5, 2, 3, 4, 5, 6, 8 or 10 times a power of ten; 1 unless finite and positive."""
     if not (np.isfinite(value) and value > 0):
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))

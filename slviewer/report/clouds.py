@@ -111,9 +111,9 @@ def _sample_points(view: CloudView) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Indices of the points that a chequered view shows: in each square of x and y those of one scan alone.
+    """Indices of the points of a chequered view, which shows one scan only in each square of x and y.
 
-    The scans take turns from square to square, among those that measured there (told in finer squares).
+    The scans take turns from square to square, among those that measured there (decided on finer squares).
     """
     low, high = np.percentile(points[:, :2], [0.5, 99.5], axis=0)
     fine = float(np.max(high - low)) / (SQUARES * FINER)

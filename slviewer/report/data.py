@@ -70,7 +70,7 @@ class MergePair:
 
 @dataclass(frozen=True, eq=False)
 class PixelCurve:
-    """One camera pixel's data, (n,) each, and what was fitted to it (the Letter, eq. 9-11).
+    """One camera pixel's data, (n,) each, and the functions fitted to it (the Letter, eq. 9-11).
 
     ``coefficients`` (5,) c0 ... c4 for phase in rad and lengths in mm; ``rms_mm`` (3,) in z, x, y.
     """
@@ -87,7 +87,7 @@ class PixelCurve:
 
 @dataclass(frozen=True, eq=False)
 class ErrorMaps:
-    """Signed errors (h, w) mm, NaN where nothing counts, of each model on one capture, with RMS and noise floor."""
+    """Signed errors (h, w) mm, NaN at excluded pixels, of each model on one capture, with RMS and noise floor."""
 
     title: str
     maps: Mapping[str, np.ndarray]
@@ -99,8 +99,8 @@ class ErrorMaps:
 class CloudView:
     """A scan to look at: ``points`` (h, w, 3) organised, or (n, 3), mm, NaN where invalid.
 
-    ``normals`` like ``points``, or None (found from the grid); ``source`` (n,) numbers the scan that each point of a
-    merged cloud comes from, ``names`` names these; ``note`` is said beside the number of points.
+    ``normals`` like ``points``, or None (computed from the grid); ``source`` (n,) numbers the scan that each point of a
+    merged cloud comes from, ``names`` names these; ``note`` is shown beside the number of points.
     """
 
     name: str
@@ -164,7 +164,7 @@ class CaptureRow:
 class PoseResiduals:
     """Features of one board pose: camera ``pixels`` (n, 2) and ``camera``, ``projector`` residuals (n, 2) px.
 
-    ``projector_pixels`` (n, 2) is where the projector's residuals belong. NaN: set aside or not read.
+    ``projector_pixels`` (n, 2) is where the projector's residuals belong. NaN: excluded or not read.
     """
 
     pixels: np.ndarray
@@ -244,7 +244,7 @@ class DriftRow:
 
 @dataclass(frozen=True, eq=False)
 class SessionData:
-    """A session's captures, its calibrations, and what was measured with them.
+    """A session's captures, its calibrations, and the measurements made with them.
 
     ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that made ``calibration``.
     ``sections``: names, and lines (k, 2) mm, along and up; ``deviations`` from nominal models, with their arrays.

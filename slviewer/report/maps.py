@@ -1,4 +1,4 @@
-"""Pictures of what is known of each camera pixel: RMS of its fit, error of its point."""
+"""Maps of per-pixel quantities in the camera image: RMS of the fit, error of the measured point."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -104,7 +104,7 @@ def error_maps(
 
 
 def error_limit(maps: list[np.ndarray]) -> float:
-    """Where a symmetric colour scale for all of ``maps`` ends, mm: 99 % of the errors lie within."""
+    """Upper limit, mm, of a symmetric colour scale for all of ``maps``: 99 % of the absolute errors are below it."""
     samples = [m.ravel()[:: max(1, m.size // 300_000)] for m in maps]
     return round_up(percentile(np.abs(np.concatenate(samples)), 99))
 

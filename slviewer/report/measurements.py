@@ -1,4 +1,4 @@
-"""What was measured on scans, and how far they lie off their nominal models: tables, sections, coloured surfaces."""
+"""Measurements on scans, and deviations of scans from nominal models: tables, sections, coloured surfaces."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -42,7 +42,7 @@ MOST_DRAWN = 4000
 
 
 def measurements_section(rows: Sequence[Measurement], sections: Sequence[tuple[str, Lines]]) -> Section:
-    """Every measurement with its units and uncertainties, and each section as it was cut."""
+    """The section with every measurement, its unit and uncertainty, and a plot of each cross-section."""
     items: list[Item] = [
         PageNotice(f"{row.name} is out of date: its surface has changed. Measure again.") for row in rows if row.stale
     ]
@@ -110,7 +110,7 @@ def section_plot(
 
 
 def deviations_section(deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]]) -> Section:
-    """Each comparison with a nominal model: verdict, picture and figures."""
+    """The section with each comparison with a nominal model: verdict, picture and statistics."""
     items: list[Item] = []
     for measured, arrays in deviations:
         items += _deviation_items(measured, arrays)
@@ -210,7 +210,7 @@ def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: flo
 
 
 def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figure:
-    """The scan coloured by its deviation, what of the nominal was not measured in grey, and the histogram.
+    """Figure of the scan coloured by its deviation, unmeasured parts of the nominal in grey, and the histogram.
 
     ``arrays``: some ``points`` (n, 3) mm of the scan with the nominal's ``normals`` there and ``signed`` (n,) mm
     deviations; ``uncovered`` (k, 3) mm; ``counts`` (m,) of all points between ``edges`` (m + 1,) mm.

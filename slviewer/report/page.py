@@ -131,7 +131,7 @@ class Section:
 
 
 class Headline(NamedTuple):
-    """A key number with its unit, what it is, and what to compare it with."""
+    """A key number with its unit, its label, and a note with a value for comparison."""
 
     value: str
     label: str

@@ -23,7 +23,7 @@ _DECISIONS: dict[str | None, tuple[str, Mark]] = {
 
 
 def verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
-    """The level in plain words, and every finding with what to do."""
+    """The section with the verdict's level, and every finding with its remedy."""
     words, kind = _LEVELS[verdict.level]
     items: list[Item] = [PageNotice(words, kind)]  # type: ignore[arg-type]
     for finding in verdict.findings:
@@ -35,14 +35,14 @@ def verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
 
 
 def verdict_headline(verdict: Verdict) -> Headline:
-    """The level, beside the number of findings."""
+    """The headline with the verdict's level and the number of findings."""
     mark: Mark = "better" if verdict.level == "good" else "worse"
     count = len(verdict.findings)
     return Headline(verdict.level, "verdict on the calibration", f"{count} finding{'s' * (count != 1)}", mark)
 
 
 def models_section(models: ModelsView) -> Section:
-    """Which models there are, how they compare on held-out poses, and results of the joint adjustment."""
+    """The section about the models: comparison on held-out poses, and results of the joint adjustment."""
     items: list[Item] = [PageNotice(f"{model}: {words}.", "plain") for model, words in models.scales.items()]
     used = f"Measured with {models.used}"
     used += (
@@ -63,7 +63,7 @@ def models_section(models: ModelsView) -> Section:
 
 
 def comparison_table(compared: CrossValidation, bold: str) -> Table:
-    """The models on held-out poses, RMS; the name of the model ``bold`` in bold, the smallest errors marked."""
+    """Table of the models' RMS on held-out poses; the name of the model ``bold`` in bold, the smallest errors marked."""
     figures = {
         "plane_mm": (Column("plane", "mm"), 4),
         "board_mm": (Column("board", "mm"), 4),
@@ -91,7 +91,7 @@ def comparison_table(compared: CrossValidation, bold: str) -> Table:
 
 
 def splined_table(summary: Mapping[str, Any]) -> Table:
-    """Results of the joint adjustment, as `SplinedModel.summary` gives them."""
+    """Table of the results of the joint adjustment, as `SplinedModel.summary` gives them."""
     noise, local, covered = summary["noise_px"], summary["local_distortion_rms_px"], summary["cells_lit"]
     low, high = summary["board_height_mm"]
     rows = [
@@ -107,7 +107,7 @@ def splined_table(summary: Mapping[str, Any]) -> Table:
 
 
 def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:
-    """Every acceptance test: decisions, scale, budget, repeatability; the last one first."""
+    """The section with every acceptance test: decisions, scale, budget, repeatability; the last one first."""
     items: list[Item] = []
     for view in reversed(acceptances):
         items += _acceptance_items(view)
@@ -191,7 +191,7 @@ def _budget_table(budget: Mapping[str, Any]) -> Table:
 
 
 def drift_section(checks: Sequence[DriftRow]) -> Section:
-    """The answer of the last drift check, and the history."""
+    """The section with the result of the last drift check, and the history."""
     last = checks[-1].drift
     is_still_good = last.verdict == "still good"
     because = f", because {'; '.join(last.reasons)}" if last.reasons else ""

@@ -1,4 +1,4 @@
-"""The Letter's experiments remade, as the sections of a page: its figures and tables, its own numbers beside ours."""
+"""Report sections of the Letter's experiments, repeated: figures and tables, the Letter's values beside ours."""
 
 from collections.abc import Sequence
 
@@ -43,7 +43,7 @@ def reproduction_title(data: ReproductionData) -> tuple[str, str]:
 
 
 def reproduction_headlines(data: ReproductionData) -> list[Headline]:
-    """Flatness, flatness inside R2, a sphere's radius and the spacing of spheres: stereo against pixelwise."""
+    """Headlines: flatness, flatness inside R2, a sphere's radius and the spacing of spheres: stereo against pixelwise."""
     mean = {m: known_mean([row.rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
     letter = {m: known_mean([row.letter_rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
     floor = known_mean([row.noise_floor_mm.get(OURS, np.nan) for row in data.planes])
@@ -80,7 +80,7 @@ def reproduction_headlines(data: ReproductionData) -> list[Headline]:
 
 
 def reproduction_sections(data: ReproductionData) -> list[Section]:
-    """The calibration, the planes, the spheres and the merged object, in the Letter's order."""
+    """Sections: the calibration, the planes, the spheres and the merged object, in the Letter's order."""
     return [_calibration_section(data), _planes_section(data), _spheres_section(data), _merged_section(data)]
 
 

@@ -93,7 +93,7 @@ def residual_arrows(title: str, pixels: np.ndarray, residuals: np.ndarray, size:
 
 
 def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> Figure:
-    """Where the features (n, 2) px of each pose lay in an image of ``size``: their hulls, and how much they cover."""
+    """Figure of the features (n, 2) px of each pose in an image of ``size``, their hulls and covered share."""
     import cv2
 
     coverage_count = np.zeros((size[1], size[0]), np.uint8)

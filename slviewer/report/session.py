@@ -1,4 +1,4 @@
-"""Any session as the sections of a page: what was captured, how it was calibrated, and what that measures."""
+"""Report sections of a session: captures, calibration and verification."""
 
 from collections.abc import Mapping
 
@@ -47,7 +47,7 @@ def session_title(data: SessionData) -> tuple[str, str]:
 
 
 def session_headlines(data: SessionData) -> list[Headline]:
-    """Poses used, reprojection error, fit, and the best flatness that was proven."""
+    """Headlines: poses used, reprojection error, RMS of the fit, and the best flatness verified."""
     headlines = [] if data.verdict is None else [verdict_headline(data.verdict)]
     calibration = data.calibration
     if calibration is not None:
@@ -75,7 +75,7 @@ def session_headlines(data: SessionData) -> list[Headline]:
 
 
 def _plane_headline(data: SessionData) -> list[Headline]:
-    """The flattest model's mean plane RMS, beside its noise floor and the other models'."""
+    """Headline of the flattest model's mean plane RMS, beside its noise floor and the other models'."""
     planes = [v for v in data.verifications if v.shape == "plane"]
     means = {m: known_mean([v.rms_mm.get(m, np.nan) for v in planes]) for m in models_of([v.rms_mm for v in planes])}
     means = {m: mean for m, mean in means.items() if np.isfinite(mean)}
@@ -90,7 +90,7 @@ def _plane_headline(data: SessionData) -> list[Headline]:
 
 
 def session_sections(data: SessionData) -> list[Section]:
-    """What to look at first, whatever of calibration, proofs and clouds the session holds, and its captures."""
+    """Sections: warnings, then calibration, verification and clouds as far as present, then the captures."""
     sections = _notice_section(data)
     if data.verdict is not None:
         sections.append(verdict_section(data.verdict, data.verdict_of_calibration))
@@ -197,7 +197,7 @@ def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
 
 
 def lens_rows(stereo: StereoModel) -> list[tuple[str, str, str, str]]:
-    """Both lenses' parameters in words: (name, unit, camera's, projector's)."""
+    """Table rows with both lenses' parameters as text: (name, unit, camera's, projector's)."""
 
     def values(lens: Lens, sigma: float) -> list[str]:
         """Image size, focal lengths with standard deviation ``sigma``, principal point (px) and distortion as texts."""
@@ -218,7 +218,7 @@ def lens_rows(stereo: StereoModel) -> list[tuple[str, str, str, str]]:
 
 
 def rig_rows(stereo: StereoModel) -> list[tuple[str, str]]:
-    """Where the projector stands in the camera's frame, in words: (quantity, value with its unit)."""
+    """Table rows with the projector's pose in the camera frame as text: (quantity, value with its unit)."""
     R, t = stereo.rig.R, np.asarray(stereo.rig.t, float).ravel()
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
     axes = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))

@@ -1,4 +1,4 @@
-"""Where the verified planes lay in front of the camera."""
+"""Positions of the verified planes in front of the camera."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -24,7 +24,7 @@ from slviewer.report.page import Figure
 
 
 def planes_in_space(outlines: Mapping[str, np.ndarray], depth_range_mm: tuple[float, float]) -> Figure:
-    """The planes in the camera's frame: in perspective, from the side and from above; R2 is shaded.
+    """Figure of the planes in the camera frame: in perspective, from the side and from above; R2 is shaded.
 
     ``outlines``: by name, three or more points (n, 3) mm of a plane; their hull within the plane is drawn.
     """
@@ -66,7 +66,7 @@ def _draw_profile(
     low: np.ndarray,
     high: np.ndarray,
 ) -> None:
-    """Depth to the right against x or y, each plane named above its upper end."""
+    """Draw depth to the right against x or y, each plane named above its upper end."""
     axes.axvspan(*depth_range_mm, color=BAND, zorder=0, label="R2, the calibrated depths")
     margin = 0.1 * (high[axis] - low[axis])
     bottom, top = low[axis] - margin, high[axis] + margin
@@ -96,7 +96,7 @@ def _draw_profile(
 
 
 def _spread_labels(wanted: Mapping[str, float], gap: float, end: float) -> dict[str, float]:
-    """Places near the wanted ones, at least ``gap`` apart and none beyond ``end``."""
+    """Label positions near the wanted ones, at least ``gap`` apart and none beyond ``end``."""
     names = sorted(wanted, key=lambda name: wanted[name])
     places = np.array([wanted[name] for name in names])
     for i in range(1, len(places)):
@@ -116,7 +116,7 @@ def _draw_perspective(
     low: np.ndarray,
     high: np.ndarray,
 ) -> None:
-    """The perspective view: depth runs away to the right, the image's up is up."""
+    """Draw the perspective view: depth runs away to the right, the image's up is up."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     style_image_axes(axes)
@@ -152,7 +152,7 @@ def _draw_perspective(
 
 
 def _convex_hull(name: str, points: np.ndarray) -> np.ndarray:
-    """The corners (m, 3), in order, of the convex hull of points that lie about in one plane."""
+    """The corners (m, 3), in order, of the convex hull of points close to one plane."""
     from scipy.spatial import ConvexHull
 
     points = np.asarray(points, float).reshape(-1, np.shape(points)[-1])
@@ -176,7 +176,7 @@ def _classify_depth(hull: np.ndarray, depth_range_mm: tuple[float, float]) -> st
 
 
 def _shorten_names(names: list[str]) -> dict[str, str]:
-    """Names without what all of them begin with (and its zeros): plane_01 is 1."""
+    """Names without their common prefix and leading zeros: plane_01 becomes 1."""
     common = 0
     while len(names) > 1 and len({name[: common + 1] for name in names}) == 1 and common < len(names[0]):
         common += 1

@@ -1,4 +1,4 @@
-"""Numbers as tables: every value with its unit and its rival, and who wins in colour and in words."""
+"""Tables of results: every value with its unit beside the value of another model, and which is better."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -14,14 +14,14 @@ UNKNOWN = Cell("–", "muted")
 
 
 def format_number(value: float, digits: int = 3, signed: bool = False) -> str | Cell:
-    """A value with so many decimals, halves rounded up as people do; a dash where it is unknown."""
+    """The value as text with ``digits`` decimals, halves rounded up; a dash for NaN."""
     if not np.isfinite(value):
         return UNKNOWN
     return f"{value * (1 + 1e-9):{'+' if signed else ''}.{digits}f}".replace("-", "−")
 
 
 def better_worse(error: float, rival: float) -> Mark:
-    """How an error (its size) stands to its rival's."""
+    """The mark "better" or "worse" of an error against a rival's, by magnitude."""
     error, rival = abs(error), abs(rival)
     if not (np.isfinite(error) and np.isfinite(rival)) or abs(error - rival) <= EQUAL * max(error, rival):
         return ""
@@ -29,7 +29,7 @@ def better_worse(error: float, rival: float) -> Mark:
 
 
 def compare_errors(error: float, rival: float) -> str | Cell:
-    """``2.6 times better``, in words and in colour."""
+    """The cell that compares an error with a rival's, such as ``2.6 times better``, coloured."""
     error, rival = abs(error), abs(rival)
     if not (np.isfinite(error) and np.isfinite(rival) and error > 0 and rival > 0):
         return UNKNOWN
@@ -51,7 +51,7 @@ def models_of(rows: Sequence[Mapping[str, float]]) -> list[str]:
 
 
 def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
-    """Incidence, RMS and floor by model, who wins, and, where rows have them, the Letter's own figures."""
+    """Table of planes: incidence, RMS and floor by model, which is better, and, where rows have them, the Letter's own figures."""
     rms, floor = _values_by_model(rows, "rms_mm"), _values_by_model(rows, "noise_floor_mm")
     letter = _values_by_model(rows, "letter_rms_mm")
     columns: list[_CellColumn] = [
@@ -78,7 +78,7 @@ def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
 
 
 def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
-    """RMS, floor and fitted radius by model, who wins in the radius, and the Letter's own figures where known."""
+    """Table of spheres: RMS, floor and fitted radius by model, which radius is better, and the Letter's own figures where known."""
     rms, floor = _values_by_model(rows, "rms_mm"), _values_by_model(rows, "noise_floor_mm")
     radius, letter = _values_by_model(rows, "radius_mm"), _values_by_model(rows, "letter_rms_mm")
     errors = _signed_errors(rms, radius, [row.true_radius_mm for row in rows])
@@ -125,12 +125,12 @@ def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
 
 
 def spacing_error(rows: Sequence[SpacingRow], model: str) -> float:
-    """The mean size of a model's spacing errors, mm."""
+    """The mean absolute spacing error of a model, mm."""
     return known_mean([abs(row.measured_mm.get(model, np.nan) - row.known_mm) for row in rows])
 
 
 def merge_table(pairs: Sequence[MergePair], caption: str) -> Table:
-    """How each scan lies on the reference, beside the Letter's figure where there is one."""
+    """Table of the alignment of each scan to the reference, beside the Letter's value where there is one."""
     letter = any(np.isfinite(pair.letter_rms_mm) for pair in pairs)
     columns = [Column("scan", align="left"), Column("reference", align="left"), Column("ICP RMS", "mm")]
     columns += [Column("overlap", "%")] + ([Column("the Letter's ICP RMS", "mm")] if letter else [])
@@ -143,7 +143,7 @@ def merge_table(pairs: Sequence[MergePair], caption: str) -> Table:
 
 
 def format_incidence(incidence: Mapping[str, float]) -> str | Cell:
-    """``9 / 91 / 0``; a dash where it is unknown."""
+    """Shares in R1, R2 and R3 in percent as text, such as ``9 / 91 / 0``; a dash where unknown."""
     if not incidence:
         return UNKNOWN
     return " / ".join(f"{abs(incidence.get(region, 0.0)):.1f}".removesuffix(".0") for region in ("R1", "R2", "R3"))
@@ -169,14 +169,14 @@ def _values_by_model(rows: Sequence[object], figure: str) -> dict[str, list[floa
 def _signed_errors(
     models: Iterable[str], measured: Mapping[str, Sequence[float]], true: Sequence[float]
 ) -> dict[str, list[float]]:
-    """{model: measured less true value in every row, then the mean of their sizes}."""
+    """{model: measured less true value in every row, then the mean of their magnitudes}."""
     unknown = [np.nan] * (len(true) + 1)
     errors = {m: [v - t for v, t in zip(measured.get(m, unknown)[:-1], true, strict=True)] for m in models}
     return {model: [*each, known_mean([abs(error) for error in each])] for model, each in errors.items()}
 
 
 def _comparison_columns(errors: Mapping[str, Sequence[float]], words: str) -> list[_CellColumn]:
-    """Each further model's errors against the first model's, in words."""
+    """Columns that compare each further model's errors with the first model's."""
     first, *others = errors
     return [
         (Column(f"{words} {first}", "", model, "left"), list(map(compare_errors, errors[model], errors[first])))

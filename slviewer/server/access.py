@@ -55,14 +55,14 @@ class Access:
         self.cookie_name = f"slviewer_{port}"
 
     def role_of(self, token: str) -> Role | None:
-        """Whose token this is, in a time that does not depend on how much of it is right."""
+        """The role that a token belongs to, or None, compared in constant time."""
         given = token.encode("utf-8", "surrogateescape")
         operator = hmac.compare_digest(given, self.token.encode())
         viewer = hmac.compare_digest(given, self.view_token.encode())
         return "operator" if operator else "viewer" if viewer else None
 
     def role(self, headers: Headers) -> Role:
-        """The role that the request's cookie gives; Refusal without a valid one."""
+        """The role of the request's cookie; raises Refusal without a valid one."""
         for header in headers.get_all("Cookie"):
             for part in header.split(";"):
                 name, _, value = part.strip().partition("=")
@@ -74,19 +74,19 @@ class Access:
         )
 
     def set_cookie(self, role: Role) -> str:
-        """The Set-Cookie header: unreadable for scripts, never sent along from another site, gone with the browser."""
+        """The Set-Cookie header of a role: HttpOnly, SameSite, for this browser session."""
         token = self.token if role == "operator" else self.view_token
         return f"{self.cookie_name}={token}; HttpOnly; SameSite=Strict; Path=/"
 
     def host(self, headers: Headers, local_address: str) -> str:
-        """The request's Host, where it is one of this server's names; Refusal otherwise (DNS rebinding)."""
+        """The request's Host if it is one of this server's names; raises Refusal otherwise (DNS rebinding)."""
         hosts = headers.get_all("Host")
         if len(hosts) != 1 or hosts[0].lower() not in self._list_hosts(local_address):
             raise Refusal(HTTPStatus.MISDIRECTED_REQUEST, "This server is not reached by that host name.")
         return hosts[0].lower()
 
     def check_origin(self, headers: Headers, host: str, websocket: bool) -> None:
-        """Refusal where another site's page sent the request; a WebSocket must say which page opened it."""
+        """Raise Refusal if another site's page sent the request; a WebSocket must say which page opened it."""
         origins = headers.get_all("Origin")
         own = {f"http://{host}", f"https://{host}"}
         if any(origin.lower() not in own for origin in origins) or (websocket and len(origins) != 1):

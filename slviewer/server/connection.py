@@ -72,7 +72,7 @@ class Connection(ServerConnection):
 
 
 class _Tail(Response):
-    """The rest of an answer that was begun by hand."""
+    """The rest of a response whose beginning was already sent."""
 
     def serialize(self) -> bytes:
         """The bytes of the body, without status line and headers: those have been sent."""
@@ -80,7 +80,7 @@ class _Tail(Response):
 
 
 def quiet_logger() -> logging.Logger:
-    """websockets' logger for this server: what strangers send it is no error of ours."""
+    """The websockets logger of this server, which drops errors that clients cause, such as failed handshakes."""
     logger = logging.getLogger("slviewer.server.websockets")
     if not logger.filters:
         logger.addFilter(_is_server_error)

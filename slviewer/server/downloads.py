@@ -1,4 +1,4 @@
-"""Files that the application offers, by names that cannot be guessed; nothing else is read from the disk."""
+"""Files offered for download under names that cannot be guessed; no other file can be read."""
 
 import contextlib
 import os
@@ -27,7 +27,7 @@ class Offer:
 
 
 class Downloads:
-    """What can be fetched right now."""
+    """The files that can be downloaded at present."""
 
     def __init__(self) -> None:
         self._offers: dict[str, Offer] = {}
@@ -45,11 +45,11 @@ class Downloads:
         return PREFIX + key
 
     def clear(self) -> None:
-        """No longer offer anything (another session is opened)."""
+        """Withdraw all offered files (another session is opened)."""
         self._offers.clear()
 
     def open(self, address: str) -> tuple[Headers, BinaryIO] | None:
-        """The headers and the open file for an address; None where nothing is offered, or it is there no more."""
+        """The headers and the open file for an address; None if it is not offered or no longer exists."""
         offer = self._offers.get(address.removeprefix(PREFIX))
         if offer is None:
             return None

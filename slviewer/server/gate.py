@@ -22,7 +22,7 @@ TEXT_LIMIT = 20_000
 
 
 class ViserGate:
-    """Stands between one client's connection and viser, and lets pass what that client may send.
+    """Filters the messages of one client, and passes on to viser those that this client may send.
 
     A refused message is dropped: it may be no attack at all, but a click on a button that was disabled a moment ago.
     """
@@ -56,7 +56,7 @@ class ViserGate:
         self._uploads.close()
 
     def _check_message(self, message: Any, raw: bytes) -> bytes:
-        """The bytes that are passed on to viser for this message; raises MessageRefused where it is not allowed."""
+        """The bytes to pass on to viser for this message; raises MessageRefused if it is not allowed."""
         server, client = self._server, self._client
         assert client is not None
         # besides where they look from, those who watch may say that they have drawn something, when they are asked

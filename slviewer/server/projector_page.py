@@ -1,4 +1,4 @@
-"""The projector's page, and its end of the wire: what a browser projector sends, and what its page answers."""
+"""The page of a browser projector, and the messages between it and the server."""
 
 import asyncio
 import contextlib

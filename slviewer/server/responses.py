@@ -33,7 +33,7 @@ def harden(headers: Headers, policy: str = _CLOSED) -> None:
 
 
 def page_policy(html: bytes, host: str) -> str:
-    """The policy of our own pages: run the scripts in them, show pictures, connect to this server; nothing else."""
+    """Content-Security-Policy of our own pages: inline scripts, images and connections to this server only."""
     scripts = " ".join(script_hash(m) for m in re.findall(rb"<script[^>]*>(.*?)</script>", html, re.S)) or "'none'"
     return (
         f"{_CLOSED}; script-src {scripts}; style-src 'unsafe-inline'; img-src 'self' data: blob:; "
@@ -56,5 +56,5 @@ def viser_policy(scripts: tuple[str, ...], host: str) -> str:
 
 
 def script_hash(script: bytes) -> str:
-    """A script's name in a Content-Security-Policy."""
+    """A script's SHA hash as a source in a Content-Security-Policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}'"

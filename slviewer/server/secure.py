@@ -42,7 +42,7 @@ class SafeServer:
 
     @property
     def view_url(self) -> str:
-        """The link for those who watch and change nothing."""
+        """The link for viewers, who may change nothing."""
         return self.link("/", "viewer")
 
     def link(self, path: str, role: Role = "operator") -> str:
@@ -56,7 +56,7 @@ class SafeServer:
         return ipaddress.ip_address(self._address()).is_loopback
 
     def role(self, client_id: int) -> Role | None:
-        """Whether a client of viser operates or watches; None once it is gone."""
+        """The role of a client of viser, operator or viewer; None once it is disconnected."""
         connection = viser_internals.connection_of(self.viser, client_id)
         return None if connection is None else connection.role
 

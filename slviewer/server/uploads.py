@@ -33,7 +33,7 @@ class _Transfer:
 
 
 class Uploads:
-    """The uploads that one client has under way."""
+    """The unfinished uploads of one client."""
 
     def __init__(self, budget: UploadBudget, forget: Callable[[str], None]) -> None:
         self._budget = budget

@@ -1,4 +1,4 @@
-"""Which browsers have drawn what they were sent: what is sent over and over goes at each one's own pace.
+"""Which browsers have drawn the updates sent to them, so that each is updated at its own pace.
 
 A browser answers a question once all that was sent before it has been drawn, so that an answer tells more than any
 buffer of the network's: one that stalls, on the way or at its screen, has one picture on its way to it and no more.
@@ -48,7 +48,7 @@ class Viewers:
         viser_internals.request_answer(client, lambda: self._record_answer(number))
 
     def slowest_s(self) -> float:
-        """How long the slowest of them took for what it was sent last, those apart that have stalled; 0: none did."""
+        """Time, s, that the slowest client took to draw its last update, stalled ones excluded; 0 if there is none."""
         now = time.monotonic()
         with self._lock:
             waiting = [now - sent_s for sent_s in self._request_times.values() if now - sent_s < STALLED_S]

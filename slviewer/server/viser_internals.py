@@ -70,7 +70,7 @@ class _Websockets:
 
 
 def start(serve: Callable[..., Any], host: str, port: int, label: str | None) -> viser.ViserServer:
-    """viser's server, listening through `serve` (called as websockets' own); no share tunnel, nothing printed."""
+    """Start viser's server, listening through `serve` (called as websockets' own), without a share tunnel or output."""
     with _starting, _silence_prints():
         _infra.websockets = _Websockets(serve)  # type: ignore[assignment]
         try:
@@ -106,7 +106,7 @@ def client_page() -> bytes:
 
 
 def stop(server: viser.ViserServer) -> None:
-    """End viser's server and its threads, without a word."""
+    """Stop viser's server and its threads, without output."""
     with _silence_prints():
         server.stop()
 
@@ -118,7 +118,7 @@ def _refuse_tunnel(*_: Any, **__: Any) -> NoReturn:
 
 @contextlib.contextmanager
 def _silence_prints() -> Iterator[None]:
-    """viser prints its own address, without the token, and its end: both only confuse the operator."""
+    """Suppress what viser prints: its own address, without the token, and its end, which only confuse the operator."""
     printing = rich.print
     rich.print = lambda *_, **__: None
     try:
@@ -207,7 +207,7 @@ def scene_api(server: viser.ViserServer, client_id: int, owner: str) -> Any:
 
 
 def listens_to_gizmo(scene: Any, client_id: int, name: str) -> bool:
-    """Whether this gizmo is there to be moved, and someone listens to it; also while one removed is still held."""
+    """Whether this gizmo exists and has a callback; also true while a removed one is still being dragged."""
     if (client_id, name) in scene._active_transform_drag_handles:
         return True
     handle = scene._handle_from_transform_controls_name.get(name)
@@ -215,7 +215,7 @@ def listens_to_gizmo(scene: Any, client_id: int, name: str) -> bool:
 
 
 def listens_to_clicks(scene: Any, name: str) -> bool:
-    """Whether someone listens to clicks on this node."""
+    """Whether a callback for clicks on this node is registered."""
     handle = scene._handle_from_node_name.get(name)
     return handle is not None and bool(handle._impl.click_cb) and _is_visible(scene, name)
 
@@ -229,14 +229,14 @@ def _is_visible(scene: Any, name: str) -> bool:
 
 
 def listens_to_pointer(server: viser.ViserServer, client_id: int, event: str) -> bool:
-    """Whether someone listens to this event of the pointer over the whole scene."""
+    """Whether a callback for this pointer event over the whole scene is registered."""
     client = server._connected_clients.get(client_id)
     scenes = [server.scene] if client is None else [server.scene, client.scene]
     return any(entry.event_type == event for scene in scenes for entry in scene._scene_pointer_cb)
 
 
 def is_awaited(server: viser.ViserServer, client_id: int, kind: type[Message]) -> bool:
-    """Whether the server asked this client a question that is answered by this kind of message."""
+    """Whether the server awaits this kind of message from the client, as the response to a request."""
     client = server._connected_clients.get(client_id)
     return client is not None and bool(client._websock_connection._incoming_handlers.get(kind))
 
@@ -257,7 +257,7 @@ def request_answer(client: viser.ClientHandle, answered: Callable[[], None]) -> 
 
 
 def forget_upload(server: viser.ViserServer, client_id: int | None, transfer: str) -> None:
-    """Let go of what was received of an upload."""
+    """Discard the received parts of an upload."""
     for api in gui_apis(server, client_id):
         api._current_file_upload_states.pop(transfer, None)
 

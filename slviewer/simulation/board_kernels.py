@@ -51,7 +51,7 @@ def intersect(rays, origin, axes, rotation, bounds, shape):
 
 @kernel()
 def _albedo(x, y, bounds, kind, pitch, cells, circles, radius, mark, white, dark):
-    """What is printed at one point: 0 beside the plate."""
+    """Albedo at one point of the board, ``white`` or ``dark``; 0 outside the plate."""
     px, py = x - bounds[0], y - bounds[1]
     if not (0 <= px <= bounds[2] and 0 <= py <= bounds[3]):
         return 0.0

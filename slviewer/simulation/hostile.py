@@ -117,7 +117,7 @@ def expose_frames(
     severity: Severity = "mild",
     seed: int = 0,
 ) -> np.ndarray:
-    """(n, h, w) uint8: what the camera records of the ``light`` (n, h, w), spoilt by the fault.
+    """(n, h, w) uint8: frames that the camera records of the ``light`` (n, h, w), with the fault applied.
 
     ``room_light`` as ``Renderer.room_light`` gives it. The same ``number`` and ``seed`` give the same noise, fault or
     not.

@@ -62,7 +62,7 @@ def exposure_loop_gains(light: np.ndarray, off: float, speed: float = 0.15) -> n
 
 
 def add_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
-    """Mains light under a rolling shutter: bands of 1 + depth sin that stand elsewhere in each frame."""
+    """Add mains flicker under a rolling shutter: bands 1 + depth sin, at another phase in each frame."""
     n, height, _ = light.shape
     rows = 1.6 * np.arange(height) / height
     phase = 0.37 * np.arange(n)[:, None] + shot.rng.uniform(0, 1, (n, 1)) * 0.1
@@ -70,7 +70,7 @@ def add_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
 
 
 def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
-    """A lamp in the room, a fifth as strong as the projector, that flickers by ``depth`` of its light."""
+    """Add ambient light, a fifth as strong as the projector's, that flickers by ``depth`` of its light."""
     n, height, _ = light.shape
     rows = 1.6 * np.arange(height) / height
     bands = 0.2 * (1 + depth * np.sin(2 * np.pi * (rows + 0.29 * np.arange(n)[:, None])))
@@ -96,7 +96,7 @@ def add_colour_wheel(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
 
 
 def add_crosstalk(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
-    """A display that answers slowly: each image holds a share of the one before."""
+    """Mix a share of the previous image into each, as a display with a slow response does."""
     before = np.concatenate([light[:1], light[:-1]])
     return np.float32(1 - share) * light + np.float32(share) * before
 
@@ -173,17 +173,17 @@ def add_hot_pixels(frames: np.ndarray, share: float, shot: Shot) -> np.ndarray:
 
 
 def delay_frames(frames: np.ndarray, by: float = 1, shot: Shot | None = None) -> np.ndarray:
-    """Every frame shows what was projected so many frames before."""
+    """The frames (n, h, w) delayed: each shows the pattern projected ``by`` frames before."""
     return np.roll(frames, int(by), axis=0)
 
 
 def drop_frame(frames: np.ndarray, index: int) -> np.ndarray:
-    """Without one frame: those that follow come a place earlier, and the last comes twice."""
+    """The frames (n, h, w) with one dropped: later ones move forward by one, and the last is repeated."""
     return np.concatenate([np.delete(frames, index, axis=0), frames[-1:]])
 
 
 def show_instead(frames: np.ndarray, places: Sequence[int], sources: Sequence[int]) -> np.ndarray:
-    """The frames with each of ``places`` showing what belongs at the place of the same number in ``sources``."""
+    """The frames (n, h, w) with those at the indices ``places`` replaced by those at ``sources``."""
     out = frames.copy()
     out[list(places)] = frames[list(sources)]
     return out

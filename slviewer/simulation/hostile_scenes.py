@@ -1,4 +1,4 @@
-"""Faults of rigs and scenes: what moves, bends or is set wrongly, and what stands in the view beside the thing."""
+"""Faults of rigs and scenes: motion, bending, wrong settings, and further objects in the view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class SceneGroup:
     scenes: Sequence[Scene]
 
     def trace(self, rays: np.ndarray) -> Surface:
-        """The nearest of what the scenes' own surfaces give."""
+        """The nearest surface of all scenes along each ray."""
         first, *others = (scene.trace(rays) for scene in self.scenes)
         points, normals, albedo = first.points.copy(), first.normals.copy(), first.albedo.copy()
         for surface in others:
@@ -40,7 +40,7 @@ class SceneGroup:
         return Surface(points, normals, albedo)
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """Whether any of the scenes stands on the way."""
+        """Whether any of the scenes blocks the way from a point to the source."""
         blocked = [scene.occluded(points, source) for scene in self.scenes]
         blocked += [_is_behind_plate(scene, points, source) for scene in self.scenes if isinstance(scene, BoardScene)]
         return np.logical_or.reduce(blocked)
@@ -59,7 +59,7 @@ class DirtyBoard:
     seed: int = 0
 
     def trace(self, rays: np.ndarray) -> Surface:
-        """The board's surface, darker where dirt lies."""
+        """The board's surface, with reduced albedo at dirt."""
         surface = self.scene.trace(rays)
         hit = surface.albedo > 0
         pose = self.scene.pose
@@ -187,7 +187,7 @@ def dim_projector(rig: SimulatedRig, amplitude: float, number: int) -> Simulated
 
 
 def overexpose(rig: SimulatedRig, times: float, number: int) -> SimulatedRig:
-    """White light reaches so many times the camera's full scale."""
+    """The rig overexposed: white light reaches ``times`` the camera's full scale."""
     sensor = rig.sensor
     return replace(rig, sensor=replace(sensor, peak_level=sensor.dark_level + times * 255))
 
@@ -200,13 +200,13 @@ def refocus_camera(rig: SimulatedRig, share: float, number: int) -> SimulatedRig
 
 
 def drift_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig:
-    """The projector's mount warms up, and turns by ``mrad`` over eight captures."""
+    """The rig with its projector turned a little in each capture, by ``mrad`` over eight, as a warming mount does."""
     turn = rotation(1e-3 * mrad * min(number, 8) / 8 * np.array([0.6, 0.7, 0.4]))
     return replace(rig, R=turn @ rig.R, t=turn @ rig.t)
 
 
 def knock_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig:
-    """The projector was knocked after the calibration."""
+    """The rig with its projector turned by ``mrad`` after the calibration, as by a knock."""
     turn = rotation(1e-3 * mrad * np.array([0.6, 0.7, 0.4]))
     return replace(rig, R=turn @ rig.R, t=turn @ rig.t)
 
@@ -226,12 +226,12 @@ def moving_scenes(scene: Scene, by_mm: float) -> list[Scene]:
 
 
 def dirty_scene(scene: Scene, share: float, number: int) -> Scene:
-    """Dust and scratches on boards."""
+    """The scene with dust and scratches on this share of its board; scenes without a board are unchanged."""
     return DirtyBoard(scene, share) if isinstance(scene, BoardScene) else scene
 
 
 def put_on_table(scene: Scene, reflectivity: float, number: int) -> Scene:
-    """The thing stands on a polished table, which ends its view 3 mm below it."""
+    """The scene on a polished table 3 mm below the object, which mirrors it."""
     if isinstance(scene, BoardScene):
         (x, y), (width, height) = scene.corner, scene.plate
         corners = np.array([(x + a * width, y + b * height, 0.0) for a in (0, 1) for b in (0, 1)])
@@ -244,7 +244,7 @@ def put_on_table(scene: Scene, reflectivity: float, number: int) -> Scene:
 
 
 def add_second_board(scene: Scene, size_mm: float, number: int) -> Scene:
-    """Another white plate of this width stands 70 mm behind the thing, to the left of it."""
+    """The scene with another white plate of this width 70 mm behind the object, to the left of it."""
     if isinstance(scene, BoardScene):
         middle = scene.pose.to_camera(np.array([*(np.array(scene.corner) + np.array(scene.plate) / 2), 0.0]))
     elif isinstance(scene, Spheres):

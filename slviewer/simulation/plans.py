@@ -88,7 +88,7 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 
 def _list_directions(n: int) -> np.ndarray:
-    """(n, 2) in -1 ... 1: where in its view each board stands; corners most, then edges, then the middle."""
+    """(n, 2) in -1 ... 1: position of each board in the field of view; corners most, then edges, then the middle."""
     corners = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
     cycle = [*corners, (0, 0), *corners, (1, 0), *corners, (0, -1), *corners, (-1, 0), *corners, (0, 1)]
     return np.array([cycle[i % len(cycle)] for i in range(n)], float)

@@ -15,7 +15,7 @@ from slviewer.simulation.waves import random_waves
 
 @dataclass(frozen=True)
 class Sensor:
-    """How light becomes grey levels; the field's comments stand in ``assets/simulation/letter.toml``.
+    """How light becomes grey levels; the fields are explained in ``assets/simulation/letter.toml``.
 
     Noise of one pixel of one frame: variance = read_variance + shot_variance (level - dark_level), in grey levels
     squared, then rounding to 8 bits adds 1/12. It is the same at every scale, so that figures can be compared.

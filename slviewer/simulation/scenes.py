@@ -1,4 +1,4 @@
-"""What stands before the simulated rig, and what its camera rays meet.
+"""Scenes in front of the simulated rig, and the surfaces that its camera rays meet.
 
 Every scene answers two questions: `trace` (where do the rays meet the surface, with which normal and albedo) and
 `occluded` (does the scene itself stand between a surface point and the projector). All lengths in mm, camera frame.

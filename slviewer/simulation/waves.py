@@ -1,4 +1,4 @@
-"""The local distortion of a simulated lens: what no Brown polynomial expresses.
+"""The local distortion of a simulated lens that no Brown polynomial can express.
 
 A sum of plane waves in random directions, each coordinate with amplitudes of its own. Real lenses and DMD
 optics leave such residuals of a tenth of a pixel or two after the best polynomial; they are what the pixel-wise model

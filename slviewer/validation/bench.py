@@ -1,4 +1,4 @@
-"""How long the main stages take, beside what they cannot beat."""
+"""Benchmark of the main stages, with lower bounds of their duration."""
 
 import resource
 import sys
@@ -124,7 +124,7 @@ def bench(
 
 
 def _time_decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:
-    """Phase steps and Gray code; the kernel's seconds apart."""
+    """Rows of decoding phase steps and Gray code, and the seconds of the kernel alone."""
     coded = frames[:-1]  # without the texture
     kernel, moved, least = _time_with_floor(_time_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
     whole = median(lambda: decode(sequence, frames, "x"), 5)
@@ -151,7 +151,7 @@ def _time_kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callabl
 
 
 def _time_measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
-    """Points from phases, and all in one pass, by both fast models; then a file of them."""
+    """Rows of points from phases and of one fused pass, by both fast models, and of writing a file."""
     rows = []
     phase = decode(sequence, frames, "x")
     pixelwise, compiled, rays = _make_calibrations(frames.shape[1:])
@@ -175,7 +175,7 @@ def _time_measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
 
 
 def _time_one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
-    """The fused kernel, which reads ``numbers`` float32 of calibration a pixel; nothing new is asked for in it."""
+    """The row of the fused kernel, which reads ``numbers`` float32 of calibration a pixel and allocates nothing."""
     light = one.light(frames)
     scan = one.run(frames, light)
     seconds, moved, least = _time_with_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
@@ -218,7 +218,7 @@ def _time_live(rig: SimulatedRig, renderer: Renderer) -> list[Row]:
 def _time_peers(
     rig: SimulatedRig, renderer: Renderer, plan: dict[str, Any], coded: float
 ) -> tuple[list[Row], tuple[str, ...]]:
-    """Other programs; ``coded`` seconds took our kernel for phase steps and Gray code."""
+    """Rows of other programs; ``coded`` seconds took our kernel for phase steps and Gray code."""
     rows: list[Row] = []
     absent = tuple(text for text in (missing("fringes"), missing("small-gicp")) if text)
     if not missing("fringes"):
@@ -292,14 +292,14 @@ def _time_fit(observations: list[Observation], stereo: StereoModel) -> tuple[flo
 
 
 def _make_splined(compiled: CompiledAxis, rays: np.ndarray) -> SplinedModel:
-    """A splined model of which there is only what one pass reads."""
+    """A splined model with made-up values, of which only the arrays that one pass reads are filled."""
     model = object.__new__(SplinedModel)
     vars(model).update(rays=rays, _compiled={"x": compiled})
     return model
 
 
 def _time_file(cloud: Cloud) -> Row:
-    """A cloud with texture and noise as a PLY, beside writing as many bytes."""
+    """The row of writing a cloud with texture and noise as PLY, against writing as many bytes."""
     mask = cloud.mask
     with tempfile.TemporaryDirectory() as folder:
         path, plain = Path(folder) / "cloud.ply", Path(folder) / "plain"

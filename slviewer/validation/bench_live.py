@@ -141,7 +141,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
 
 
 class _Viewer:
-    """A browser's connection: one that `draws` takes everything and says so; one that does not, reads nothing."""
+    """A browser's connection: with `draws` it receives and acknowledges everything, otherwise it reads nothing."""
 
     def __init__(self, server: SafeServer, draws: bool) -> None:
         self._server, self._draws = server, draws
@@ -242,7 +242,7 @@ def _get_last_notice(operator: Operator) -> str:
 
 
 def _measure_memory_mb() -> float:
-    """Of this process, in use; NaN where the system does not report it."""
+    """Memory in use by this process, MB; NaN where the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:

@@ -1,4 +1,4 @@
-"""Rows of the benchmark: how times are taken, memory floors, a CUDA device, and other people's programs."""
+"""Rows of the benchmark: timing, memory floors, a CUDA device, and other programs."""
 
 import statistics
 from collections.abc import Callable
@@ -154,7 +154,7 @@ INSTALL = "pip install 'slviewer[bench]'"
 
 
 def missing(package: str) -> str:
-    """How to install a peer that is absent, in words; empty where it is here."""
+    """Text on how to install a missing peer package; empty if it is installed."""
     try:
         version(package)
     except PackageNotFoundError:

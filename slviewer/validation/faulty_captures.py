@@ -130,7 +130,7 @@ class FaultBench:
 
 
 def _describe_periods(bench: FaultBench, **period_px: float) -> DiagnosedCalibration:
-    """Fringes of other periods than the description says, {axis: described period}."""
+    """The diagnosed calibration with described fringe periods that are wrong, {axis: described period}."""
     frames = [
         replace(f, period_px=period_px[f.axis]) if f.kind == "phase" and f.axis in period_px else f
         for f in bench.sequence.frames
@@ -139,12 +139,12 @@ def _describe_periods(bench: FaultBench, **period_px: float) -> DiagnosedCalibra
 
 
 def _describe_board(bench: FaultBench, columns: int, rows: int) -> DiagnosedCalibration:
-    """A board of another size than the one that was captured."""
+    """The diagnosed calibration with a described board of another size than the captured one."""
     return bench.attempt_disturbed(board=replace(bench.board, columns=columns, rows=rows))
 
 
 def _renumber_features(bench: FaultBench, order: FrameChange) -> DiagnosedCalibration:
-    """Features of one pose in another order; ``order`` turns (rows, columns) indices."""
+    """The diagnosed calibration with the features of one pose in another order; ``order`` turns (rows, columns) indices."""
     captures = bench.examine_clean()
     observation = captures[2].observation
     assert observation is not None
@@ -159,7 +159,7 @@ def _renumber_features(bench: FaultBench, order: FrameChange) -> DiagnosedCalibr
 
 
 def _move_board(bench: FaultBench, by_mm: Sequence[float], share: float) -> DiagnosedCalibration:
-    """One pose whose board has moved after this share of the frames."""
+    """The diagnosed calibration with one pose whose board moved after ``share`` of the frames."""
     pose, frames = bench.poses[2], bench.frames(2).copy()
     from_frame = round(share * len(frames))
     frames[from_frame:] = bench.render(Pose(pose.R, pose.t + np.array(by_mm)), 2)[from_frame:]
@@ -173,7 +173,7 @@ def _apply_gamma(bench: FaultBench, gamma: float) -> DiagnosedCalibration:
 
 
 def _tilt_boards_alike(bench: FaultBench, tilt_deg: float, spread_deg: float) -> DiagnosedCalibration:
-    """All boards tilted alike, but for a hand's unsteadiness."""
+    """The diagnosed calibration from boards that are all tilted alike, within ``spread_deg``."""
     rng = np.random.default_rng(5)
     middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
     captures = []
@@ -186,7 +186,7 @@ def _tilt_boards_alike(bench: FaultBench, tilt_deg: float, spread_deg: float) ->
 
 
 def _avoid_corner(bench: FaultBench) -> DiagnosedCalibration:
-    """Poses of which none reaches the image's top right."""
+    """The diagnosed calibration from poses of which none reaches the image's top right."""
     wide = replace(bench, count=MANY)
     width, height = bench.rig.camera.size
     captures = []

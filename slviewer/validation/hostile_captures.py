@@ -57,7 +57,7 @@ class MeasuredScan:
 
 @dataclass(eq=False)
 class CaseReport:
-    """What the program said of a case: its warnings, the causes that it named by word, and the error that ended it."""
+    """The program's messages on a case: its warnings, the causes that it named, and the error that ended it."""
 
     warnings: list[str] = field(default_factory=list)
     named: list[frozenset[str]] = field(default_factory=list)

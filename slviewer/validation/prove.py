@@ -1,4 +1,4 @@
-"""What the program claims of itself, proved on simulated rigs whose truth is known."""
+"""The program's claims, proved on simulated rigs with known ground truth."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

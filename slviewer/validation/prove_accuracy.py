@@ -123,7 +123,7 @@ class RigFigures:
 
     @property
     def predicted_over_floor(self) -> float:
-        """Of the plane where it is farthest from 1; NaN where one is not known."""
+        """Ratio of predicted noise to the floor of the plane where it is farthest from 1; NaN where one is unknown."""
         ratios = [plane.predicted_mm / plane.rms_mm[FLOOR] for plane in self.planes.values()]
         return max(ratios, key=lambda ratio: math.inf if math.isnan(ratio) else abs(math.log(ratio)))
 
@@ -166,7 +166,7 @@ def judge_accuracy(rigs: Sequence[RigFigures], scale: float) -> Proof:
 
 
 def check_rig(rig: RigFigures) -> tuple[BandCheck, ...]:
-    """The bounds that one rig's figures have to keep."""
+    """The checks of one rig's figures against their bounds."""
     floor, splined = rig.mean_mm(FLOOR), rig.mean_mm("splined")
     regions = {plane.region for plane in rig.planes.values()}
     radius, spacing = rig.largest_errors_mm

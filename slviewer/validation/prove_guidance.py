@@ -120,7 +120,7 @@ def judge_guidance(figures: Sequence[WayFigures], scale: float) -> Proof:
 
 
 def _observe_random(rig: SimulatedRig, count: int, report: Progress) -> list[Observation]:
-    """The observations of poses drawn as the Letter's were; unreadable ones are skipped."""
+    """The observations of poses drawn at random like the Letter's; undetected ones are skipped."""
     observations = [
         _observe_pose(rig, pose, i, part(report, 0.9 * i / count, 0.9))
         for i, pose in enumerate(target_poses(rig, BOARD, count))

@@ -1,4 +1,4 @@
-"""Whether scans are registered and meshed as well as is claimed, on a simulated rig whose truth is known.
+"""Proof of the claimed accuracy of registration and meshing, on a simulated rig with known ground truth.
 
 Three depths and a full turn of an object are measured with the splined calibration of rendered target poses, registered
 and fused; pairs that do not determine a pose must be refused.

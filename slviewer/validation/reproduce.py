@@ -1,4 +1,4 @@
-"""The Letter's experiments on the simulated rig, its figures remade, and its tables beside ours."""
+"""The Letter's experiments repeated on the simulated rig, with its tables beside ours."""
 
 import json
 import shutil
@@ -91,7 +91,7 @@ def reproduce(
 
 
 def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> None:
-    """Fills the session, unless it holds this scale and seed already; refuses one that holds anything else."""
+    """Simulate the session unless it has this scale and seed already; raises an error if it has other data."""
     if is_session(session):
         made = _load_truth(session)
         if (made.get("scale"), made.get("seed")) == (scale, seed):

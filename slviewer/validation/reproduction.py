@@ -35,7 +35,7 @@ MODELS = ("stereo", "pixelwise", "splined")
 
 @dataclass(frozen=True)
 class Reproduction:
-    """Everything that the experiments gave."""
+    """The results of all experiments."""
 
     quick: bool
     stereo: StereoModel
@@ -62,7 +62,7 @@ class Reproduction:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Every figure that ``text`` shows, and what stands behind it."""
+        """All figures that ``text`` shows, and the values that they are computed from."""
         return {
             "quick": self.quick,
             "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
@@ -76,7 +76,7 @@ class Reproduction:
         }
 
     def text(self) -> str:
-        """Both tables with the Letter's figures beside ours, and what else there is to know."""
+        """Both tables with the Letter's figures beside ours, and further results."""
         rms, theirs = self.stereo.reprojection_rms_px, letter.REPROJECTION_RMS_PX
         icp = letter.EXPERIMENT_3_ICP_RMS_MM
         spacing = self.spacing_rms_mm
@@ -112,7 +112,7 @@ class Reproduction:
 
 
 def _select_columns(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The columns that fit a terminal; coverage and points set aside stand in the report."""
+    """The columns that fit a terminal, without coverage and excluded points, which the report has."""
     return [{k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k} for row in table]
 
 
@@ -217,7 +217,7 @@ def error_maps(title: str, comparison: Comparison) -> ErrorMaps:
 
 
 def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
-    """Points (n, 3) mm of the stereo model's plane, where the pixels that counted look at it."""
+    """Points (n, 3) mm of the stereo model's plane on the rays of the evaluated pixels."""
     result = comparison.results["stereo"]
     assert isinstance(result, PlaneResult)
     v, u = np.nonzero(result.inliers)
