@@ -53,7 +53,7 @@ def finish_figure(drawing: Any, caption: str, alt: str) -> Figure:
 
 
 def style_axes(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK) -> None:
-    """Style axes plainly: a light grid, two spines, labels in the page's sizes; ``x`` and ``y`` name quantity and unit."""
+    """Style axes plainly: a light grid, two spines, labels in the page's sizes; ``x`` and ``y`` name the axes."""
     axes.set_title(title, fontsize=TITLE_PT, color=colour, loc="left", fontweight="bold", pad=7)
     axes.set_xlabel(x, fontsize=TEXT_PT, color=SOFT)
     axes.set_ylabel(y, fontsize=TEXT_PT, color=SOFT)
@@ -91,7 +91,7 @@ def colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) 
 
 
 def draw_map(axes: Any, image: NDArray[np.floating], colours: str, levels: int, low: float, high: float) -> Any:
-    """Draw a map (h, w), grey where NaN, with ``levels`` levels of a colour map from ``low`` to ``high``; returns the image.
+    """Draw a map (h, w), grey where NaN, with ``levels`` levels of a colour map ``low`` to ``high``; returns the image.
 
     Maps that are finer than the figure are averaged.
     """

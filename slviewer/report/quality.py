@@ -63,7 +63,7 @@ def models_section(models: ModelsView) -> Section:
 
 
 def comparison_table(compared: CrossValidation, bold: str) -> Table:
-    """Table of the models' RMS on held-out poses; the name of the model ``bold`` in bold, the smallest errors marked."""
+    """Table of the models' RMS on held-out poses; the model ``bold`` in bold, the smallest errors marked."""
     figures = {
         "plane_mm": (Column("plane", "mm"), 4),
         "board_mm": (Column("board", "mm"), 4),

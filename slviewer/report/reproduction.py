@@ -43,7 +43,7 @@ def reproduction_title(data: ReproductionData) -> tuple[str, str]:
 
 
 def reproduction_headlines(data: ReproductionData) -> list[Headline]:
-    """Headlines: flatness, flatness inside R2, a sphere's radius and the spacing of spheres: stereo against pixelwise."""
+    """Headlines: flatness, flatness inside R2, sphere radius and spacing of spheres: stereo against pixelwise."""
     mean = {m: known_mean([row.rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
     letter = {m: known_mean([row.letter_rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
     floor = known_mean([row.noise_floor_mm.get(OURS, np.nan) for row in data.planes])

@@ -1,4 +1,4 @@
-"""A small renderer of point clouds: a depth buffer, and the mean colour of the points at the front, shaded by their normals."""
+"""Renderer of point clouds: a depth buffer, and the mean colour of the front points, shaded by their normals."""
 
 import cv2
 import numpy as np

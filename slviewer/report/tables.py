@@ -51,7 +51,7 @@ def models_of(rows: Sequence[Mapping[str, float]]) -> list[str]:
 
 
 def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
-    """Table of planes: incidence, RMS and floor by model, which is better, and, where rows have them, the Letter's own figures."""
+    """Table of planes: incidence, RMS and floor by model, the better one, and the Letter's figures where given."""
     rms, floor = _values_by_model(rows, "rms_mm"), _values_by_model(rows, "noise_floor_mm")
     letter = _values_by_model(rows, "letter_rms_mm")
     columns: list[_CellColumn] = [
@@ -78,7 +78,7 @@ def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
 
 
 def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
-    """Table of spheres: RMS, floor and fitted radius by model, which radius is better, and the Letter's own figures where known."""
+    """Table of spheres: RMS, floor and fitted radius by model, the better radius, the Letter's figures where given."""
     rms, floor = _values_by_model(rows, "rms_mm"), _values_by_model(rows, "noise_floor_mm")
     radius, letter = _values_by_model(rows, "radius_mm"), _values_by_model(rows, "letter_rms_mm")
     errors = _signed_errors(rms, radius, [row.true_radius_mm for row in rows])

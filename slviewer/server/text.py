@@ -26,7 +26,7 @@ def escape(text: str) -> str:
 def safe_name(name: str, default: str = "upload") -> str:
     """A file name made of the last part of `name`: no folder, no hidden file, nothing a file system would refuse.
 
-    Letters of every script stay; at most 120 characters and 200 bytes, with its suffix; `default` if the result is empty.
+    Letters of every script stay; at most 120 characters and 200 bytes, with its suffix; `default` if empty.
     """
     last = re.split(r"[/\\]", unicodedata.normalize("NFC", str(name)))[-1]
     last = re.sub(r'[<>:"|?*]', "_", _INVISIBLE.sub("", last)).strip(" .")

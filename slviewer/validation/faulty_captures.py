@@ -130,7 +130,7 @@ class FaultBench:
 
 
 def _describe_periods(bench: FaultBench, **period_px: float) -> DiagnosedCalibration:
-    """The diagnosed calibration with described fringe periods that are wrong, {axis: described period}."""
+    """Diagnosed calibration with described fringe periods that are wrong, {axis: described period}."""
     frames = [
         replace(f, period_px=period_px[f.axis]) if f.kind == "phase" and f.axis in period_px else f
         for f in bench.sequence.frames
@@ -144,7 +144,7 @@ def _describe_board(bench: FaultBench, columns: int, rows: int) -> DiagnosedCali
 
 
 def _renumber_features(bench: FaultBench, order: FrameChange) -> DiagnosedCalibration:
-    """The diagnosed calibration with the features of one pose in another order; ``order`` turns (rows, columns) indices."""
+    """The diagnosed calibration with one pose's features reordered; ``order`` maps (rows, columns) indices."""
     captures = bench.examine_clean()
     observation = captures[2].observation
     assert observation is not None
