@@ -22,7 +22,7 @@ class RigUnderTest:
     """An open rig. Images come as (h, w) float32 grey levels of every `stride`-th row and column.
 
     ``settle_ms`` and ``stale`` are the results of the latency check: the time to wait after a change, and how many
-    images to throw away. ``dark`` and ``white`` are the references, ``illuminated`` (h, w) bool is lit by the projector;
+    images to throw away. ``dark`` and ``white`` are the references, ``illuminated`` (h, w) bool lit by the projector;
     ``noise`` of one grey level, and ``unsteady``, by how much whole images differ, as a share of the white light (rms).
     """
 
